@@ -57,9 +57,9 @@ impl Text {
             }
             let is_declaration = line.starts_with("const ") || line.starts_with("layout(");
             while is_declaration && !code.contains([';', '{']) {
-                let (more, behind) = split_comment(lines.next().expect("a declaration ends"));
+                let (more, after) = split_comment(lines.next().expect("a declaration ends"));
                 code += &more;
-                comment += &behind;
+                comment += &after;
             }
             if comment.is_empty() {
                 comment = above.join(" ");
@@ -138,11 +138,10 @@ impl Text {
         };
         let (mut rust, mut rest) = (String::new(), value);
         while let Some(begin) = rest.find(is_word) {
-            let (operator, behind) = rest.split_at(begin);
-            let (found, behind) =
-                behind.split_at(behind.find(|c| !is_word(c)).unwrap_or(behind.len()));
+            let (operator, after) = rest.split_at(begin);
+            let (found, after) = after.split_at(after.find(|c| !is_word(c)).unwrap_or(after.len()));
             rust = rust + operator + &word(found)?;
-            rest = behind;
+            rest = after;
         }
         Some(rust + rest)
     }

@@ -13,8 +13,8 @@ use nightsplat::ash::vk::Handle as _;
 use nightsplat::ash::{self, khr, vk};
 use nightsplat::glam::{DAffine3, DVec3, Vec3};
 use nightsplat::{
-    Camera, Gaussians, Gpu, HostDevice, HostRecording, Image, RenderOptions, RenderSettings,
-    Renderer, Start, Status, required_device_features,
+    Camera, Gaussians, Gpu, HostDevice, HostRecording, Image, Initialization, RenderOptions,
+    RenderSettings, Renderer, Status, required_device_features,
 };
 
 const OPTIONS: RenderOptions = RenderOptions { sh_degree: 0, background: [0.05, 0.05, 0.1] };
@@ -73,7 +73,8 @@ fn ring() -> nightsplat::Result<Gaussians> {
         |angle: f64| [0.0, 1.0, 2.0].map(|third| 0.5 + 0.5 * (angle + third * TAU / 3.0).cos());
     let positions: Vec<DVec3> = angles.clone().map(position).collect();
     let colors: Vec<Vec3> = angles.map(|angle| DVec3::from(hue(angle)).as_vec3()).collect();
-    let mut gaussians = Gaussians::from_points(&positions, &colors, 0, &Start::default(), 0)?;
+    let mut gaussians =
+        Gaussians::from_points(&positions, &colors, 0, &Initialization::default(), 0)?;
     gaussians.raw_opacities_mut().fill(2.0);
     gaussians.log_scales_mut().fill(Vec3::splat(-3.0));
     Ok(gaussians)

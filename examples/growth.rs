@@ -11,7 +11,7 @@ use std::time::Instant;
 
 use glam::DVec3;
 use nightsplat::base::random::Stream;
-use nightsplat::cli::bench::scene::{self, Scene};
+use nightsplat::cli::bench::scene::{self, BenchScene};
 use nightsplat::gpu::{DeviceChoice, Gpu, PassTime};
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, Point};
@@ -86,7 +86,7 @@ type Measured = Result<(f64, u64)>;
 /// A training step of the plain model.
 fn step(gpu: &Gpu, [width, height]: [u32; 2], gaussians: usize) -> Measured {
     gpu.reset_peak_memory();
-    let scene = Scene::new(width, height, gaussians);
+    let scene = BenchScene::new(width, height, gaussians);
     let mut trainer = scene::plain(gpu, &scene)?;
     Ok((least(|| trainer.profile_step())?, gpu.peak_memory()))
 }
@@ -195,7 +195,7 @@ fn print_axis<T: Copy>(
                 Err(
                     error @ (Error::OutOfMemory { .. }
                     | Error::BufferTooLarge { .. }
-                    | Error::Crowded { .. }
+                    | Error::TileLimit { .. }
                     | Error::Usage(_)),
                 ),
             ) => writeln!(out, "{value:12} {error}")?,

@@ -6,7 +6,7 @@
 
 use std::path::PathBuf;
 
-use nightsplat::run::{self, Event, HeldRun};
+use nightsplat::run::{self, Event, IfExists};
 use nightsplat::synthetic::{self, SyntheticOptions};
 use nightsplat::{Dataset, DeviceChoice, Gpu, ToneCurve, ToneSettings, TrainConfig};
 
@@ -29,7 +29,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         &config,
         &dataset,
         &folder.join("run"),
-        HeldRun::Replace,
+        IfExists::Replace,
         |event| match event {
             Event::Started { steps, .. } => println!("{steps} steps"),
             Event::Step(report) if report.step.is_multiple_of(50) => {

@@ -42,7 +42,7 @@ pub(crate) const PARSERS: [Parser; 15] = [
 
 fn curve(path: &Path) -> Result<()> {
     if path.extension().is_some_and(|extension| extension == "toml") {
-        said(Profile::load(path).map(drop));
+        printed(Profile::load(path).map(drop));
     }
     let settings = ToneSettings::load(path)?;
     // What is plotted, shown and trained with.
@@ -69,7 +69,7 @@ fn image(path: &Path) -> Result<()> {
 fn file(extension: &str, bytes: &[u8], read: impl FnOnce(&Path) -> Result<()>) {
     let path = FOLDER.with(|folder| folder.path().join("file").with_extension(extension));
     fs::write(&path, bytes).unwrap();
-    said(read(&path));
+    printed(read(&path));
 }
 
 /// Puts the bytes in the place of one file of a dataset and loads that.
@@ -80,7 +80,7 @@ fn dataset(set: &str, place: &str, bytes: &[u8]) {
     }
     let original = fs::read(root.join(place)).unwrap_or_default();
     fs::write(root.join(place), bytes).unwrap();
-    said(Dataset::load(&root, &LoadOptions::default()).map(|dataset| {
+    printed(Dataset::load(&root, &LoadOptions::default()).map(|dataset| {
         assert!(dataset.points.iter().all(|point| point.position.is_finite()));
         let cameras = dataset.views.iter().map(|view| view.camera);
         for camera in cameras {
@@ -91,7 +91,7 @@ fn dataset(set: &str, place: &str, bytes: &[u8]) {
 }
 
 /// An error is one line.
-fn said(outcome: Result<()>) {
+fn printed(outcome: Result<()>) {
     if let Err(error) = outcome {
         let message = error.to_string();
         assert!(!message.is_empty() && !message.contains('\n'), "{message:?}");

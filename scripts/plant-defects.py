@@ -73,7 +73,7 @@ DEFECTS = [
     ("guard: coefficients stay within 16-bit floats", "shaders-glsl/include/half.glsl",
      "clamp(floor(x / unit + share) * unit, -LARGEST_HALF, LARGEST_HALF)", "floor(x / unit + share) * unit",
      "--test splats beyond"),
-    ("a split's first half stays what its parent was", "shaders-glsl/include/fate.glsl",
+    ("a split's first half stays what its parent was", "shaders-glsl/include/densify_action.glsl",
      "return fate == FATE_SPLIT || copy_index > 0;", "return copy_index > 0;", "--test splats densify::"),
     ("what a camera would see otherwise is split", "shaders-glsl/splats/densify/densify_score.comp",
      "is_candidate && is_safe_to_split(i) ?", "is_candidate ?", "--test splats densify::"),

@@ -9,19 +9,19 @@ mod model;
 mod patch;
 mod path;
 #[cfg(feature = "io")]
-mod places;
+mod poses;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, Vec2Swizzles as _};
 
 #[cfg(feature = "io")]
 pub(crate) use axes::upwards;
 #[cfg(feature = "io")]
-pub use frame::Frame;
+pub use frame::TrainingFrame;
 pub use model::{CameraModel, KannalaBrandt};
 pub use patch::Patch;
 pub use path::CameraPath;
 #[cfg(feature = "io")]
-pub(crate) use places::Places;
+pub(crate) use poses::CameraPoses;
 
 /// A camera with its pose: a pinhole, or a fisheye as it is.
 #[derive(Clone, Copy, Debug, PartialEq)]

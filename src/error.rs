@@ -1,6 +1,6 @@
 //! What can go wrong, sorted by what the user can do about it.
 //!
-//! A message names a setting by its key in config.toml: `max_gaussians`, `density.fill`.
+//! A message names a setting by its key in config.toml: `max_gaussians`, `density.depth_seeding`.
 
 use std::path::{Path, PathBuf};
 
@@ -115,7 +115,7 @@ pub enum Error {
         "{view}: {splats} splats on one tile of {tile} pixels, {device} follows {limit}; lower \
          max_gaussians or take another device"
     )]
-    Crowded {
+    TileLimit {
         /// The render, or the training step and its view.
         view: String,
         /// The most splats of one tile.
@@ -197,7 +197,7 @@ impl Error {
             | Self::BufferTooLarge { .. }
             | Self::DeviceLost { .. }
             | Self::Vulkan { .. }
-            | Self::Crowded { .. } => 4,
+            | Self::TileLimit { .. } => 4,
             Self::Stopped { cause, .. } | Self::BatchStopped { cause, .. } => cause.exit_code(),
             Self::Output { .. }
             | Self::NotFinite { .. }
@@ -258,9 +258,9 @@ mod tests {
 
     #[test]
     fn what_a_file_says_becomes_one_line_that_ends() {
-        let said = |problem: &str| Error::input("file", problem).to_string();
-        assert_eq!(said("is no\nnumber"), r"file: is no\nnumber");
-        let endless = said(&"ö\n".repeat(5000));
+        let printed = |problem: &str| Error::input("file", problem).to_string();
+        assert_eq!(printed("is no\nnumber"), r"file: is no\nnumber");
+        let endless = printed(&"ö\n".repeat(5000));
         assert!(endless.chars().count() < 1020 && endless.ends_with(" ..."), "{endless}");
     }
 }

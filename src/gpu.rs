@@ -26,7 +26,6 @@ mod instance;
 mod kernel;
 mod limits;
 mod memory;
-mod offered;
 mod pci;
 mod pipeline;
 mod reconvergence;
@@ -36,6 +35,7 @@ mod slice;
 mod statistics;
 mod subgroups;
 mod submission;
+mod supported;
 #[cfg(feature = "testing")]
 #[doc(hidden)]
 pub mod testing;
@@ -62,7 +62,6 @@ pub use kernel::{Binding, Bound, Interface, Kernel, Recordable};
 #[cfg(feature = "check")]
 pub use kernel::{OnHost, Reference};
 pub use memory::MemoryBudget;
-pub use offered::PUSH_VARIABLE;
 pub use pci::PciAddress;
 pub use pipeline::Pipeline;
 pub use recorder::{HostRecording, Recorder, Threads};
@@ -71,6 +70,7 @@ pub use slice::{Slice, SliceMut};
 pub use statistics::Statistic;
 pub use subgroups::SUBGROUP_VARIABLE;
 pub use submission::{PassTime, Submission};
+pub use supported::PUSH_VARIABLE;
 pub use tuning::{TUNE_VARIABLE, Tile, TunedTile};
 
 use crate::{Error, Result};
@@ -110,11 +110,11 @@ pub struct Properties {
     pub cooperative_matrix: Option<CooperativeMatrix>,
     /// A subgroup whose lanes agree stays together, whatever the others of its workgroup do: promised, not only so; never of a
     /// device that a host lends.
-    pub keeps_subgroups: bool,
+    pub has_uniform_subgroup_control_flow: bool,
     /// Passes may push their descriptors; where not, they bind sets.
-    pub pushes_descriptors: bool,
+    pub has_push_descriptors: bool,
     /// Kernels can be asked for their registers and spills; never of a device that a host lends.
-    pub tells_statistics: bool,
+    pub has_pipeline_statistics: bool,
 }
 
 /// Everything that buffers, pipelines and submissions need to outlive their [`Gpu`].
@@ -148,7 +148,7 @@ struct Shared {
     /// What the file of the fastest tiles says; read when it is first asked.
     tuned_tiles: OnceLock<Vec<TunedTile>>,
     /// What we created around the device and destroy with it; nothing for a borrowed device.
-    owned: Option<instance::Owned>,
+    owned: Option<instance::OwnedInstance>,
 }
 
 /// What was recorded since the device was opened.

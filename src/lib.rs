@@ -164,7 +164,7 @@ pub use gpu::{CheckReport, CheckedPass, Difference, Tolerance};
 // Cameras, Gaussians, and what draws them.
 pub use camera::{Camera, CameraModel, CameraPath, KannalaBrandt};
 pub use photographs::image::Image;
-pub use splats::halves::StorageFormat;
+pub use splats::packed_sh::StorageFormat;
 pub use splats::render::{
     Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status, Viewpoint,
 };
@@ -179,24 +179,24 @@ pub use {
     photographs::metrics::Scores,
     photographs::tone::{Profile, Table, ToneCurve, ToneSettings},
     results::export::{Format, spz::Version as SpzVersion},
-    splats::scene::init::Start,
+    splats::scene::init::Initialization,
     train::{Ended, MemoryEstimate, Part, Preset, Rendered, StepReport, TrainConfig, Trainer},
 };
 
 /// What a [`TrainConfig`] is made of.
 #[cfg(feature = "io")]
 pub mod config {
-    pub use crate::camera::Frame;
+    pub use crate::camera::TrainingFrame;
     pub use crate::loss::exposure::ExposureRates;
     pub use crate::loss::{ParameterWeights, Weights};
-    pub use crate::networks::{DenoiserSettings, Form, Precision};
+    pub use crate::networks::{DenoiserSettings, NetworkVariant, Precision};
     pub use crate::photographs::dataset::MeasuredSize;
     pub use crate::photographs::tone::{GainChoice, TableInput, White};
     pub use crate::splats::densify::DensityControl;
     pub use crate::splats::optimizer::{LearningRates, Schedule};
     pub use crate::train::{
-        Background, CacheSize, CheckConfig, DensityConfig, EndReason, ExposureConfig, Learning,
-        ModelConfig, NetworkRates, NotFinite, PhotographBits, PrecisionConfig, StopConfig,
+        Background, CacheSize, CheckConfig, DensityConfig, EndReason, ExposureConfig, ModelConfig,
+        NetworkRates, NotFinite, OnOff, PhotographBits, PrecisionConfig, StopConfig,
     };
 }
 
@@ -211,9 +211,11 @@ pub mod synthetic {
 /// Training into a directory with a log, checkpoints and scores, and such a directory read back.
 #[cfg(feature = "io")]
 pub mod run {
-    pub use crate::results::eval::{Against, Layer, Leftover, Player, ViewScore, means};
+    pub use crate::results::eval::{
+        ModelRenderer, ReferenceKind, RenderLayer, ResidualTransmittance, ViewScore, means,
+    };
     pub use crate::results::run::{
-        Event, HeldRun, Spent, Trained, load_config, load_model, load_networks, train,
+        Event, IfExists, ResourceUsage, RunSummary, load_config, load_model, load_networks, train,
     };
     pub use crate::train::Networks;
 }

@@ -283,14 +283,14 @@ impl Losses {
 
 /// The rectangle of a view whose pixels a loss counts; the others are context.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Interior {
+pub struct LossRegion {
     /// The first column and row.
     pub origin: UVec2,
     /// Width and height in pixels.
     pub size: UVec2,
 }
 
-impl Interior {
+impl LossRegion {
     /// All of a view.
     pub const fn whole(size: UVec2) -> Self {
         Self { origin: UVec2::ZERO, size }

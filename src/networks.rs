@@ -8,6 +8,7 @@
 //! Norms use the statistics of the image itself, in training and afterwards: there are no running averages.
 
 mod conv;
+pub mod crop;
 mod denoiser;
 mod file;
 mod half;
@@ -18,7 +19,6 @@ mod parameters;
 mod relu;
 mod tonemapper;
 mod trunk;
-pub mod window;
 
 use glam::UVec2;
 use serde::{Deserialize, Serialize};
@@ -38,7 +38,7 @@ pub(crate) use trunk::{Trunk, published};
 /// How a network begins and ends.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Form {
+pub enum NetworkVariant {
     /// What goes in comes out until something better is learned: the network's last layer begins at zero, has nothing behind
     /// it, and what it says is a difference.
     #[default]

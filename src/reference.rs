@@ -25,6 +25,8 @@ mod conv3x3_half;
 pub mod conv3x3_weight_gradient;
 mod conv3x3_weight_gradient_half;
 mod conv_strided;
+mod crop_gather;
+mod crop_scatter;
 mod denoising;
 mod densify_decide;
 mod densify_moments;
@@ -80,8 +82,6 @@ mod sort_upsweep;
 pub mod splat;
 pub mod ssim;
 mod structure_l1;
-mod window_gather;
-mod window_scatter;
 
 use glam::UVec2;
 

@@ -17,11 +17,11 @@ pub mod attributes;
 pub mod batches;
 #[cfg(feature = "io")]
 pub mod densify;
-pub mod halves;
 #[cfg(any(feature = "io", feature = "check"))]
 pub mod harmonics;
 #[cfg(feature = "io")]
 pub mod optimizer;
+pub mod packed_sh;
 pub mod render;
 pub mod scene;
 pub mod sort;

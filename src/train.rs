@@ -5,12 +5,12 @@ mod cache;
 mod checkpoint;
 mod config;
 mod decisions;
+mod depth_seeding;
 pub mod diagnose;
 mod difference;
 mod early_stopping;
 mod epochs;
 mod exposures;
-mod fill;
 mod first_gaussians;
 mod growth;
 mod layers;
@@ -37,7 +37,7 @@ mod target_views;
 mod terms;
 mod views;
 
-use crate::camera::{Camera, Frame};
+use crate::camera::{Camera, TrainingFrame};
 #[cfg(feature = "check")]
 use crate::gpu::CheckReport;
 use crate::gpu::{Gpu, PassTime, Recorder};
@@ -51,20 +51,20 @@ use crate::{Error, Result};
 pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
 pub use config::{
-    Background, CheckConfig, DensityConfig, ExposureConfig, Learning, NotFinite, StopConfig,
+    Background, CheckConfig, DensityConfig, ExposureConfig, NotFinite, OnOff, StopConfig,
     TrainConfig,
 };
 use early_stopping::Convergence;
 pub use early_stopping::{EndReason, Ended};
 use growth::Growth;
-pub use layers::{Layer, Origin, Settings, values};
+pub use layers::{Origin, Settings, SettingsLayer, values};
 pub use measuring::TargetExposure;
 pub use memory::MemoryEstimate;
 use model::Model;
 pub use networks::Networks;
 pub use parts::{ModelConfig, ModelName, NetworkRates, Part};
 use passes::background;
-pub use planned::{Planned, Planning, Said, diagnosed};
+pub use planned::{PlanSource, PlannedRun, RequestedSettings, diagnosed};
 pub use precision::{PhotographBits, PrecisionConfig};
 pub use preset::Preset;
 #[cfg(feature = "testing")]
@@ -135,7 +135,7 @@ pub struct Trainer {
     /// What is trained on.
     fingerprint: Fingerprint,
     /// Where everything on the device lies.
-    frame: Frame,
+    frame: TrainingFrame,
     /// In units of the frame.
     extent: f64,
     /// Steps done.
@@ -218,7 +218,7 @@ impl Trainer {
 
     /// Where the Gaussians are trained.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn frame(&self) -> &Frame {
+    pub(crate) fn frame(&self) -> &TrainingFrame {
         &self.frame
     }
 
@@ -236,7 +236,7 @@ impl Trainer {
     ///
     /// # Errors
     /// [`Error::Usage`] where the run has ended early, [`Error::NotFinite`] where a loss term or a gradient is NaN and [`StopConfig::not_finite`] leaves no view out,
-    /// [`Error::Crowded`] where the device cannot follow as many splats as lie on one tile, [`Error::Disagrees`] where a
+    /// [`Error::TileLimit`] where the device cannot follow as many splats as lie on one tile, [`Error::Disagrees`] where a
     /// checked step is to stop at a difference and has one, or the device is out of memory or lost.
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
         if until > self.step && self.step < self.config.steps && self.has_ended() {
@@ -286,8 +286,8 @@ impl Trainer {
     /// As [`Trainer::advance`]; a step that overflows its memory is not counted, the next [`Trainer::advance`] redoes it.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         let step = self.step + 1;
-        self.make_room_for_degree()?;
-        self.supervision.views.bring(&self.config, step..=step)?;
+        self.allocate_sh_degree()?;
+        self.supervision.views.make_resident(&self.config, step..=step)?;
         let times = self.gpu.clone().profile("step", |pass| self.record_step(pass, step, 0))?;
         if self.gpu.read(self.renderer.status())?.first() == Some(&0) {
             self.step = step;
@@ -299,7 +299,7 @@ impl Trainer {
     fn record_step(&mut self, pass: &mut Recorder<'_>, step: u64, slot: u32) -> Result<()> {
         let schedule = &self.config.schedule;
         let view = self.view_id(step);
-        let settling_rate = self.settling_rate(step);
+        let cooldown_factor = self.cooldown_factor(step);
         let options = RenderOptions {
             sh_degree: self.sh_degree(step),
             background: background(&self.config, step),
@@ -323,10 +323,10 @@ impl Trainer {
             },
         )?;
         supervision.regularise((gpu, pass), model, renderer, slot)?;
-        let rates = schedule.learning_rates(step, self.extent).scaled(settling_rate);
+        let rates = schedule.learning_rates(step, self.extent).scaled(cooldown_factor);
         let (degree, status) = (options.sh_degree, renderer.status());
         model.update((gpu, pass), &optimizer.adam, step, &rates, degree, status)?;
-        supervision.update(pass, &optimizer.adam, step, settling_rate, status)
+        supervision.update(pass, &optimizer.adam, step, cooldown_factor, status)
     }
 
     /// The networks; none where the model has none.
@@ -339,7 +339,7 @@ impl Trainer {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn learning_rates(&self, step: u64) -> LearningRates {
         let rates = self.config.schedule.learning_rates(step, self.extent);
-        rates.scaled(self.settling_rate(step))
+        rates.scaled(self.cooldown_factor(step))
     }
 
     /// Renders what `camera` sees, with every SH degree trained so far, before a black background.

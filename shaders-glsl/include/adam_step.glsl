@@ -15,7 +15,7 @@ struct Moments {
 };
 
 // Positive phrasing: an infinite or NaN gradient fails the test.
-vec4 tame(vec4 gradient) {
+vec4 clamp_gradient(vec4 gradient) {
     vec4 bounded = clamp(gradient, -GRADIENT_BOUND, GRADIENT_BOUND);
     return mix(vec4(0.0), bounded, lessThan(abs(gradient), vec4(3e38)));
 }

@@ -16,8 +16,8 @@ struct Camera {
     vec2  focal;            // pixels
     vec2  principal_point;  // pixels
     uvec2 size;             // pixels
-    vec2  least_slope;      // pinhole: where the Jacobian of the projection is taken at the least
-    vec2  most_slope;       // and at the most: beyond, the affine approximation of a splat explodes
+    vec2  min_slope;      // pinhole: where the Jacobian of the projection is taken at the least
+    vec2  max_slope;       // and at the most: beyond, the affine approximation of a splat explodes
     vec4  distortion;       // fisheye: coefficients of the angle's powers 3, 5, 7 and 9
     float largest_angle;    // fisheye: nothing is seen so far off the axis or farther, radians
     uint  model;            // CAMERA_*

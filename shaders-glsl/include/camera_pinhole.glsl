@@ -11,7 +11,7 @@ vec2 pinhole_project(vec3 point, Camera camera) {
 
 // x / z and y / z, no farther than the Jacobian is taken.
 vec2 clamped_slope(vec3 point, Camera camera) {
-    return clamp(point.xy / point.z, camera.least_slope, camera.most_slope);
+    return clamp(point.xy / point.z, camera.min_slope, camera.max_slope);
 }
 
 Jacobian pinhole_jacobian(vec3 point, Camera camera) {

@@ -1,5 +1,5 @@
 // SH coefficients above degree 0 as 16-bit floats, two in a word: a Gaussian's follow each other, and where their number is
-// odd, the last is alone. `src/splats/halves.rs` is the host's.
+// odd, the last is alone. `src/splats/packed_sh.rs` is the host's.
 
 // Below it a 16-bit float is subnormal, which some devices flush: of these there is none but 0.
 const float SMALLEST_HALF = 6.103515625e-05;

@@ -6,4 +6,4 @@ const uint STATUS_WORDS      = 3;
 const uint STATUS_OVERFLOWED = 1;  // more intersections than memory was reserved for
 const uint STATUS_NOT_FINITE = 2;  // a loss term is NaN or infinite
 const uint STATUS_GRADIENT   = 8;  // a gradient is NaN or infinite, and no flag was up before
-const uint STATUS_CROWDED    = 4;  // more splats on one tile than the blending kernels follow
+const uint STATUS_TILE_LIMIT    = 4;  // more splats on one tile than the blending kernels follow

@@ -25,7 +25,7 @@ uvec2 tile_run(uint tile, uint longest_run) {
     uint count = run.y - run.x;
     if (count > longest_run) {
         if (subgroupElect()) {
-            atomicOr(status[0], STATUS_CROWDED);
+            atomicOr(status[0], STATUS_TILE_LIMIT);
             atomicMax(status[2], count);
         }
         run.y = run.x;

@@ -15,8 +15,8 @@ layout(constant_id = 0) const uint ROWS = 16;
 layout(push_constant) uniform Params {
     uint  width;           // pixels
     uint  height;          // pixels
-    uvec2 interior_begin;  // the first pixel
-    uvec2 interior_end;    // one past the last
+    uvec2 loss_begin;  // the first pixel
+    uvec2 loss_end;    // one past the last
     float mse_weight;      // u
     float tv_weight;       // v
     float mean_scale;      // 1 / (3hw), h x w the interior
@@ -42,17 +42,17 @@ void main() {
     uint plane = strip / down * width * height;
     // A workgroup's last threads can be beyond the image: no rows, yet they take part in the sums.
     uint end_row = strip < 3 * down ? min(first_row + ROWS, height) : first_row;
-    bool in_columns = x >= interior_begin.x && x < interior_end.x;
-    bool has_left = in_columns && x > interior_begin.x;
-    bool has_right = in_columns && x + 1 < interior_end.x;
+    bool in_columns = x >= loss_begin.x && x < loss_end.x;
+    bool has_left = in_columns && x > loss_begin.x;
+    bool has_right = in_columns && x + 1 < loss_end.x;
 
     float squares = 0.0;
     vec2 pairs = vec2(0);  // squared differences along x, y
     for (uint y = first_row; y < end_row; ++y) {
         uint i = plane + y * width + x;
-        bool inside = in_columns && y >= interior_begin.y && y < interior_end.y;
-        bool has_up = inside && y > interior_begin.y;
-        bool has_down = inside && y + 1 < interior_end.y;
+        bool inside = in_columns && y >= loss_begin.y && y < loss_end.y;
+        bool has_up = inside && y > loss_begin.y;
+        bool has_down = inside && y + 1 < loss_end.y;
         float a = denoised[i];
         float left = inside && has_left ? a - denoised[i - 1] : 0.0;
         float right = inside && has_right ? denoised[i + 1] - a : 0.0;

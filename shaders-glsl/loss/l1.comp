@@ -5,13 +5,13 @@
 //! The gradient of mean|a - b| with respect to the render a, b the pseudo-GT, and partial sums of |a - b|.
 //!
 //! A thread takes `VALUES_PER_THREAD` values, one subgroup apart, so that a subgroup reads one run. At a = b the gradient
-//! is 0. With `WITH_INTERIOR` the mean is over a rectangle of the view, and outside it the gradient is 0. The first term of
+//! is 0. With `WITH_LOSS_REGION` the mean is over a rectangle of the view, and outside it the gradient is 0. The first term of
 //! a step writes the gradient, the others add to it. Reference: `src/reference/l1.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(constant_id = 0) const uint VALUES_PER_THREAD = 32;
-layout(constant_id = 1) const bool WITH_INTERIOR = false;
+layout(constant_id = 1) const bool WITH_LOSS_REGION = false;
 layout(constant_id = 2) const bool ADDS = false;
 
 layout(push_constant) uniform Params {
@@ -19,8 +19,8 @@ layout(push_constant) uniform Params {
     float l1_scale;        // 1 / (3hw), h x w the interior
     uint  width;           // pixels; this and what follows only with an interior
     uint  height;          // pixels
-    uvec2 interior_begin;  // the first pixel
-    uvec2 interior_end;    // one past the last
+    uvec2 loss_begin;  // the first pixel
+    uvec2 loss_end;    // one past the last
 };
 
 layout(binding = 0) readonly  buffer Render   { float render[]; };    // (3, H, W), not clamped
@@ -29,10 +29,10 @@ layout(binding = 2)           buffer DRender  { float d_render[]; };  // (3, H, 
 layout(binding = 3) writeonly buffer Partials { float partials[]; };  // one per workgroup
 
 bool counts(uint i) {
-    if (WITH_INTERIOR) {
+    if (WITH_LOSS_REGION) {
         uint row = i / width;
         uvec2 pixel = uvec2(i - row * width, row % height);
-        return all(greaterThanEqual(pixel, interior_begin)) && all(lessThan(pixel, interior_end));
+        return all(greaterThanEqual(pixel, loss_begin)) && all(lessThan(pixel, loss_end));
     }
     return true;
 }

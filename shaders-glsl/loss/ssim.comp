@@ -32,8 +32,8 @@ layout(constant_id = 3) const bool ADDS = false;
 layout(push_constant) uniform Params {
     uint  width;           // pixels
     uint  height;          // pixels
-    uvec2 interior_begin;  // the first pixel
-    uvec2 interior_end;    // one past the last
+    uvec2 loss_begin;  // the first pixel
+    uvec2 loss_end;    // one past the last
     float l1_scale;        // (1 - w) / (3hw), h x w the interior
     float ssim_scale;      // w / (3hw)
 };
@@ -89,7 +89,7 @@ bool has_output(Strip strip, uint column) {
 
 // The rectangle whose pixels count: all of them, or the interior of a view with a margin.
 bool is_inside(uint x, uint y) {
-    return x >= interior_begin.x && x < interior_end.x && y >= interior_begin.y && y < interior_end.y;
+    return x >= loss_begin.x && x < loss_end.x && y >= loss_begin.y && y < loss_end.y;
 }
 
 bool is_aligned() {

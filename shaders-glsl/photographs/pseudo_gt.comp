@@ -31,7 +31,7 @@ layout(push_constant) uniform Params {
 layout(binding = 0) readonly  buffer Codes      { uint codes[]; };     // (3, H, W), the lowest bits of a word first
 layout(binding = 1) readonly  buffer Values     { float values[]; };   // one per code, or (3, H, W); sRGB-encoded
 layout(binding = 2) readonly  buffer Parameters { ToneParameters parameters[]; };
-layout(binding = 3) readonly  buffer Numbers    { float numbers[]; };  // (3, K, 3) knots x, y, slope; or (3, PROFILE_WIDTH)
+layout(binding = 3) readonly  buffer CurveInputs    { float numbers[]; };  // (3, K, 3) knots x, y, slope; or (3, PROFILE_WIDTH)
 layout(binding = 4) writeonly buffer Target     { float target[]; };   // (3, H, W)
 
 float stored(uint i) {

@@ -301,7 +301,7 @@ mod tests {
     fn a_rule_takes_what_it_says() {
         use Bound::{Excluded, Included, Unbounded};
         let open = Rule::Number(Excluded(0.0), Excluded(1.0));
-        for (rule, said, taken, refused) in [
+        for (rule, printed, taken, refused) in [
             (open, "above 0 and below 1", 0.5, 1.0),
             (Rule::above(0.0, 100.0), "above 0 and at most 100", 100.0, 0.0),
             (Rule::from_to(0.1, 0.9), "0.1 to 0.9", 0.1, 0.95),
@@ -311,8 +311,8 @@ mod tests {
             (Rule::at_least(1), "a whole number, at least 1", 3.0, 2.5),
             (Rule::Whole(0, 3), "a whole number, 0 to 3", 3.0, 4.0),
         ] {
-            assert_eq!(rule.to_string(), said);
-            assert!(rule.takes_number(taken) && !rule.takes_number(refused), "{said}");
+            assert_eq!(rule.to_string(), printed);
+            assert!(rule.takes_number(taken) && !rule.takes_number(refused), "{printed}");
         }
         assert!(
             Rule::OneOf(&["on", "off"]).takes_text("on") && !Rule::OneOf(&["a"]).takes_text("b")

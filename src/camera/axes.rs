@@ -39,7 +39,7 @@ pub(crate) fn upwards(poses: &[Camera]) -> DVec3 {
 /// The point with the least squared distances to the optical axes; `None` where they are as good as parallel.
 pub(super) fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
     /// Less of the cameras' turns says nothing of a distance.
-    const LEAST_DETERMINANT: f64 = 1e-6;
+    const MIN_DETERMINANT: f64 = 1e-6;
     let (mut matrix, mut vector) = (DMat3::ZERO, DVec3::ZERO);
     for pose in poses {
         let axis = forward(pose);
@@ -49,6 +49,6 @@ pub(super) fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
         vector += across * pose.center();
     }
     let matrix = matrix * (1.0 / poses.len() as f64);
-    let is_definite = matrix.determinant() > LEAST_DETERMINANT;
+    let is_definite = matrix.determinant() > MIN_DETERMINANT;
     is_definite.then(|| matrix.inverse() * (vector / poses.len() as f64))
 }

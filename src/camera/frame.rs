@@ -20,7 +20,7 @@ settings! {
 "frame."
 /// A translation and a scaling of the world.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Frame {
+pub struct TrainingFrame {
     /// The origin of the frame in which the model is trained, in the world.
     center: [f64; 3] = [0.0; 3], "found from the cameras, and recorded"
         => Rule::List(3, 3, &Rule::Number(Bound::Unbounded, Bound::Unbounded)), in "world units";
@@ -42,7 +42,7 @@ const FAR_FROM_ORIGIN: f64 = 64.0;
 /// A camera so many times as far from the middle as half of them are stands elsewhere.
 const OUTLIER: f64 = 32.0;
 
-impl Frame {
+impl TrainingFrame {
     /// The world itself.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) const WORLD: Self = Self { center: [0.0; 3], scale: 1.0 };
@@ -151,7 +151,7 @@ mod tests {
     fn a_camera_before_the_frame_shows_what_it_shows_of_the_world() {
         for (extent, offset) in [(2.0, 0.0), (2e-6, 0.0), (2e6, 3e7), (1.0, 1e7), (40.0, 1e7)] {
             let center = DVec3::new(offset, -0.5 * offset, 0.1 * offset);
-            let frame = Frame::new(center, extent);
+            let frame = TrainingFrame::new(center, extent);
             let rotation = camera(DVec3::ZERO).view_from_world.matrix3;
             let camera = camera(rotation * -center + DVec3::new(0.1, 0.2, 1.0) * extent);
             for x in [-0.3, 0.0, 0.2] {
@@ -169,19 +169,23 @@ mod tests {
     #[test]
     fn a_world_near_its_origin_of_an_extent_of_one_and_a_half_to_three_is_its_own_frame() {
         for extent in [1.51, 2.0, 2.99] {
-            assert_eq!(Frame::new(DVec3::splat(4.0), extent), Frame::WORLD, "{extent}");
+            assert_eq!(
+                TrainingFrame::new(DVec3::splat(4.0), extent),
+                TrainingFrame::WORLD,
+                "{extent}"
+            );
         }
-        assert_eq!(Frame::new(DVec3::ZERO, 3.1).scale, 0.5);
-        assert_eq!(Frame::new(DVec3::ZERO, 1.4).scale, 2.0);
+        assert_eq!(TrainingFrame::new(DVec3::ZERO, 3.1).scale, 0.5);
+        assert_eq!(TrainingFrame::new(DVec3::ZERO, 1.4).scale, 2.0);
         for exponent in -40..40 {
             let extent = 1.7 * f64::from(exponent).exp2();
-            assert_eq!(Frame::new(DVec3::ZERO, extent).scale * extent, 1.7);
+            assert_eq!(TrainingFrame::new(DVec3::ZERO, extent).scale * extent, 1.7);
         }
-        let far = Frame::new(DVec3::new(1e7, 0.0, 0.0), 2.0);
+        let far = TrainingFrame::new(DVec3::new(1e7, 0.0, 0.0), 2.0);
         assert_eq!((far.center[0], far.file_origin().x), (1e7, 1e7));
-        assert_eq!(Frame::new(DVec3::new(100.0, 0.0, 0.0), 2.0).file_origin(), DVec3::ZERO);
+        assert_eq!(TrainingFrame::new(DVec3::new(100.0, 0.0, 0.0), 2.0).file_origin(), DVec3::ZERO);
         for extent in [1e-300, 1e300, f64::MIN_POSITIVE, f64::MAX] {
-            assert!(Frame::new(DVec3::ZERO, extent).check_rows().is_ok(), "{extent}");
+            assert!(TrainingFrame::new(DVec3::ZERO, extent).check_rows().is_ok(), "{extent}");
         }
     }
 

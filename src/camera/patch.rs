@@ -165,8 +165,8 @@ impl From<&Patch> for kernels::Camera {
             focal,
             principal_point: patch.own_camera().principal_point.as_vec2(),
             size: patch.size,
-            least_slope: -(principal_point + margin) / focal,
-            most_slope: (whole - principal_point + margin) / focal,
+            min_slope: -(principal_point + margin) / focal,
+            max_slope: (whole - principal_point + margin) / focal,
             distortion,
             largest_angle,
             model: patch.camera.model.number(),
@@ -274,12 +274,12 @@ mod tests {
     fn a_patch_takes_its_jacobian_as_far_as_the_whole_does() {
         let camera = camera(100, 60);
         let whole = kernels::Camera::from(&Patch::from(&camera));
-        assert_eq!(whole.least_slope, Vec2::new(-62.0 / 80.0, -42.0 / 90.0));
-        assert_eq!(whole.most_slope, Vec2::new(68.0 / 80.0, 36.0 / 90.0));
+        assert_eq!(whole.min_slope, Vec2::new(-62.0 / 80.0, -42.0 / 90.0));
+        assert_eq!(whole.max_slope, Vec2::new(68.0 / 80.0, 36.0 / 90.0));
         assert_eq!(Patch::from(&camera).half_view(), Vec2::new(50.0, 30.0));
         let patches = camera.patches(|size| size.x <= 50);
         let right = kernels::Camera::from(&patches[1]);
-        assert_eq!((right.least_slope, right.most_slope), (whole.least_slope, whole.most_slope));
+        assert_eq!((right.min_slope, right.max_slope), (whole.min_slope, whole.max_slope));
         assert_eq!(right.principal_point, Vec2::new(-3.0, 33.0));
         assert_eq!(patches[1].half_view(), Vec2::new(25.0, 15.0));
     }

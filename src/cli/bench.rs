@@ -15,7 +15,7 @@ use super::table;
 use crate::Error;
 use crate::gpu::{CheckReport, DeviceChoice, Gpu, PassTime};
 use crate::kernels;
-use scene::Scene;
+use scene::BenchScene;
 
 /// Check a training step against the CPU references, pass by pass, then time its kernels and its stages.
 ///
@@ -99,7 +99,7 @@ pub fn run(args: &BenchArgs) -> Result<()> {
         let sizes = if is_sized { &[[width, height]][..] } else { &TUNED_SIZES };
         return tune::run(&bench, sizes, args.gaussians, args.json);
     }
-    let scene = Scene::new(width, height, args.gaussians);
+    let scene = BenchScene::new(width, height, args.gaussians);
     let mut trainers = scene::trainers(&bench.gpu, &scene)?;
     let checked = match args.unchecked {
         true => CheckReport::default(),
@@ -144,7 +144,7 @@ impl Findings {
         })
     }
 
-    fn as_text(&self, bench: &Bench, scene: &Scene, has_bounds: bool) -> String {
+    fn as_text(&self, bench: &Bench, scene: &BenchScene, has_bounds: bool) -> String {
         let (properties, stages) = (bench.gpu.properties(), &self.stages);
         let head = format!(
             "{}, {}\n{}x{} pixels, {} Gaussians, {} intersections; medians of {} runs",

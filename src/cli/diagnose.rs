@@ -15,7 +15,7 @@ use crate::Error;
 use crate::base::output::write_whole;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
-use crate::results::eval::{Leftover, hole_warning};
+use crate::results::eval::{ResidualTransmittance, hole_warning};
 use crate::train::diagnose::{Diagnosis, Noise, Plan, SceneDiagnosis, ViewDiagnosis};
 use crate::train::{Preset, TrainConfig, diagnosed};
 
@@ -78,7 +78,7 @@ struct Output<'a> {
     plan: &'a Plan,
     /// Of the model of a run, by view.
     #[serde(skip_serializing_if = "Option::is_none")]
-    leftover_transmittance: Option<&'a BTreeMap<String, Leftover>>,
+    residual_transmittance: Option<&'a BTreeMap<String, ResidualTransmittance>>,
 }
 
 /// Measures, plans and prints.
@@ -106,8 +106,9 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     }
     let device = gpu.properties().name.as_str();
     let text = if args.json {
-        let leftover_transmittance = run.as_ref().map(|(_, leftovers)| leftovers);
-        let output = Output { device, diagnosis: &diagnosis, plan: &plan, leftover_transmittance };
+        let residual_transmittance =
+            run.as_ref().map(|(_, residual_transmittances)| residual_transmittances);
+        let output = Output { device, diagnosis: &diagnosis, plan: &plan, residual_transmittance };
         let json = serde_json::to_string_pretty(&output);
         json.map_err(|error| Error::output("standard output", error.to_string()))? + "\n"
     } else {
@@ -118,17 +119,26 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
 }
 
 /// How much of the background the model of a run shows in every view of the dataset, and what to say of it.
-fn holes(run: &Path, args: &DiagnoseArgs) -> Result<(String, BTreeMap<String, Leftover>)> {
-    let FinishedRun { config, dataset, mut player, .. } =
+fn holes(
+    run: &Path,
+    args: &DiagnoseArgs,
+) -> Result<(String, BTreeMap<String, ResidualTransmittance>)> {
+    let FinishedRun { config, dataset, mut model_renderer, .. } =
         FinishedRun::open(run, Some(&args.dataset), args.device.as_ref())?;
-    let mut leftovers = BTreeMap::new();
+    let mut residual_transmittances = BTreeMap::new();
     for view in &dataset.views {
-        let leftover = Leftover::of(&player.render(view)?, view);
-        leftovers.extend(leftover.map(|leftover| (view.name.clone(), leftover)));
+        let residual_transmittance = ResidualTransmittance::of(&model_renderer.render(view)?, view);
+        residual_transmittances.extend(
+            residual_transmittance
+                .map(|residual_transmittance| (view.name.clone(), residual_transmittance)),
+        );
     }
-    let views = leftovers.iter().map(|(name, leftover)| (name.as_str(), *leftover));
+    let views = residual_transmittances
+        .iter()
+        .map(|(name, residual_transmittance)| (name.as_str(), *residual_transmittance));
     let healthy = || {
-        let mean = Leftover::mean(leftovers.values().copied()).map_or(0.0, |own| own.mean);
+        let mean = ResidualTransmittance::mean(residual_transmittances.values().copied())
+            .map_or(0.0, |own| own.mean);
         format!(
             "{}: {:.1} % of the background shows through the model",
             run.display(),
@@ -136,7 +146,7 @@ fn holes(run: &Path, args: &DiagnoseArgs) -> Result<(String, BTreeMap<String, Le
         )
     };
     let remark = hole_warning(views, config.background).unwrap_or_else(healthy);
-    Ok((remark, leftovers))
+    Ok((remark, residual_transmittances))
 }
 
 /// What `--max-resolution` says.
@@ -243,7 +253,12 @@ fn scene_facts(scene: &SceneDiagnosis) -> [(&'static str, String); 5] {
     };
     let brightness = format!(
         "mean {:.4}, p10 {:.4}, p90 {:.4}, cubic mean {:.4}; lift {:.1}, {:.0} times too little light",
-        scene.mean_luminance, scene.p10, scene.p90, scene.cubic_mean, scene.lift, scene.darkening
+        scene.mean_luminance,
+        scene.p10,
+        scene.p90,
+        scene.cubic_mean,
+        scene.brightening,
+        scene.darkening
     );
     let exposure = format!(
         "spread {:.2} stops between the views, light uneven by {:.1} stops within",

@@ -12,9 +12,9 @@ use crate::gpu::DeviceChoice;
 use crate::networks::lpips::{Lpips, Measure, Range};
 use crate::photographs::dataset::View;
 use crate::photographs::metrics::Scores;
-use crate::results::eval::{self, Leftover, ViewScore, Yardstick};
+use crate::results::eval::{self, ResidualTransmittance, ScoreReference, ViewScore};
 use crate::results::run;
-use crate::train::Learning;
+use crate::train::OnOff;
 
 /// Score a run on the test views of its dataset.
 ///
@@ -76,25 +76,25 @@ impl From<LpipsRange> for Range {
 /// # Errors
 /// The folder holds no run with a model, its dataset is gone, or a file cannot be written.
 pub fn run(args: &EvalArgs) -> Result<()> {
-    let FinishedRun { gpu, config, dataset, gaussian_count, mut player } =
+    let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer } =
         FinishedRun::open(&args.run, args.dataset.as_deref(), args.device.as_ref())?;
     let load = |weights| Lpips::load(&gpu, weights, args.lpips_range.into());
     let lpips = args.lpips.as_ref().map(load).transpose()?;
     let measure = lpips.as_ref().map(Lpips::measure);
-    let mut yardstick = Yardstick::of(&gpu, &config.tone, &dataset)?;
+    let mut score_reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
     let images = match is_model(&args.run) {
         true => args.run.with_extension("eval"),
         false => args.run.join("eval"),
     };
-    let bar = progress_bar(yardstick.view_count(&dataset));
+    let bar = progress_bar(score_reference.view_count(&dataset));
     let render = |view: &View| {
         bar.set_message(printable(&view.name).into_owned());
-        player.render(view)
+        model_renderer.render(view)
     };
-    let scored = eval::score_by(&mut yardstick, &dataset, render, |score, compared| {
+    let scored = eval::score_by(&mut score_reference, &dataset, render, |score, compared| {
         let lpips = lpips.as_ref().map(|lpips| compared.lpips(&gpu, lpips));
         score.scores.lpips = lpips.transpose()?;
-        if config.exposure.learn == Learning::On {
+        if config.exposure.learn == OnOff::On {
             score.aligned = Some(compared.aligned()?);
         }
         if args.save_images {
@@ -104,7 +104,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         Ok(())
     })?;
     bar.finish_and_clear();
-    eval::warn_of_holes(&scored, &dataset, config.background, |view| player.render(view))?;
+    eval::warn_of_holes(&scored, &dataset, config.background, |view| model_renderer.render(view))?;
     if scored.is_empty() {
         let root = dataset.root.display();
         tracing::warn!(
@@ -125,12 +125,12 @@ pub fn run(args: &EvalArgs) -> Result<()> {
             eval::add_lpips(&mut metrics, &scored, measure);
         }
         eval::add_reference(&mut metrics, &config.tone);
-        for what in [run::SPENT, run::TARGET_EXPOSURE, run::ENDED, run::HELD_OUT_COURSE] {
+        for what in [run::SPENT, run::TARGET_EXPOSURE, run::ENDED, run::HELD_OUT_CURVE] {
             if let Some(known) = recorded.get(what) {
                 metrics[what] = known.clone();
             }
         }
-        if config.exposure.learn == Learning::On {
+        if config.exposure.learn == OnOff::On {
             eval::add_exposure(&mut metrics, &scored);
         }
         writeln!(out, "{metrics:#}")?;
@@ -152,9 +152,13 @@ fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> String {
     header.extend(measure.map(Measure::title));
     // Before the denoiser.
     header.extend(mean_r0.iter().flat_map(|_| ["PSNR of R_0", "SSIM of R_0"]).map(str::to_owned));
-    let mean_leftover = Leftover::mean(scored.iter().filter_map(|view| view.leftover));
-    header.extend(mean_leftover.iter().flat_map(|_| ["leftover", "99 %"]).map(str::to_owned));
-    let row = |name: &str, scores: &Scores, r0: Option<&Scores>, leftover: Option<Leftover>| {
+    let mean_transmittance =
+        ResidualTransmittance::mean(scored.iter().filter_map(|view| view.residual_transmittance));
+    header.extend(mean_transmittance.iter().flat_map(|_| ["leftover", "99 %"]).map(str::to_owned));
+    let row = |name: &str,
+               scores: &Scores,
+               r0: Option<&Scores>,
+               residual_transmittance: Option<ResidualTransmittance>| {
         let Scores { psnr, psnr_channel_mean, ssim, lpips } = scores;
         let mut row = vec![
             name.to_owned(),
@@ -166,13 +170,16 @@ fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> String {
         row.extend(
             r0.into_iter().flat_map(|r0| [format!("{:.2}", r0.psnr), format!("{:.4}", r0.ssim)]),
         );
-        let leftover = leftover.into_iter().flat_map(|own| [own.mean, own.q99]);
-        row.extend(leftover.map(|value| format!("{value:.4}")));
+        let residual_transmittance =
+            residual_transmittance.into_iter().flat_map(|own| [own.mean, own.q99]);
+        row.extend(residual_transmittance.map(|value| format!("{value:.4}")));
         row
     };
     let mut rows = vec![header];
-    let of_view = |view: &ViewScore| row(&view.name, &view.scores, view.r0.as_ref(), view.leftover);
+    let of_view = |view: &ViewScore| {
+        row(&view.name, &view.scores, view.r0.as_ref(), view.residual_transmittance)
+    };
     rows.extend(scored.iter().map(of_view));
-    rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref(), mean_leftover)));
+    rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref(), mean_transmittance)));
     table::aligned(&rows)
 }

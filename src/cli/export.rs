@@ -177,7 +177,7 @@ fn page(
     let title = format!("{} by nightsplat", provenance.dataset);
     let up = args.up(config);
     let (bookmarks, up) = if has_networks(config) {
-        let FinishedRun { mut player, dataset, .. } = FinishedRun::open_with(
+        let FinishedRun { mut model_renderer, dataset, .. } = FinishedRun::open_with(
             &args.run,
             args.dataset.as_deref(),
             args.device.as_ref(),
@@ -186,7 +186,7 @@ fn page(
             },
         )?;
         let bookmarks = bookmarks(args, gaussians.origin, &dataset, |view| {
-            let networks = player.render(view)?.output().clone();
+            let networks = model_renderer.render(view)?.output().clone();
             Ok(Some(("model with its networks".to_owned(), networks)))
         })?;
         (bookmarks, up.unwrap_or_else(|| dataset.up()))

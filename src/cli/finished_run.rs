@@ -5,7 +5,7 @@ use std::path::Path;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::photographs::tone::{ToneCurve, ToneSettings};
-use crate::results::eval::Player;
+use crate::results::eval::ModelRenderer;
 use crate::results::run;
 use crate::splats::scene::{Gaussians, ply};
 use crate::train::TrainConfig;
@@ -17,7 +17,7 @@ pub(super) struct FinishedRun {
     pub(super) config: TrainConfig,
     pub(super) dataset: Dataset,
     pub(super) gaussian_count: usize,
-    pub(super) player: Player,
+    pub(super) model_renderer: ModelRenderer,
 }
 
 impl FinishedRun {
@@ -75,7 +75,7 @@ impl FinishedRun {
         Ok(Self {
             dataset,
             gaussian_count: gaussians.count,
-            player: Player::new(
+            model_renderer: ModelRenderer::new(
                 &gpu,
                 &gaussians,
                 &config,
@@ -97,8 +97,8 @@ impl FinishedRun {
         let gpu = Gpu::new(device.unwrap_or(&DeviceChoice::Best))?;
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
         config.frame = Some(dataset.frame());
-        let player = Player::new(&gpu, &gaussians, &config, None)?;
-        Ok(Self { gpu, config, dataset, gaussian_count: gaussians.count, player })
+        let model_renderer = ModelRenderer::new(&gpu, &gaussians, &config, None)?;
+        Ok(Self { gpu, config, dataset, gaussian_count: gaussians.count, model_renderer })
     }
 }
 

@@ -1,8 +1,8 @@
 //! `nightsplat pose`: from photographs without cameras to a dataset.
 
 mod clip;
-mod lifted;
 mod reconstruction;
+mod tone_mapped;
 mod tool;
 
 use std::collections::BTreeMap;
@@ -101,10 +101,10 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         photographs(&args.photos)?
     };
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
-    let lifted = out.work.join("lifted");
-    let gain = lifted::write(&gpu, &photographs, &lifted)?;
+    let tone_mapped = out.work.join("tone-mapped");
+    let gain = tone_mapped::write(&gpu, &photographs, &tone_mapped)?;
     say(begin, &format!("{} photographs lifted (gain {gain:.1})", photographs.len()))?;
-    let models = reconstruction.models(&lifted, |what| say(begin, what))?;
+    let models = reconstruction.models(&tone_mapped, |what| say(begin, what))?;
     let (model, placed) = Dataset::largest_model(&models)?.filter(|(_, placed)| placed.len() >= FEWEST).ok_or_else(|| {
         let problem = format!(
             "COLMAP found no cameras for these {} photographs: they show too little in common or no texture; take more of them, closer together, or expose longer ({} has its output)",

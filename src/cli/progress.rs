@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
-use crate::results::eval::{self, Against, ViewScore};
+use crate::results::eval::{self, ReferenceKind, ViewScore};
 use crate::results::run::Event;
 use crate::train::{MemoryEstimate, StepReport};
 
@@ -39,17 +39,17 @@ fn foreseen(memory: &MemoryEstimate) -> String {
         mebibytes @ 0..10_000 => format!("{mebibytes} MiB"),
         mebibytes => format!("{:.1} GiB", mebibytes as f64 / 1024.0),
     };
-    let MemoryEstimate { gaussians, device, host, most_gaussians, most_device, most_host } = memory;
+    let MemoryEstimate { gaussians, device, host, peak_gaussians, peak_device, peak_host } = memory;
     let now = format!(
         "memory: a step with {gaussians} Gaussians takes {} on the device, {} on the host",
         size(*device),
         size(*host)
     );
-    if most_gaussians == gaussians {
+    if peak_gaussians == gaussians {
         return now;
     }
-    let (most_device, most_host) = (size(*most_device), size(*most_host));
-    format!("{now}; up to {most_gaussians}, {most_device} and {most_host}")
+    let (peak_device, peak_host) = (size(*peak_device), size(*peak_host));
+    format!("{now}; up to {peak_gaussians}, {peak_device} and {peak_host}")
 }
 
 /// Says what a run does, event by event.
@@ -65,7 +65,7 @@ pub(crate) struct Reporter {
     may_end_early: bool,
     /// When the run began, and after which step.
     begin: (Instant, u64),
-    spoke: Instant,
+    last_line: Instant,
 }
 
 impl Reporter {
@@ -78,7 +78,7 @@ impl Reporter {
             steps: 0,
             may_end_early: false,
             begin: (now, 0),
-            spoke: now,
+            last_line: now,
         }
     }
 
@@ -93,7 +93,7 @@ impl Reporter {
             Event::Started { step, steps, may_end_early, .. } => {
                 let now = Instant::now();
                 (self.steps, self.may_end_early) = (steps, may_end_early);
-                (self.begin, self.spoke) = ((now, step), now);
+                (self.begin, self.last_line) = ((now, step), now);
             }
             Event::LastStep { last, .. } => (self.steps, self.may_end_early) = (last, false),
             _ => {}
@@ -161,7 +161,7 @@ impl Reporter {
             }
             Event::Step(report) if self.is_due() || report.step == self.steps => {
                 let StepReport { step, view, loss, gaussians, .. } = report;
-                let (each, left) = self.pace(*step);
+                let (each, left) = self.batching(*step);
                 json!({
                     "event": "step", "step": step, "steps": self.steps, "view": view, "loss": loss,
                     "gaussians": gaussians, "ms_per_step": each, "seconds_left": left,
@@ -192,15 +192,15 @@ impl Reporter {
     }
 
     fn is_due(&mut self) -> bool {
-        let is_due = self.spoke.elapsed() >= SILENCE;
+        let is_due = self.last_line.elapsed() >= SILENCE;
         if is_due {
-            self.spoke = Instant::now();
+            self.last_line = Instant::now();
         }
         is_due
     }
 
     fn line(&self, StepReport { step, loss, gaussians, .. }: &StepReport) -> String {
-        let (each, left) = self.pace(*step);
+        let (each, left) = self.batching(*step);
         let (steps, left) = (self.steps, duration(left));
         let most = at_most(self.may_end_early);
         format!(
@@ -209,7 +209,7 @@ impl Reporter {
     }
 
     /// Milliseconds of a step so far, and the seconds left at that speed.
-    fn pace(&self, step: u64) -> (f64, f64) {
+    fn batching(&self, step: u64) -> (f64, f64) {
         let (begin, before) = self.begin;
         let each = begin.elapsed().as_secs_f64() / (step - before).max(1) as f64;
         (1e3 * each, each * self.steps.saturating_sub(step) as f64)
@@ -221,7 +221,7 @@ pub(crate) fn summary(scored: &[ViewScore]) -> Option<String> {
     let (mean, r0) = eval::means(scored);
     let mean = mean?;
     let before = r0.map(|r0| format!("; before the denoiser {:.2} dB, {:.3}", r0.psnr, r0.ssim));
-    let against = scored.first().filter(|view| view.against != Against::References);
+    let against = scored.first().filter(|view| view.against != ReferenceKind::References);
     let against = against.map(|view| format!(" against their {}", view.against.name()));
     Some(format!(
         "{} test views{}: PSNR {:.2} dB (channel mean {:.2}), SSIM {:.3}{}",
@@ -290,19 +290,20 @@ mod tests {
             gaussians: 2400,
             milliseconds: 480.0,
         };
-        let said = "step 200 of 400: loss 0.0432, 2400 Gaussians, 500 ms a step, 1 min 40 s left";
-        assert_eq!(progress.line(&report), said);
+        let expected =
+            "step 200 of 400: loss 0.0432, 2400 Gaussians, 500 ms a step, 1 min 40 s left";
+        assert_eq!(progress.line(&report), expected);
         progress.may_end_early = true;
-        let said = "step 200 of at most 400: loss 0.0432, 2400 Gaussians, 500 ms a step, at most 1 min 40 s left";
-        assert_eq!(progress.line(&report), said);
+        let expected = "step 200 of at most 400: loss 0.0432, 2400 Gaussians, 500 ms a step, at most 1 min 40 s left";
+        assert_eq!(progress.line(&report), expected);
         assert!(!progress.is_due());
-        progress.spoke -= SILENCE;
+        progress.last_line -= SILENCE;
         assert!(progress.is_due() && !progress.is_due());
     }
 
     #[test]
     fn a_duration_has_two_units_at_most() {
-        let said = [0.4, 59.4, 60.0, 156.0, 3600.0, 9000.0].map(duration);
-        assert_eq!(said, ["0 s", "59 s", "1 min 0 s", "2 min 36 s", "1 h 0 min", "2 h 30 min"]);
+        let expected = [0.4, 59.4, 60.0, 156.0, 3600.0, 9000.0].map(duration);
+        assert_eq!(expected, ["0 s", "59 s", "1 min 0 s", "2 min 36 s", "1 h 0 min", "2 h 30 min"]);
     }
 }

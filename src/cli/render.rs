@@ -17,7 +17,7 @@ use crate::loss::exposure::Affine;
 use crate::photographs::dataset::{Dataset, Split, View};
 use crate::photographs::image::{Image, Orientation};
 use crate::photographs::tone::exposed_anew;
-use crate::results::eval::Layer;
+use crate::results::eval::RenderLayer;
 use crate::train::TrainConfig;
 use crate::{Error, results::run};
 
@@ -53,7 +53,7 @@ pub struct RenderArgs {
     /// What to show: rgb, denoised, depth, structure, illumination or noise [default: denoised where the model has a
     /// denoiser, else rgb]. A PNG of depth stretches from the least to the largest value of the view
     #[arg(long)]
-    pub layer: Option<Layer>,
+    pub layer: Option<RenderLayer>,
     /// Show every training view as bright as its target, where the photographs differ in exposure; without it, and where a
     /// view was not trained on, the model's own exposure
     #[arg(long)]
@@ -150,7 +150,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     if let Some(video) = &args.video {
         video::check(video, *format)?;
     }
-    let FinishedRun { config, dataset, mut player, .. } =
+    let FinishedRun { config, dataset, mut model_renderer, .. } =
         FinishedRun::open(run, args.dataset.as_deref(), device.as_ref())?;
     let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
     let shots = shots(args, &config, &dataset)?;
@@ -167,10 +167,10 @@ pub fn run(args: &RenderArgs) -> Result<()> {
             }
         };
         match layer {
-            None => color(player.render_camera(camera)?.output().clone())?,
-            Some(layer) if layer.is_color() => color(player.layer(camera, *layer)?)?,
+            None => color(model_renderer.render_camera(camera)?.output().clone())?,
+            Some(layer) if layer.is_color() => color(model_renderer.layer(camera, *layer)?)?,
             Some(layer) => {
-                let numbers = player.layer(camera, *layer)?.turned(*orientation);
+                let numbers = model_renderer.layer(camera, *layer)?.turned(*orientation);
                 save_numbers(numbers, *layer, *format, &path)?;
             }
         }
@@ -266,14 +266,14 @@ impl ViewExposures {
 /// Numbers that are no colour: an EXR file holds them as they are.
 fn save_numbers(
     mut image: Image,
-    layer: Layer,
+    layer: RenderLayer,
     format: ImageFormat,
     path: &Path,
 ) -> crate::Result<()> {
     if format == ImageFormat::Exr {
         return image.save_exr_as_stored(path);
     }
-    if layer == Layer::Depth {
+    if layer == RenderLayer::Depth {
         let least = image.data.iter().copied().fold(f32::INFINITY, f32::min);
         let largest = image.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
         let scale = 1.0 / (largest - least).max(f32::MIN_POSITIVE);

@@ -16,9 +16,9 @@ use super::signals;
 use crate::base::output::printable;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
-use crate::results::run::{self, HeldRun, RunDirectory, Session, Trained};
+use crate::results::run::{self, IfExists, RunDirectory, RunSummary, Session};
 use crate::train::diagnose::Plan;
-use crate::train::{Origin, Planned, Planning, Said};
+use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
@@ -60,8 +60,8 @@ pub struct TrainArgs {
 /// # Errors
 /// Whatever keeps the run from its end, in one line.
 pub fn run(args: &TrainArgs) -> Result<()> {
-    let mut said = args.options.said(&args.dataset)?;
-    said.settings(None)?.config()?.check()?;
+    let mut requested = args.options.requested(&args.dataset)?;
+    requested.settings(None)?.config()?.check()?;
     match args.resume {
         true => RunDirectory::check_resumed(&args.out)?,
         false => RunDirectory::check(&args.out, args.overwrite)?,
@@ -70,20 +70,20 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     if is_resumed && args.options.gives("steps") {
         // The views that it began with stay held out.
         let views = i64::try_from(run::load_config(&args.out)?.stop.views)?;
-        said.options.push("stop.views", views.into(), Origin::Run)?;
+        requested.options.push("stop.views", views.into(), Origin::Run)?;
     }
     let given = args.plan.clone().filter(|path| path != Path::new("none"));
     let file = given.or_else(|| run::plan_of(&args.out).filter(|_| is_resumed));
     if is_resumed
         && !args.explain
-        && let Some(steps) = done_by_stamp(args, &said, file.as_deref())?
+        && let Some(steps) = done_by_stamp(args, &requested, file.as_deref())?
     {
-        return say_done(args, steps);
+        return print_done(args, steps);
     }
-    let device = said.settings(None)?.config()?.device;
+    let device = requested.settings(None)?.config()?.device;
     let gpu = Gpu::new(&device.parse::<DeviceChoice>()?)?;
     let planning = planning(args, file.as_deref(), is_resumed);
-    let Planned { config, settings, plan, dataset } = said.planned(planning, &gpu)?;
+    let PlannedRun { config, settings, plan, dataset } = requested.planned(planning, &gpu)?;
     if args.explain {
         return Ok(write!(std::io::stdout(), "{}", printable(&settings.explained(&config)?))?);
     }
@@ -92,7 +92,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let finished = if args.resume { run::done_steps(&args.out, &config, &dataset)? } else { None };
     if let Some(steps) = finished {
-        return say_done(args, steps);
+        return print_done(args, steps);
     }
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
     let is_text = form != ProgressForm::Json;
@@ -106,15 +106,16 @@ pub fn run(args: &TrainArgs) -> Result<()> {
             plan.as_ref().map(diagnose::decisions).unwrap_or_default()
         )?;
     }
-    let held = if args.resume { HeldRun::Resume } else { held_unless(args.overwrite) };
+    let if_exists =
+        if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
     let mut progress = Reporter::new(form).with_facts(serde_json::json!(facts));
     let session = Session {
         plan: plan.as_ref(),
         settings: Some(&settings),
-        held,
+        if_exists,
         requests: signals::requests()?,
     };
-    let Trained { trainer, ended, scored, spent, .. } =
+    let RunSummary { trainer, ended, scored, spent, .. } =
         run::train_in(&gpu, &config, &dataset, &args.out, &session, |event| {
             progress.observe(event);
         })?;
@@ -142,30 +143,34 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     Ok(())
 }
 
-fn say_done(args: &TrainArgs, steps: u64) -> Result<()> {
+fn print_done(args: &TrainArgs, steps: u64) -> Result<()> {
     let done = format!("{} is done: {steps} steps", args.out.display());
     Ok(writeln!(std::io::stdout(), "{}", printable(&done))?)
 }
 
 /// The steps of the run that is to go on, if it is done and the files of its dataset are as they were: nothing is decoded for
 /// that.
-fn done_by_stamp(args: &TrainArgs, said: &Said, file: Option<&Path>) -> crate::Result<Option<u64>> {
+fn done_by_stamp(
+    args: &TrainArgs,
+    requested: &RequestedSettings,
+    file: Option<&Path>,
+) -> crate::Result<Option<u64>> {
     let plan = file.map(Plan::read).transpose()?;
-    run::done_steps_by_stamp(&args.out, &said.settings(plan.as_ref())?.config()?)
+    run::done_steps_by_stamp(&args.out, &requested.settings(plan.as_ref())?.config()?)
 }
 
 /// What decides what no option says: a plan where one is named, a run keeps to, or the photographs ask for.
-fn planning<'a>(args: &TrainArgs, file: Option<&'a Path>, is_resumed: bool) -> Planning<'a> {
+fn planning<'a>(args: &TrainArgs, file: Option<&'a Path>, is_resumed: bool) -> PlanSource<'a> {
     match file {
-        Some(file) => Planning::File(file),
+        Some(file) => PlanSource::File(file),
         None if args.plan.is_none() && !is_resumed && args.options.wants_a_plan() => {
-            Planning::Diagnosis
+            PlanSource::Diagnosis
         }
-        None => Planning::Nothing,
+        None => PlanSource::Nothing,
     }
 }
 
 /// What `--overwrite` says.
-fn held_unless(overwrite: bool) -> HeldRun {
-    if overwrite { HeldRun::Replace } else { HeldRun::Refuse }
+fn overwrite_or_refuse(overwrite: bool) -> IfExists {
+    if overwrite { IfExists::Replace } else { IfExists::Refuse }
 }

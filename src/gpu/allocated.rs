@@ -13,7 +13,7 @@ use crate::{Error, Result};
 
 /// A Vulkan buffer and the memory behind it.
 #[derive(Debug)]
-pub(super) struct Memory {
+pub(super) struct DeviceMemory {
     pub(super) shared: Arc<Shared>,
     pub(super) raw: vk::Buffer,
     /// Taken when the buffer retires.
@@ -21,7 +21,7 @@ pub(super) struct Memory {
     name: String,
 }
 
-impl Memory {
+impl DeviceMemory {
     pub(super) fn new(
         shared: &Arc<Shared>,
         name: &str,
@@ -96,7 +96,7 @@ impl Memory {
     }
 }
 
-impl Drop for Memory {
+impl Drop for DeviceMemory {
     fn drop(&mut self) {
         if let Some(allocation) = self.allocation.take() {
             self.shared.retire(Retired::Buffer(self.raw, allocation));
@@ -117,7 +117,7 @@ mod tests {
     fn a_buffer_that_does_not_fit_says_why() {
         // A device of its own: validation has something to say about a petabyte.
         let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
-        let refused = Memory::new(&gpu.shared, "staging", 1 << 50, MemoryLocation::CpuToGpu);
+        let refused = DeviceMemory::new(&gpu.shared, "staging", 1 << 50, MemoryLocation::CpuToGpu);
         let error = refused.unwrap_err();
         assert!(error.to_string().contains("`staging` needs 1125899906842624 bytes"), "{error}");
         let cause = std::error::Error::source(&error).map(ToString::to_string);

@@ -6,7 +6,7 @@ use ash::vk::Handle as _;
 use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::Allocation;
 
-use super::allocated::Memory;
+use super::allocated::DeviceMemory;
 use super::{Bound, Gpu, Properties, Slice, SliceMut};
 use crate::{Error, Result};
 
@@ -14,7 +14,7 @@ use crate::{Error, Result};
 /// `SliceMut`s that borrow it. Dropping it frees the memory once no submission uses it.
 #[derive(Debug)]
 pub struct Buffer<T> {
-    memory: Memory,
+    memory: DeviceMemory,
     len: usize,
     element: PhantomData<T>,
 }
@@ -96,7 +96,7 @@ impl Gpu {
         len: usize,
     ) -> Result<Buffer<T>> {
         let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
-        let memory = Memory::new(&self.shared, name, bytes, MemoryLocation::GpuOnly)?;
+        let memory = DeviceMemory::new(&self.shared, name, bytes, MemoryLocation::GpuOnly)?;
         Ok(Buffer { memory, len, element: PhantomData })
     }
 
@@ -151,8 +151,12 @@ impl Gpu {
             return Ok(());
         }
         let bytes: &[u8] = bytemuck::cast_slice(data);
-        let mut staging =
-            Memory::new(&self.shared, "staging", bytes.len() as u64, MemoryLocation::CpuToGpu)?;
+        let mut staging = DeviceMemory::new(
+            &self.shared,
+            "staging",
+            bytes.len() as u64,
+            MemoryLocation::CpuToGpu,
+        )?;
         if let Some(mapped) = staging.allocation.as_mut().and_then(Allocation::mapped_slice_mut) {
             mapped[..bytes.len()].copy_from_slice(bytes);
         }

@@ -91,7 +91,7 @@ pub(crate) struct SchedulerVariables {
 
 /// The device that is used.
 #[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Picked {
+pub(crate) struct SelectedDevice {
     /// Its position.
     pub(crate) index: usize,
     /// The variables that picked it, if any did, and what they count.
@@ -119,7 +119,11 @@ impl SchedulerVariables {
     ///
     /// # Errors
     /// There is no such device, or the variables name one that Vulkan does not have, or leave none.
-    pub(crate) fn pick(&self, choice: &DeviceChoice, devices: &[DeviceReport]) -> Result<Picked> {
+    pub(crate) fn pick(
+        &self,
+        choice: &DeviceChoice,
+        devices: &[DeviceReport],
+    ) -> Result<SelectedDevice> {
         let position = |is_meant: &dyn Fn(&DeviceReport) -> bool| devices.iter().position(is_meant);
         let index = match choice {
             DeviceChoice::Best => return self.best(devices),
@@ -137,10 +141,10 @@ impl SchedulerVariables {
         };
         let problem = || no_such_device(&format!("there is no Vulkan device {choice}"), devices);
         let index = index.ok_or_else(problem)?;
-        Ok(Picked { index, reason: None, is_doubtful: false })
+        Ok(SelectedDevice { index, reason: None, is_doubtful: false })
     }
 
-    fn best(&self, devices: &[DeviceReport]) -> Result<Picked> {
+    fn best(&self, devices: &[DeviceReport]) -> Result<SelectedDevice> {
         let set: Vec<_> = [
             ("CUDA_VISIBLE_DEVICES", &self.cuda),
             ("ROCR_VISIBLE_DEVICES", &self.rocr),
@@ -161,19 +165,20 @@ impl SchedulerVariables {
             ""
         };
         let reason = (!set.is_empty()).then(|| format!("{set}{counted}"));
-        Ok(Picked { index, reason, is_doubtful })
+        Ok(SelectedDevice { index, reason, is_doubtful })
     }
 
     /// The devices that the variables name, in their order; where they name none, all that they do not hide. And whether
     /// they may mean others.
     fn visible(&self, devices: &[DeviceReport]) -> Result<(Vec<usize>, bool)> {
-        let nvidia = Named::new("CUDA_VISIBLE_DEVICES", of_vendor(devices, NVIDIA), devices)
-            .narrow(self.cuda.as_deref());
-        let rocr = Named::new("ROCR_VISIBLE_DEVICES", of_vendor(devices, AMD), devices)
+        let nvidia =
+            VisibleDevices::new("CUDA_VISIBLE_DEVICES", of_vendor(devices, NVIDIA), devices)
+                .narrow(self.cuda.as_deref());
+        let rocr = VisibleDevices::new("ROCR_VISIBLE_DEVICES", of_vendor(devices, AMD), devices)
             .narrow(self.rocr.as_deref());
         let amd = match (rocr, self.hip.as_deref()) {
             (Ok(rocr), Some(hip)) => {
-                Named { variable: "HIP_VISIBLE_DEVICES", ..rocr }.narrow(Some(hip))
+                VisibleDevices { variable: "HIP_VISIBLE_DEVICES", ..rocr }.narrow(Some(hip))
             }
             (rocr, _) => rocr,
         };
@@ -218,7 +223,7 @@ impl SchedulerVariables {
 }
 
 /// What is left of a vendor's devices.
-struct Named<'a> {
+struct VisibleDevices<'a> {
     variable: &'static str,
     devices: Vec<usize>,
     /// By a variable.
@@ -226,7 +231,7 @@ struct Named<'a> {
     all: &'a [DeviceReport],
 }
 
-impl<'a> Named<'a> {
+impl<'a> VisibleDevices<'a> {
     fn new(variable: &'static str, devices: Vec<usize>, all: &'a [DeviceReport]) -> Self {
         Self { variable, devices, is_narrowed: false, all }
     }
@@ -362,7 +367,7 @@ mod tests {
     #[test]
     fn a_choice_that_names_no_device_says_which_there_are() {
         let node = node();
-        for (text, said) in [
+        for (text, expected) in [
             ("5", "number 5"),
             ("arc", "called `arc`"),
             ("uuid:ff", "whose UUID begins with ff"),
@@ -371,7 +376,7 @@ mod tests {
             let choice: DeviceChoice = text.parse().unwrap();
             let problem = SchedulerVariables::default().pick(&choice, &node).unwrap_err();
             let message = problem.to_string();
-            assert!(message.contains(said) && message.contains("Vega, llvmpipe"), "{message}");
+            assert!(message.contains(expected) && message.contains("Vega, llvmpipe"), "{message}");
         }
         let gpus = &node[..4];
         let problem = SchedulerVariables::default().pick(&DeviceChoice::Cpu, gpus).unwrap_err();

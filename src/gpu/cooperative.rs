@@ -2,7 +2,7 @@
 
 use ash::{khr, vk};
 
-use super::offered::Offered;
+use super::supported::Supported;
 
 /// Rows of the first factor, columns of the second, and what both share, of the products that kernels build on:
 /// 16-bit factors, sums in single precision, a subgroup's work.
@@ -23,15 +23,15 @@ const MAX_SIDE: u32 = 16;
 pub(super) const EXTENSION: &std::ffi::CStr = khr::cooperative_matrix::NAME;
 
 /// The largest product that the device offers; none without the extension or one of the features it needs.
-pub(super) fn offered(
+pub(super) fn supported(
     entry: &ash::Entry,
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
-    offered: &Offered,
+    supported: &Supported,
 ) -> Option<CooperativeMatrix> {
     let name = EXTENSION.to_string_lossy();
-    let vulkan12 = &offered.vulkan12;
-    let has_all = offered.extensions.contains(name.as_ref())
+    let vulkan12 = &supported.vulkan12;
+    let has_all = supported.extensions.contains(name.as_ref())
         && vulkan12.shader_float16 == vk::TRUE
         && vulkan12.vulkan_memory_model == vk::TRUE
         && vulkan12.vulkan_memory_model_device_scope == vk::TRUE;

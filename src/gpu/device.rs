@@ -11,19 +11,20 @@ use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 
 #[cfg(feature = "check")]
 use super::checked::Checks;
-use super::choice::Picked;
+use super::choice::SelectedDevice;
 use super::cooperative;
 use super::descriptors::Descriptors;
 use super::device_report::{device_memory, report};
 #[cfg(feature = "testing")]
 use super::faults::Faults;
 use super::instance::{
-    Owned, instance, loader_error, physical_devices, validation_is_installed, validation_version,
+    OwnedInstance, instance, loader_error, physical_devices, validation_is_installed,
+    validation_version,
 };
 use super::limits::max_workgroups;
 use super::memory::{BudgetQuery, MemoryUsage};
-use super::offered::{OPTIONAL_EXTENSIONS, Offered};
 use super::requirements::required_device_features;
+use super::supported::{OPTIONAL_EXTENSIONS, Supported};
 use super::validation::FIRST_SAFE_WITH_LABELS;
 use super::{
     DeviceChoice, DeviceReport, Gpu, Properties, Queue, SchedulerVariables, Shared, address_space,
@@ -85,20 +86,23 @@ impl Gpu {
     fn open(choice: &DeviceChoice, validate: bool, takes_tuning: bool) -> Result<Self> {
         address_space::check()?;
         let mut owned = instance(validate)?;
-        let opened = choose(&owned, choice).and_then(|(physical, offered)| {
-            owned.cache_path = cache_path(&offered);
+        let opened = choose(&owned, choice).and_then(|(physical, supported)| {
+            owned.cache_path = cache_path(&supported);
             if takes_tuning {
-                let vk::PhysicalDeviceProperties { vendor_id, device_id, .. } = offered.properties;
+                let vk::PhysicalDeviceProperties { vendor_id, device_id, .. } =
+                    supported.properties;
                 owned.tuning_path = tuning::path(cache_folder(), vendor_id, device_id);
             }
-            let Owned { entry, instance, .. } = &owned;
+            let OwnedInstance { entry, instance, .. } = &owned;
             let properties = Properties {
-                cooperative_matrix: cooperative::offered(entry, instance, physical, &offered),
-                keeps_subgroups: reconvergence::offered(instance, physical, &offered),
-                tells_statistics: tells_statistics(&offered),
-                ..properties(instance, physical, &offered)?
+                cooperative_matrix: cooperative::supported(entry, instance, physical, &supported),
+                has_uniform_subgroup_control_flow: reconvergence::supported(
+                    instance, physical, &supported,
+                ),
+                has_pipeline_statistics: has_pipeline_statistics(&supported),
+                ..properties(instance, physical, &supported)?
             };
-            create_device(instance, physical, &offered, &properties)
+            create_device(instance, physical, &supported, &properties)
                 .map(|(device, queue)| (physical, properties, device, queue))
         });
         match opened {
@@ -141,10 +145,10 @@ impl Gpu {
             let device = ash::Device::load(instance.fp_v1_0(), vk::Device::from_raw(host.device));
             (instance, device)
         };
-        let offered = Offered::gather(&instance, physical).map_err(loader_error)?;
-        offered.check()?;
+        let supported = Supported::gather(&instance, physical).map_err(loader_error)?;
+        supported.check()?;
         let queue = Queue { raw: vk::Queue::from_raw(host.queue), family: host.queue_family };
-        let properties = properties(&instance, physical, &offered)?;
+        let properties = properties(&instance, physical, &supported)?;
         Self::assemble(&instance, physical, properties, device, queue, None)
     }
 
@@ -154,7 +158,7 @@ impl Gpu {
         properties: Properties,
         device: ash::Device,
         queue: Queue,
-        owned: Option<Owned>,
+        owned: Option<OwnedInstance>,
     ) -> Result<Self> {
         #[cfg(feature = "testing")]
         let faults = Faults::from_environment()?;
@@ -190,11 +194,11 @@ impl Gpu {
         let layer = owned.as_ref().and_then(|owned| validation_version(&owned.entry));
         let has_labels = layer.is_some_and(|version| version >= FIRST_SAFE_WITH_LABELS);
         let executables = properties
-            .tells_statistics
+            .has_pipeline_statistics
             .then(|| khr::pipeline_executable_properties::Device::new(instance, &device));
         Ok(Self {
             shared: Arc::new(Shared {
-                descriptors: Descriptors::of(instance, &device, properties.pushes_descriptors),
+                descriptors: Descriptors::of(instance, &device, properties.has_push_descriptors),
                 properties,
                 labels: debug.clone().filter(|_| has_labels),
                 debug,
@@ -225,11 +229,11 @@ impl Gpu {
 // Physical device
 
 /// The device that is meant, by what the machine's devices and a scheduler's variables say.
-fn choose(owned: &Owned, choice: &DeviceChoice) -> Result<(vk::PhysicalDevice, Offered)> {
+fn choose(owned: &OwnedInstance, choice: &DeviceChoice) -> Result<(vk::PhysicalDevice, Supported)> {
     let all = physical_devices(&owned.instance)?;
     let reports =
         all.iter().map(|&physical| report(owned, physical)).collect::<Result<Vec<_>>>()?;
-    let Picked { index, reason, is_doubtful } =
+    let SelectedDevice { index, reason, is_doubtful } =
         SchedulerVariables::of_this_process().pick(choice, &reports)?;
     if let Some(reason) = reason {
         let DeviceReport { name, uuid, .. } = &reports[index];
@@ -238,46 +242,46 @@ fn choose(owned: &Owned, choice: &DeviceChoice) -> Result<(vk::PhysicalDevice, O
             false => tracing::info!("{name}, {uuid}: {reason}"),
         }
     }
-    let offered = Offered::gather(&owned.instance, all[index]).map_err(loader_error)?;
-    offered.check()?;
-    Ok((all[index], offered))
+    let supported = Supported::gather(&owned.instance, all[index]).map_err(loader_error)?;
+    supported.check()?;
+    Ok((all[index], supported))
 }
 
 fn properties(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
-    offered: &Offered,
+    supported: &Supported,
 ) -> Result<Properties> {
     let mut driver = vk::PhysicalDeviceDriverProperties::default();
     let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut driver);
     // SAFETY: the chain points at a live local.
     unsafe { instance.get_physical_device_properties2(physical, &mut properties) };
-    let limits = offered.properties.limits;
+    let limits = supported.properties.limits;
     let text =
         |text: Result<&CStr, _>| text.map(|t| t.to_string_lossy().into_owned()).unwrap_or_default();
     Ok(Properties {
-        name: offered.device_name(),
+        name: supported.device_name(),
         driver: format!(
             "{} {}",
             text(driver.driver_name_as_c_str()),
             text(driver.driver_info_as_c_str())
         ),
         memory: device_memory(instance, physical),
-        subgroup_size: offered.lanes()?,
-        subgroup_size_is_selectable: offered.subgroups.are_selectable,
+        subgroup_size: supported.lanes()?,
+        subgroup_size_is_selectable: supported.subgroups.are_selectable,
         max_storage_buffer_range: u64::from(limits.max_storage_buffer_range),
         max_workgroups: max_workgroups(&limits),
         max_loop_iterations: match driver.driver_id {
             vk::DriverId::MESA_LLVMPIPE => LLVMPIPE_LOOP_ITERATIONS,
             _ => u32::MAX,
         },
-        timestamp_bits: offered.timestamp_bits,
+        timestamp_bits: supported.timestamp_bits,
         timestamp_period: limits.timestamp_period,
-        is_cpu: offered.properties.device_type == vk::PhysicalDeviceType::CPU,
+        is_cpu: supported.properties.device_type == vk::PhysicalDeviceType::CPU,
         cooperative_matrix: None,
-        keeps_subgroups: false,
-        pushes_descriptors: offered.pushes_descriptors(),
-        tells_statistics: false,
+        has_uniform_subgroup_control_flow: false,
+        has_push_descriptors: supported.has_push_descriptors(),
+        has_pipeline_statistics: false,
     })
 }
 
@@ -287,16 +291,17 @@ const LLVMPIPE_LOOP_ITERATIONS: u32 = 65_535;
 fn create_device(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
-    offered: &Offered,
+    supported: &Supported,
     properties: &Properties,
 ) -> Result<(ash::Device, Queue)> {
-    let family = offered.compute_family.unwrap_or_default();
+    let family = supported.compute_family.unwrap_or_default();
     let priorities = [1.0];
     let queues = [vk::DeviceQueueCreateInfo::default()
         .queue_family_index(family)
         .queue_priorities(&priorities)];
     let is_wanted = |name: &&CStr| {
-        offered.has(name) && (*name != khr::push_descriptor::NAME || offered.pushes_descriptors())
+        supported.has(name)
+            && (*name != khr::push_descriptor::NAME || supported.has_push_descriptors())
     };
     let optional = OPTIONAL_EXTENSIONS.iter().copied().filter(is_wanted);
     let mut extensions: Vec<_> = optional.map(CStr::as_ptr).collect();
@@ -317,19 +322,19 @@ fn create_device(
     }
     let mut uniform = vk::PhysicalDeviceShaderSubgroupUniformControlFlowFeaturesKHR::default()
         .shader_subgroup_uniform_control_flow(true);
-    if properties.keeps_subgroups {
+    if properties.has_uniform_subgroup_control_flow {
         extensions.push(reconvergence::EXTENSION.as_ptr());
         info = info.push_next(&mut uniform);
     }
     let mut executables = vk::PhysicalDevicePipelineExecutablePropertiesFeaturesKHR::default()
         .pipeline_executable_info(true);
-    if properties.tells_statistics {
+    if properties.has_pipeline_statistics {
         extensions.push(statistics::EXTENSION.as_ptr());
         info = info.push_next(&mut executables);
     }
     let info =
         info.enabled_extension_names(&extensions).push_next(&mut vulkan12).push_next(&mut vulkan13);
-    let device = offered.device_name();
+    let device = supported.device_name();
     // SAFETY: `info` points at live locals; the requirements were checked.
     unsafe {
         let device = instance
@@ -341,8 +346,8 @@ fn create_device(
 }
 
 /// One file per device and driver, in the user's cache folder.
-fn cache_path(offered: &Offered) -> Option<PathBuf> {
-    let p = &offered.properties;
+fn cache_path(supported: &Supported) -> Option<PathBuf> {
+    let p = &supported.properties;
     let name = format!("{:x}-{:x}-{:x}.pipelines", p.vendor_id, p.device_id, p.driver_version);
     Some(cache_folder()?.join(name))
 }
@@ -356,6 +361,6 @@ fn cache_folder() -> Option<PathBuf> {
 }
 
 /// A device that has the extension has its one feature.
-fn tells_statistics(offered: &Offered) -> bool {
-    offered.has(statistics::EXTENSION)
+fn has_pipeline_statistics(supported: &Supported) -> bool {
+    supported.has(statistics::EXTENSION)
 }

@@ -5,10 +5,10 @@ use ash::vk;
 use super::REQUIREMENTS;
 
 use super::cooperative::{self, CooperativeMatrix};
-use super::instance::{Owned, instance, loader_error, physical_devices};
+use super::instance::{OwnedInstance, instance, loader_error, physical_devices};
 use super::limits::max_workgroups;
-use super::offered::Offered;
 use super::pci::PciAddress;
+use super::supported::Supported;
 use crate::Result;
 
 /// One device and how it meets the requirements, for `doctor`.
@@ -94,20 +94,20 @@ pub fn devices() -> Result<Vec<DeviceReport>> {
 }
 
 pub(super) fn report(
-    Owned { instance, entry, .. }: &Owned,
+    OwnedInstance { instance, entry, .. }: &OwnedInstance,
     physical: vk::PhysicalDevice,
 ) -> Result<DeviceReport> {
-    let offered = Offered::gather(instance, physical).map_err(loader_error)?;
-    let version = offered.properties.api_version;
+    let supported = Supported::gather(instance, physical).map_err(loader_error)?;
+    let version = supported.properties.api_version;
     let (major, minor, patch) = (
         vk::api_version_major(version),
         vk::api_version_minor(version),
         vk::api_version_patch(version),
     );
-    let limits = offered.properties.limits;
+    let limits = supported.properties.limits;
     Ok(DeviceReport {
-        name: offered.device_name(),
-        kind: match offered.properties.device_type {
+        name: supported.device_name(),
+        kind: match supported.properties.device_type {
             vk::PhysicalDeviceType::DISCRETE_GPU => "discrete",
             vk::PhysicalDeviceType::INTEGRATED_GPU => "integrated",
             vk::PhysicalDeviceType::VIRTUAL_GPU => "virtual",
@@ -115,25 +115,25 @@ pub(super) fn report(
             _ => "other",
         },
         api_version: format!("{major}.{minor}.{patch}"),
-        vendor: offered.properties.vendor_id,
-        uuid: hyphenated(&offered.uuid),
-        pci: offered.pci,
+        vendor: supported.properties.vendor_id,
+        uuid: hyphenated(&supported.uuid),
+        pci: supported.pci,
         // What the variable asks of another device is no matter here.
-        subgroup_size: offered.lanes().unwrap_or(offered.subgroups.own),
-        subgroup_sizes: offered.subgroups.all(),
+        subgroup_size: supported.lanes().unwrap_or(supported.subgroups.own),
+        subgroup_sizes: supported.subgroups.all(),
         memory: device_memory(instance, physical),
         limits: DeviceLimits {
             max_storage_buffer_range: u64::from(limits.max_storage_buffer_range),
-            max_allocation: offered.max_allocation,
+            max_allocation: supported.max_allocation,
             max_workgroups: max_workgroups(&limits),
             max_workgroup_invocations: limits.max_compute_work_group_invocations,
             max_shared_memory: limits.max_compute_shared_memory_size,
             max_storage_buffers: limits.max_per_stage_descriptor_storage_buffers,
         },
-        cooperative_matrix: cooperative::offered(entry, instance, physical, &offered),
+        cooperative_matrix: cooperative::supported(entry, instance, physical, &supported),
         requirements: REQUIREMENTS
             .iter()
-            .map(|r| RequirementReport { name: r.name, why: r.why, met: r.met_by(&offered) })
+            .map(|r| RequirementReport { name: r.name, why: r.why, met: r.met_by(&supported) })
             .collect(),
     })
 }

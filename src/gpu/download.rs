@@ -5,7 +5,7 @@ use std::marker::PhantomData;
 use gpu_allocator::MemoryLocation;
 use gpu_allocator::vulkan::Allocation;
 
-use super::allocated::Memory;
+use super::allocated::DeviceMemory;
 use super::recorder::HOST_SUBMITS;
 use super::{Bound, Gpu, Recorder, Slice};
 use crate::{Error, Result};
@@ -13,7 +13,7 @@ use crate::{Error, Result};
 /// A copy of a buffer that a submission brings to the host.
 #[derive(Debug)]
 pub struct Download<T> {
-    host: Memory,
+    host: DeviceMemory,
     len: usize,
     value: u64,
     element: PhantomData<T>,
@@ -60,7 +60,7 @@ impl Recorder<'_> {
                 "`{name}` cannot be downloaded where the host submits; once that is done, `Gpu::read` it"
             )));
         }
-        let host = Memory::new(self.shared(), name, bound.size, MemoryLocation::GpuToCpu)?;
+        let host = DeviceMemory::new(self.shared(), name, bound.size, MemoryLocation::GpuToCpu)?;
         if bound.size > 0 {
             self.copy_raw(bound, host.bound(), bound.size);
         }

@@ -13,7 +13,7 @@ const INSTALL: &str = "install a Vulkan driver, or the software device: on Debia
      `apt install libvulkan1 mesa-vulkan-drivers`";
 
 /// What we created around a device of our own.
-pub(super) struct Owned {
+pub(super) struct OwnedInstance {
     pub(super) instance: ash::Instance,
     pub(super) messenger: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
     /// Where compiled pipelines are kept.
@@ -24,7 +24,7 @@ pub(super) struct Owned {
     pub(super) entry: ash::Entry,
 }
 
-impl Owned {
+impl OwnedInstance {
     pub(super) fn save_pipeline_cache(&self, device: &ash::Device, cache: vk::PipelineCache) {
         let Some(path) = &self.cache_path else { return };
         // SAFETY: the cache is live. A cache that cannot be kept costs time, never correctness.
@@ -90,7 +90,7 @@ fn instance_has(entry: &ash::Entry, extension: &CStr) -> Result<bool> {
     Ok(all.iter().any(|own| own.extension_name_as_c_str() == Ok(extension)))
 }
 
-pub(super) fn instance(validate: bool) -> Result<Owned> {
+pub(super) fn instance(validate: bool) -> Result<OwnedInstance> {
     let entry = entry()?;
     let app = vk::ApplicationInfo::default()
         .application_name(c"nightsplat")
@@ -129,7 +129,7 @@ pub(super) fn instance(validate: bool) -> Result<Owned> {
             })
             .transpose()
             .map_err(loader_error)?;
-        Ok(Owned { instance, messenger, cache_path: None, tuning_path: None, entry })
+        Ok(OwnedInstance { instance, messenger, cache_path: None, tuning_path: None, entry })
     }
 }
 

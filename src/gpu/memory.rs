@@ -113,7 +113,7 @@ impl Default for MemoryUsage {
 /// Memory that there is, but not for us.
 #[derive(Debug, thiserror::Error)]
 #[error("{now} of {limit} bytes are taken")]
-pub(super) struct BeyondLimit {
+pub(super) struct MemoryLimitExceeded {
     now: u64,
     limit: u64,
 }
@@ -121,9 +121,13 @@ pub(super) struct BeyondLimit {
 impl MemoryUsage {
     /// # Errors
     /// So many bytes more are beyond the limit.
-    pub(super) fn admit(&self, bytes: u64) -> Result<(), BeyondLimit> {
+    pub(super) fn admit(&self, bytes: u64) -> Result<(), MemoryLimitExceeded> {
         let (now, limit) = (self.now.load(Ordering::Acquire), self.limit.load(Ordering::Acquire));
-        if now.saturating_add(bytes) > limit { Err(BeyondLimit { now, limit }) } else { Ok(()) }
+        if now.saturating_add(bytes) > limit {
+            Err(MemoryLimitExceeded { now, limit })
+        } else {
+            Ok(())
+        }
     }
 
     pub(super) fn add(&self, bytes: u64) {

@@ -126,7 +126,7 @@ pub(super) unsafe fn raw_pipeline(
 ) -> Result<vk::Pipeline, vk::Result> {
     let mut code = ash::util::read_spv(&mut Cursor::new(interface.spirv))
         .map_err(|_| vk::Result::ERROR_INITIALIZATION_FAILED)?;
-    if !shared.properties.keeps_subgroups {
+    if !shared.properties.has_uniform_subgroup_control_flow {
         code = reconvergence::unasked(&code);
     }
     if let Some(id) = interface.subgroup_size_id {

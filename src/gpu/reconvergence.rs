@@ -6,7 +6,7 @@
 
 use ash::{khr, vk};
 
-use super::offered::Offered;
+use super::supported::Supported;
 
 /// The extension a device is created with to be asked.
 pub(super) const EXTENSION: &std::ffi::CStr = khr::shader_subgroup_uniform_control_flow::NAME;
@@ -20,12 +20,12 @@ const OP_EXECUTION_MODE: u32 = 16;
 const HEADER: usize = 5;
 
 /// Whether the device makes the promise.
-pub(super) fn offered(
+pub(super) fn supported(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
-    offered: &Offered,
+    supported: &Supported,
 ) -> bool {
-    if !offered.has(EXTENSION) {
+    if !supported.has(EXTENSION) {
         return false;
     }
     let mut feature = vk::PhysicalDeviceShaderSubgroupUniformControlFlowFeaturesKHR::default();
@@ -41,11 +41,11 @@ pub(super) fn unasked(code: &[u32]) -> Vec<u32> {
     let mut kept = header.to_vec();
     while let Some(&first) = rest.first() {
         let length = (first >> 16) as usize;
-        let (instruction, behind) = rest.split_at(length.clamp(1, rest.len()));
+        let (instruction, after) = rest.split_at(length.clamp(1, rest.len()));
         if !asks(instruction) {
             kept.extend_from_slice(instruction);
         }
-        rest = behind;
+        rest = after;
     }
     kept
 }

@@ -3,7 +3,7 @@
 use ash::vk;
 
 use super::limits::{MAX_BUFFERS, SUBGROUP_SIZES};
-use super::offered::Offered;
+use super::supported::Supported;
 use crate::{Error, Result};
 
 /// The subgroup operations that our kernels use.
@@ -22,7 +22,7 @@ pub struct Requirement {
     pub name: &'static str,
     /// What it is needed for.
     pub why: &'static str,
-    offered: fn(&Offered) -> bool,
+    supported: fn(&Supported) -> bool,
 }
 
 impl std::fmt::Debug for Requirement {
@@ -32,8 +32,8 @@ impl std::fmt::Debug for Requirement {
 }
 
 impl Requirement {
-    pub(super) fn met_by(&self, offered: &Offered) -> bool {
-        (self.offered)(offered)
+    pub(super) fn met_by(&self, supported: &Supported) -> bool {
+        (self.supported)(supported)
     }
 }
 
@@ -42,52 +42,52 @@ pub const REQUIREMENTS: &[Requirement] = &[
     Requirement {
         name: "Vulkan 1.3",
         why: "the baseline of every kernel",
-        offered: |o| o.properties.api_version >= vk::API_VERSION_1_3,
+        supported: |o| o.properties.api_version >= vk::API_VERSION_1_3,
     },
     Requirement {
         name: "compute queue",
         why: "everything runs on one",
-        offered: |o| o.compute_family.is_some(),
+        supported: |o| o.compute_family.is_some(),
     },
     Requirement {
         name: "maxPerStageDescriptorStorageBuffers >= 16",
         why: "the most buffers that one pass binds",
-        offered: |o| o.properties.limits.max_per_stage_descriptor_storage_buffers >= MAX_BUFFERS,
+        supported: |o| o.properties.limits.max_per_stage_descriptor_storage_buffers >= MAX_BUFFERS,
     },
     Requirement {
         name: "timelineSemaphore",
         why: "one counter orders all submissions",
-        offered: |o| o.vulkan12.timeline_semaphore == vk::TRUE,
+        supported: |o| o.vulkan12.timeline_semaphore == vk::TRUE,
     },
     Requirement {
         name: "scalarBlockLayout",
         why: "the same bytes in GLSL and Rust",
-        offered: |o| o.vulkan12.scalar_block_layout == vk::TRUE,
+        supported: |o| o.vulkan12.scalar_block_layout == vk::TRUE,
     },
     Requirement {
         name: "hostQueryReset",
         why: "timestamps of every pass",
-        offered: |o| o.vulkan12.host_query_reset == vk::TRUE,
+        supported: |o| o.vulkan12.host_query_reset == vk::TRUE,
     },
     Requirement {
         name: "synchronization2",
         why: "barriers and submissions",
-        offered: |o| o.vulkan13.synchronization2 == vk::TRUE,
+        supported: |o| o.vulkan13.synchronization2 == vk::TRUE,
     },
     Requirement {
         name: "subgroupSizeControl",
         why: "one subgroup owns a tile: its size must be known",
-        offered: |o| o.vulkan13.subgroup_size_control == vk::TRUE,
+        supported: |o| o.vulkan13.subgroup_size_control == vk::TRUE,
     },
     Requirement {
         name: "computeFullSubgroups",
         why: "every lane of a subgroup takes part",
-        offered: |o| o.vulkan13.compute_full_subgroups == vk::TRUE,
+        supported: |o| o.vulkan13.compute_full_subgroups == vk::TRUE,
     },
     Requirement {
         name: "subgroup operations basic, vote, arithmetic, ballot, shuffle in compute",
         why: "blending and sorting without barriers",
-        offered: |o| {
+        supported: |o| {
             o.subgroup_operations.contains(SUBGROUP_OPERATIONS)
                 && o.subgroup_stages.contains(vk::ShaderStageFlags::COMPUTE)
         },
@@ -95,17 +95,17 @@ pub const REQUIREMENTS: &[Requirement] = &[
     Requirement {
         name: "subgroup size 4 to 128",
         why: "a ballot fits four words, a tile at most 32 rows of lanes",
-        offered: |o| SUBGROUP_SIZES.contains(&o.subgroups.own),
+        supported: |o| SUBGROUP_SIZES.contains(&o.subgroups.own),
     },
     Requirement {
         name: "maxComputeWorkGroupInvocations >= 256",
         why: "the widest workgroup",
-        offered: |o| o.properties.limits.max_compute_work_group_invocations >= 256,
+        supported: |o| o.properties.limits.max_compute_work_group_invocations >= 256,
     },
     Requirement {
         name: "maxComputeSharedMemorySize >= 24576",
         why: "the state of a tile",
-        offered: |o| o.properties.limits.max_compute_shared_memory_size >= 24_576,
+        supported: |o| o.properties.limits.max_compute_shared_memory_size >= 24_576,
     },
 ];
 
@@ -124,7 +124,7 @@ pub fn required_device_features()
     (vulkan12, vulkan13)
 }
 
-impl Offered {
+impl Supported {
     /// # Errors
     /// The first requirement that is not met, by its name.
     pub(super) fn check(&self) -> Result<()> {
@@ -148,7 +148,7 @@ mod tests {
     use crate::gpu::subgroups::SubgroupSizes;
 
     /// A device that meets every requirement, just so.
-    fn sufficient() -> Offered {
+    fn sufficient() -> Supported {
         let mut properties =
             vk::PhysicalDeviceProperties { api_version: vk::API_VERSION_1_3, ..Default::default() };
         properties.limits.max_compute_work_group_invocations = 256;
@@ -158,14 +158,14 @@ mod tests {
             *to = *from as _;
         }
         let (vulkan12, vulkan13) = required_device_features();
-        Offered {
+        Supported {
             properties,
             subgroups: SubgroupSizes {
                 own: 4,
                 are_selectable: false,
                 least: 4,
                 most: 4,
-                most_in_workgroup: 64,
+                workgroup_limit: 64,
             },
             subgroup_operations: SUBGROUP_OPERATIONS,
             subgroup_stages: vk::ShaderStageFlags::COMPUTE,
@@ -183,7 +183,7 @@ mod tests {
 
     #[test]
     fn each_missing_requirement_is_the_one_that_is_named() {
-        type Break = (&'static str, fn(&mut Offered));
+        type Break = (&'static str, fn(&mut Supported));
         let breaks: [Break; 13] = [
             ("Vulkan 1.3", |o| o.properties.api_version = vk::API_VERSION_1_2),
             ("compute queue", |o| o.compute_family = None),
@@ -208,9 +208,9 @@ mod tests {
         assert!(sufficient().check().is_ok());
         assert_eq!(breaks.len(), REQUIREMENTS.len());
         for (name, break_it) in breaks {
-            let mut offered = sufficient();
-            break_it(&mut offered);
-            let message = offered.check().unwrap_err().to_string();
+            let mut supported = sufficient();
+            break_it(&mut supported);
+            let message = supported.check().unwrap_err().to_string();
             assert!(message.starts_with(&format!("Abacus 3000 lacks {name}")), "{message}");
             assert!(message.contains("nightsplat doctor") && !message.contains('\n'), "{message}");
         }

@@ -5,13 +5,13 @@ use std::marker::PhantomData;
 use std::ops::Range;
 
 use super::Bound;
-use super::allocated::Memory;
+use super::allocated::DeviceMemory;
 use crate::{Error, Result};
 
 /// Elements of a buffer to read.
 #[derive(Clone, Copy, Debug)]
 pub struct Slice<'a, T> {
-    memory: &'a Memory,
+    memory: &'a DeviceMemory,
     /// Where it begins in the memory, in elements.
     first: usize,
     len: usize,
@@ -23,9 +23,9 @@ pub struct Slice<'a, T> {
 ///
 /// ```compile_fail,E0502
 /// # use nightsplat::gpu::{Buffer, Gpu};
-/// # use nightsplat::kernels::window_gather;
-/// fn copied_onto_itself(buffer: &mut Buffer<f32>) -> window_gather::Buffers<'_> {
-///     window_gather::Buffers { image: buffer.slice(), content: buffer.slice_mut() }
+/// # use nightsplat::kernels::crop_gather;
+/// fn copied_onto_itself(buffer: &mut Buffer<f32>) -> crop_gather::Buffers<'_> {
+///     crop_gather::Buffers { image: buffer.slice(), content: buffer.slice_mut() }
 /// }
 /// ```
 ///
@@ -33,12 +33,12 @@ pub struct Slice<'a, T> {
 ///
 /// ```compile_fail,E0596
 /// # use nightsplat::gpu::{Buffer, Gpu};
-/// # use nightsplat::kernels::window_gather;
+/// # use nightsplat::kernels::crop_gather;
 /// fn written_through_a_shared_reference<'a>(
 ///     image: &'a Buffer<f32>,
 ///     content: &'a Buffer<f32>,
-/// ) -> window_gather::Buffers<'a> {
-///     window_gather::Buffers { image: image.slice(), content: content.slice_mut() }
+/// ) -> crop_gather::Buffers<'a> {
+///     crop_gather::Buffers { image: image.slice(), content: content.slice_mut() }
 /// }
 /// ```
 ///
@@ -46,17 +46,17 @@ pub struct Slice<'a, T> {
 ///
 /// ```
 /// # use nightsplat::gpu::{Buffer, Gpu};
-/// # use nightsplat::kernels::window_gather;
+/// # use nightsplat::kernels::crop_gather;
 /// fn copied_to_another<'a>(
 ///     image: &'a Buffer<f32>,
 ///     content: &'a mut Buffer<f32>,
-/// ) -> window_gather::Buffers<'a> {
-///     window_gather::Buffers { image: image.slice(), content: content.slice_mut() }
+/// ) -> crop_gather::Buffers<'a> {
+///     crop_gather::Buffers { image: image.slice(), content: content.slice_mut() }
 /// }
 /// ```
 #[derive(Debug)]
 pub struct SliceMut<'a, T> {
-    memory: &'a Memory,
+    memory: &'a DeviceMemory,
     first: usize,
     len: usize,
     element: PhantomData<&'a mut T>,
@@ -67,7 +67,7 @@ const ALIGNMENT: usize = 256;
 
 impl<'a, T: bytemuck::Pod> Slice<'a, T> {
     /// The first `len` elements of the memory.
-    pub(super) fn new(memory: &'a Memory, len: usize) -> Self {
+    pub(super) fn new(memory: &'a DeviceMemory, len: usize) -> Self {
         Self { memory, first: 0, len, element: PhantomData }
     }
 
@@ -103,7 +103,7 @@ impl<'a, T: bytemuck::Pod> Slice<'a, T> {
 
 impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
     /// The first `len` elements of memory whose owner is borrowed for it alone.
-    pub(super) fn new(memory: &'a Memory, len: usize) -> Self {
+    pub(super) fn new(memory: &'a DeviceMemory, len: usize) -> Self {
         Self { memory, first: 0, len, element: PhantomData }
     }
 
@@ -183,7 +183,7 @@ impl<'a> SliceMut<'a, f32> {
 }
 
 /// Where a range of `len` elements begins, checked.
-fn offset_of<T>(memory: &Memory, len: usize, range: &Range<usize>) -> Result<usize> {
+fn offset_of<T>(memory: &DeviceMemory, len: usize, range: &Range<usize>) -> Result<usize> {
     let name = memory.name();
     if range.start > range.end || range.end > len {
         let what =
@@ -200,7 +200,7 @@ fn offset_of<T>(memory: &Memory, len: usize, range: &Range<usize>) -> Result<usi
 }
 
 /// Vulkan has no empty bindings: what stands for one is at the begin, where every buffer has some bytes.
-fn bound<T>(memory: &Memory, first: usize, len: usize) -> Bound {
+fn bound<T>(memory: &DeviceMemory, first: usize, len: usize) -> Bound {
     let first = if len == 0 { 0 } else { first };
     let [offset, size] = [first, len].map(|n| (n * size_of::<T>()) as u64);
     Bound { raw: memory.handle(), offset, size }

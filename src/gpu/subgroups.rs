@@ -16,7 +16,7 @@ pub(super) struct SubgroupSizes {
     pub(super) least: u32,
     pub(super) most: u32,
     /// The most subgroups of a workgroup.
-    pub(super) most_in_workgroup: u32,
+    pub(super) workgroup_limit: u32,
 }
 
 impl SubgroupSizes {
@@ -29,7 +29,7 @@ impl SubgroupSizes {
         let fit = |&size: &u32| {
             SUBGROUP_SIZES.contains(&size)
                 && (self.least..=self.most).contains(&size)
-                && WORKGROUP / size <= self.most_in_workgroup
+                && WORKGROUP / size <= self.workgroup_limit
         };
         powers.filter(fit).collect()
     }
@@ -67,7 +67,7 @@ mod tests {
     const INTEL: u32 = 0x8086;
 
     fn sizes(own: u32, [least, most]: [u32; 2]) -> SubgroupSizes {
-        SubgroupSizes { own, are_selectable: true, least, most, most_in_workgroup: 32 }
+        SubgroupSizes { own, are_selectable: true, least, most, workgroup_limit: 32 }
     }
 
     #[test]
@@ -87,7 +87,7 @@ mod tests {
     fn a_size_that_is_asked_for_is_one_that_the_device_has() {
         let intel = sizes(32, [8, 32]);
         assert_eq!(lanes(intel, INTEL, Some("16")), Ok(16));
-        assert_eq!(SubgroupSizes { most_in_workgroup: 16, ..intel }.all(), [16, 32]);
+        assert_eq!(SubgroupSizes { workgroup_limit: 16, ..intel }.all(), [16, 32]);
         for wanted in ["48", "64", "4", "0", "-8", "all"] {
             let problem = lanes(intel, INTEL, Some(wanted)).unwrap_err();
             assert!(problem.contains(wanted) && problem.contains("8 or 16 or 32"), "{problem}");

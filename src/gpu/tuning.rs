@@ -186,9 +186,9 @@ mod tests {
             timestamp_period: 1.0,
             is_cpu: false,
             cooperative_matrix: None,
-            pushes_descriptors: true,
-            keeps_subgroups: false,
-            tells_statistics: false,
+            has_push_descriptors: true,
+            has_uniform_subgroup_control_flow: false,
+            has_pipeline_statistics: false,
         }
     }
 

@@ -3,7 +3,7 @@
 use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
-use super::{Interior, LossSpec, Term, TermOn, check_weight, holds, no_scratch, value_count};
+use super::{LossRegion, LossSpec, Term, TermOn, check_weight, holds, no_scratch, value_count};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::denoising;
@@ -43,7 +43,7 @@ pub struct DenoisingInputs<'a> {
     /// Width and height in pixels.
     pub size: UVec2,
     /// The pixels that count.
-    pub interior: Interior,
+    pub loss_region: LossRegion,
     /// (3, H, W)
     pub denoised: &'a Buffer<f32>,
     /// What it is held to, (3, H, W).
@@ -117,7 +117,7 @@ impl DenoisingLoss {
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,
-        DenoisingInputs { size, interior, denoised, render }: DenoisingInputs<'_>,
+        DenoisingInputs { size, loss_region, denoised, render }: DenoisingInputs<'_>,
         DenoisingGradients { d_denoised, d_render }: DenoisingGradients<'_>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
@@ -125,22 +125,22 @@ impl DenoisingLoss {
         if size.min_element() == 0 || workgroups as usize > self.mse_partials.len() {
             return Err(no_scratch("denoising term", size));
         }
-        interior.check(size)?;
+        loss_region.check(size)?;
         for buffer in [denoised, render, &*d_denoised, &*d_render] {
             holds(buffer, value_count(size) as usize)?;
         }
         log.check()?;
-        let UVec2 { x: columns, y: rows } = interior.size;
+        let UVec2 { x: columns, y: rows } = loss_region.size;
         // One column or row has no pair of neighbours across.
         let pair_scale = |pairs: u32| if pairs == 0 { 0.0 } else { 2.0 / (3.0 * pairs as f32) };
-        let mean_scale = 1.0 / value_count(interior.size) as f32;
+        let mean_scale = 1.0 / value_count(loss_region.size) as f32;
         pass.dispatch(
             &self.pipeline,
             &denoising::Params {
                 width: size.x,
                 height: size.y,
-                interior_begin: interior.origin,
-                interior_end: interior.end(),
+                loss_begin: loss_region.origin,
+                loss_end: loss_region.end(),
                 mse_weight: self.weights.mse as f32,
                 tv_weight: self.weights.total_variation as f32,
                 mean_scale,

@@ -7,7 +7,7 @@ use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
-    Gradient, Interior, LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, holds,
+    Gradient, LossRegion, LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, holds,
     no_scratch, value_count,
 };
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -64,13 +64,13 @@ impl Term {
 /// How the SSIM kernel marches over a view: the columns of a lane, the rows of a subgroup, and the floats that its loads and
 /// stores are aligned to.
 #[derive(Clone, Copy, Debug)]
-struct March {
+struct SsimLayout {
     columns: u32,
     rows: u32,
     alignment: u32,
 }
 
-impl March {
+impl SsimLayout {
     /// What suits the device, the first that fits a view: on a processor loads and stores cost the most, so that a subgroup
     /// is as wide as the first-level cache holds what its registers do not, and goes far; a GPU needs narrow strips, which
     /// stay in registers.
@@ -120,7 +120,7 @@ pub struct LossInputs<'a> {
     /// Width and height in pixels.
     pub size: UVec2,
     /// The pixels that count.
-    pub interior: Interior,
+    pub loss_region: LossRegion,
     /// (3, H, W), not clamped.
     pub render: &'a Buffer<f32>,
     /// (3, H, W)
@@ -143,7 +143,7 @@ enum Kernels {
     /// The SSIM weight is zero: no SSIM is evaluated.
     L1 {
         whole: Pipeline<l1::Kernel>,
-        interior: Pipeline<l1::Kernel>,
+        loss_region: Pipeline<l1::Kernel>,
         values_per_workgroup: u32,
     },
     Ssim(Ssim),
@@ -153,7 +153,7 @@ enum Kernels {
 struct Ssim {
     weight: f64,
     lanes: u32,
-    kernels: Vec<(March, Pipeline<ssim::Kernel>)>,
+    kernels: Vec<(SsimLayout, Pipeline<ssim::Kernel>)>,
 }
 
 impl Loss {
@@ -172,20 +172,21 @@ impl Loss {
         let subgroup_size = gpu.properties().subgroup_size;
         let kernels = if ssim_weight > 0.0 {
             let kernel = |march| {
-                let March { columns, rows, alignment } = march;
+                let SsimLayout { columns, rows, alignment } = march;
                 let constants = ssim::Constants { columns, rows, alignment, adds };
                 Ok((march, gpu.pipeline(&constants)?))
             };
             Kernels::Ssim(Ssim {
                 weight: ssim_weight,
                 lanes: subgroup_size,
-                kernels: March::on(gpu).into_iter().map(kernel).collect::<Result<_>>()?,
+                kernels: SsimLayout::on(gpu).into_iter().map(kernel).collect::<Result<_>>()?,
             })
         } else {
             let constants = l1::Constants { adds, ..Default::default() };
             Kernels::L1 {
                 whole: gpu.pipeline(&constants)?,
-                interior: gpu.pipeline(&l1::Constants { with_interior: true, ..constants })?,
+                loss_region: gpu
+                    .pipeline(&l1::Constants { with_loss_region: true, ..constants })?,
                 values_per_workgroup: subgroup_size * constants.values_per_thread,
             }
         };
@@ -232,18 +233,18 @@ impl Loss {
         let [l1_partials, ssim_partials] = [&mut self.l1_partials, &mut self.ssim_partials];
         let mut ssim_count = 0;
         match &mut self.kernels {
-            Kernels::L1 { whole, interior, .. } => {
+            Kernels::L1 { whole, loss_region, .. } => {
                 let LossInputs { size, render, target, .. } = inputs;
-                let is_whole = inputs.interior == Interior::whole(size);
+                let is_whole = inputs.loss_region == LossRegion::whole(size);
                 pass.dispatch(
-                    if is_whole { whole } else { interior },
+                    if is_whole { whole } else { loss_region },
                     &l1::Params {
                         value_count: value_count(size),
-                        l1_scale: 1.0 / inputs.interior.value_count() as f32,
+                        l1_scale: 1.0 / inputs.loss_region.value_count() as f32,
                         width: size.x,
                         height: size.y,
-                        interior_begin: inputs.interior.origin,
-                        interior_end: inputs.interior.end(),
+                        loss_begin: inputs.loss_region.origin,
+                        loss_end: inputs.loss_region.end(),
                     },
                     l1::Buffers {
                         render: render.slice(),
@@ -259,7 +260,7 @@ impl Loss {
                 ssim.record(pass, threads, inputs, d_render, [l1_partials, ssim_partials])?;
             }
         }
-        let scale = 1.0 / inputs.interior.value_count() as f32;
+        let scale = 1.0 / inputs.loss_region.value_count() as f32;
         let [l1, ssim] = self.terms;
         log.record(
             pass,
@@ -283,7 +284,7 @@ impl Loss {
         if !fits {
             return Err(no_scratch("loss", inputs.size));
         }
-        inputs.interior.check(inputs.size)?;
+        inputs.loss_region.check(inputs.size)?;
         for buffer in [inputs.render, inputs.target, d_render] {
             holds(buffer, values as usize)?;
         }
@@ -305,7 +306,7 @@ impl Kernels {
 
 impl Ssim {
     /// The last one fits every view.
-    fn kernel(&self, size: UVec2) -> &(March, Pipeline<ssim::Kernel>) {
+    fn kernel(&self, size: UVec2) -> &(SsimLayout, Pipeline<ssim::Kernel>) {
         let last = self.kernels.len() - 1;
         let first = self.kernels.iter().position(|(march, _)| march.fits(size));
         &self.kernels[first.unwrap_or(last)]
@@ -315,18 +316,18 @@ impl Ssim {
         &self,
         pass: &mut Recorder<'_>,
         threads: Threads,
-        LossInputs { size, interior, render, target }: LossInputs<'_>,
+        LossInputs { size, loss_region, render, target }: LossInputs<'_>,
         d_render: &mut Buffer<f32>,
         [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],
     ) -> Result<()> {
-        let mean_scale = 1.0 / f64::from(interior.value_count());
+        let mean_scale = 1.0 / f64::from(loss_region.value_count());
         pass.dispatch(
             &self.kernel(size).1,
             &ssim::Params {
                 width: size.x,
                 height: size.y,
-                interior_begin: interior.origin,
-                interior_end: interior.end(),
+                loss_begin: loss_region.origin,
+                loss_end: loss_region.end(),
                 l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
                 ssim_scale: (self.weight * mean_scale) as f32,
             },
@@ -354,7 +355,7 @@ impl LossTerm for Loss {
         d_render: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
-        let inputs = LossInputs { size, interior: Interior::whole(size), render, target };
+        let inputs = LossInputs { size, loss_region: LossRegion::whole(size), render, target };
         self.record(pass, inputs, d_render, log)
     }
 }

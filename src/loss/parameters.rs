@@ -127,8 +127,8 @@ impl ParameterTerms {
         let each = self.gaussians_per_workgroup;
         let workgroups = |batch: &Batch| batch.gaussian_count().div_ceil(each);
         // Batches bind parts of the partial sums; what lies between these counts as 0.
-        let room = |batch: &Batch| (workgroups(batch) as usize).next_multiple_of(PART);
-        let total: usize = batches.iter().map(|batch| room(&batch)).sum();
+        let padded = |batch: &Batch| (workgroups(batch) as usize).next_multiple_of(PART);
+        let total: usize = batches.iter().map(|batch| padded(&batch)).sum();
         let all: u32 = batches.iter().map(|batch| batch.gaussian_count()).sum();
         if self.opacity_partials.len() < total {
             self.opacity_partials = self.gpu.uninit("opacity_partials", total)?;
@@ -141,7 +141,7 @@ impl ParameterTerms {
         let scale = |weight: f64, each: f64| (weight / (each * f64::from(all.max(1)))) as f32;
         let mut first = 0;
         for batch in batches.iter() {
-            let part = first..first + room(&batch);
+            let part = first..first + padded(&batch);
             first = part.end;
             pass.dispatch(
                 &self.pipeline,

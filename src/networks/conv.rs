@@ -27,7 +27,7 @@ pub(super) enum Activation {
 
 /// What a convolution adds to, in place of overwriting it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Adds {
+pub(super) enum AccumulateInto {
     Nothing,
     /// Its output.
     Output,
@@ -83,7 +83,7 @@ pub(super) struct Conv {
 
 /// The input of a convolution and the gradient of its output before the activation.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Seen<'a> {
+pub(super) struct WeightGradientInputs<'a> {
     pub(super) source: &'a Buffer<f32>,
     pub(super) d_target: &'a Buffer<f32>,
 }
@@ -97,13 +97,13 @@ impl Conv {
         gpu: &Gpu,
         [inputs, outputs]: [u32; 2],
         activation: Activation,
-        adds: Adds,
+        adds: AccumulateInto,
     ) -> Result<Self> {
         let none = Activation::None;
-        let accumulate = adds == Adds::Output;
-        let forward = Form { activation, transposed: false, accumulate };
-        let accumulate = adds == Adds::InputGradient;
-        let backward = Form { activation: none, transposed: true, accumulate };
+        let accumulate = adds == AccumulateInto::Output;
+        let forward = ConvVariant { activation, transposed: false, accumulate };
+        let accumulate = adds == AccumulateInto::InputGradient;
+        let backward = ConvVariant { activation: none, transposed: true, accumulate };
         Ok(Self {
             inputs,
             outputs,
@@ -148,7 +148,7 @@ impl Conv {
         pass: &mut Recorder<'_>,
         size: UVec2,
         offset: u32,
-        seen: Seen<'_>,
+        seen: WeightGradientInputs<'_>,
         partials: &mut Buffer<f32>,
         gradients: &mut Buffer<f32>,
     ) -> Result<()> {
@@ -161,7 +161,7 @@ impl Conv {
 
 /// What a product is for.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Form {
+pub(super) struct ConvVariant {
     pub(super) activation: Activation,
     pub(super) transposed: bool,
     pub(super) accumulate: bool,
@@ -177,8 +177,8 @@ pub(super) struct Product {
 }
 
 impl Product {
-    pub(super) fn new(gpu: &Gpu, outputs: u32, form: Form) -> Result<Self> {
-        let Form { activation, transposed, accumulate } = form;
+    pub(super) fn new(gpu: &Gpu, outputs: u32, variant: ConvVariant) -> Result<Self> {
+        let ConvVariant { activation, transposed, accumulate } = variant;
         let [columns, rows] = conv_shape(gpu);
         let channels = outputs.min(OUT_BLOCK);
         let kernel = gpu.pipeline(&conv3x3::Constants {
@@ -240,7 +240,7 @@ impl WeightGradient {
         pass: &mut Recorder<'_>,
         size: UVec2,
         [in_channels, out_channels]: [u32; 2],
-        Seen { source, d_target }: Seen<'_>,
+        WeightGradientInputs { source, d_target }: WeightGradientInputs<'_>,
         partials: &mut Buffer<f32>,
     ) -> Result<()> {
         pass.dispatch(

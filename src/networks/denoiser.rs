@@ -16,14 +16,14 @@ mod memory;
 
 use glam::UVec2;
 
-use self::memory::{Activations, Earlier, Extent, Memory, Repeat};
-use super::conv::{Activation, Adds, Conv, Precision, Seen, Strips};
-use super::half::{PackedMap, Way};
-use super::inner::{Inner, Layer, Map};
-use super::norm::{Backward, Forward, Norm, Use};
+use self::memory::{Activations, DenoiserExtent, DenoiserMemory, EarlierStages, Repeat};
+use super::conv::{AccumulateInto, Activation, Conv, Precision, Strips, WeightGradientInputs};
+use super::half::{Direction, PackedMap};
+use super::inner::{Inner, InnerLayer, Map};
+use super::norm::{Backward, Forward, Norm, NormUse};
 use super::parameters::{Layout, Parameters};
 use super::relu::ReluBackward;
-use super::{Form, RGB, check_images, out_of_turn, pixel_count};
+use super::{NetworkVariant, RGB, check_images, out_of_turn, pixel_count};
 use crate::base::random::Stream;
 use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Properties, Recorder, Threads};
@@ -49,7 +49,7 @@ pub struct DenoiserSettings {
     precision: Precision = Precision::Single => Rule::OneOf(&["single", "half"]), "--denoiser-precision P";
     /// How the networks begin and end, the tonemapper too: identity, which lets through what goes in until something better
     /// is learned, or paper.
-    form: Form = Form::Identity => Rule::OneOf(&["identity", "paper"]);
+    variant: NetworkVariant = NetworkVariant::Identity => Rule::OneOf(&["identity", "paper"]);
 }
 }
 
@@ -62,7 +62,7 @@ impl DenoiserSettings {
             repeats: 6,
             channels: 64,
             precision: Precision::Single,
-            form: Form::Paper,
+            variant: NetworkVariant::Paper,
         }
     }
 
@@ -92,9 +92,9 @@ pub struct Denoiser {
     parameters: Parameters,
     stages: Vec<Stage>,
     kernels: Kernels,
-    reserved: Extent,
-    memory: Memory,
-    earlier: Earlier,
+    reserved: DenoiserExtent,
+    memory: DenoiserMemory,
+    earlier: EarlierStages,
     /// The size of the forward pass that the memory holds.
     recorded: Option<UVec2>,
 }
@@ -139,13 +139,15 @@ impl Denoiser {
             conv_in: layout.conv(&format!("{k}.conv_in"), RGB, channels),
             conv: layout.conv(&format!("{k}.conv"), channels, channels),
             norm: layout.norm(&format!("{k}.norm"), channels),
-            conv_out: match settings.form {
-                Form::Identity => layout.zero_conv(&format!("{k}.conv_out"), channels, RGB),
-                Form::Paper => layout.conv(&format!("{k}.conv_out"), channels, RGB),
+            conv_out: match settings.variant {
+                NetworkVariant::Identity => {
+                    layout.zero_conv(&format!("{k}.conv_out"), channels, RGB)
+                }
+                NetworkVariant::Paper => layout.conv(&format!("{k}.conv_out"), channels, RGB),
             },
         };
         let stages = (0..settings.stages).map(stage).collect();
-        let reserved = Extent::default();
+        let reserved = DenoiserExtent::default();
         let held = settings.held_on(gpu);
         Ok(Self {
             gpu: gpu.clone(),
@@ -159,8 +161,8 @@ impl Denoiser {
             stages,
             kernels: Kernels::new(gpu, settings)?,
             reserved,
-            memory: Memory::new(gpu, held, reserved)?,
-            earlier: Earlier::default(),
+            memory: DenoiserMemory::new(gpu, held, reserved)?,
+            earlier: EarlierStages::default(),
             recorded: None,
         })
     }
@@ -200,19 +202,19 @@ impl Denoiser {
     /// The memory that [`Denoiser::reserve`] takes for a view.
     #[cfg(feature = "testing")]
     pub fn bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
-        Extent::of(settings, size).bytes(settings)
+        DenoiserExtent::of(settings, size).bytes(settings)
     }
 
     /// The memory that [`Denoiser::keep_activations`] takes for a view beside it.
     #[cfg(feature = "testing")]
     pub fn kept_bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
-        Earlier::bytes(settings, Extent::of(settings, size))
+        EarlierStages::bytes(settings, DenoiserExtent::of(settings, size))
     }
 
     /// Whether the device binds every map of a view of `size`.
     pub fn fits_on(gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> bool {
         let held = settings.held_on(gpu);
-        Extent::of(held, size).check(gpu, held, size).is_ok()
+        DenoiserExtent::of(held, size).check(gpu, held, size).is_ok()
     }
 
     /// Takes the memory for views up to `size`, unless it is there already.
@@ -220,7 +222,7 @@ impl Denoiser {
     /// # Errors
     /// A map exceeds what the device can bind, or the device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
-        let needed = Extent::of(self.held, size);
+        let needed = DenoiserExtent::of(self.held, size);
         if needed.fits(self.reserved) {
             return Ok(());
         }
@@ -229,8 +231,8 @@ impl Denoiser {
         // The old memory goes first: both together may not fit.
         self.recorded = None;
         let extent = needed.max(std::mem::take(&mut self.reserved));
-        self.memory = Memory::new(gpu, self.held, Extent::default())?;
-        self.memory = Memory::new(gpu, self.held, extent)?;
+        self.memory = DenoiserMemory::new(gpu, self.held, DenoiserExtent::default())?;
+        self.memory = DenoiserMemory::new(gpu, self.held, extent)?;
         self.reserved = extent;
         Ok(())
     }
@@ -241,16 +243,16 @@ impl Denoiser {
     /// # Errors
     /// The device was lost.
     pub fn keep_activations(&mut self, size: UVec2, most: u64) -> Result<bool> {
-        let (settings, needed) = (self.held, Extent::of(self.held, size));
+        let (settings, needed) = (self.held, DenoiserExtent::of(self.held, size));
         if needed.fits(self.earlier.extent()) {
             return Ok(true);
         }
         let extent = needed.max(self.earlier.extent());
-        if Earlier::bytes(settings, extent) > most {
+        if EarlierStages::bytes(settings, extent) > most {
             return Ok(false);
         }
-        (self.recorded, self.earlier) = (None, Earlier::default());
-        match Earlier::new(&self.gpu, settings, extent) {
+        (self.recorded, self.earlier) = (None, EarlierStages::default());
+        match EarlierStages::new(&self.gpu, settings, extent) {
             Ok(earlier) => self.earlier = earlier,
             Err(Error::OutOfMemory { .. } | Error::BufferTooLarge { .. }) => return Ok(false),
             Err(other) => return Err(other),
@@ -275,18 +277,18 @@ impl Denoiser {
         input: &Buffer<f32>,
         render: &Buffer<f32>,
     ) -> Result<()> {
-        let (pixels, extent) = (pixel_count(size)?, Extent::of(self.held, size));
+        let (pixels, extent) = (pixel_count(size)?, DenoiserExtent::of(self.held, size));
         if !extent.fits(self.reserved) {
             return Err(out_of_turn("denoiser", size, "reserve memory for that size first"));
         }
         check_images(pixels, [input, render])?;
         let Self { kernels, parameters, earlier, .. } = self;
-        let Memory { activations: shared, denoised, .. } = &mut self.memory;
+        let DenoiserMemory { activations: shared, denoised, .. } = &mut self.memory;
         for (k, stage) in self.stages.iter().enumerate() {
             let (before, from_here) = denoised.split_at_mut(k);
             let stage_input = before.last().unwrap_or(input);
             let own = earlier.of(k, extent, shared);
-            kernels.conv.prepare(pass, Way::Forward, stage.inner(&parameters.values))?;
+            kernels.conv.prepare(pass, Direction::Forward, stage.inner(&parameters.values))?;
             kernels.stage_forward(pass, size, stage, &parameters.values, stage_input, own)?;
             let value_count = RGB * pixels as u32;
             pass.dispatch(
@@ -329,11 +331,11 @@ impl Denoiser {
             return Err(out_of_turn("denoiser", size, remedy));
         }
         let Self { kernels, memory, earlier, parameters, stages, held, .. } = self;
-        let extent = Extent::of(*held, size);
+        let extent = DenoiserExtent::of(*held, size);
         let are_kept = extent.fits(earlier.extent());
         pass.fill(&mut parameters.gradients, 0);
         for stage in stages.iter() {
-            kernels.conv.prepare(pass, Way::Backward, stage.inner(&parameters.values))?;
+            kernels.conv.prepare(pass, Direction::Backward, stage.inner(&parameters.values))?;
         }
         let last = stages.len() - 1;
         for (k, stage) in stages.iter().enumerate().rev() {
@@ -370,7 +372,7 @@ impl Denoiser {
                 d_packed: &mut memory.d_packed,
                 partials: &mut memory.partials,
             };
-            let ends = Ends { stage_input, d_update: &memory.d_update, d_stage_input };
+            let ends = StageMaps { stage_input, d_update: &memory.d_update, d_stage_input };
             kernels.stage_backward(pass, size, stage, parameters, maps, ends)?;
         }
         Ok(())
@@ -387,7 +389,7 @@ struct Maps<'a> {
 }
 
 /// The images at both ends of a stage's network.
-struct Ends<'a> {
+struct StageMaps<'a> {
     stage_input: &'a Buffer<f32>,
     d_update: &'a Buffer<f32>,
     /// Added to.
@@ -396,20 +398,20 @@ struct Ends<'a> {
 
 impl Kernels {
     fn new(gpu: &Gpu, settings: DenoiserSettings) -> Result<Self> {
-        let DenoiserSettings { channels, precision, form, .. } = settings;
+        let DenoiserSettings { channels, precision, variant, .. } = settings;
         let Properties { name, cooperative_matrix, .. } = gpu.properties();
         if precision == Precision::Half && cooperative_matrix.is_none() {
             tracing::warn!("{name} offers no 16-bit matrices: the denoiser is in single precision");
         }
-        let adds = Adds::InputGradient;
-        let identity = form == Form::Identity;
+        let adds = AccumulateInto::InputGradient;
+        let identity = variant == NetworkVariant::Identity;
         let activation = if identity { Activation::None } else { Activation::Sigmoid };
         Ok(Self {
             channels,
             repeats: settings.repeats as usize,
             conv_in: Conv::new(gpu, [RGB, channels], Activation::Relu, adds)?,
             conv: Inner::new(gpu, channels, settings.stages, adds, precision)?,
-            conv_out: Conv::new(gpu, [channels, RGB], activation, Adds::Nothing)?,
+            conv_out: Conv::new(gpu, [channels, RGB], activation, AccumulateInto::Nothing)?,
             norm: Norm::new(gpu, channels)?,
             relu_backward: ReluBackward::new(gpu)?,
             residual: gpu.pipeline(&residual::Constants { identity })?,
@@ -448,12 +450,12 @@ impl Kernels {
         stage: &Stage,
         parameters: &mut Parameters,
         maps: Maps<'_>,
-        ends: Ends<'_>,
+        ends: StageMaps<'_>,
     ) -> Result<()> {
         let Parameters { values, gradients, .. } = parameters;
         let Maps { activations, d_features, d_convolved, d_packed, partials } = maps;
         let last = activations.features(self.repeats);
-        let seen = Seen { source: last, d_target: ends.d_update };
+        let seen = WeightGradientInputs { source: last, d_target: ends.d_update };
         self.conv_out.weight_gradient(pass, size, stage.conv_out, seen, partials, gradients)?;
         self.conv_out.data_gradient(
             pass,
@@ -479,7 +481,7 @@ impl Kernels {
         let value_count = self.channels * size.element_product();
         let first = activations.features(0);
         self.relu_backward.record(pass, value_count, first, d_features)?;
-        let seen = Seen { source: ends.stage_input, d_target: &*d_features };
+        let seen = WeightGradientInputs { source: ends.stage_input, d_target: &*d_features };
         self.conv_in.weight_gradient(pass, size, stage.conv_in, seen, partials, gradients)?;
         let d_input = ends.d_stage_input;
         self.conv_in.data_gradient(pass, size, stage.conv_in, values, d_features, d_input)
@@ -488,11 +490,11 @@ impl Kernels {
 
 impl Stage {
     /// The layer that is repeated.
-    fn inner(self, values: &Buffer<f32>) -> Layer<'_> {
-        Layer { number: self.number, offset: self.conv, values }
+    fn inner(self, values: &Buffer<f32>) -> InnerLayer<'_> {
+        InnerLayer { number: self.number, offset: self.conv, values }
     }
 
-    fn norm_use(&self, size: UVec2, repeat: usize) -> Use {
-        Use { pixel_count: size.element_product(), offset: self.norm, repeat: repeat as u32 }
+    fn norm_use(&self, size: UVec2, repeat: usize) -> NormUse {
+        NormUse { pixel_count: size.element_product(), offset: self.norm, repeat: repeat as u32 }
     }
 }

@@ -2,7 +2,7 @@
 
 use glam::UVec2;
 
-use super::conv::{Adds, HALF_STRIP_ROWS, Reduce, Strips};
+use super::conv::{AccumulateInto, HALF_STRIP_ROWS, Reduce, Strips};
 use crate::Result;
 use crate::gpu::{Buffer, CooperativeMatrix, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::packed::{PACKED_CHANNELS, PACKED_COLUMNS, PACKED_ROWS};
@@ -19,13 +19,13 @@ const STRIP_BLOCKS: u32 = 2;
 const CHUNK: u32 = 2048;
 
 /// Eight halves.
-type Eight = [u32; 4];
+type HalfVec8 = [u32; 4];
 
 /// Feature maps as a factor, and the bits of their largest magnitude.
 #[derive(Debug)]
 pub(super) struct PackedMap {
     largest: Buffer<u32>,
-    halves: Buffer<Eight>,
+    halves: Buffer<HalfVec8>,
 }
 
 impl PackedMap {
@@ -33,13 +33,13 @@ impl PackedMap {
     ///
     /// # Errors
     /// The device is out of memory.
-    pub(super) fn new(gpu: &Gpu, eights: usize) -> Result<Self> {
-        let largest = gpu.uninit("largest", eights.min(1))?;
-        Ok(Self { largest, halves: gpu.uninit("packed_map", eights)? })
+    pub(super) fn new(gpu: &Gpu, packed_count: usize) -> Result<Self> {
+        let largest = gpu.uninit("largest", packed_count.min(1))?;
+        Ok(Self { largest, halves: gpu.uninit("packed_map", packed_count)? })
     }
 
     /// The eights of a view.
-    pub(super) fn eights(size: UVec2, channels: u32) -> usize {
+    pub(super) fn packed_count(size: UVec2, channels: u32) -> usize {
         let columns = size.x.next_multiple_of(PACKED_COLUMNS) as usize + 2;
         let rows = size.y.next_multiple_of(PACKED_ROWS) as usize + 2;
         columns * rows * channels.next_multiple_of(PACKED_CHANNELS) as usize / 8
@@ -50,12 +50,12 @@ impl PackedMap {
 #[derive(Debug)]
 pub(super) struct PackedWeights {
     largest: Buffer<u32>,
-    halves: [Buffer<Eight>; 2],
+    halves: [Buffer<HalfVec8>; 2],
 }
 
 /// Where a convolution goes.
 #[derive(Clone, Copy, Debug)]
-pub(super) enum Way {
+pub(super) enum Direction {
     /// From input to output.
     Forward = 0,
     /// From the gradient of the output to that of the input.
@@ -85,7 +85,7 @@ impl HalfConv {
         gpu: &Gpu,
         channels: u32,
         matrix: CooperativeMatrix,
-        adds: Adds,
+        adds: AccumulateInto,
     ) -> Result<Self> {
         let CooperativeMatrix { m, n, k } = matrix;
         let [blocks, strip_blocks] =
@@ -104,7 +104,10 @@ impl HalfConv {
             largest: gpu.pipeline(&largest_magnitude::Constants { chunk: CHUNK })?,
             pack_map: gpu.pipeline(&pack_map::Constants::default())?,
             pack_weights: [pack_weights(false)?, pack_weights(true)?],
-            products: [product(true, Adds::Output)?, product(false, Adds::InputGradient)?],
+            products: [
+                product(true, AccumulateInto::Output)?,
+                product(false, AccumulateInto::InputGradient)?,
+            ],
             weight_gradient: gpu.pipeline(&conv3x3_weight_gradient_half::Constants {
                 m,
                 n,
@@ -121,12 +124,12 @@ impl HalfConv {
     /// # Errors
     /// The device is out of memory.
     pub(super) fn packed_weights(&self, gpu: &Gpu) -> Result<PackedWeights> {
-        let halves = || gpu.uninit("packed_weights", self.weight_eights() as usize);
+        let halves = || gpu.uninit("packed_weights", self.packed_weight_count() as usize);
         let largest = gpu.uninit("largest_weight", 1)?;
         Ok(PackedWeights { largest, halves: [halves()?, halves()?] })
     }
 
-    fn weight_eights(&self) -> u32 {
+    fn packed_weight_count(&self) -> u32 {
         9 * self.channels.next_multiple_of(PACKED_CHANNELS).pow(2) / 8
     }
 
@@ -134,13 +137,13 @@ impl HalfConv {
     pub(super) fn pack_weights(
         &self,
         pass: &mut Recorder<'_>,
-        way: Way,
+        way: Direction,
         offset: u32,
         values: &Buffer<f32>,
         packed: &mut PackedWeights,
     ) -> Result<()> {
         let PackedWeights { largest, halves } = packed;
-        if let Way::Forward = way {
+        if let Direction::Forward = way {
             let value_count = 9 * self.channels * self.channels;
             self.largest(pass, [offset, value_count], values, largest)?;
         }
@@ -153,7 +156,7 @@ impl HalfConv {
                 values: values.slice(),
                 packed: halves[way as usize].slice_mut(),
             },
-            Threads::Exactly([self.weight_eights(), 1, 1]),
+            Threads::Exactly([self.packed_weight_count(), 1, 1]),
         )
     }
 
@@ -167,7 +170,7 @@ impl HalfConv {
     ) -> Result<()> {
         let (channels, PackedMap { largest, halves }) = (self.channels, packed);
         self.largest(pass, [0, channels * size.element_product()], source, largest)?;
-        let eights = PackedMap::eights(size, channels) as u32;
+        let packed_count = PackedMap::packed_count(size, channels) as u32;
         pass.dispatch(
             &self.pack_map,
             &pack_map::Params { size, channels },
@@ -176,7 +179,7 @@ impl HalfConv {
                 source: source.slice(),
                 packed: halves.slice_mut(),
             },
-            Threads::Exactly([eights / (PACKED_CHANNELS / 8), 1, 1]),
+            Threads::Exactly([packed_count / (PACKED_CHANNELS / 8), 1, 1]),
         )
     }
 
@@ -202,7 +205,7 @@ impl HalfConv {
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
-        way: Way,
+        way: Direction,
         (offset, values): (u32, &Buffer<f32>),
         weights: &PackedWeights,
         source: &PackedMap,

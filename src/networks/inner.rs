@@ -2,8 +2,8 @@
 
 use glam::UVec2;
 
-use super::conv::{Activation, Adds, Conv, Precision, Seen, Strips};
-use super::half::{HalfConv, PackedMap, PackedWeights, Way};
+use super::conv::{AccumulateInto, Activation, Conv, Precision, Strips, WeightGradientInputs};
+use super::half::{Direction, HalfConv, PackedMap, PackedWeights};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
 
@@ -16,7 +16,7 @@ pub(super) enum Inner {
 
 /// A layer: which it is, and where it lies in the values.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Layer<'a> {
+pub(super) struct InnerLayer<'a> {
     pub(super) number: usize,
     pub(super) offset: u32,
     pub(super) values: &'a Buffer<f32>,
@@ -36,7 +36,7 @@ impl Inner {
         gpu: &Gpu,
         channels: u32,
         layers: u32,
-        adds: Adds,
+        adds: AccumulateInto,
         precision: Precision,
     ) -> Result<Self> {
         let Some(matrix) = precision.matrix(gpu) else {
@@ -51,10 +51,10 @@ impl Inner {
     pub(super) fn prepare(
         &mut self,
         pass: &mut Recorder<'_>,
-        way: Way,
-        layer: Layer<'_>,
+        way: Direction,
+        layer: InnerLayer<'_>,
     ) -> Result<()> {
-        let Layer { number, offset, values } = layer;
+        let InnerLayer { number, offset, values } = layer;
         match self {
             Self::Single(_) => Ok(()),
             Self::Half { conv, layers } => {
@@ -68,17 +68,17 @@ impl Inner {
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
-        layer: Layer<'_>,
+        layer: InnerLayer<'_>,
         source: Map<'_>,
         target: &mut Buffer<f32>,
     ) -> Result<()> {
-        let (Layer { number, offset, values }, Map { single, packed }) = (layer, source);
+        let (InnerLayer { number, offset, values }, Map { single, packed }) = (layer, source);
         match self {
             Self::Single(conv) => conv.forward(pass, size, offset, values, single, target),
             Self::Half { conv, layers } => {
                 conv.pack_map(pass, size, single, packed)?;
                 let (own, weights) = ((offset, values), &layers[number]);
-                conv.product(pass, size, Way::Forward, own, weights, packed, target)
+                conv.product(pass, size, Direction::Forward, own, weights, packed, target)
             }
         }
     }
@@ -90,16 +90,16 @@ impl Inner {
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
-        layer: Layer<'_>,
+        layer: InnerLayer<'_>,
         source: (&Buffer<f32>, &PackedMap),
         d_target: Map<'_>,
         d_source: &mut Buffer<f32>,
         strips: Strips<'_>,
     ) -> Result<()> {
-        let (Layer { number, offset, values }, Map { single, packed }) = (layer, d_target);
+        let (InnerLayer { number, offset, values }, Map { single, packed }) = (layer, d_target);
         match self {
             Self::Single(conv) => {
-                let seen = Seen { source: source.0, d_target: single };
+                let seen = WeightGradientInputs { source: source.0, d_target: single };
                 let Strips { partials, gradients } = strips;
                 conv.weight_gradient(pass, size, offset, seen, partials, gradients)?;
                 conv.data_gradient(pass, size, offset, values, single, d_source)
@@ -109,7 +109,7 @@ impl Inner {
                 let factors = [source.1, &*packed];
                 conv.weight_gradient(pass, size, offset, factors, single, strips)?;
                 let (own, weights) = ((offset, values), &layers[number]);
-                conv.product(pass, size, Way::Backward, own, weights, packed, d_source)
+                conv.product(pass, size, Direction::Backward, own, weights, packed, d_source)
             }
         }
     }

@@ -37,7 +37,7 @@ pub(super) struct NormMemory {
 
 /// One use of a norm: how many pixels, where its parameters are, and which use of them it is.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Use {
+pub(super) struct NormUse {
     pub(super) pixel_count: u32,
     pub(super) offset: u32,
     pub(super) repeat: u32,
@@ -97,7 +97,7 @@ impl Norm {
     pub(super) fn forward(
         &self,
         pass: &mut Recorder<'_>,
-        of: Use,
+        of: NormUse,
         values: &Buffer<f32>,
         memory: &mut NormMemory,
         Forward { source, shortcut, target }: Forward<'_>,
@@ -134,7 +134,7 @@ impl Norm {
     pub(super) fn backward(
         &self,
         pass: &mut Recorder<'_>,
-        of: Use,
+        of: NormUse,
         values: &Buffer<f32>,
         gradients: &mut Buffer<f32>,
         memory: &mut NormMemory,
@@ -180,7 +180,7 @@ impl Norm {
     }
 
     /// One workgroup per chunk and channel, and one per channel.
-    fn threads(&self, of: Use) -> (Threads, Threads) {
+    fn threads(&self, of: NormUse) -> (Threads, Threads) {
         let per_chunk = [of.pixel_count.div_ceil(CHUNK), self.channels, 1];
         (Threads::Workgroups(per_chunk), Threads::Workgroups([1, self.channels, 1]))
     }

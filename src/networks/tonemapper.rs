@@ -2,10 +2,12 @@
 
 use glam::UVec2;
 
-use super::conv::{Activation, Adds, Conv, Precision, Seen, partial_count};
+use super::conv::{
+    AccumulateInto, Activation, Conv, Precision, WeightGradientInputs, partial_count,
+};
 use super::parameters::{Layout, Parameters};
 use super::relu::ReluBackward;
-use super::{Form, RGB, check_binding, check_images, out_of_turn, pixel_count};
+use super::{NetworkVariant, RGB, check_binding, check_images, out_of_turn, pixel_count};
 use crate::Result;
 use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -22,7 +24,7 @@ const CHANNELS: u32 = 16;
 #[derive(Debug)]
 pub struct Tonemapper {
     gpu: Gpu,
-    form: Form,
+    variant: NetworkVariant,
     parameters: Parameters,
     /// Where the layers lie in the parameters.
     offsets: [u32; 3],
@@ -31,13 +33,13 @@ pub struct Tonemapper {
     product_backward: Pipeline<product_backward::Kernel>,
     relu_backward: ReluBackward,
     reserved: [usize; 2],
-    memory: Memory,
+    memory: TonemapperMemory,
     /// The size of the forward pass that the memory holds.
     recorded: Option<UVec2>,
 }
 
 #[derive(Debug)]
-struct Memory {
+struct TonemapperMemory {
     /// (3, H, W)
     product: Buffer<f32>,
     /// Both (16, H, W).
@@ -59,36 +61,36 @@ impl Tonemapper {
     ///
     /// # Errors
     /// The driver refuses a kernel, or the device is out of memory.
-    pub fn new(gpu: &Gpu, form: Form, seed: u64) -> Result<Self> {
+    pub fn new(gpu: &Gpu, variant: NetworkVariant, seed: u64) -> Result<Self> {
         let mut layout = Layout::new(Stream::new(seed, STREAM));
         let offsets = [
             layout.conv("conv1", RGB, CHANNELS),
             layout.conv("conv2", CHANNELS, CHANNELS),
-            match form {
-                Form::Identity => layout.zero_conv("conv3", CHANNELS, RGB),
-                Form::Paper => layout.conv("conv3", CHANNELS, RGB),
+            match variant {
+                NetworkVariant::Identity => layout.zero_conv("conv3", CHANNELS, RGB),
+                NetworkVariant::Paper => layout.conv("conv3", CHANNELS, RGB),
             },
         ];
         let (relu, none) = (Activation::Relu, Activation::None);
-        let [adds_input, adds_output] = match form {
-            Form::Identity => [Adds::InputGradient, Adds::Output],
-            Form::Paper => [Adds::Nothing; 2],
+        let [adds_input, adds_output] = match variant {
+            NetworkVariant::Identity => [AccumulateInto::InputGradient, AccumulateInto::Output],
+            NetworkVariant::Paper => [AccumulateInto::Nothing; 2],
         };
         Ok(Self {
             gpu: gpu.clone(),
-            form,
+            variant,
             parameters: layout.upload(gpu, ("tonemapper", Self::LEARNING_RATE), "{}".to_owned())?,
             offsets,
             convs: [
                 Conv::new(gpu, [RGB, CHANNELS], relu, adds_input)?,
-                Conv::new(gpu, [CHANNELS, CHANNELS], relu, Adds::Nothing)?,
+                Conv::new(gpu, [CHANNELS, CHANNELS], relu, AccumulateInto::Nothing)?,
                 Conv::new(gpu, [CHANNELS, RGB], none, adds_output)?,
             ],
             product: gpu.pipeline(&product::Constants::default())?,
             product_backward: gpu.pipeline(&product_backward::Constants::default())?,
             relu_backward: ReluBackward::new(gpu)?,
             reserved: [0; 2],
-            memory: Memory::new(gpu, [0; 2])?,
+            memory: TonemapperMemory::new(gpu, [0; 2])?,
             recorded: None,
         })
     }
@@ -126,8 +128,8 @@ impl Tonemapper {
         let extent = [pixels.max(self.reserved[0]), partials.max(self.reserved[1])];
         // The old memory goes first: both together may not fit.
         (self.recorded, self.reserved) = (None, [0; 2]);
-        self.memory = Memory::new(&self.gpu, [0; 2])?;
-        self.memory = Memory::new(&self.gpu, extent)?;
+        self.memory = TonemapperMemory::new(&self.gpu, [0; 2])?;
+        self.memory = TonemapperMemory::new(&self.gpu, extent)?;
         self.reserved = extent;
         Ok(())
     }
@@ -158,7 +160,7 @@ impl Tonemapper {
             return Err(out_of_turn("tonemapper", size, "reserve memory for that size first"));
         }
         check_images(pixels, [illumination, denoised])?;
-        let Memory { product, features: [first, second], output, .. } = &mut self.memory;
+        let TonemapperMemory { product, features: [first, second], output, .. } = &mut self.memory;
         let value_count = RGB * pixels as u32;
         pass.dispatch(
             &self.product,
@@ -174,7 +176,7 @@ impl Tonemapper {
         let values = &self.parameters.values;
         conv_in.forward(pass, size, at_in, values, product, first)?;
         conv.forward(pass, size, at, values, first, second)?;
-        if self.form == Form::Identity {
+        if self.variant == NetworkVariant::Identity {
             pass.copy(product, output);
         }
         conv_out.forward(pass, size, at_out, values, second, output)?;
@@ -204,26 +206,27 @@ impl Tonemapper {
             let remedy = "each backward pass needs a forward pass of its own before it";
             return Err(out_of_turn("tonemapper", size, remedy));
         }
-        let Memory { product, features, d_features, d_product, partials, .. } = &mut self.memory;
+        let TonemapperMemory { product, features, d_features, d_product, partials, .. } =
+            &mut self.memory;
         let Parameters { values, gradients, .. } = &mut self.parameters;
         let ([conv_in, conv, conv_out], [at_in, at, at_out]) = (&self.convs, self.offsets);
         let ([first, second], [d_first, d_second]) = (features, d_features);
         let threads = |value_count| Threads::Exactly([value_count, 1, 1]);
         pass.fill(gradients, 0);
 
-        let seen = Seen { source: second, d_target: d_output };
+        let seen = WeightGradientInputs { source: second, d_target: d_output };
         conv_out.weight_gradient(pass, size, at_out, seen, partials, gradients)?;
         conv_out.data_gradient(pass, size, at_out, values, d_output, d_second)?;
         let value_count = CHANNELS * pixels as u32;
         self.relu_backward.record(pass, value_count, second, d_second)?;
-        let seen = Seen { source: first, d_target: d_second };
+        let seen = WeightGradientInputs { source: first, d_target: d_second };
         conv.weight_gradient(pass, size, at, seen, partials, gradients)?;
         conv.data_gradient(pass, size, at, values, d_second, d_first)?;
         self.relu_backward.record(pass, value_count, first, d_first)?;
-        if self.form == Form::Identity {
+        if self.variant == NetworkVariant::Identity {
             pass.copy(d_output, d_product);
         }
-        let seen = Seen { source: product, d_target: d_first };
+        let seen = WeightGradientInputs { source: product, d_target: d_first };
         conv_in.weight_gradient(pass, size, at_in, seen, partials, gradients)?;
         conv_in.data_gradient(pass, size, at_in, values, d_first, d_product)?;
         let value_count = RGB * pixels as u32;
@@ -257,7 +260,7 @@ fn check_maps(gpu: &Gpu, size: UVec2) -> Result<()> {
     check_binding(gpu, "the tonemapper's feature maps", size, CHANNELS as usize * pixels)
 }
 
-impl Memory {
+impl TonemapperMemory {
     fn new(gpu: &Gpu, [pixels, partials]: [usize; 2]) -> Result<Self> {
         let map = |name| gpu.uninit(name, CHANNELS as usize * pixels);
         let image = |name| gpu.uninit(name, RGB as usize * pixels);

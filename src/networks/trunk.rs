@@ -5,7 +5,7 @@ use std::path::Path;
 
 use glam::UVec2;
 
-use super::conv::{Activation, Form, Product};
+use super::conv::{Activation, ConvVariant, Product};
 use super::file::TensorFile;
 use super::{RGB, float_bytes};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -23,7 +23,7 @@ pub enum Network {
 }
 
 /// A convolution, behind it a ReLU.
-struct Layer {
+struct TrunkLayer {
     /// Of its tensors in `lpips`.
     name: &'static str,
     channels: [u32; 2],
@@ -38,12 +38,12 @@ struct Layer {
 }
 
 /// A convolution that keeps the size of its input.
-const fn conv(name: &'static str, channels: [u32; 2], window: u32) -> Layer {
+const fn conv(name: &'static str, channels: [u32; 2], window: u32) -> TrunkLayer {
     let (stride, padding) = (1, window / 2);
-    Layer { name, channels, window, stride, padding, pool: None, is_compared: false }
+    TrunkLayer { name, channels, window, stride, padding, pool: None, is_compared: false }
 }
 
-impl Layer {
+impl TrunkLayer {
     const fn pooled(self, window: u32) -> Self {
         Self { pool: Some(window), ..self }
     }
@@ -53,15 +53,15 @@ impl Layer {
     }
 }
 
-static ALEXNET: [Layer; 5] = [
-    Layer { stride: 4, padding: 2, ..conv("net.slice1.0", [RGB, 64], 11) }.compared(),
+static ALEXNET: [TrunkLayer; 5] = [
+    TrunkLayer { stride: 4, padding: 2, ..conv("net.slice1.0", [RGB, 64], 11) }.compared(),
     conv("net.slice2.3", [64, 192], 5).pooled(3).compared(),
     conv("net.slice3.6", [192, 384], 3).pooled(3).compared(),
     conv("net.slice4.8", [384, 256], 3).compared(),
     conv("net.slice5.10", [256, 256], 3).compared(),
 ];
 
-static VGG16: [Layer; 13] = [
+static VGG16: [TrunkLayer; 13] = [
     conv("net.slice1.0", [RGB, 64], 3),
     conv("net.slice1.2", [64, 64], 3).compared(),
     conv("net.slice2.5", [64, 128], 3).pooled(2),
@@ -103,7 +103,7 @@ impl Network {
         }
     }
 
-    fn layers(self) -> &'static [Layer] {
+    fn layers(self) -> &'static [TrunkLayer] {
         match self {
             Self::Alex => &ALEXNET,
             Self::Vgg => &VGG16,
@@ -111,7 +111,7 @@ impl Network {
     }
 
     /// The least width and height that leave the last layer a pixel.
-    fn least_size(self) -> u32 {
+    fn min_size(self) -> u32 {
         match self {
             Self::Alex => 31,
             Self::Vgg => 16,
@@ -169,20 +169,21 @@ impl Trunk {
         network: Network,
     ) -> Result<Self> {
         let mut values = vec![];
-        for Layer { name, channels: [inputs, outputs], window, .. } in network.layers() {
+        for TrunkLayer { name, channels: [inputs, outputs], window, .. } in network.layers() {
             let [inputs, outputs, window] = [*inputs, *outputs, *window].map(|n| n as usize);
             let shapes = [("weight", &[outputs, inputs, window, window][..]), ("bias", &[outputs])];
             for (part, shape) in shapes {
                 values.extend(published(path, file, &format!("{name}.{part}"), shape)?);
             }
         }
-        let form = Form { activation: Activation::Relu, transposed: false, accumulate: false };
+        let variant =
+            ConvVariant { activation: Activation::Relu, transposed: false, accumulate: false };
         let narrowest = network.layers().iter().map(|layer| layer.channels[1]).min();
         Ok(Self {
             network,
             values: gpu.buffer(network.name(), &values)?,
             strided: gpu.pipeline(&conv_strided::Constants::default())?,
-            product: Product::new(gpu, narrowest.unwrap_or(1), form)?,
+            product: Product::new(gpu, narrowest.unwrap_or(1), variant)?,
             pool: gpu.pipeline(&max_pool::Constants::default())?,
         })
     }
@@ -191,7 +192,7 @@ impl Trunk {
     /// The last layer would have no pixel of such a picture, or one binding cannot span an image of it.
     pub(crate) fn check(&self, gpu: &Gpu, size: UVec2) -> Result<()> {
         let UVec2 { x: width, y: height } = size;
-        let (title, least) = (self.network.title(), self.network.least_size());
+        let (title, least) = (self.network.title(), self.network.min_size());
         if size.min_element() < least {
             return Err(Error::Usage(format!(
                 "LPIPS of {title} looks at pictures of {least} pixels to a side and more, not {width}x{height}"
@@ -229,7 +230,7 @@ impl Trunk {
         let (mut source, mut size) = (gpu.buffer("picture", picture)?, size);
         let (mut offset, mut activations) = (0, vec![]);
         for layer in self.network.layers() {
-            let Layer { channels: [inputs, outputs], window, .. } = *layer;
+            let TrunkLayer { channels: [inputs, outputs], window, .. } = *layer;
             let [within, after] = layer.sizes(size);
             if let Some(window) = layer.pool {
                 let mut pooled = gpu.uninit("pooled", floats(inputs, within))?;
@@ -271,14 +272,14 @@ impl Trunk {
     fn convolve(
         &self,
         pass: &mut Recorder<'_>,
-        layer: &Layer,
+        layer: &TrunkLayer,
         [size, target_size]: [UVec2; 2],
         offset: u32,
         source: &Buffer<f32>,
         target: &mut Buffer<f32>,
     ) -> Result<()> {
         let (values, channels) = (&self.values, layer.channels);
-        let Layer { window, stride, padding, .. } = *layer;
+        let TrunkLayer { window, stride, padding, .. } = *layer;
         if window == 3 {
             return self.product.record(pass, size, channels, offset, values, source, target);
         }
@@ -306,7 +307,7 @@ impl Trunk {
     }
 }
 
-impl Layer {
+impl TrunkLayer {
     /// Pixels of what is convolved and of what comes out, for a picture that comes in.
     fn sizes(&self, size: UVec2) -> [UVec2; 2] {
         let within = self.pool.map_or(size, |window| (size - window) / POOL_STRIDE + 1);

@@ -49,7 +49,7 @@ pub use original::Original;
 pub(crate) use pixels::Look;
 use points::points;
 use source::Source;
-use split::{TEST_EVERY, say_whose_split_gives_way, split};
+use split::{TEST_EVERY, log_split, split};
 
 /// Photographs with cameras, and points of the scene they show.
 #[derive(Clone, Debug)]
@@ -282,7 +282,7 @@ impl Dataset {
         options.check()?;
         let files = Files::default();
         let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
-        say_whose_split_gives_way(root, &frames, options);
+        log_split(root, &frames, options);
         split(root, &mut frames, options.test_every, &files)?;
 
         let sources = sources(root, &frames, options, &files, &mut skipped);
@@ -310,7 +310,7 @@ impl Dataset {
         );
         let mut dataset = Self { root: root.to_owned(), views, points, skipped };
         dataset.leave_out_far_points();
-        dataset.say_what_stands_elsewhere();
+        dataset.warn_of_other_worlds();
         Ok(dataset)
     }
 

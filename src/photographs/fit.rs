@@ -29,7 +29,7 @@ use serde::Serialize;
 pub use self::histogram::{Cell, Column, Histogram};
 use self::model::Model;
 pub use self::model::psnr;
-pub use self::pairs::{Pair, Scene};
+pub use self::pairs::{FitScene, Pair};
 pub use self::profile::{
     ColourPair, ColourScene, ProfileFold, ProfileScores, cross_validate_profile, fit_profile,
     profile_scores,

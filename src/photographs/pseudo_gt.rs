@@ -4,7 +4,7 @@
 //! stored photograph, parameters -> pseudo_gt -> target
 //! ```
 //!
-//! Which parameters a photograph's statistics give is said on the host ([`ToneSettings::lift`]). A photograph beyond the
+//! Which parameters a photograph's statistics give is said on the host ([`ToneSettings::tone_mapping`]). A photograph beyond the
 //! device's limits comes in tiles.
 
 mod encoded;
@@ -85,7 +85,7 @@ impl PseudoGt {
                 image.len()
             )));
         }
-        let stored = Stored { code_bits: 32, codes: &self.no_codes, values: image };
+        let stored = EncodedSlices { code_bits: 32, codes: &self.no_codes, values: image };
         self.dispatch(pass, stored, image.len(), Some((parameters, view)), target)
     }
 
@@ -111,14 +111,20 @@ impl PseudoGt {
             let problem = format!("buffer `{name}` holds {len} values, not {value_count}");
             return Err(Error::Usage(problem));
         }
-        self.dispatch(pass, Stored { code_bits, codes, values }, value_count, curve, target)?;
+        self.dispatch(
+            pass,
+            EncodedSlices { code_bits, codes, values },
+            value_count,
+            curve,
+            target,
+        )?;
         Ok(target)
     }
 
     fn dispatch(
         &self,
         pass: &mut Recorder<'_>,
-        Stored { code_bits, codes, values }: Stored<'_>,
+        EncodedSlices { code_bits, codes, values }: EncodedSlices<'_>,
         value_count: usize,
         curve: Option<(&Buffer<ToneParameters>, u32)>,
         target: &mut Buffer<f32>,
@@ -160,7 +166,7 @@ impl PseudoGt {
 }
 
 /// What of a photograph a dispatch binds.
-struct Stored<'a> {
+struct EncodedSlices<'a> {
     code_bits: u32,
     codes: &'a Buffer<u32>,
     values: &'a Buffer<f32>,

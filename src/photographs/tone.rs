@@ -22,7 +22,7 @@ mod families;
 mod file;
 mod histogram;
 mod law;
-mod lift;
+mod mapping;
 mod profile;
 mod real;
 mod settings;
@@ -31,13 +31,13 @@ mod table;
 
 pub(crate) use self::exposure::all_black;
 pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
-pub use self::families::{Constant, FAMILIES, Family, Law, ToneCurve, White};
+pub use self::families::{Constant, FAMILIES, Family, OffsetMode, ToneCurve, White};
 pub use self::file::CurveChoice;
 pub use self::histogram::LuminanceHistogram;
 #[cfg(feature = "fit")]
-pub(crate) use self::law::{Numbers, PhotographCurve, law};
+pub(crate) use self::law::{CurveInputs, PhotographCurve, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
-pub use self::lift::{Lift, Measured, Scene};
+pub use self::mapping::{MeasuredPhotograph, SceneTone, ToneMapping};
 pub use self::profile::Profile;
 #[cfg(feature = "check")]
 pub(crate) use self::profile::profiled;

@@ -14,7 +14,7 @@ pub(super) fn stepped<T: Real>(
     [p, g, m, v]: [f32; 4],
 ) -> [T; 3] {
     let of = |x: f32| T::of(x.into());
-    let g = tame(g);
+    let g = clamp_gradient(g);
     let [old, new] = [BETA1, 1.0 - BETA1].map(|beta| of(beta as f32));
     let m = old * of(m) + new * of(g);
     let [old, new] = [BETA2, 1.0 - BETA2].map(|beta| of(beta as f32));
@@ -23,7 +23,7 @@ pub(super) fn stepped<T: Real>(
     [of(p) - of(rate) * m / divisor, m, v]
 }
 
-fn tame(gradient: f32) -> f32 {
+fn clamp_gradient(gradient: f32) -> f32 {
     let bound = GRADIENT_BOUND as f32;
     if gradient.is_finite() { gradient.clamp(-bound, bound) } else { 0.0 }
 }
@@ -35,7 +35,7 @@ pub(super) fn from_halves(word: u32) -> [f32; 2] {
 
 /// Both moments after the step as the device has them, where no product and sum are fused, and the chance of its rounding.
 pub(super) fn moments_after(step: u32, [p, g, m, v]: [f32; 4]) -> ([f32; 2], u32) {
-    let g = tame(g);
+    let g = clamp_gradient(g);
     let m = BETA1 as f32 * m + (1.0 - BETA1) as f32 * g;
     let v = BETA2 as f32 * v + (1.0 - BETA2) as f32 * g * g;
     ([m, v], random_bits((p.to_bits() ^ v.to_bits()).wrapping_add(random_bits(step))))

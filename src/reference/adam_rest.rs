@@ -2,7 +2,7 @@ use super::adam::{from_halves, in_halves, moments_after, stepped};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::adam_rest::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::half::{LARGEST_HALF, SMALLEST_HALF};
-use crate::splats::halves::value;
+use crate::splats::packed_sh::value;
 
 /// A multiple of the unit of halves at a number, up or down as `chance` has it; its bits as a half.
 fn rounded_by_chance(x: f32, chance: u32) -> u16 {
@@ -12,7 +12,7 @@ fn rounded_by_chance(x: f32, chance: u32) -> u16 {
     let unit = if below { smallest } else { f32::from_bits(exponent - (10 << 23)) };
     let share = (chance >> 19) as f32 / 8192.0;
     // A multiple is a half: the nearest is itself.
-    crate::splats::halves::nearest(((x / unit + share).floor() * unit).clamp(-largest, largest))
+    crate::splats::packed_sh::nearest(((x / unit + share).floor() * unit).clamp(-largest, largest))
 }
 
 impl Reference for Kernel {

@@ -10,7 +10,7 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::RECORD_HEAD;
 
-/// Adds to `records` (splats, record) what one pixel with the values `render` and the gradient `d_render` says:
+/// Adds to `gradient_records` (splats, record) what one pixel with the values `render` and the gradient `d_render` says:
 /// the gradients of mean2d, conic and opacity, to which the first `shaping` channels speak, and of the colours.
 #[expect(clippy::too_many_arguments, reason = "a pixel, its splats and its gradients")]
 pub fn blend_pixel_backward(
@@ -21,13 +21,13 @@ pub fn blend_pixel_backward(
     pixel: DVec2,
     alpha_max: f64,
     shaping: usize,
-    records: &mut [f64],
+    gradient_records: &mut [f64],
 ) {
     let (channels, head) = (render.len(), RECORD_HEAD as usize);
     let mut light = render.to_vec();
     for fragment in fragments(splats, pixel, alpha_max).0 {
         let Splat { conic, opacity, .. } = splats[fragment.index];
-        let record = &mut records[(head + channels) * fragment.index..][..head + channels];
+        let record = &mut gradient_records[(head + channels) * fragment.index..][..head + channels];
         let weight = fragment.alpha * fragment.before;
         let mut d_alpha = 0.0;
         for c in 0..channels {
@@ -67,15 +67,25 @@ fn for_each_tile(
     mut write: impl FnMut(usize, f64),
     visit: impl Fn(&TileList, &Pixel, &mut [f64]),
 ) {
-    let Slices { tile_ranges, sorted_slots, owners, splats, colors, render, d_render, .. } = slices;
+    let Slices {
+        tile_ranges,
+        sorted_intersections,
+        gaussian_ids,
+        splats,
+        colors,
+        render,
+        d_render,
+        ..
+    } = slices;
     let (channels, pixels) = (constants.channels as usize, params.size.element_product() as usize);
     let record = RECORD_HEAD as usize + channels;
     let tile = UVec2::new(constants.tile_width, constants.tile_height);
     for index in 0..params.tile_columns * params.size.y.div_ceil(tile.y) {
         let range = tile_ranges[index as usize];
-        let slots = &sorted_slots[range.x as usize..range.y as usize];
-        let list = TileList::new(constants.channels, slots, owners, splats, colors);
-        let mut sums = vec![0.0; record * list.slots.len()];
+        let intersection_ids = &sorted_intersections[range.x as usize..range.y as usize];
+        let list =
+            TileList::new(constants.channels, intersection_ids, gaussian_ids, splats, colors);
+        let mut sums = vec![0.0; record * list.intersection_ids.len()];
         for pixel in tile_pixels(index, params.tile_columns, tile, params.size) {
             let at = (pixel.y * params.size.x + pixel.x) as usize;
             let values =
@@ -84,7 +94,7 @@ fn for_each_tile(
             visit(&list, &Pixel { center: pixel.as_dvec2() + 0.5, render, d_render }, &mut sums);
         }
         let stored = stored_record(constants.channels);
-        for (sums, &slot) in sums.chunks(record).zip(&list.slots) {
+        for (sums, &slot) in sums.chunks(record).zip(&list.intersection_ids) {
             let padded = sums.iter().copied().chain(std::iter::repeat(0.0));
             (stored * slot as usize..)
                 .zip(padded.take(stored))
@@ -133,8 +143,9 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
         let alpha_max = constants.alpha_max.into();
-        let records: &mut [f32] = bytemuck::cast_slice_mut(std::mem::take(&mut slices.records));
-        let write = |at: usize, sum: f64| records[at] = sum as f32;
+        let gradient_records: &mut [f32] =
+            bytemuck::cast_slice_mut(std::mem::take(&mut slices.gradient_records));
+        let write = |at: usize, sum: f64| gradient_records[at] = sum as f32;
         for_each_tile(params, constants, &slices, write, |list, pixel, sums| {
             let Pixel { center, render, d_render } = pixel;
             blend_pixel_backward(
@@ -151,11 +162,11 @@ impl Reference for Kernel {
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let mut bounds = vec![0.0; 3 * slices.records.len()];
+        let mut bounds = vec![0.0; 3 * slices.gradient_records.len()];
         let write = |at: usize, bound: f64| bounds[at] = bound;
         for_each_tile(params, constants, &slices, write, |list, pixel, bounds| {
             add_bounds(constants, list, pixel, bounds);
         });
-        Tolerances { records: Tolerance::Each(bounds) }
+        Tolerances { gradient_records: Tolerance::Each(bounds) }
     }
 }

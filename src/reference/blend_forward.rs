@@ -7,7 +7,7 @@ use super::splat::{Splat, fragments, stored_color};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
 use crate::kernels::blend_forward::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::kernels::status::STATUS_CROWDED;
+use crate::kernels::status::STATUS_TILE_LIMIT;
 
 /// One pixel's channels and transmittance, from splats front to back with colours (splats, channels).
 pub fn blend_pixel(
@@ -31,7 +31,7 @@ pub fn blend_pixel(
 
 /// What a tile blends, front to back.
 pub(super) struct TileList {
-    pub(super) slots: Vec<u32>,
+    pub(super) intersection_ids: Vec<u32>,
     pub(super) splats: Vec<Splat>,
     /// (splats, channels)
     pub(super) colors: Vec<f64>,
@@ -40,18 +40,19 @@ pub(super) struct TileList {
 impl TileList {
     pub(super) fn new(
         channels: u32,
-        slots: &[u32],
-        owners: &[u32],
+        intersection_ids: &[u32],
+        gaussian_ids: &[u32],
         splats: &[ProjectedSplat],
         colors: &[Vec3],
     ) -> Self {
-        let (channels, ids) =
-            (channels as usize, || slots.iter().map(|&slot| owners[slot as usize] as usize));
+        let (channels, ids) = (channels as usize, || {
+            intersection_ids.iter().map(|&slot| gaussian_ids[slot as usize] as usize)
+        });
         let (stored, colors) =
             (stored_color(channels as u32), bytemuck::cast_slice::<_, f32>(colors));
         let color = |id| colors[stored * id..][..channels].iter().map(|&c| f64::from(c));
         Self {
-            slots: slots.to_vec(),
+            intersection_ids: intersection_ids.to_vec(),
             splats: ids().map(|id| Splat::from(&splats[id])).collect(),
             colors: ids().flat_map(color).collect(),
         }
@@ -84,12 +85,13 @@ fn for_each_tile(
     slices: &Slices<'_>,
     mut visit: impl FnMut(&TileList, &mut dyn Iterator<Item = UVec2>),
 ) {
-    let Slices { sorted_slots, owners, splats, colors, .. } = slices;
+    let Slices { sorted_intersections, gaussian_ids, splats, colors, .. } = slices;
     let tile = UVec2::new(constants.tile_width, constants.tile_height);
     for (index, (range, count)) in (0..).zip(tile_runs(params, constants, slices)) {
         let shown = if count > params.longest_run { 0 } else { count };
-        let slots = &sorted_slots[range.x as usize..][..shown as usize];
-        let list = TileList::new(constants.channels, slots, owners, splats, colors);
+        let intersection_ids = &sorted_intersections[range.x as usize..][..shown as usize];
+        let list =
+            TileList::new(constants.channels, intersection_ids, gaussian_ids, splats, colors);
         visit(&list, &mut tile_pixels(index, params.tile_columns, tile, params.size));
     }
 }
@@ -102,7 +104,7 @@ impl Reference for Kernel {
             slices.tile_ranges[tile] = run;
             if count > params.longest_run {
                 slices.tile_ranges[tile].y = run.x;
-                slices.status[0] |= STATUS_CROWDED;
+                slices.status[0] |= STATUS_TILE_LIMIT;
                 slices.status[2] = slices.status[2].max(count);
             }
         }

@@ -39,7 +39,7 @@ pub enum Model {
 
 /// What a model makes of a point: all in units of the focal lengths.
 #[derive(Clone, Copy, Debug)]
-pub struct Place {
+pub struct ImagePoint {
     /// Relative to the principal point.
     pub at: DVec2,
     /// Its derivative with respect to the point, row by row.
@@ -56,8 +56,8 @@ impl From<&kernels::Camera> for Camera {
                 largest_angle: camera.largest_angle.into(),
             }),
             _ => Model::Pinhole(Pinhole {
-                least_slope: camera.least_slope.as_dvec2(),
-                most_slope: camera.most_slope.as_dvec2(),
+                min_slope: camera.min_slope.as_dvec2(),
+                max_slope: camera.max_slope.as_dvec2(),
             }),
         };
         Self {
@@ -101,7 +101,7 @@ impl Camera {
         [self.focal.x * x, self.focal.y * y]
     }
 
-    fn place(&self, point: DVec3) -> Place {
+    fn place(&self, point: DVec3) -> ImagePoint {
         match &self.model {
             Model::Pinhole(pinhole) => pinhole.place(point),
             Model::Fisheye(fisheye) => fisheye.place(point),

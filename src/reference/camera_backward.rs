@@ -39,7 +39,8 @@ fn inputs(params: &Params, constants: &Constants, slices: &Slices<'_>, i: usize)
     let Gaussian { mean, quat, log_scale, .. } = planes.load(slices.parameters, i);
     let camera = Camera::from(&slices.cameras[params.camera_index as usize]);
     let far = camera.center().length();
-    let record = summed_record(constants.channels, slices.emitted[i], slices.records);
+    let record =
+        summed_record(constants.channels, slices.intersection_ranges[i], slices.gradient_records);
     let own = [mean.to_array().to_vec(), quat.to_array().to_vec(), log_scale.to_array().to_vec()];
     let mut values = own.concat();
     let mut errors: Vec<f64> = values.iter().map(|value| OFF * (value.abs() + 1.0)).collect();

@@ -17,7 +17,7 @@ impl Terms {
         let Slices { denoised, render, .. } = slices;
         let (width, values) = (params.width as usize, 3 * (params.width * params.height) as usize);
         let counts = |i: usize| {
-            inside(i, [params.width, params.height], [params.interior_begin, params.interior_end])
+            inside(i, [params.width, params.height], [params.loss_begin, params.loss_end])
         };
         let [u, v] = [params.mse_weight, params.tv_weight].map(f64::from);
         let (mut d, mut squares, mut tv) = (vec![0.0; values], 0.0, 0.0);

@@ -1,9 +1,9 @@
 use crate::gpu::Reference;
-use crate::kernels::densify_decide::{Constants, Kernel, Params, Slices};
-use crate::kernels::fate::{
-    FATE_CLONE, FATE_KEEP, FATE_PRUNE, FATE_SPLIT, KEY_KEEP, KEY_PRUNE, TALLY_CANDIDATES,
-    TALLY_CLONED, TALLY_PRUNED, TALLY_SPLIT,
+use crate::kernels::densify_action::{
+    ACTION_CLONE, ACTION_KEEP, ACTION_PRUNE, ACTION_SPLIT, COUNTER_CANDIDATES, COUNTER_CLONED,
+    COUNTER_PRUNED, COUNTER_SPLIT, KEY_KEEP, KEY_PRUNE,
 };
+use crate::kernels::densify_decide::{Constants, Kernel, Params, Slices};
 use crate::splats::attributes::Attribute;
 
 impl Reference for Kernel {
@@ -11,14 +11,14 @@ impl Reference for Kernel {
         let n = params.gaussian_count as usize;
         let (first, of_batch) = (params.first_gaussian as usize, params.batch_count as usize);
         let log_scales = Attribute::LogScales.column(0) * of_batch;
-        let kept = params.gaussian_count - slices.tally[TALLY_PRUNED as usize];
-        let room = params
+        let kept = params.gaussian_count - slices.counters[COUNTER_PRUNED as usize];
+        let available = params
             .max_gaussians
             .saturating_sub(kept)
             .div_ceil(params.rounds_left)
-            .min(params.most_added);
-        let end = if slices.tally[TALLY_CANDIDATES as usize] > room {
-            slices.sorted_keys[room as usize]
+            .min(params.max_added);
+        let end = if slices.counters[COUNTER_CANDIDATES as usize] > available {
+            slices.sorted_keys[available as usize]
         } else {
             KEY_KEEP
         };
@@ -29,18 +29,18 @@ impl Reference for Kernel {
             }
             let log_scales = &slices.parameters[log_scales + 3 * (i - first)..][..3];
             let largest = log_scales.iter().copied().fold(f32::MIN, f32::max);
-            let fate = if key < end {
+            let action = if key < end {
                 let is_small = !constants.conserving && largest <= params.split_log_scale;
-                if is_small { FATE_CLONE } else { FATE_SPLIT }
+                if is_small { ACTION_CLONE } else { ACTION_SPLIT }
             } else if key == KEY_PRUNE {
-                FATE_PRUNE
+                ACTION_PRUNE
             } else {
-                FATE_KEEP
+                ACTION_KEEP
             };
-            slices.fates[i] = fate;
-            slices.offspring_counts[i] = [0, 1, 2, 2][fate as usize];
-            slices.tally[TALLY_CLONED as usize] += u32::from(fate == FATE_CLONE);
-            slices.tally[TALLY_SPLIT as usize] += u32::from(fate == FATE_SPLIT);
+            slices.actions[i] = action;
+            slices.child_counts[i] = [0, 1, 2, 2][action as usize];
+            slices.counters[COUNTER_CLONED as usize] += u32::from(action == ACTION_CLONE);
+            slices.counters[COUNTER_SPLIT as usize] += u32::from(action == ACTION_SPLIT);
         }
     }
 }

@@ -8,7 +8,7 @@ impl Reference for Kernel {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
         let [features, columns] = [params.feature_count, params.column_count].map(|n| n as usize);
         let new = [params.first_new_gaussian, params.new_gaussian_count];
-        for copy in copies(n, slices.fates, slices.offsets, new) {
+        for copy in copies(n, slices.actions, slices.offsets, new) {
             for (column, width) in planes(features, columns) {
                 for k in 0..width {
                     let moment = slices.moments[column * n + width * copy.of + k];

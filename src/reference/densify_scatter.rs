@@ -8,11 +8,12 @@ use super::gaussian::sigmoid;
 use super::random::random_bits;
 use super::rounding::{TRIGONOMETRIC, UNIT};
 use crate::gpu::{Reference, Tolerance};
-use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::kernels::fate::{
-    FATE_CLONE, FATE_KEEP, FATE_SPLIT, PAPER_LOG_SPLIT_FACTOR, SPLIT_ACROSS, SPLIT_ACROSS_SLOPE,
-    SPLIT_ALONG, SPLIT_ALONG_SLOPE, SPLIT_OFFSET, SPLIT_OPACITY, SPLIT_OPACITY_SLOPE,
+use crate::kernels::densify_action::{
+    ACTION_CLONE, ACTION_KEEP, ACTION_SPLIT, PAPER_LOG_SPLIT_FACTOR, SPLIT_ACROSS,
+    SPLIT_ACROSS_SLOPE, SPLIT_ALONG, SPLIT_ALONG_SLOPE, SPLIT_OFFSET, SPLIT_OPACITY,
+    SPLIT_OPACITY_SLOPE,
 };
+use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::splats::attributes::{Attribute, planes};
 
 fn random_uniform(key: u32) -> f32 {
@@ -27,7 +28,7 @@ fn random_normal3(key: u32) -> Vec3 {
 }
 
 /// One of what comes of a Gaussian.
-pub(super) struct Copy {
+pub(super) struct Child {
     pub(super) of: usize,
     /// The first or the second.
     index: u32,
@@ -38,20 +39,20 @@ pub(super) struct Copy {
 /// The copies of all `count` Gaussians that belong to a batch of the new: how many lie before it, and how many it is of.
 pub(super) fn copies<'a>(
     count: usize,
-    fates: &'a [u32],
+    actions: &'a [u32],
     offsets: &'a [u32],
     [first_new, new_count]: [u32; 2],
-) -> impl Iterator<Item = Copy> + use<'a> {
+) -> impl Iterator<Item = Child> + use<'a> {
     (0..count).flat_map(move |of| {
-        let fate = fates[of];
-        let count = match fate {
-            FATE_CLONE | FATE_SPLIT => 2,
-            FATE_KEEP => 1,
+        let action = actions[of];
+        let count = match action {
+            ACTION_CLONE | ACTION_SPLIT => 2,
+            ACTION_KEEP => 1,
             _ => 0,
         };
         (0..count).filter_map(move |index| {
             let to = (offsets[of] + index).checked_sub(first_new).filter(|&to| to < new_count)?;
-            Some(Copy { of, index, to: to as usize, is_new: fate == FATE_SPLIT || index > 0 })
+            Some(Child { of, index, to: to as usize, is_new: action == ACTION_SPLIT || index > 0 })
         })
     })
 }
@@ -120,7 +121,7 @@ impl Reference for Kernel {
         let [features, columns] = [params.feature_count, params.column_count].map(|n| n as usize);
         let step_key = random_bits(random_bits(params.seed).wrapping_add(params.step));
         let new = [params.first_new_gaussian, params.new_gaussian_count];
-        for Copy { of: i, index, to, is_new } in copies(n, slices.fates, slices.offsets, new) {
+        for Child { of: i, index, to, is_new } in copies(n, slices.actions, slices.offsets, new) {
             for (column, width) in planes(features, columns) {
                 for k in 0..width {
                     slices.new_parameters[column * new_n + width * to + k] =
@@ -137,7 +138,7 @@ impl Reference for Kernel {
             } else {
                 let draw = 2 * (params.first_gaussian + i as u32) + index;
                 let key = random_bits(step_key.wrapping_add(draw));
-                drawn(&parent, rotation, slices.fates[i] == FATE_SPLIT, key)
+                drawn(&parent, rotation, slices.actions[i] == ACTION_SPLIT, key)
             };
             let [means, log_scales, raw_opacities] = changed(new_n);
             for k in 0..3 {
@@ -155,8 +156,8 @@ impl Reference for Kernel {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
         let mut bounds = vec![0.0; slices.new_parameters.len()];
         let new = [params.first_new_gaussian, params.new_gaussian_count];
-        let copies = copies(n, slices.fates, slices.offsets, new);
-        for Copy { of: i, to, .. } in copies.filter(|copy| copy.is_new) {
+        let copies = copies(n, slices.actions, slices.offsets, new);
+        for Child { of: i, to, .. } in copies.filter(|copy| copy.is_new) {
             let parent = shape(slices.parameters, n, i);
             let [means, log_scales, raw_opacities] = changed(new_n);
             let scale: f64 =

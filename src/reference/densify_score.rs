@@ -8,10 +8,10 @@ use super::rotation::{rotation, unit_quat};
 use super::rounding::UNIT;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::camera::NEAREST;
-use crate::kernels::densify_score::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::kernels::fate::{
-    KEY_KEEP, KEY_PRUNE, KEY_TOP, SPLIT_OFFSET, TALLY_CANDIDATES, TALLY_PRUNED,
+use crate::kernels::densify_action::{
+    COUNTER_CANDIDATES, COUNTER_PRUNED, KEY_KEEP, KEY_PRUNE, KEY_TOP, SPLIT_OFFSET,
 };
+use crate::kernels::densify_score::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::DILATION;
 use crate::splats::attributes::{Attribute, planes};
 
@@ -100,8 +100,8 @@ impl Reference for Kernel {
             };
             slices.keys[i] = key;
             slices.ids[i] = params.first_gaussian + i as u32;
-            slices.tally[TALLY_CANDIDATES as usize] += u32::from(key < KEY_KEEP);
-            slices.tally[TALLY_PRUNED as usize] += u32::from(key == KEY_PRUNE);
+            slices.counters[COUNTER_CANDIDATES as usize] += u32::from(key < KEY_KEEP);
+            slices.counters[COUNTER_PRUNED as usize] += u32::from(key == KEY_PRUNE);
         }
     }
 
@@ -125,7 +125,7 @@ impl Reference for Kernel {
         let close = (0..n).filter(|&i| is_close(i)).count();
         Tolerances {
             keys: Tolerance::Each(keys.collect()),
-            tally: Tolerance::Each(vec![close as f64]),
+            counters: Tolerance::Each(vec![close as f64]),
             ..Tolerances::default()
         }
     }

@@ -27,7 +27,7 @@ fn reserved(
     let one = |rank: usize| {
         let id = slices.sorted_ids[rank];
         let before = slices.sums[rank / constants.partition_size as usize];
-        let first = before.wrapping_add(slices.slots_before[rank]);
+        let first = before.wrapping_add(slices.intersection_offsets[rank]);
         let end = first.wrapping_add(slices.tile_counts[id as usize]);
         let is_counted = first <= end && end <= slices.counts[0];
         (id, first..if is_counted { end } else { first })
@@ -44,12 +44,12 @@ impl Reference for Kernel {
                 false => covered(params, constants, &slices.splats[id as usize]),
             };
             let count = reserved.len().min(covered.len()) as u32;
-            slices.emitted[id as usize] = UVec2::new(first, first + count);
+            slices.intersection_ranges[id as usize] = UVec2::new(first, first + count);
             let padding = std::iter::repeat(NO_TILE);
             for (slot, tile) in reserved.zip(covered.into_iter().chain(padding)) {
                 slices.tiles[slot as usize] = tile;
-                slices.slots[slot as usize] = slot;
-                slices.owners[slot as usize] = id;
+                slices.intersection_ids[slot as usize] = slot;
+                slices.gaussian_ids[slot as usize] = id;
             }
         }
     }
@@ -57,7 +57,7 @@ impl Reference for Kernel {
     /// Where a border of the ellipse lies within rounding of that of a tile, its Gaussian may or may not cover the tile.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let mut tiles = vec![0.0; slices.tiles.len()];
-        let mut emitted = vec![0.0; 2 * slices.emitted.len()];
+        let mut intersection_ranges = vec![0.0; 2 * slices.intersection_ranges.len()];
         for (id, reserved) in reserved(params, constants, &slices) {
             if reserved.is_empty() {
                 continue;
@@ -66,12 +66,12 @@ impl Reference for Kernel {
             let exact = covered(params, constants, splat);
             if moved(splat).iter().any(|splat| covered(params, constants, splat) != exact) {
                 tiles[reserved.start as usize..reserved.end as usize].fill(f64::INFINITY);
-                emitted[2 * id as usize + 1] = reserved.len() as f64;
+                intersection_ranges[2 * id as usize + 1] = reserved.len() as f64;
             }
         }
         Tolerances {
             tiles: Tolerance::Each(tiles),
-            emitted: Tolerance::Each(emitted),
+            intersection_ranges: Tolerance::Each(intersection_ranges),
             ..Tolerances::default()
         }
     }

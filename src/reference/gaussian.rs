@@ -6,7 +6,7 @@ use std::ops::Range;
 use glam::{DVec3, DVec4};
 
 use crate::splats::attributes::{Attribute, PlaneCounts, column_count, planes};
-use crate::splats::halves::Halves;
+use crate::splats::packed_sh::PackedSh;
 
 /// A Gaussian, or the gradient of one, in f64.
 #[derive(Clone, Debug, PartialEq)]
@@ -63,9 +63,9 @@ impl Planes {
         let Self { count: gaussians, feature_count: features, sh_degree } = self;
         let columns = column_count(features, sh_degree);
         match half_rest {
-            true => {
-                Halves::new(PlaneCounts { gaussians, columns, features }).unpack(parameters).into()
-            }
+            true => PackedSh::new(PlaneCounts { gaussians, columns, features })
+                .unpack(parameters)
+                .into(),
             false => parameters.into(),
         }
     }

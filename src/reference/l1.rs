@@ -9,10 +9,11 @@ fn differences(
     constants: &Constants,
     slices: &Slices<'_>,
 ) -> impl Iterator<Item = Rounded> {
-    let interior = [params.interior_begin, params.interior_end];
+    let loss_region = [params.loss_begin, params.loss_end];
     (0..params.value_count as usize).map(move |i| {
         let target = Rounded::exact(slices.target[i]);
-        let counts = !constants.with_interior || inside(i, [params.width, params.height], interior);
+        let counts =
+            !constants.with_loss_region || inside(i, [params.width, params.height], loss_region);
         if counts { Rounded::exact(slices.render[i]) - target } else { Rounded::default() }
     })
 }

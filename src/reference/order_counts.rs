@@ -4,7 +4,8 @@ use crate::kernels::status::STATUS_OVERFLOWED;
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { sorted_ids, tile_counts, slots_before, sums, counts, status, .. } = slices;
+        let Slices { sorted_ids, tile_counts, intersection_offsets, sums, counts, status, .. } =
+            slices;
         let (count, partition_size) =
             (params.gaussian_count as usize, constants.partition_size as usize);
         sums[0] = 0;
@@ -15,7 +16,7 @@ impl Reference for Kernel {
                 before = 0;
             }
             let count = tile_counts[sorted_ids[rank] as usize];
-            slots_before[rank] = before;
+            intersection_offsets[rank] = before;
             before = before.wrapping_add(count);
             total += u64::from(count);
         }

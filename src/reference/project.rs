@@ -109,7 +109,7 @@ fn tile_count(size: UVec2, constants: &Constants, splat: &ProjectedSplat) -> u32
 }
 
 /// A view, and the Gaussians in it.
-struct Scene<'a> {
+struct ProjectionInputs<'a> {
     params: &'a Params,
     constants: &'a Constants,
     /// Of the image, pixels.
@@ -118,7 +118,7 @@ struct Scene<'a> {
     planes: Planes,
 }
 
-impl<'a> Scene<'a> {
+impl<'a> ProjectionInputs<'a> {
     fn new(params: &'a Params, constants: &'a Constants, cameras: &[kernels::Camera]) -> Self {
         let Constants { channels, sh_degree, .. } = *constants;
         let planes = Planes::of(params.gaussian_count, channels, sh_degree);
@@ -222,7 +222,7 @@ impl<'a> Scene<'a> {
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { parameters, splats, colors, depth_keys, ids, tile_counts, cameras } = slices;
-        let scene = Scene::new(params, constants, cameras);
+        let scene = ProjectionInputs::new(params, constants, cameras);
         let parameters = scene.planes.floats(parameters, constants.half_rest);
         let stored = stored_color(constants.channels);
         let colors = bytemuck::cast_slice_mut::<_, f32>(colors);
@@ -247,7 +247,7 @@ impl Reference for Kernel {
 
     /// A Gaussian at the border of being culled may be; one whose ellipse borders on a tile may cover it.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let scene = Scene::new(params, constants, slices.cameras);
+        let scene = ProjectionInputs::new(params, constants, slices.cameras);
         let parameters = scene.planes.floats(slices.parameters, constants.half_rest);
         let (n, stored) = (scene.planes.count, stored_color(constants.channels));
         let [mut splats, mut colors, mut depth_keys, mut tile_counts] =

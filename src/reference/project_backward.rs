@@ -11,7 +11,7 @@ use super::splat::{Splat, stored_color, stored_record};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels;
 use crate::kernels::project_backward::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::kernels::shared_slots::SHARED_SLOTS;
+use crate::kernels::shared_intersections::SHARED_INTERSECTIONS;
 use crate::kernels::splat::{DILATION, RECORD_HEAD};
 use crate::kernels::status::STATUS_GRADIENT;
 
@@ -123,14 +123,14 @@ fn outer_product(column: DVec3, row: DVec3) -> DMat3 {
 const HEAD: usize = RECORD_HEAD as usize;
 
 /// A view, and the Gaussians in it.
-struct Scene<'a> {
+struct ProjectionInputs<'a> {
     params: &'a Params,
     constants: &'a Constants,
     camera: Camera,
     planes: Planes,
 }
 
-impl<'a> Scene<'a> {
+impl<'a> ProjectionInputs<'a> {
     fn new(params: &'a Params, constants: &'a Constants, cameras: &[kernels::Camera]) -> Self {
         let Constants { channels, sh_degree, .. } = *constants;
         let planes = Planes::of(params.gaussian_count, channels, sh_degree);
@@ -183,17 +183,23 @@ impl<'a> Scene<'a> {
 
 /// The sum of the records of a Gaussian with these slots. Those of few slots are added up in f32 in the kernel's very order;
 /// those of many by the lanes of a subgroup, in an order that is the device's.
-pub(super) fn summed_record(channels: u32, slots: UVec2, records: &[Vec3]) -> Vec<Rounded> {
-    let records = bytemuck::cast_slice::<_, f32>(records);
-    let slots = slots.x as usize..slots.y as usize;
+pub(super) fn summed_record(
+    channels: u32,
+    intersection_ids: UVec2,
+    gradient_records: &[Vec3],
+) -> Vec<Rounded> {
+    let gradient_records = bytemuck::cast_slice::<_, f32>(gradient_records);
+    let intersection_ids = intersection_ids.x as usize..intersection_ids.y as usize;
     let sum = |k: usize| {
-        let numbers = slots.clone().map(|slot| records[stored_record(channels) * slot + k]);
-        if slots.len() <= SHARED_SLOTS as usize {
+        let numbers = intersection_ids
+            .clone()
+            .map(|slot| gradient_records[stored_record(channels) * slot + k]);
+        if intersection_ids.len() <= SHARED_INTERSECTIONS as usize {
             return Rounded::exact(numbers.fold(0.0, |sum, number| sum + number));
         }
         let magnitudes: f64 = numbers.clone().map(|number| f64::from(number.abs())).sum();
         let sum = Rounded::exact(numbers.map(f64::from).sum::<f64>() as f32);
-        Rounded { error: UNIT * chain(slots.len()) * magnitudes, ..sum }
+        Rounded { error: UNIT * chain(intersection_ids.len()) * magnitudes, ..sum }
     };
     (0..HEAD + channels as usize).map(sum).collect()
 }
@@ -204,15 +210,24 @@ fn values(record: &[Rounded]) -> Vec<f64> {
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { parameters, splats, colors, tile_counts, emitted, records, .. } = slices;
+        let Slices {
+            parameters,
+            splats,
+            colors,
+            tile_counts,
+            intersection_ranges,
+            gradient_records,
+            ..
+        } = slices;
         let Slices { status, gradients, grad_norm_sums, visit_counts, .. } = slices;
         // Of all Gaussians, as the device may look at them in any order.
         let before = status[0];
-        let scene = Scene::new(params, constants, slices.cameras);
+        let scene = ProjectionInputs::new(params, constants, slices.cameras);
         let parameters = scene.planes.floats(parameters, constants.half_rest);
         gradients[..scene.planes.float_count()].fill(0.0);
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
-            let record = summed_record(constants.channels, emitted[i], records);
+            let record =
+                summed_record(constants.channels, intersection_ranges[i], gradient_records);
             let d_splat = scene.d_splat(colors, &values(&record), i);
             let gaussian = scene.planes.load(&parameters, i);
             let gradient = scene.backward(&gaussian, &Splat::from(&splats[i]), &d_splat);
@@ -234,7 +249,7 @@ impl Reference for Kernel {
     /// Attributes also pass through sums and exponentials with terms of order one, means through the view.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         const OFF: f64 = 256.0 * UNIT;
-        let scene = Scene::new(params, constants, slices.cameras);
+        let scene = ProjectionInputs::new(params, constants, slices.cameras);
         let parameters = scene.planes.floats(slices.parameters, constants.half_rest);
         let one = Planes { count: 1, ..scene.planes };
         let far = scene.camera.center().length();
@@ -246,7 +261,11 @@ impl Reference for Kernel {
             let mut inputs = vec![0.0; one.float_count()];
             one.store(&gaussian, 0, |at, value| inputs[at] = value);
             inputs.extend(splat.conic.to_array());
-            let record = summed_record(constants.channels, slices.emitted[i], slices.records);
+            let record = summed_record(
+                constants.channels,
+                slices.intersection_ranges[i],
+                slices.gradient_records,
+            );
             inputs.extend(values(&record));
             let mut errors: Vec<f64> = (0..inputs.len())
                 .map(|at| {

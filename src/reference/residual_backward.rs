@@ -5,7 +5,7 @@ use crate::kernels::residual_backward::{Constants, Kernel, Params, Slices, Toler
 
 /// What the gradient `d` of the result of [`super::residual::residual`] becomes behind the clamp, which lets it pass
 /// within 0 and 1, bounds included: the gradient of `R_0`, and the negative of those of I and u.
-pub fn behind_clamp(difference: f64, d: f64) -> f64 {
+pub fn clamp_backward(difference: f64, d: f64) -> f64 {
     if (0.0..=1.0).contains(&difference) { d } else { 0.0 }
 }
 
@@ -24,7 +24,7 @@ impl Reference for Kernel {
         }
         for i in 0..params.value_count as usize {
             let difference = render[i] - (stage_input[i] + update[i]);
-            let d = behind_clamp(difference.into(), d_denoised[i].into());
+            let d = clamp_backward(difference.into(), d_denoised[i].into());
             let u = f64::from(update[i]);
             d_update[i] = (-d * u * (1.0 - u)) as f32;
             d_stage_input[i] = -d as f32;

@@ -69,12 +69,12 @@ fn ssim_of_moments<T: Real>(a: T, b: T, aa: T, bb: T, ab: T) -> Ssim<T> {
 #[cfg(feature = "testing")]
 pub fn gradient(
     [width, height]: [usize; 2],
-    interior: [UVec2; 2],
+    loss_region: [UVec2; 2],
     [l1_scale, ssim_scale]: [f64; 2],
     a: &[f64],
     b: &[f64],
 ) -> Vec<f64> {
-    let counts = |i: usize| inside(i, [width as u32, height as u32], interior);
+    let counts = |i: usize| inside(i, [width as u32, height as u32], loss_region);
     let map = ssim(width, height, a, b);
     let blurred = [0, 1, 2].map(|m| {
         let derivative = |(i, of): (usize, &Ssim)| if counts(i) { of.d_moments[m] } else { 0.0 };
@@ -125,8 +125,8 @@ fn outcomes(params: &Params, slices: &Slices<'_>) -> Vec<Outcome> {
 
 fn outcomes_of_channel(params: &Params, a: &[Rounded], b: &[Rounded]) -> Vec<Outcome> {
     let size = [params.width as usize, params.height as usize];
-    let interior = [params.interior_begin, params.interior_end];
-    let counts = |i: usize| inside(i, [params.width, params.height], interior);
+    let loss_region = [params.loss_begin, params.loss_end];
+    let counts = |i: usize| inside(i, [params.width, params.height], loss_region);
     let moment = |of: fn(Rounded, Rounded) -> Rounded| {
         let plane: Vec<_> = a.iter().zip(b).map(|(&a, &b)| of(a, b)).collect();
         rounded_blur(size, &plane)

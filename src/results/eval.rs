@@ -7,26 +7,28 @@ use std::str::FromStr;
 
 use serde_json::{Map, Value, json};
 
-use crate::camera::{Camera, Frame};
+use crate::camera::{Camera, TrainingFrame};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::lpips::{Lpips, Measure};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::photographs::metrics::{self, Scores};
-use crate::photographs::tone::{Scene, ToneCurve, ToneSettings};
+use crate::photographs::tone::{SceneTone, ToneCurve, ToneSettings};
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::{DeviceGaussians, Feature, Gaussians, Shape};
 use crate::train::{Networks, Rendered, TestTargets, TrainConfig};
 use crate::{Error, Result};
 
-mod holes;
+mod transmittance;
 
-pub use holes::{Leftover, MOST_LEFTOVER, hole_warning, warn_of_holes};
+pub use transmittance::{
+    MAX_RESIDUAL_TRANSMITTANCE, ResidualTransmittance, hole_warning, warn_of_holes,
+};
 
 /// What test views are scored against.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Against {
+pub enum ReferenceKind {
     /// Normal-light photographs.
     #[default]
     References,
@@ -36,7 +38,7 @@ pub enum Against {
     Photographs,
 }
 
-impl Against {
+impl ReferenceKind {
     /// What a score is to be read with; none against references, as scores are understood.
     pub fn label(self) -> Option<&'static str> {
         match self {
@@ -63,16 +65,16 @@ impl Against {
 
 /// What the test views of a dataset are scored against.
 #[derive(Debug, Default)]
-pub struct Yardstick {
+pub struct ScoreReference {
     /// Which kind that is.
-    pub against: Against,
+    pub against: ReferenceKind,
     /// What makes them, where they are no reference images.
     targets: Option<TestTargets>,
     /// What it made, by view, of photographs that are kept as well.
     made: BTreeMap<String, Image>,
 }
 
-impl Yardstick {
+impl ScoreReference {
     /// The reference images where a test view has one; without any, the targets that `tone apply` gives the test views in the
     /// scene of the training photographs.
     ///
@@ -90,7 +92,7 @@ impl Yardstick {
         gpu: &Gpu,
         tone: &ToneSettings,
         dataset: &Dataset,
-        scene: &Scene,
+        scene: &SceneTone,
     ) -> Result<Self> {
         Self::made_by(tone, dataset, || TestTargets::in_scene(gpu, tone, scene))
     }
@@ -101,25 +103,25 @@ impl Yardstick {
         targets: impl FnOnce() -> Result<TestTargets>,
     ) -> Result<Self> {
         let against = Self::kind(tone, dataset);
-        let targets = (against != Against::References).then(targets).transpose()?;
+        let targets = (against != ReferenceKind::References).then(targets).transpose()?;
         Ok(Self { against, targets, made: BTreeMap::new() })
     }
 
     /// Which kind it will be.
-    pub fn kind(tone: &ToneSettings, dataset: &Dataset) -> Against {
+    pub fn kind(tone: &ToneSettings, dataset: &Dataset) -> ReferenceKind {
         let has_references = dataset.test_views().any(View::has_reference);
         let has_photographs = dataset.test_views().any(View::has_photograph);
         match tone.curve {
-            _ if has_references || !has_photographs => Against::References,
-            ToneCurve::None => Against::Photographs,
-            _ => Against::PseudoGt,
+            _ if has_references || !has_photographs => ReferenceKind::References,
+            ToneCurve::None => ReferenceKind::Photographs,
+            _ => ReferenceKind::PseudoGt,
         }
     }
 
     /// How many of the dataset's test views it has something for.
     pub fn view_count(&self, dataset: &Dataset) -> usize {
         let has_target = match self.against {
-            Against::References => View::has_reference,
+            ReferenceKind::References => View::has_reference,
             _ => View::has_photograph,
         };
         dataset.test_views().filter(|view| has_target(view)).count()
@@ -152,14 +154,14 @@ pub struct ViewScore {
     /// Those behind the gain and bias of each channel that bring the render nearest to what it should be, where it was asked.
     pub aligned: Option<Scores>,
     /// How much of the background shows; none of what is no render.
-    pub leftover: Option<Leftover>,
+    pub residual_transmittance: Option<ResidualTransmittance>,
     /// What it was scored against.
-    pub against: Against,
+    pub against: ReferenceKind,
 }
 
 /// The two pictures that a view's scores compare, in 8 bits as they are saved.
 #[derive(Debug)]
-pub struct Compared<'a> {
+pub struct ScoredImages<'a> {
     /// The view.
     pub view: &'a View,
     /// What the model shows of it.
@@ -168,7 +170,7 @@ pub struct Compared<'a> {
     pub target: Image,
 }
 
-impl Compared<'_> {
+impl ScoredImages<'_> {
     /// LPIPS over the pixels that count.
     ///
     /// # Errors
@@ -192,9 +194,9 @@ impl Compared<'_> {
     ///
     /// # Errors
     /// The folder cannot be written.
-    pub fn save(&self, folder: &Path, against: Against) -> Result<()> {
+    pub fn save(&self, folder: &Path, against: ReferenceKind) -> Result<()> {
         let targets = match against {
-            Against::References => "references",
+            ReferenceKind::References => "references",
             _ => "targets",
         };
         for (name, image) in [("renders", &self.render), (targets, &self.target)] {
@@ -210,15 +212,15 @@ impl Compared<'_> {
 
 /// A finished model on the device, ready to be rendered.
 #[derive(Debug)]
-pub struct Player {
+pub struct ModelRenderer {
     gaussians: DeviceGaussians,
     renderer: Renderer,
     networks: Option<Networks>,
     /// Where the Gaussians lie.
-    frame: Frame,
+    frame: TrainingFrame,
 }
 
-impl Player {
+impl ModelRenderer {
     /// Uploads the `gaussians` of a run of `config`, as its `model.ply` has them but for the colours, which are the model's;
     /// `networks` belong to them. The run's tile is taken where it suits the device.
     ///
@@ -266,19 +268,19 @@ impl Player {
     ///
     /// # Errors
     /// The model has no such layer, or the device is out of memory or lost.
-    pub fn layer(&mut self, camera: &Camera, layer: Layer) -> Result<Image> {
+    pub fn layer(&mut self, camera: &Camera, layer: RenderLayer) -> Result<Image> {
         let lacks =
             || Error::Usage(format!("the model has no {}; {}", layer.name(), self.layers()));
         let feature = match layer {
-            Layer::Rgb => return Ok(self.render_camera(camera)?.colors),
-            Layer::Denoised => {
+            RenderLayer::Rgb => return Ok(self.render_camera(camera)?.colors),
+            RenderLayer::Denoised => {
                 let lacks = lacks();
                 return self.render_camera(camera)?.denoised.ok_or(lacks);
             }
-            Layer::Depth => Feature::Depth,
-            Layer::Structure => Feature::Structure,
-            Layer::Illumination => Feature::Illumination,
-            Layer::Noise => Feature::Noise,
+            RenderLayer::Depth => Feature::Depth,
+            RenderLayer::Structure => Feature::Structure,
+            RenderLayer::Illumination => Feature::Illumination,
+            RenderLayer::Noise => Feature::Noise,
         };
         let planes = self.shape().features.channels_of(feature).ok_or_else(lacks)?;
         let Camera { width, height, .. } = *camera;
@@ -313,7 +315,7 @@ impl Player {
 
 /// What can be seen of a model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Layer {
+pub enum RenderLayer {
     /// R_0, the Gaussians' colours.
     Rgb,
     /// R_K, behind the denoiser.
@@ -328,7 +330,7 @@ pub enum Layer {
     Noise,
 }
 
-impl Layer {
+impl RenderLayer {
     /// Every layer.
     pub const ALL: [Self; 6] =
         [Self::Rgb, Self::Denoised, Self::Depth, Self::Structure, Self::Illumination, Self::Noise];
@@ -351,7 +353,7 @@ impl Layer {
     }
 }
 
-impl FromStr for Layer {
+impl FromStr for RenderLayer {
     type Err = Error;
 
     fn from_str(name: &str) -> Result<Self> {
@@ -372,7 +374,7 @@ pub fn score(
     dataset: &Dataset,
     render: impl FnMut(&View) -> Result<Rendered>,
 ) -> Result<Vec<ViewScore>> {
-    score_by(&mut Yardstick::default(), dataset, render, |_, _| Ok(()))
+    score_by(&mut ScoreReference::default(), dataset, render, |_, _| Ok(()))
 }
 
 /// As [`score`], by any yardstick; `look` sees the pictures of each view, which are gone behind it.
@@ -380,16 +382,16 @@ pub fn score(
 /// # Errors
 /// As there, and those of `look`; a photograph that is not kept can no longer be read, or the device is out of memory or lost.
 pub fn score_by(
-    yardstick: &mut Yardstick,
+    score_reference: &mut ScoreReference,
     dataset: &Dataset,
     mut render: impl FnMut(&View) -> Result<Rendered>,
-    mut look: impl FnMut(&mut ViewScore, &Compared<'_>) -> Result<()>,
+    mut look: impl FnMut(&mut ViewScore, &ScoredImages<'_>) -> Result<()>,
 ) -> Result<Vec<ViewScore>> {
-    let (mut scored, against) = (vec![], yardstick.against);
+    let (mut scored, against) = (vec![], score_reference.against);
     for view in dataset.test_views() {
-        let Some(target) = yardstick.target(view)? else { continue };
+        let Some(target) = score_reference.target(view)? else { continue };
         let rendered = render(view)?;
-        let compared = Compared { view, render: quantized(rendered.output()), target };
+        let compared = ScoredImages { view, render: quantized(rendered.output()), target };
         let of = |render: &Image| Scores::of_counted(render, &compared.target, view.mask.as_ref());
         let has_denoiser = rendered.denoised.is_some();
         let mut score = ViewScore {
@@ -397,7 +399,7 @@ pub fn score_by(
             scores: of(&compared.render)?,
             r0: has_denoiser.then(|| of(&quantized(&rendered.colors))).transpose()?,
             aligned: None,
-            leftover: Leftover::of(&rendered, view),
+            residual_transmittance: ResidualTransmittance::of(&rendered, view),
             against,
         };
         look(&mut score, &compared)?;
@@ -429,10 +431,13 @@ pub fn metrics(
     if let Some(label) = label(scored) {
         metrics[AGAINST] = json!(label);
     }
-    let leftovers = || scored.iter().filter_map(|view| Some((&view.name, view.leftover?)));
-    if let Some(mean) = Leftover::mean(leftovers().map(|(_, leftover)| leftover)) {
-        let views: BTreeMap<_, _> = leftovers().collect();
-        metrics["leftover_transmittance"] = json!({ "mean": mean, "views": views });
+    let residual_transmittances =
+        || scored.iter().filter_map(|view| Some((&view.name, view.residual_transmittance?)));
+    if let Some(mean) = ResidualTransmittance::mean(
+        residual_transmittances().map(|(_, residual_transmittance)| residual_transmittance),
+    ) {
+        let views: BTreeMap<_, _> = residual_transmittances().collect();
+        metrics["residual_transmittance"] = json!({ "mean": mean, "views": views });
     }
     metrics
 }

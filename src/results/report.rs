@@ -110,8 +110,8 @@ impl Report {
 
 impl Facts {
     fn html(&self) -> String {
-        let row = |[name, said]: &[String; 2]| {
-            format!("<tr><th scope=\"row\">{}</th><td>{}</td></tr>\n", escape(name), escape(said))
+        let row = |[name, value]: &[String; 2]| {
+            format!("<tr><th scope=\"row\">{}</th><td>{}</td></tr>\n", escape(name), escape(value))
         };
         let rows: String = self.rows.iter().map(row).collect();
         let title = escape(&self.title);

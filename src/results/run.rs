@@ -1,6 +1,6 @@
 //! A training run from its first step to its last file: what the command does, without its progress bar.
 
-mod aside;
+mod backup;
 mod directory;
 mod done;
 mod events;
@@ -17,12 +17,12 @@ mod train;
 
 pub use directory::{Progress, RunDirectory, load_progress};
 pub use done::{done_steps, done_steps_by_stamp};
-pub use events::{Event, Trained};
-pub(crate) use files::{ENDED, HELD_OUT_COURSE, SPENT, TARGET_EXPOSURE};
+pub use events::{Event, RunSummary};
+pub(crate) use files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE};
 pub use load::{
     is_finished, load_config, load_exposures, load_metrics, load_model, load_networks, other_views,
     plan_of, stopped_at,
 };
-pub use meter::{Spent, energy_counters};
+pub use meter::{ResourceUsage, energy_counters};
 pub use requests::Requests;
-pub use train::{HeldRun, Session, train, train_in};
+pub use train::{IfExists, Session, train, train_in};

@@ -15,14 +15,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu, Pipeline, Threads};
-use crate::kernels::fate::{
-    TALLY_CANDIDATES, TALLY_CLONED, TALLY_PRUNED, TALLY_SPLIT, TALLY_WORDS,
+use crate::kernels::densify_action::{
+    COUNTER_CANDIDATES, COUNTER_CLONED, COUNTER_PRUNED, COUNTER_SPLIT, COUNTER_WORDS,
 };
 use crate::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
 use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::Batch;
-use crate::splats::halves::StorageFormat;
 use crate::splats::optimizer::Moments;
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
 use crate::splats::sort::{Count, RadixSort, Scan};
 use crate::{Error, Result};
@@ -142,10 +142,10 @@ pub struct Densifier {
 struct Scratch {
     keys: Buffer<u32>,
     ids: Buffer<u32>,
-    fates: Buffer<u32>,
-    offspring_counts: Buffer<u32>,
+    actions: Buffer<u32>,
+    child_counts: Buffer<u32>,
     offsets: Buffer<u32>,
-    tally: Buffer<u32>,
+    counters: Buffer<u32>,
     total: Buffer<u32>,
     count: Buffer<u32>,
 }
@@ -155,11 +155,11 @@ impl Scratch {
         Ok(Self {
             keys: gpu.uninit("densify_keys", capacity)?,
             ids: gpu.uninit("densify_ids", capacity)?,
-            fates: gpu.uninit("fates", capacity)?,
-            offspring_counts: gpu.uninit("offspring_counts", capacity)?,
-            offsets: gpu.uninit("offspring_offsets", capacity)?,
-            tally: gpu.uninit("densify_tally", TALLY_WORDS as usize)?,
-            total: gpu.uninit("offspring_total", 1)?,
+            actions: gpu.uninit("densify_actions", capacity)?,
+            child_counts: gpu.uninit("child_counts", capacity)?,
+            offsets: gpu.uninit("child_offsets", capacity)?,
+            counters: gpu.uninit("densify_counters", COUNTER_WORDS as usize)?,
+            total: gpu.uninit("child_total", 1)?,
             count: gpu.uninit("gaussian_count", 1)?,
         })
     }
@@ -222,26 +222,26 @@ impl Densifier {
     ) -> Result<DensifyReport> {
         check(gaussians, &inputs)?;
         let limit = self.settings.max_gaussians.min(round.most);
-        let mut most_added = u32::MAX;
+        let mut max_added = u32::MAX;
         for trial in 1..=TRIALS {
-            let tally = self.decide(gaussians, &inputs, limit, most_added, round)?;
-            let report = report(gaussians.layout.count, &tally);
+            let counters = self.decide(gaussians, &inputs, limit, max_added, round)?;
+            let report = report(gaussians.layout.count, &counters);
             let added = report.split + report.cloned;
             if added + report.pruned == 0 {
                 return Ok(report);
             }
-            let mut room = self.room(gaussians, &inputs, report.count, limit)?;
-            self.scatter(gaussians, &mut inputs, &mut room, &report, round.step)?;
-            let parameters = room.words.as_ref().unwrap_or(inputs.gradients).slice();
+            let mut spare_buffers = self.spare_buffers(gaussians, &inputs, report.count, limit)?;
+            self.scatter(gaussians, &mut inputs, &mut spare_buffers, &report, round.step)?;
+            let parameters = spare_buffers.words.as_ref().unwrap_or(inputs.gradients).slice();
             let layout = Layout { count: report.count, ..gaussians.layout };
             let new = GaussianSlice { layout, parameters };
             let share = if added == 0 { 1.0 } else { keeps(new)? };
             if share >= 1.0 {
-                self.commit(gaussians, inputs, room, &report)?;
+                self.commit(gaussians, inputs, spare_buffers, &report)?;
                 return Ok(report);
             }
             tracing::debug!("step {}: of {added} splits, {share:.3} may stay", round.step);
-            most_added = if trial + 1 < TRIALS { (share * added as f64) as u32 } else { 0 };
+            max_added = if trial + 1 < TRIALS { (share * added as f64) as u32 } else { 0 };
         }
         Err(Error::Usage("density control: the last trial of a round splits nothing".to_owned()))
     }
@@ -257,7 +257,7 @@ impl Densifier {
         gaussians: &DeviceGaussians,
         DensifyInputs { grad_norm_sums, visit_counts, .. }: &DensifyInputs<'_>,
         limit: usize,
-        most_added: u32,
+        max_added: u32,
         round: Round,
     ) -> Result<Vec<u32>> {
         let DeviceGaussians { layout, parameters, .. } = gaussians;
@@ -287,14 +287,14 @@ impl Densifier {
             max_gaussians: limit.min(u32::MAX as usize) as u32,
             rounds_left: round.rounds_left.clamp(1, u64::from(u32::MAX)) as u32,
             split_log_scale: split_scale.ln() as f32,
-            most_added,
+            max_added,
         };
         let batches = layout.batches(&self.gpu);
         let Self { scratch, sort, scan, cameras, .. } = self;
         self.gpu.write(&mut scratch.count, &[count])?;
         let mut download = None;
         self.gpu.run("densify_decide", |pass| {
-            pass.fill(&mut scratch.tally, 0);
+            pass.fill(&mut scratch.counters, 0);
             for batch in batches.iter() {
                 let buffers = densify_score::Buffers {
                     parameters: batch.rows(parameters, columns)?,
@@ -302,7 +302,7 @@ impl Densifier {
                     visit_counts: batch.rows(&**visit_counts, 1)?,
                     keys: batch.rows_mut(&mut scratch.keys, 1)?,
                     ids: batch.rows_mut(&mut scratch.ids, 1)?,
-                    tally: scratch.tally.slice_mut(),
+                    counters: scratch.counters.slice_mut(),
                     cameras: cameras.slice(),
                 };
                 let threads = Threads::Exactly([batch.gaussian_count(), 1, 1]);
@@ -315,27 +315,27 @@ impl Densifier {
                     parameters: batch.rows(parameters, columns)?,
                     sorted_keys: scratch.keys.slice(),
                     sorted_ids: scratch.ids.slice(),
-                    tally: scratch.tally.slice_mut(),
-                    fates: scratch.fates.slice_mut(),
-                    offspring_counts: scratch.offspring_counts.slice_mut(),
+                    counters: scratch.counters.slice_mut(),
+                    actions: scratch.actions.slice_mut(),
+                    child_counts: scratch.child_counts.slice_mut(),
                 };
                 let threads = Threads::Exactly([count, 1, 1]);
                 pass.dispatch(&self.decide, &decide(batch), buffers, threads)?;
             }
-            let Scratch { offspring_counts, offsets, total, .. } = scratch;
-            scan.record(pass, counted, offspring_counts, offsets, total)?;
-            download = Some(pass.download(&scratch.tally)?);
+            let Scratch { child_counts, offsets, total, .. } = scratch;
+            scan.record(pass, counted, child_counts, offsets, total)?;
+            download = Some(pass.download(&scratch.counters)?);
             Ok(())
         })?;
-        download.map_or_else(|| Ok(vec![]), |tally| tally.wait())
+        download.map_or_else(|| Ok(vec![]), |counters| counters.wait())
     }
 
-    /// Writes the new parameters beside the old ones: to the words of `room`, or the gradients.
+    /// Writes the new parameters beside the old ones: to the words of `spare_buffers`, or the gradients.
     fn scatter(
         &self,
         gaussians: &DeviceGaussians,
         inputs: &mut DensifyInputs<'_>,
-        room: &mut Room,
+        spare_buffers: &mut SpareBuffers,
         report: &DensifyReport,
         step: u64,
     ) -> Result<()> {
@@ -352,17 +352,17 @@ impl Densifier {
             first_gaussian: from.first_gaussian(),
             first_new_gaussian: to.first_gaussian(),
         };
-        if room.words.is_none() {
-            room.widen(inputs.gradients);
+        if spare_buffers.words.is_none() {
+            spare_buffers.widen(inputs.gradients);
         }
-        let target = room.words.as_mut().unwrap_or(inputs.gradients);
-        let Scratch { fates, offsets, .. } = &self.scratch;
+        let target = spare_buffers.words.as_mut().unwrap_or(inputs.gradients);
+        let Scratch { actions, offsets, .. } = &self.scratch;
         let pairs = self.pairs(&gaussians.layout, report);
         self.gpu.run("densify_scatter", |pass| {
             for &(from, to) in &pairs {
                 let buffers = densify_scatter::Buffers {
                     parameters: from.rows(parameters, columns)?,
-                    fates: from.rows(fates, 1)?,
+                    actions: from.rows(actions, 1)?,
                     offsets: from.rows(offsets, 1)?,
                     new_parameters: to.rows_mut(&mut *target, columns)?,
                 };
@@ -379,7 +379,7 @@ impl Densifier {
         &self,
         gaussians: &mut DeviceGaussians,
         inputs: DensifyInputs<'_>,
-        mut room: Room,
+        mut spare_buffers: SpareBuffers,
         report: &DensifyReport,
     ) -> Result<()> {
         let PlaneCounts { columns, features, .. } = gaussians.layout.floats();
@@ -391,16 +391,16 @@ impl Densifier {
             first_new_gaussian: to.first_gaussian(),
         };
         let DensifyInputs { moments, grad_norm_sums, visit_counts, gradients: spare } = inputs;
-        let Scratch { fates, offsets, .. } = &self.scratch;
+        let Scratch { actions, offsets, .. } = &self.scratch;
         let pairs = self.pairs(&gaussians.layout, report);
-        std::mem::swap(&mut gaussians.parameters, room.words.as_mut().unwrap_or(spare));
+        std::mem::swap(&mut gaussians.parameters, spare_buffers.words.as_mut().unwrap_or(spare));
         self.gpu.run("densify_moments", |pass| {
             for (_, moments) in moments.planes_mut() {
-                room.widen(spare);
+                spare_buffers.widen(spare);
                 for &(from, to) in &pairs {
                     let buffers = densify_moments::Buffers {
                         moments: from.planes(&*moments)?.words(),
-                        fates: from.rows(fates, 1)?,
+                        actions: from.rows(actions, 1)?,
                         offsets: from.rows(offsets, 1)?,
                         new_moments: to.planes_mut(&mut *spare)?.words(),
                     };
@@ -409,10 +409,10 @@ impl Densifier {
                 }
                 std::mem::swap(moments, spare);
             }
-            room.widen(spare);
+            spare_buffers.widen(spare);
             Ok(())
         })?;
-        if let Some((sums, counts)) = room.statistics {
+        if let Some((sums, counts)) = spare_buffers.statistics {
             (*grad_norm_sums, *visit_counts) = (sums, counts);
         }
         gaussians.layout.count = report.count;
@@ -428,13 +428,13 @@ impl Densifier {
     }
 
     /// What takes the place of all buffers where one is too short for `count` Gaussians, allocated before one of them goes.
-    fn room(
+    fn spare_buffers(
         &self,
         gaussians: &DeviceGaussians,
         inputs: &DensifyInputs<'_>,
         count: usize,
         limit: usize,
-    ) -> Result<Room> {
+    ) -> Result<SpareBuffers> {
         let DeviceGaussians { layout, parameters, .. } = gaussians;
         let (columns, capacity) = (layout.floats().columns, capacity(count, limit));
         let buffer = |columns| self.gpu.uninit_in_windows("planes", capacity * columns);
@@ -448,10 +448,10 @@ impl Densifier {
         let is_short = inputs.grad_norm_sums.len() < count
             || held.iter().any(|plane| plane.len() < count * columns);
         if !is_short {
-            return Ok(Room { planes: vec![], words, statistics: None });
+            return Ok(SpareBuffers { planes: vec![], words, statistics: None });
         }
         let sums = self.gpu.uninit("grad_norm_sums", capacity)?;
-        Ok(Room {
+        Ok(SpareBuffers {
             planes: held.iter().map(|_| buffer(columns)).collect::<Result<_>>()?,
             words,
             statistics: Some((sums, self.gpu.uninit("visit_counts", capacity)?)),
@@ -460,7 +460,7 @@ impl Densifier {
 }
 
 /// Buffers for more Gaussians.
-struct Room {
+struct SpareBuffers {
     /// One for each plane set, the gradients among them, or none where their own take turns.
     planes: Vec<Buffer<f32>>,
     /// What parameters with halves go to.
@@ -468,7 +468,7 @@ struct Room {
     statistics: Option<(Buffer<f32>, Buffer<u32>)>,
 }
 
-impl Room {
+impl SpareBuffers {
     /// Puts a longer buffer in the place of `spare`, which goes once the device is done with it; none where there is room.
     fn widen(&mut self, spare: &mut Buffer<f32>) {
         if let Some(longer) = self.planes.pop() {
@@ -482,15 +482,16 @@ pub(crate) fn capacity(count: usize, limit: usize) -> usize {
     (count + count / 2).min(limit).max(count)
 }
 
-fn report(count: usize, tally: &[u32]) -> DensifyReport {
-    let tally = |place: u32| tally.get(place as usize).map_or(0, |&count| count as usize);
-    let (cloned, split, pruned) = (tally(TALLY_CLONED), tally(TALLY_SPLIT), tally(TALLY_PRUNED));
+fn report(count: usize, counters: &[u32]) -> DensifyReport {
+    let counters = |place: u32| counters.get(place as usize).map_or(0, |&count| count as usize);
+    let (cloned, split, pruned) =
+        (counters(COUNTER_CLONED), counters(COUNTER_SPLIT), counters(COUNTER_PRUNED));
     DensifyReport {
         cloned,
         split,
         pruned,
         count: count - pruned + cloned + split,
-        refused: tally(TALLY_CANDIDATES) - cloned - split,
+        refused: counters(COUNTER_CANDIDATES) - cloned - split,
     }
 }
 

@@ -14,7 +14,7 @@ use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Slice, SliceMut, Threa
 use crate::kernels::{adam, adam_rest};
 use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::Batch;
-use crate::splats::halves::StorageFormat;
+use crate::splats::packed_sh::StorageFormat;
 use crate::{Error, Result};
 
 /// The exponential means of the gradients and of their squares: planes, as the parameters are, in buffers or in slices of

@@ -8,11 +8,11 @@
 //! Counts stay on the device. Where the intersections of a view exceed the memory reserved for them, a status flag is
 //! raised, nothing is rendered or updated, and the host grows the buffers and redoes the step ([`Renderer::grow`]).
 
+mod buffers;
 mod cameras;
-mod frame;
+mod capacity;
+mod images;
 mod limits;
-mod pictures;
-mod room;
 mod settings;
 
 use std::collections::BTreeMap;
@@ -26,17 +26,17 @@ use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
-use crate::splats::halves::StorageFormat;
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{GaussianSlice, Layout, Shape};
 use crate::splats::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
+pub use buffers::RenderBuffers;
+pub use buffers::Status;
+use buffers::{RANKS_PER_PARTITION, color_vectors};
 #[cfg(feature = "testing")]
 pub use cameras::CameraGradient;
 pub use cameras::{Viewpoint, Viewpoints};
-pub use frame::Frame;
-pub use frame::Status;
-use frame::{RANKS_PER_PARTITION, color_vectors};
 use limits::{longest_run, splats_per_turn};
 pub use settings::RenderSettings;
 
@@ -85,7 +85,7 @@ pub struct Renderer {
     blend_backward: Pipeline<blend_backward::Kernel>,
     depth_sort: RadixSort,
     tile_sort: RadixSort,
-    frame: Frame,
+    frame: RenderBuffers,
 }
 
 impl Renderer {
@@ -131,7 +131,7 @@ impl Renderer {
             ))?,
             depth_sort: RadixSort::new(gpu, 0)?,
             tile_sort: RadixSort::new(gpu, 0)?,
-            frame: Frame::new(gpu, settings.channels())?,
+            frame: RenderBuffers::new(gpu, settings.channels())?,
         })
     }
 
@@ -183,7 +183,7 @@ impl Renderer {
 
     /// Everything that the passes of the last render handed each other.
     #[doc(hidden)]
-    pub fn frame(&self) -> &Frame {
+    pub fn frame(&self) -> &RenderBuffers {
         &self.frame
     }
 
@@ -198,11 +198,11 @@ impl Renderer {
         (&self.frame.render, &mut self.frame.status)
     }
 
-    /// What to say of a view whose [`Status::crowd`] is too large for this device.
-    pub(crate) fn too_crowded(&self, view: String, splats: u32) -> Error {
+    /// What to say of a view whose [`Status::splats_per_tile`] is too large for this device.
+    pub(crate) fn too_many_splats(&self, view: String, splats: u32) -> Error {
         let [width, height] = self.tile.size;
         let (tile, device) = (format!("{width}x{height}"), self.gpu.properties().name.clone());
-        Error::Crowded { view, splats, tile, device, limit: self.longest_run }
+        Error::TileLimit { view, splats, tile, device, limit: self.longest_run }
     }
 
     /// Lowers every flag of the status.
@@ -246,8 +246,8 @@ impl Renderer {
             },
             blend_forward::Buffers {
                 counts: frame.counts.slice(),
-                sorted_slots: frame.slots.slice(),
-                owners: frame.owners.slice(),
+                sorted_intersections: frame.intersection_ids.slice(),
+                gaussian_ids: frame.gaussian_ids.slice(),
                 splats: frame.splats.slice(),
                 colors: frame.colors.slice(),
                 render: frame.render.slice_mut(),
@@ -285,13 +285,13 @@ impl Renderer {
             &blend_backward::Params { size: view.size, tile_columns: view.tiles.x },
             blend_backward::Buffers {
                 tile_ranges: frame.tile_ranges.slice(),
-                sorted_slots: frame.slots.slice(),
-                owners: frame.owners.slice(),
+                sorted_intersections: frame.intersection_ids.slice(),
+                gaussian_ids: frame.gaussian_ids.slice(),
                 splats: frame.splats.slice(),
                 colors: frame.colors.slice(),
                 render: frame.render.slice(),
                 d_render: d_render.slice(),
-                records: frame.records.slice_mut(),
+                gradient_records: frame.gradient_records.slice_mut(),
             },
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )?;
@@ -314,8 +314,8 @@ impl Renderer {
                     splats: batch.rows(&frame.splats, 1)?,
                     colors: batch.rows(&frame.colors, color_vectors)?,
                     tile_counts: batch.rows(&frame.tile_counts, 1)?,
-                    emitted: batch.rows(&frame.emitted, 1)?,
-                    records: frame.records.slice(),
+                    intersection_ranges: batch.rows(&frame.intersection_ranges, 1)?,
+                    gradient_records: frame.gradient_records.slice(),
                     status: frame.status.slice_mut(),
                     gradients: batch.planes_mut(&mut *gradients.parameters)?,
                     grad_norm_sums: batch.rows_mut(&mut *gradients.grad_norm_sums, 1)?,
@@ -399,7 +399,7 @@ impl Renderer {
             order_counts::Buffers {
                 sorted_ids: frame.ids.slice(),
                 tile_counts: frame.tile_counts.slice(),
-                slots_before: frame.slots_before.slice_mut(),
+                intersection_offsets: frame.intersection_offsets.slice_mut(),
                 sums: frame.sums.slice_mut(),
                 counts: frame.counts.slice_mut(),
                 status: frame.status.slice_mut(),
@@ -414,20 +414,26 @@ impl Renderer {
                 counts: frame.counts.slice(),
                 sorted_ids: frame.ids.slice(),
                 tile_counts: frame.tile_counts.slice(),
-                slots_before: frame.slots_before.slice(),
+                intersection_offsets: frame.intersection_offsets.slice(),
                 sums: frame.sums.slice(),
                 splats: frame.splats.slice(),
                 tiles: frame.tiles.slice_mut(),
-                slots: frame.slots.slice_mut(),
-                owners: frame.owners.slice_mut(),
-                emitted: frame.emitted.slice_mut(),
+                intersection_ids: frame.intersection_ids.slice_mut(),
+                gaussian_ids: frame.gaussian_ids.slice_mut(),
+                intersection_ranges: frame.intersection_ranges.slice_mut(),
             },
             Threads::Exactly([gaussian_count, 1, 1]),
         )?;
-        let emitted = Count { counts: &frame.counts, index: 0 };
+        let intersection_ranges = Count { counts: &frame.counts, index: 0 };
         // One value more than there are tiles: padding sorts behind them all.
         let bits = u32::BITS - view.tile_count().leading_zeros();
-        self.tile_sort.record(pass, emitted, &mut frame.tiles, &mut frame.slots, bits)
+        self.tile_sort.record(
+            pass,
+            intersection_ranges,
+            &mut frame.tiles,
+            &mut frame.intersection_ids,
+            bits,
+        )
     }
 
     /// Columns and rows of tiles.

@@ -18,7 +18,7 @@ mod neighbours;
 pub mod ply;
 
 #[cfg(feature = "io")]
-use crate::camera::Frame;
+use crate::camera::TrainingFrame;
 pub use crate::splats::attributes::{ATTRIBUTES, Attribute, PlaneCounts, rest_coefficients};
 use crate::splats::attributes::{column_count, planes};
 #[cfg(feature = "io")]
@@ -101,11 +101,11 @@ impl Gaussians {
         planes(self.shape.features.width(), width(self.shape))[attribute as usize]
     }
 
-    /// The same Gaussians out of a frame, relative to an origin that lets f32 hold them: [`Frame::file_origin`].
+    /// The same Gaussians out of a frame, relative to an origin that lets f32 hold them: [`TrainingFrame::file_origin`].
     #[cfg(feature = "io")]
-    pub(crate) fn to_world(&self, frame: &Frame) -> Self {
+    pub(crate) fn to_world(&self, frame: &TrainingFrame) -> Self {
         let origin = frame.file_origin();
-        if *frame == Frame::WORLD {
+        if *frame == TrainingFrame::WORLD {
             return self.clone();
         }
         let offset = DVec3::from_array(frame.center) - origin;
@@ -115,8 +115,8 @@ impl Gaussians {
 
     /// Gaussians of the world in a frame: what [`Gaussians::to_world`] gave comes back.
     #[cfg(feature = "io")]
-    pub(crate) fn to_frame(&self, frame: &Frame) -> Self {
-        if *frame == Frame::WORLD && self.origin == DVec3::ZERO {
+    pub(crate) fn to_frame(&self, frame: &TrainingFrame) -> Self {
+        if *frame == TrainingFrame::WORLD && self.origin == DVec3::ZERO {
             return self.clone();
         }
         let offset = DVec3::from_array(frame.center) - self.origin;

@@ -98,7 +98,7 @@ fn host_memory() -> Option<u64> {
 #[derive(Debug)]
 pub(super) struct Cache {
     gpu: Gpu,
-    kept: Vec<Kept>,
+    kept: Vec<CachedImage>,
     /// Those on the device, by when they were asked for last.
     on_device: BTreeSet<(u64, usize)>,
     budget: u64,
@@ -117,7 +117,7 @@ pub(super) struct Slot(usize);
 
 /// A photograph on the device, in the file, or both.
 #[derive(Debug)]
-pub(super) struct Kept {
+pub(super) struct CachedImage {
     on_device: Option<Arc<Encoded>>,
     in_file: Option<InFile>,
     bytes: u64,
@@ -139,7 +139,7 @@ impl Cache {
     pub(super) fn keep(&mut self, photograph: Encoded) -> Result<Slot> {
         let place = self.kept.len();
         let bytes = photograph.bytes();
-        self.kept.push(Kept {
+        self.kept.push(CachedImage {
             in_file: None,
             bytes,
             asked: 0,
@@ -148,7 +148,7 @@ impl Cache {
         self.on_device.insert((0, place));
         self.taken += bytes;
         if self.taken > self.budget {
-            self.put_away(place)?;
+            self.evict(place)?;
         }
         Ok(Slot(place))
     }
@@ -174,8 +174,8 @@ impl Cache {
     /// The file cannot be read, or the device is out of memory or lost.
     pub(super) fn load(&self, Slot(place): Slot) -> Result<Arc<Encoded>> {
         match &self.kept[place] {
-            Kept { on_device: Some(photograph), .. } => Ok(Arc::clone(photograph)),
-            Kept { in_file: Some(in_file), .. } => Ok(Arc::new(in_file.load(&self.gpu)?)),
+            CachedImage { on_device: Some(photograph), .. } => Ok(Arc::clone(photograph)),
+            CachedImage { in_file: Some(in_file), .. } => Ok(Arc::new(in_file.load(&self.gpu)?)),
             _ => Err(Error::Usage("a photograph is gone".to_owned())),
         }
     }
@@ -195,7 +195,7 @@ impl Cache {
     ///
     /// # Errors
     /// The file cannot be read or written, or the device is out of memory or lost.
-    pub(super) fn bring(&mut self, wanted: &[Slot]) -> Result<()> {
+    pub(super) fn make_resident(&mut self, wanted: &[Slot]) -> Result<()> {
         self.clock += 1;
         for &Slot(place) in wanted {
             let kept = &mut self.kept[place];
@@ -205,13 +205,13 @@ impl Cache {
             kept.asked = self.clock;
         }
         for &Slot(place) in wanted {
-            let Kept { on_device: None, bytes, .. } = self.kept[place] else { continue };
+            let CachedImage { on_device: None, bytes, .. } = self.kept[place] else { continue };
             while self.taken + bytes > self.budget {
                 let oldest = self.on_device.first().copied();
                 let Some((_, idle)) = oldest.filter(|(asked, _)| *asked < self.clock) else {
                     break;
                 };
-                self.put_away(idle)?;
+                self.evict(idle)?;
             }
             let kept = &mut self.kept[place];
             if let Some(in_file) = &kept.in_file {
@@ -224,7 +224,7 @@ impl Cache {
     }
 
     /// Takes a photograph off the device, after it has been written to the file the first time.
-    fn put_away(&mut self, place: usize) -> Result<()> {
+    fn evict(&mut self, place: usize) -> Result<()> {
         let kept = &mut self.kept[place];
         let Some(photograph) = kept.on_device.take() else { return Ok(()) };
         self.on_device.remove(&(kept.asked, place));
@@ -343,7 +343,7 @@ mod tests {
 
     #[test]
     fn sizes_are_read_as_people_write_them() {
-        for (text, bytes, said) in [
+        for (text, bytes, printed) in [
             ("4G", 4 << 30, "4G"),
             ("512m", 512 << 20, "512M"),
             ("1.5 GiB", 3 << 29, "1536M"),
@@ -352,7 +352,7 @@ mod tests {
             ("0", 0, "0"),
         ] {
             let size: CacheSize = text.parse().unwrap();
-            assert_eq!((size.0, size.to_string().as_str()), (bytes, said), "{text}");
+            assert_eq!((size.0, size.to_string().as_str()), (bytes, printed), "{text}");
             assert_eq!(size.to_string().parse::<CacheSize>().unwrap(), size);
         }
         for text in ["", "G", "-1G", "much", "4X", "NaN"] {
@@ -388,7 +388,7 @@ mod tests {
             assert_eq!(cache.holds_all(), budget == 1 << 30);
             for wanted in [&[0, 1][..], &[6], &[5, 2], &[3], &[0, 4], &[2]] {
                 let of_wanted: Vec<Slot> = wanted.iter().map(|&place| slots[place]).collect();
-                cache.bring(&of_wanted).unwrap();
+                cache.make_resident(&of_wanted).unwrap();
                 for &place in wanted {
                     let brought = cache.on_device(slots[place]).unwrap();
                     assert!(decoded(brought) == values(place), "{budget}: {place}");

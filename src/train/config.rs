@@ -15,25 +15,25 @@ use super::precision::PrecisionConfig;
 use super::streams;
 use crate::base::random::Stream;
 use crate::base::settings::{Rule, settings};
-use crate::camera::frame::{FRAME_EXTENT, Frame};
+use crate::camera::frame::{FRAME_EXTENT, TrainingFrame};
 use crate::gpu::Tile;
 use crate::loss::{LossConfig, ParameterWeights};
-use crate::networks::Form;
+use crate::networks::NetworkVariant;
 use crate::photographs::dataset::{DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize};
 use crate::photographs::tone::ToneSettings;
 use crate::splats::densify::DensityControl;
-use crate::splats::halves::StorageFormat;
 use crate::splats::optimizer::Schedule;
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::RenderSettings;
-use crate::splats::scene::init::Start;
+use crate::splats::scene::init::Initialization;
 use crate::splats::scene::{MAX_SH_DEGREE, Shape};
 use crate::{Error, Result};
 
-pub use exposure::{ExposureConfig, Learning};
+pub use exposure::{ExposureConfig, OnOff};
 pub use stop::{NotFinite, StopConfig};
 
 /// Pixels of a patch; smaller ones have more border than content.
-pub(super) const LEAST_PATCH: u64 = 256;
+pub(super) const MIN_PATCH: u64 = 256;
 
 /// What is seen where no splat is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -85,7 +85,7 @@ pub struct TrainConfig {
     /// Train on photographs of more pixels than this patch by patch; steps then take less memory, and more of them see each
     /// photograph once.
     patch_pixels: Option<u64> = None, "as many as the device can bind"
-        => Rule::at_least(LEAST_PATCH), in "pixels", "--patch-pixels N";
+        => Rule::at_least(MIN_PATCH), in "pixels", "--patch-pixels N";
     /// Hold out every Nth view by name, whatever split the dataset has; 0: none, train on all.
     test_every: Option<usize> = None, "the dataset's split, else every 8th" => Rule::COUNT, in "views", "--test-every N";
     /// Memory for photographs, such as 4G, on the device and decoded on the host; the rest waits on disk, which takes time and
@@ -138,13 +138,13 @@ sections {
     #[serde(skip)]
     spool: Option<PathBuf>;
     /// Where the model is trained; left out, it is found from the cameras, and recorded.
-    frame: Option<Frame>;
+    frame: Option<TrainingFrame>;
     /// The curve that lifts each photograph.
     tone: ToneSettings;
     /// Steps whose every pass is compared with its CPU reference.
     check: CheckConfig;
     /// What the first Gaussians look like.
-    start: Start;
+    start: Initialization;
     /// Learning rates, and what else changes with the step.
     schedule: Schedule;
     /// Density control.
@@ -196,15 +196,15 @@ pub struct DensityConfig {
     min_opacity: f64 = 0.005 => Rule::Number(Bound::Included(0.0), Bound::Excluded(1.0));
     /// This many Gaussians come of few, a tenth of them or fewer: random points up to that tenth, and in the first round
     /// Gaussians at the depths of what the views show. Of the conserving control alone; 0: none are added.
-    fill: usize = 5_000 => Rule::COUNT, in "Gaussians";
+    depth_seeding: usize = 5_000 => Rule::COUNT, in "Gaussians";
 }
 }
 
 impl DensityConfig {
     /// The most first Gaussians that are few.
-    pub(super) fn few(&self) -> usize {
+    pub(super) fn sparse_threshold(&self) -> usize {
         match self.control {
-            DensityControl::Conserving => self.fill / 10,
+            DensityControl::Conserving => self.depth_seeding / 10,
             DensityControl::Paper => 0,
         }
     }
@@ -215,7 +215,7 @@ impl DensityConfig {
         Self {
             control: DensityControl::Paper,
             gradient_threshold: 2e-4,
-            fill: 0,
+            depth_seeding: 0,
             ..Self::default()
         }
     }
@@ -227,8 +227,8 @@ impl TrainConfig {
     pub fn bare() -> Self {
         Self {
             background: Background::Black,
-            schedule: Schedule { settle_steps: 0, ..Schedule::default() },
-            density: DensityConfig { fill: 0, ..DensityConfig::default() },
+            schedule: Schedule { cooldown_steps: 0, ..Schedule::default() },
+            density: DensityConfig { depth_seeding: 0, ..DensityConfig::default() },
             stop: StopConfig { views: 0, ..StopConfig::default() },
             precision: PrecisionConfig {
                 rest: StorageFormat::Single,
@@ -257,7 +257,11 @@ impl TrainConfig {
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
             undistort: self.undistort,
-            measured: if self.tone.lift_first { MeasuredSize::Own } else { MeasuredSize::Loaded },
+            measured: if self.tone.full_resolution {
+                MeasuredSize::Own
+            } else {
+                MeasuredSize::Loaded
+            },
             hold_out: self.stop.views,
             depth: DepthOptions {
                 load: self.model.depth,
@@ -269,7 +273,7 @@ impl TrainConfig {
     }
 
     /// Switches off the depth part where no training view has a depth map, and says so.
-    pub(crate) fn leave_out_what_is_missing(&mut self, dataset: &Dataset) {
+    pub(crate) fn disable_missing_parts(&mut self, dataset: &Dataset) {
         if !self.model.depth {
             return;
         }
@@ -304,7 +308,7 @@ impl TrainConfig {
         RenderSettings {
             shape: Shape { sh_degree: self.sh_degree, features: self.model.features() },
             raw_colors: self.model.raw_colors,
-            observes: self.model.network.form == Form::Identity,
+            detach_geometry: self.model.network.variant == NetworkVariant::Identity,
             tile: self.tile,
             patch_pixels: self.patch_pixels,
             near: (self.near * FRAME_EXTENT) as f32,
@@ -353,7 +357,7 @@ impl TrainConfig {
                 rule,
             });
         }
-        if self.exposure.learn == Learning::On && self.model.tonemapper {
+        if self.exposure.learn == OnOff::On && self.model.tonemapper {
             let rule = "off where the model has a tonemapper, which holds it to the dark photographs: their exposures a gain \
                         on lifted targets does not describe";
             let (key, value) = ("exposure.learn".to_owned(), "on".to_owned());
@@ -378,7 +382,7 @@ mod tests {
     #[test]
     fn what_excludes_each_other_is_named_by_its_key() {
         let mut config = TrainConfig::default();
-        (config.exposure.learn, config.model.tonemapper) = (Learning::On, true);
+        (config.exposure.learn, config.model.tonemapper) = (OnOff::On, true);
         let message = config.check().unwrap_err().to_string();
         assert!(message.starts_with("exposure.learn is on; it must be off where"), "{message}");
     }

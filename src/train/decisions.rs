@@ -88,7 +88,7 @@ impl Trainer {
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub(super) fn make_room_for_degree(&mut self) -> Result<()> {
+    pub(super) fn allocate_sh_degree(&mut self) -> Result<()> {
         let degree = self.sh_degree(self.step + 1);
         if degree > self.model.shape().sh_degree { self.set_sh_degree(degree) } else { Ok(()) }
     }

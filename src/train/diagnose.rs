@@ -28,8 +28,8 @@ use crate::photographs::tone::{Exposure, LuminanceHistogram, is_black};
 use crate::{Error, Result};
 use geometry::Shared;
 pub use noise::Noise;
-use photograph::Measured;
-pub use plan::{Number, Plan, PlannedViews, Switch};
+use photograph::PhotographStatistics;
+pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
 
 /// A view this many times as blurred as the median is named, and at least so many pixels more.
 const BLURRED: [f64; 2] = [1.6, 0.7];
@@ -91,7 +91,7 @@ pub struct SceneDiagnosis {
     /// 0.18 / the mean light.
     pub darkening: f64,
     /// How many times brighter the targets would be than the photographs; below 1.5 no curve is needed.
-    pub lift: f64,
+    pub brightening: f64,
     /// The gain that the rule of `--curve auto` finds, of encoded values.
     pub gain: f64,
     /// Standard deviation over the views of their exposure, stops; where the points do not tell, of the gain that each asks
@@ -255,7 +255,7 @@ fn read(
 /// A photograph and what was measured of it.
 struct Photograph {
     size: [u32; 2],
-    measured: Measured,
+    measured: PhotographStatistics,
     histogram: LuminanceHistogram,
 }
 
@@ -272,7 +272,7 @@ impl Photograph {
         let counted = counted.as_deref().unwrap_or(&image.data);
         Self {
             size: [image.width, image.height],
-            measured: Measured::of(image, counted),
+            measured: PhotographStatistics::of(image, counted),
             histogram: LuminanceHistogram::of(counted),
         }
     }
@@ -328,7 +328,7 @@ impl SceneDiagnosis {
             cubic_mean: mean(|view| view.cubic_mean),
             light,
             darkening: darkening(light),
-            lift: exposure.lift(),
+            brightening: exposure.brightening(),
             gain: exposure.gain,
             exposure_spread: measured.unwrap_or(exposure.spread / std::f64::consts::LN_2),
             spread_is_measured: measured.is_some(),

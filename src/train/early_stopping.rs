@@ -16,7 +16,7 @@ use super::{TrainConfig, Trainer};
 use crate::Result;
 use crate::photographs::dataset::{Dataset, Split};
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::Scene;
+use crate::photographs::tone::SceneTone;
 
 /// Steps after a round of density control in which the held-out views are not scored: the model has settled by then.
 const SETTLING_DISTANCE: u64 = 50;
@@ -76,7 +76,7 @@ impl Convergence {
         pseudo_gt: &PseudoGt,
         dataset: &Dataset,
         config: &TrainConfig,
-        scene: &Scene,
+        scene: &SceneTone,
     ) -> Result<Self> {
         let frame = config.frame.unwrap_or_default();
         let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
@@ -91,7 +91,8 @@ impl Convergence {
 impl Trainer {
     /// The step that ends the run, as far as that is known now: fewer than its steps once it has converged.
     pub fn last_step(&self) -> u64 {
-        let early = self.converged().map(|converged| converged + self.config.settling_steps());
+        let early =
+            self.converged().map(|converged| converged + self.config.effective_cooldown_steps());
         early.map_or(self.config.steps, |early| early.min(self.config.steps))
     }
 
@@ -109,24 +110,24 @@ impl Trainer {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn may_end_early(&self) -> bool {
         let is_open = self.converged().is_none() && !self.convergence.decisions.goes_on;
-        is_open && self.step < self.settles_after() && !self.convergence.held_out.is_empty()
+        is_open && self.step < self.cooldown_begin() && !self.convergence.held_out.is_empty()
     }
 
     /// The step after which the model settles: there is no density control any more, and learning rates decay.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn settles_after(&self) -> u64 {
-        let planned = self.config.steps - self.config.settling_steps();
+    pub(crate) fn cooldown_begin(&self) -> u64 {
+        let planned = self.config.steps - self.config.effective_cooldown_steps();
         self.converged().map_or(planned, |converged| converged.min(planned))
     }
 
     /// What all learning rates of a step are multiplied by.
-    pub(super) fn settling_rate(&self, step: u64) -> f64 {
+    pub(super) fn cooldown_factor(&self, step: u64) -> f64 {
         let (length, since) =
-            (self.config.settling_steps(), step.saturating_sub(self.settles_after()));
+            (self.config.effective_cooldown_steps(), step.saturating_sub(self.cooldown_begin()));
         if length == 0 {
             1.0
         } else {
-            self.config.schedule.settling_rate(since as f64 / length as f64)
+            self.config.schedule.cooldown_factor(since as f64 / length as f64)
         }
     }
 

@@ -14,7 +14,7 @@ pub(super) struct Epochs(Mutex<VecDeque<(Key, Arc<[usize]>)>>);
 type Key = (u64, usize, u64);
 
 /// Steps are reported while later ones are recorded, at an epoch's end in the next.
-const MOST_KEPT: usize = 4;
+const MAX_KEPT: usize = 4;
 
 impl Epochs {
     /// The views of the epoch of a step, counted from 1, and the step's place among them.
@@ -26,7 +26,7 @@ impl Epochs {
         let known = kept.iter().find(|(known, _)| *known == key).map(|(_, order)| order.clone());
         let order = known.unwrap_or_else(|| {
             let order: Arc<[usize]> = order(seed, view_count, epoch).into();
-            kept.truncate(MOST_KEPT - 1);
+            kept.truncate(MAX_KEPT - 1);
             kept.push_front((key, Arc::clone(&order)));
             order
         });

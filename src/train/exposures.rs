@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use super::views::Views;
-use super::{Learning, TrainConfig, Trainer};
+use super::{OnOff, TrainConfig, Trainer};
 use crate::camera::Camera;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, View};
 use crate::photographs::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{Measured, Scene};
+use crate::photographs::tone::{MeasuredPhotograph, SceneTone};
 use crate::{Error, Result};
 
 impl Trainer {
@@ -28,7 +28,7 @@ impl Trainer {
 
 /// Where the exposure of a view begins.
 #[derive(Clone, Copy, Debug)]
-enum Start {
+enum InitialExposures {
     /// At these stops of the photograph, from anywhere.
     Stops(f64),
     /// At this affine of the target.
@@ -47,33 +47,37 @@ impl Views {
         &self,
         pseudo_gt: &PseudoGt,
         dataset: &Dataset,
-        scene: &Scene,
+        scene: &SceneTone,
         config: &TrainConfig,
     ) -> Result<Option<Vec<Affine>>> {
-        if config.exposure.learn == Learning::Off {
+        if config.exposure.learn == OnOff::Off {
             return Ok(None);
         }
         let beside = Some(dataset.root.join("exposures.csv")).filter(|path| path.is_file());
         let starts = match config.exposure.start.clone().or(beside) {
             Some(path) => self.starts_of_table(&path, dataset)?,
-            None => self.starts_of_photographs(dataset, &config.load_options())?,
+            None => self.initial_exposures(dataset, &config.load_options())?,
         };
         let stops = starts.values().filter_map(|start| match start {
-            Start::Stops(stops) => Some(*stops),
-            Start::Affine(_) => None,
+            InitialExposures::Stops(stops) => Some(*stops),
+            InitialExposures::Affine(_) => None,
         });
         let stops: Vec<f64> = stops.collect();
         let mean = stops.iter().sum::<f64>() / stops.len().max(1) as f64;
         let mut targets = Targets { pseudo_gt, dataset, scene };
         let affine = |name: &str| match starts.get(name) {
-            Some(Start::Affine(affine)) => Ok(*affine),
-            Some(Start::Stops(stops)) => targets.affine_of_stops(name, stops - mean),
+            Some(InitialExposures::Affine(affine)) => Ok(*affine),
+            Some(InitialExposures::Stops(stops)) => targets.affine_of_stops(name, stops - mean),
             None => Ok(Affine::IDENTITY),
         };
         self.names().map(affine).collect::<Result<Vec<_>>>().map(Some)
     }
 
-    fn starts_of_table(&self, path: &Path, dataset: &Dataset) -> Result<BTreeMap<String, Start>> {
+    fn starts_of_table(
+        &self,
+        path: &Path,
+        dataset: &Dataset,
+    ) -> Result<BTreeMap<String, InitialExposures>> {
         let known = table::load(path)?;
         let views: BTreeSet<&str> = dataset.views.iter().map(|view| view.name.as_str()).collect();
         let names = known.iter().map(|known| known.name.as_str());
@@ -86,10 +90,11 @@ impl Views {
             return Err(Error::input(path, problem));
         }
         let start = |known: table::KnownExposure| {
-            let stops = known.ev.map(Start::Stops);
-            Some((known.name, known.affine.map(Start::Affine).or(stops)?))
+            let stops = known.ev.map(InitialExposures::Stops);
+            Some((known.name, known.affine.map(InitialExposures::Affine).or(stops)?))
         };
-        let starts: BTreeMap<String, Start> = known.into_iter().filter_map(start).collect();
+        let starts: BTreeMap<String, InitialExposures> =
+            known.into_iter().filter_map(start).collect();
         let missing: Vec<&str> = self.names().filter(|name| !starts.contains_key(*name)).collect();
         let place = path.display();
         if missing.is_empty() {
@@ -103,19 +108,19 @@ impl Views {
         Ok(starts)
     }
 
-    fn starts_of_photographs(
+    fn initial_exposures(
         &self,
         dataset: &Dataset,
         options: &LoadOptions,
-    ) -> Result<BTreeMap<String, Start>> {
+    ) -> Result<BTreeMap<String, InitialExposures>> {
         let photographs = Dataset::photographs(&dataset.root, options).unwrap_or_default();
         let names: BTreeSet<&str> = self.names().collect();
         let own = photographs.iter().filter(|photograph| names.contains(photograph.name.as_str()));
         let start = |photograph: &Photograph| {
             let stops = exposure_value(&photograph.input)?;
-            Some((photograph.name.clone(), Start::Stops(stops)))
+            Some((photograph.name.clone(), InitialExposures::Stops(stops)))
         };
-        let starts: BTreeMap<String, Start> = own.filter_map(start).collect();
+        let starts: BTreeMap<String, InitialExposures> = own.filter_map(start).collect();
         match starts.len() {
             0 => {}
             all if all == names.len() => {
@@ -136,14 +141,14 @@ impl Views {
 struct Targets<'a> {
     pseudo_gt: &'a PseudoGt,
     dataset: &'a Dataset,
-    scene: &'a Scene,
+    scene: &'a SceneTone,
 }
 
 impl Targets<'_> {
     fn target(&mut self, photograph: &Image, camera: &Camera) -> Result<Image> {
-        let measured = Measured::of(&photograph.data).seen_by(camera);
-        let lift = self.pseudo_gt.settings().lift(self.scene, &measured);
-        self.pseudo_gt.lifted(photograph, &lift)
+        let measured = MeasuredPhotograph::of(&photograph.data).seen_by(camera);
+        let tone_mapping = self.pseudo_gt.settings().tone_mapping(self.scene, &measured);
+        self.pseudo_gt.tone_mapped(photograph, &tone_mapping)
     }
 
     /// What `stops` of a photograph's exposure, in linear light, make of its target: the affine that brings the target of the

@@ -5,13 +5,13 @@ use std::collections::BTreeMap;
 
 use glam::{DVec3, Vec3};
 
-use super::views::{Shown, TrainView, Views};
+use super::views::{ImageKind, TrainView, Views};
 use super::{TrainConfig, streams};
 use crate::base::random::Stream;
-use crate::camera::{Camera, Frame, Patch};
+use crate::camera::{Camera, Patch, TrainingFrame};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
-use crate::networks::Form;
+use crate::networks::NetworkVariant;
 use crate::photographs::dataset::{Dataset, Point};
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
@@ -24,10 +24,11 @@ impl Views {
         &self,
         dataset: &'a Dataset,
         config: &TrainConfig,
-        frame: &Frame,
+        frame: &TrainingFrame,
     ) -> Cow<'a, [Point]> {
         let own = &dataset.points;
-        let wanted = if own.is_empty() { config.random_points } else { config.density.few() };
+        let wanted =
+            if own.is_empty() { config.random_points } else { config.density.sparse_threshold() };
         let count = wanted.min(config.max_gaussians).saturating_sub(own.len());
         if count == 0 {
             return own.into();
@@ -55,7 +56,7 @@ impl Views {
         let frame = config.frame.unwrap_or_default();
         let points = self.points(dataset, config, &frame);
         let kept = &points[..points.len().min(config.max_gaussians)];
-        let fitting = config.render_settings().most_gaussians(gpu);
+        let fitting = config.render_settings().peak_gaussians(gpu);
         if kept.len() > fitting {
             let (of, device) = (kept.len(), &gpu.properties().name);
             tracing::warn!("{fitting} of {of} points begin as Gaussians: {device} binds no more");
@@ -64,7 +65,7 @@ impl Views {
         // Of the views of the dataset, the place of each among those that are trained on.
         let mut places = vec![None; dataset.views.len()];
         self.photographs().for_each(|view| places[view.index] = Some(view.place));
-        let mut targets = Pictures::new(self, gpu, pseudo_gt, Shown::Targets);
+        let mut targets = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Targets);
         let colors = init::colors_from_views(kept, &dataset.views, |index| {
             let Some(place) = places[index] else { return Ok(None) };
             let target = targets.next(place)?;
@@ -76,9 +77,10 @@ impl Views {
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
         let mut gaussians =
             Gaussians::from_points(&positions, &colors, shape, &config.start, seed)?;
-        if config.model.network.form == Form::Identity {
+        if config.model.network.variant == NetworkVariant::Identity {
             let low = if shape.features.illumination {
-                let mut photographs = Pictures::new(self, gpu, pseudo_gt, Shown::Photographs);
+                let mut photographs =
+                    ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Photographs);
                 init::colors_from_views(kept, &dataset.views, |index| {
                     places[index].map(|place| photographs.next(place)).transpose()
                 })?
@@ -91,7 +93,7 @@ impl Views {
     }
 
     /// Warns of every view in which none of the first Gaussians, given in the frame, has its mean: most often its pose is wrong.
-    pub(super) fn say_what_shows_nothing(&self, gaussians: &Gaussians) {
+    pub(super) fn warn_of_empty_views(&self, gaussians: &Gaussians) {
         let means: Vec<DVec3> = gaussians.means().iter().map(|mean| mean.as_dvec3()).collect();
         for TrainView { name, patch, .. } in self.photographs() {
             if !scattered(means.len()).any(|at| patch.camera.sees(means[at]).is_some()) {
@@ -105,25 +107,25 @@ impl Views {
 }
 
 /// Pictures of the photographs one after the other, made several at a time.
-struct Pictures<'a> {
+struct ImageBatches<'a> {
     views: &'a Views,
     gpu: &'a Gpu,
     pseudo_gt: &'a PseudoGt,
-    shown: Shown,
+    kind: ImageKind,
     /// By place.
     made: BTreeMap<usize, Image>,
 }
 
-impl<'a> Pictures<'a> {
-    fn new(views: &'a Views, gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, shown: Shown) -> Self {
-        Self { views, gpu, pseudo_gt, shown, made: BTreeMap::new() }
+impl<'a> ImageBatches<'a> {
+    fn new(views: &'a Views, gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, kind: ImageKind) -> Self {
+        Self { views, gpu, pseudo_gt, kind, made: BTreeMap::new() }
     }
 
     /// That of a place; those before are gone.
     fn next(&mut self, place: usize) -> Result<Image> {
         /// Of those that are made at a time.
-        const MOST_PIXELS: usize = 1 << 20;
-        let Self { views, gpu, pseudo_gt, shown, ref mut made } = *self;
+        const MAX_PIXELS: usize = 1 << 20;
+        let Self { views, gpu, pseudo_gt, kind, ref mut made } = *self;
         if !made.contains_key(&place) {
             let mut pixels = 0;
             let whole = views.whole();
@@ -132,10 +134,10 @@ impl<'a> Pictures<'a> {
             let now = after.take_while(|view| {
                 let is_first = pixels == 0;
                 pixels += Patch::from(&view.patch.camera).pixel_count();
-                is_first || pixels <= MOST_PIXELS
+                is_first || pixels <= MAX_PIXELS
             });
             let last = now.last().map_or(place, |view| view.place);
-            let images = views.pictures(gpu, pseudo_gt, place..last + 1, shown)?;
+            let images = views.pictures(gpu, pseudo_gt, place..last + 1, kind)?;
             *made = (place..).zip(images).collect();
         }
         let gone = || Error::Usage(format!("there is no photograph {place} to train on"));

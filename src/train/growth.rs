@@ -16,7 +16,7 @@ use crate::splats::render::RenderOptions;
 use crate::splats::scene::GaussianSlice;
 
 /// dB. A round that costs the probes more is tried again with fewer splits. All training views may lose somewhat more.
-const MOST_LOST: f64 = 0.2;
+const MAX_LOST: f64 = 0.2;
 
 /// What makes Gaussians more and fewer.
 #[derive(Debug)]
@@ -25,7 +25,7 @@ pub(super) struct Growth {
     /// Training views that tell what a round costs; none where nothing is done about it.
     pub(super) probes: TargetViews,
     /// That there is no room to grow was said.
-    pub(super) has_said_room: bool,
+    pub(super) has_logged_capacity: bool,
 }
 
 impl Trainer {
@@ -34,31 +34,34 @@ impl Trainer {
     pub(super) fn densifies_at(&self, step: u64) -> bool {
         let schedule = &self.config.schedule;
         let is_in_time = step + schedule.densify_interval <= self.config.steps;
-        schedule.densifies_at(step) && is_in_time && step <= self.settles_after()
+        schedule.densifies_at(step) && is_in_time && step <= self.cooldown_begin()
     }
 
     /// Density control after the last step, whose view had this many intersections.
     pub(super) fn control_density(&mut self, intersections: u32) -> Result<()> {
         let rounds_left = match self.config.density.control {
             DensityControl::Conserving => {
-                self.config.schedule.rounds_left(self.step, self.settles_after())
+                self.config.schedule.rounds_left(self.step, self.cooldown_begin())
             }
             DensityControl::Paper => 1,
         };
         let grown = self.growth_limit()?.max(self.model.count());
-        let (room, why) = self.room(intersections);
-        let most = room.min(grown);
-        if self.fills_at(self.step) {
-            self.fill(self.filled_count().min(most))?;
+        let (capacity, why) = self.capacity(intersections);
+        let most = capacity.min(grown);
+        if self.seeds_at(self.step) {
+            self.seed_depths(self.seeded_count().min(most))?;
             self.convergence.decisions.density_due = None;
             return self.reserve();
         }
         let round = Round { step: self.step, rounds_left, most };
         let report = self.densify(round)?;
         self.convergence.decisions.density_due = None;
-        if report.refused > 0 && room < self.config.max_gaussians && !self.growth.has_said_room {
-            self.growth.has_said_room = true;
-            tracing::warn!("growth stops at {room} Gaussians, {why}");
+        if report.refused > 0
+            && capacity < self.config.max_gaussians
+            && !self.growth.has_logged_capacity
+        {
+            self.growth.has_logged_capacity = true;
+            tracing::warn!("growth stops at {capacity} Gaussians, {why}");
         }
         self.reserve()
     }
@@ -87,27 +90,28 @@ impl Trainer {
 
     /// How many Gaussians there is room for, at least as many as there are, and what there is no more of. A view may have
     /// twice as many intersections for each Gaussian as the last one had.
-    fn room(&self, intersections: u32) -> (usize, &'static str) {
+    fn capacity(&self, intersections: u32) -> (usize, &'static str) {
         let pixels = |size: UVec2| f64::from(size.x) * f64::from(size.y);
         let largest = self.supervision.views.sizes().into_iter().map(pixels).fold(0.0, f64::max);
         let shrunk = largest / pixels(self.view_of(self.step).size());
         let met = MARGIN * shrunk * f64::from(intersections.max(1));
         let count = self.model.count();
         let each = met / count.max(1) as f64;
-        let bindable = f64::from(self.renderer.most_intersections()) / each;
-        let bindable = self.most_renderable().min(bindable as usize);
+        let bindable = f64::from(self.renderer.max_intersections()) / each;
+        let bindable = self.max_renderable().min(bindable as usize);
         let bounds = [
             (bindable, "all that the device can bind at once"),
             (self.fitting_in_vram(each), "all that fits into max_vram"),
             (self.fitting_in_ram(each), "all that fits into max_ram"),
         ];
-        let (room, why) = bounds.into_iter().min_by_key(|(room, _)| *room).unwrap_or(bounds[0]);
-        (room.max(count), why)
+        let (capacity, why) =
+            bounds.into_iter().min_by_key(|(capacity, _)| *capacity).unwrap_or(bounds[0]);
+        (capacity.max(count), why)
     }
 
     /// The most Gaussians there may be, by the setting and by what passes of the renderer bind.
-    pub(super) fn most_renderable(&self) -> usize {
-        let renderable = self.config.render_settings().most_gaussians(&self.gpu);
+    pub(super) fn max_renderable(&self) -> usize {
+        let renderable = self.config.render_settings().peak_gaussians(&self.gpu);
         self.config.max_gaussians.min(renderable)
     }
 }
@@ -115,7 +119,7 @@ impl Trainer {
 /// The share of a round's splits that stays where all of them cost this many dB. The loss grows with the square root of that
 /// share, as the splits with the largest gradients cost most (docs/benchmarks.md); a tenth is to spare.
 fn share_that_stays(lost: f64) -> f64 {
-    if lost > MOST_LOST { (0.9 * MOST_LOST / lost).powi(2) } else { 1.0 }
+    if lost > MAX_LOST { (0.9 * MAX_LOST / lost).powi(2) } else { 1.0 }
 }
 
 /// Density control in the frame, for the cameras of the training views.

@@ -1,6 +1,6 @@
 //! The settings of a run from everything that says one: defaults, preset, plan, file, options, `--set`. The later wins.
 //!
-//! Each is a [`Layer`]: some keys of config.toml with their values. [`Settings`] merges them, and knows of every value
+//! Each is a [`SettingsLayer`]: some keys of config.toml with their values. [`Settings`] merges them, and knows of every value
 //! where it comes from.
 
 use std::collections::BTreeMap;
@@ -52,9 +52,9 @@ impl fmt::Display for Origin {
 
 /// Some settings with their values; a later one of a key wins.
 #[derive(Clone, Debug, Default)]
-pub struct Layer(pub(super) Vec<(String, Value, Origin)>);
+pub struct SettingsLayer(pub(super) Vec<(String, Value, Origin)>);
 
-impl Layer {
+impl SettingsLayer {
     /// Every setting of a TOML text.
     ///
     /// # Errors
@@ -148,16 +148,16 @@ impl Layer {
 pub struct Settings(BTreeMap<String, (Value, Origin)>);
 
 impl Settings {
-    pub(super) fn merge(&mut self, layer: &Layer) {
+    pub(super) fn merge(&mut self, layer: &SettingsLayer) {
         // What belongs to a curve comes after it, wherever it stands.
         let order = |key: &str| match key {
             "tone.curve" => 0,
             "tone.auto_gain" => 1,
             _ => 2,
         };
-        let mut said: Vec<_> = layer.0.iter().collect();
-        said.sort_by_key(|(key, ..)| order(key));
-        for (key, value, origin) in said {
+        let mut stated: Vec<_> = layer.0.iter().collect();
+        stated.sort_by_key(|(key, ..)| order(key));
+        for (key, value, origin) in stated {
             self.set(key, value.clone(), origin.clone());
         }
     }
@@ -171,7 +171,7 @@ impl Settings {
                     !OF_CURVE.iter().any(|name| key.strip_prefix("tone.") == Some(name))
                 });
             }
-            "tone.auto_gain" if is_another => drop(self.0.remove("tone.lift_first")),
+            "tone.auto_gain" if is_another => drop(self.0.remove("tone.full_resolution")),
             _ => {}
         }
         if let Some(name) = key.strip_prefix("tone.constants.") {
@@ -213,8 +213,9 @@ impl Settings {
 
     /// Where a value comes from, in words.
     fn origin(&self, row: &Setting) -> String {
-        let said = self.0.get(row.key.as_ref()).map(|(_, origin)| origin.to_string());
-        said.or_else(|| row.absent.map(str::to_owned))
+        let stated = self.0.get(row.key.as_ref()).map(|(_, origin)| origin.to_string());
+        stated
+            .or_else(|| row.absent.map(str::to_owned))
             .unwrap_or_else(|| Origin::Default.to_string())
     }
 
@@ -269,7 +270,7 @@ impl TrainConfig {
     /// The file cannot be read, or says something that no run has.
     pub fn load(path: &Path) -> Result<Self> {
         let mut settings = Settings::default();
-        settings.merge(&Layer::load(path)?);
+        settings.merge(&SettingsLayer::load(path)?);
         settings.config().map_err(|problem| Error::input(path, problem.to_string()))
     }
 
@@ -279,7 +280,7 @@ impl TrainConfig {
     /// It says something that no run has.
     pub fn from_toml(text: &str) -> Result<Self> {
         let mut settings = Settings::default();
-        settings.merge(&Layer::of_toml(text, &Origin::Default)?);
+        settings.merge(&SettingsLayer::of_toml(text, &Origin::Default)?);
         settings.config()
     }
 
@@ -289,15 +290,15 @@ impl TrainConfig {
     /// # Errors
     /// [`Error::Setting`] for a value that the setting does not take, [`Error::Usage`] for a key that is no setting.
     pub fn with(&self, assignments: &[String]) -> Result<Self> {
-        let mut layer = Layer::default();
+        let mut layer = SettingsLayer::default();
         assignments.iter().try_for_each(|assignment| layer.assign(assignment))?;
         self.overlaid(&layer)
     }
 
     /// The configuration with every setting of a layer.
-    pub(super) fn overlaid(&self, layer: &Layer) -> Result<Self> {
+    pub(super) fn overlaid(&self, layer: &SettingsLayer) -> Result<Self> {
         let mut settings = Settings::default();
-        settings.merge(&Layer::of(self)?);
+        settings.merge(&SettingsLayer::of(self)?);
         settings.merge(layer);
         let config = settings.config()?;
         Ok(Self { spool: self.spool.clone(), ..config })
@@ -309,7 +310,7 @@ impl TrainConfig {
 /// # Errors
 /// None for a configuration that [`TrainConfig::check`] accepts.
 pub fn values(config: &TrainConfig) -> Result<BTreeMap<String, Value>> {
-    Ok(Layer::of(config)?.0.into_iter().map(|(key, value, _)| (key, value)).collect())
+    Ok(SettingsLayer::of(config)?.0.into_iter().map(|(key, value, _)| (key, value)).collect())
 }
 
 /// The line of a place in a text, as messages have it.
@@ -377,7 +378,7 @@ mod tests {
         let ase = with(&["tone.gain_c=2", "tone.curve=ase"]).unwrap();
         assert_eq!(ase.tone, ToneSettings { gain_c: 2.0, ..ToneSettings::new(ToneCurve::Ase) });
         let mut settings = Settings::default();
-        let layer = |text| Layer::of_toml(text, &Origin::Default).unwrap();
+        let layer = |text| SettingsLayer::of_toml(text, &Origin::Default).unwrap();
         settings.merge(&layer("[tone]\ncurve = \"ase\"\ngain_c = 2.0\ntheta = 0.4"));
         settings.merge(&layer("[tone]\ncurve = \"ap3\""));
         assert_eq!(
@@ -423,9 +424,10 @@ mod tests {
     fn a_written_configuration_says_who_says_each_value_and_reads_as_it_is() {
         let mut settings = Settings::default();
         settings.merge(
-            &Layer::of_toml("steps = 700\n[stop]\nviews = 0", &Origin::Preset("fast")).unwrap(),
+            &SettingsLayer::of_toml("steps = 700\n[stop]\nviews = 0", &Origin::Preset("fast"))
+                .unwrap(),
         );
-        let mut set = Layer::default();
+        let mut set = SettingsLayer::default();
         set.assign("steps=9").unwrap();
         set.assign("device=a\nb").unwrap();
         settings.merge(&set);

@@ -9,7 +9,7 @@ use serde::Serialize;
 use crate::Result;
 use crate::photographs::dataset::{Dataset, MeasuredSize, View};
 use crate::photographs::image::Image;
-use crate::photographs::tone::{Exposure, Measured, Scene, ToneSettings, all_black};
+use crate::photographs::tone::{Exposure, MeasuredPhotograph, SceneTone, ToneSettings, all_black};
 
 /// How bright the targets are, and what a model makes of them.
 #[derive(Clone, Debug, Serialize)]
@@ -44,13 +44,13 @@ pub(super) fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &Vi
 pub(super) fn measured(
     settings: &ToneSettings,
     dataset: &Dataset,
-) -> Result<(Scene, Vec<Measured>)> {
+) -> Result<(SceneTone, Vec<MeasuredPhotograph>)> {
     let views: Vec<&View> = photographs(dataset).map(|(_, view)| view).collect();
     let pixels = |view: &&View| u64::from(view.camera.width) * u64::from(view.camera.height);
     let largest = views.iter().map(pixels).max().unwrap_or_default();
     let mut measured = vec![];
     for views in views.chunks(Image::decoded_at_once(largest)) {
-        let of_views = views.par_iter().map(|view| measured_of(view, settings.lift_first));
+        let of_views = views.par_iter().map(|view| measured_of(view, settings.full_resolution));
         measured.extend(of_views.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
     let scene = settings.scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
@@ -60,15 +60,18 @@ pub(super) fn measured(
 /// What is measured of a view; known where its photograph was measured while it was decoded.
 ///
 /// # Errors
-/// As [`lifted_from`].
-pub(super) fn measured_of(view: &View, lift_first: bool) -> Result<Option<Measured>> {
-    let size = if lift_first { MeasuredSize::Own } else { MeasuredSize::Loaded };
-    let read_anew = view.original.as_ref().filter(|_| lift_first || view.image.is_none());
+/// As [`tone_map_source`].
+pub(super) fn measured_of(
+    view: &View,
+    full_resolution: bool,
+) -> Result<Option<MeasuredPhotograph>> {
+    let size = if full_resolution { MeasuredSize::Own } else { MeasuredSize::Loaded };
+    let read_anew = view.original.as_ref().filter(|_| full_resolution || view.image.is_none());
     let measured = match read_anew.and_then(|original| original.measured(size)) {
         Some(measured) => Some(measured.clone()),
         None => {
-            let photograph = lifted_from(view, lift_first)?;
-            photograph.map(|photograph| Measured::of(&view.counted(&photograph)))
+            let photograph = tone_map_source(view, full_resolution)?;
+            photograph.map(|photograph| MeasuredPhotograph::of(&view.counted(&photograph)))
         }
     };
     Ok(measured.map(|measured| measured.seen_by(&view.camera)))
@@ -79,6 +82,9 @@ pub(super) fn measured_of(view: &View, lift_first: bool) -> Result<Option<Measur
 ///
 /// # Errors
 /// As [`View::photograph`].
-pub(super) fn lifted_from(view: &View, lift_first: bool) -> Result<Option<Cow<'_, Image>>> {
-    if lift_first { view.photograph() } else { view.loaded() }
+pub(super) fn tone_map_source(
+    view: &View,
+    full_resolution: bool,
+) -> Result<Option<Cow<'_, Image>>> {
+    if full_resolution { view.photograph() } else { view.loaded() }
 }

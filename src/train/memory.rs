@@ -36,11 +36,11 @@ pub struct MemoryEstimate {
     /// What the process takes on the host then, on a software device with what that has.
     pub host: u64,
     /// The most Gaussians that there may come to be.
-    pub most_gaussians: usize,
+    pub peak_gaussians: usize,
     /// The most on the device on the way there.
-    pub most_device: u64,
+    pub peak_device: u64,
     /// The most on the host on the way there.
-    pub most_host: u64,
+    pub peak_host: u64,
 }
 
 impl Trainer {
@@ -58,15 +58,15 @@ impl Trainer {
     pub fn memory_estimate(&mut self) -> Result<MemoryEstimate> {
         let met = f64::from(self.intersections_of_largest_view()?);
         let (per, count) = (self.per_gaussian(), self.model.count());
-        let most_gaussians = self.most_gaussians(met);
-        let most = most_gaussians as f64;
+        let peak_gaussians = self.peak_gaussians(met);
+        let most = peak_gaussians as f64;
         let reserved = f64::from(self.renderer.intersection_capacity());
         let device = self.fixed_bytes
             + per.steady(self.model.capacity() as f64)
             + self.intersection_bytes(reserved);
         let intersections = reserved.max(met_by(most, met, count as f64));
         let grown = per.growing_to(count as f64, self.model.capacity() as f64, most);
-        let most_device = (self.fixed_bytes + self.intersection_bytes(intersections) + grown)
+        let peak_device = (self.fixed_bytes + self.intersection_bytes(intersections) + grown)
             .max(device)
             .max(self.gpu.peak_memory() as f64);
         let host = |gaussians: f64, device: f64| {
@@ -79,9 +79,9 @@ impl Trainer {
             gaussians: count,
             device: device as u64,
             host: host(count as f64, device) as u64,
-            most_gaussians,
-            most_device: most_device as u64,
-            most_host: host(most, most_device) as u64,
+            peak_gaussians,
+            peak_device: peak_device as u64,
+            peak_host: host(most, peak_device) as u64,
         })
     }
 
@@ -97,14 +97,14 @@ impl Trainer {
 
     /// The most Gaussians that the run can come to have: a limit that there is, or as many as all its rounds of growth can
     /// make.
-    fn most_gaussians(&self, met: f64) -> usize {
+    fn peak_gaussians(&self, met: f64) -> usize {
         let (count, interval) = (self.model.count(), self.config.schedule.densify_interval.max(1));
         let rounds = (self.step / interval + 1..=self.config.steps / interval)
             .filter(|round| self.densifies_at(round * interval));
         // A Gaussian becomes two at most.
         let filled = self.count_once_filled();
         let doubled = (0..rounds.count()).try_fold(filled, |count, _| count.checked_mul(2));
-        let limit = self.most_renderable();
+        let limit = self.max_renderable();
         let each = MARGIN * met / count.max(1) as f64;
         let limit = limit.min(self.fitting_in_vram(each)).min(self.fitting_in_ram(each));
         limit.min(doubled.unwrap_or(usize::MAX)).max(count)
@@ -113,7 +113,7 @@ impl Trainer {
     /// Keeps the activations that a denoiser's backward pass would compute again, within a fraction of what the run may have:
     /// the rest is the model's.
     pub(super) fn keep_activations(&mut self, sizes: &[UVec2]) -> Result<()> {
-        let most = (ACTIVATIONS * self.most_bytes()) as u64;
+        let most = (ACTIVATIONS * self.max_bytes()) as u64;
         match &mut self.supervision.networks {
             Some(terms) => terms.keep_activations(sizes, most),
             None => Ok(()),
@@ -121,7 +121,7 @@ impl Trainer {
     }
 
     /// What there may be on the device at most, by the limits and by what it has.
-    fn most_bytes(&self) -> f64 {
+    fn max_bytes(&self) -> f64 {
         let device = self.gpu.properties();
         let most = |CacheSize(bytes): CacheSize| bytes.min(device.memory);
         let vram = self.config.max_vram.map_or(device.memory, most) as f64;
@@ -223,9 +223,9 @@ impl PerGaussian {
         while count >= 1.0 && count < most {
             count = (2.0 * count).min(most);
             if count > capacity {
-                let room = (HEADROOM * count).min(most).max(count);
-                peak = peak.max(self.growing(capacity, room));
-                capacity = room;
+                let grown = (HEADROOM * count).min(most).max(count);
+                peak = peak.max(self.growing(capacity, grown));
+                capacity = grown;
             }
         }
         peak.max(self.saving(capacity))

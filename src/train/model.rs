@@ -6,8 +6,8 @@ use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::loss::{LogSlot, ParameterInputs, ParameterTerms};
 use crate::splats::attributes::{PlaneCounts, planes};
 use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, Round};
-use crate::splats::halves::StorageFormat;
 use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates, Moments};
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{
     ATTRIBUTES, Attribute, DeviceGaussians, GaussianSlice, Gaussians, Layout, Shape,
 };
@@ -105,10 +105,10 @@ impl Model {
     pub(super) fn set_sh_degree(&mut self, gpu: &Gpu, sh_degree: u32) -> Result<()> {
         let own = self.gaussians.layout;
         let new = Layout { shape: Shape { sh_degree, ..own.shape }, ..own };
-        let (room, columns) = (own.capacity, new.floats().columns);
+        let (capacity, columns) = (own.capacity, new.floats().columns);
         // Longer buffers with what they held, one after the other, and with room for as many Gaussians as before.
-        lengthen(gpu, &mut self.gaussians.parameters, room * new.words())?;
-        self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, room * columns))?;
+        lengthen(gpu, &mut self.gaussians.parameters, capacity * new.words())?;
+        self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, capacity * columns))?;
         let parameters = self.gaussians.read(gpu)?;
         let batches = own.batches(gpu);
         let planes = self.planes_mut().map(|plane| batches.read(gpu, &*plane));

@@ -6,7 +6,7 @@ use glam::UVec2;
 
 use super::ModelConfig;
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::networks::window::{Window, Windows};
+use crate::networks::crop::{CropKernels, PaddedCrop};
 use crate::networks::{self, Denoiser, Parameters, Tonemapper};
 use crate::photographs::image::Image;
 use crate::splats::scene::{COLOR_CHANNELS, Feature, Features};
@@ -19,7 +19,7 @@ pub struct Networks {
     features: Features,
     pub(super) denoiser: Option<Denoiser>,
     pub(super) tonemapper: Option<Tonemapper>,
-    pub(super) windows: Windows,
+    pub(super) crops: CropKernels,
     /// R_0 of the window, (3, h, w).
     pub(super) colors: Buffer<f32>,
     /// The noise map of the window, (3, h, w).
@@ -48,7 +48,8 @@ impl Networks {
             }
         }
         let denoiser = model.denoiser.then(|| Denoiser::new(gpu, model.network, seed));
-        let tonemapper = model.tonemapper.then(|| Tonemapper::new(gpu, model.network.form, seed));
+        let tonemapper =
+            model.tonemapper.then(|| Tonemapper::new(gpu, model.network.variant, seed));
         let (mut denoiser, mut tonemapper) = (denoiser.transpose()?, tonemapper.transpose()?);
         if let Some(denoiser) = &mut denoiser {
             denoiser.parameters_mut().learning_rate = model.rates.denoiser;
@@ -61,9 +62,9 @@ impl Networks {
             features,
             denoiser,
             tonemapper,
-            windows: Windows::new(gpu)?,
-            colors: gpu.uninit("window_colors", 0)?,
-            noise: gpu.uninit("window_noise", 0)?,
+            crops: CropKernels::new(gpu)?,
+            colors: gpu.uninit("crop_colors", 0)?,
+            noise: gpu.uninit("crop_noise", 0)?,
         })
     }
 
@@ -79,12 +80,12 @@ impl Networks {
     pub(super) fn reserve(&mut self, size: UVec2) -> Result<()> {
         let values = COLOR_CHANNELS * size.x as usize * size.y as usize;
         if self.colors.len() < values {
-            self.colors = self.gpu.uninit("window_colors", values)?;
+            self.colors = self.gpu.uninit("crop_colors", values)?;
         }
         if let Some(denoiser) = &mut self.denoiser {
             denoiser.reserve(size)?;
             if self.features.noise && self.noise.len() < values {
-                self.noise = self.gpu.uninit("window_noise", values)?;
+                self.noise = self.gpu.uninit("crop_noise", values)?;
             }
         }
         match &mut self.tonemapper {
@@ -99,16 +100,16 @@ impl Networks {
         pass: &mut Recorder<'_>,
         render: &Buffer<f32>,
         size: UVec2,
-        window: &Window,
+        crop: &PaddedCrop,
     ) -> Result<()> {
         let planes = 0..COLOR_CHANNELS;
-        self.windows.gather(pass, render, size, planes, window, &mut self.colors)?;
+        self.crops.gather(pass, render, size, planes, crop, &mut self.colors)?;
         let Some(denoiser) = &mut self.denoiser else { return Ok(()) };
         let Some(planes) = self.features.channels_of(Feature::Noise) else {
-            return denoiser.forward(pass, window.size, &self.colors, &self.colors);
+            return denoiser.forward(pass, crop.size, &self.colors, &self.colors);
         };
-        self.windows.gather(pass, render, size, planes, window, &mut self.noise)?;
-        denoiser.forward(pass, window.size, &self.noise, &self.colors)
+        self.crops.gather(pass, render, size, planes, crop, &mut self.noise)?;
+        denoiser.forward(pass, crop.size, &self.noise, &self.colors)
     }
 
     /// R_K of the window denoised last; R_0 without a denoiser.
@@ -124,7 +125,7 @@ impl Networks {
         self.reserve(size)?;
         let gpu = self.gpu.clone();
         let render = gpu.buffer("render", render)?;
-        gpu.run("denoise", |pass| self.denoise(pass, &render, size, &Window::whole(size)))?;
+        gpu.run("denoise", |pass| self.denoise(pass, &render, size, &PaddedCrop::whole(size)))?;
         let mut data = gpu.read(self.denoised())?;
         data.truncate(COLOR_CHANNELS * size.x as usize * size.y as usize);
         Ok(Image { width: size.x, height: size.y, data })

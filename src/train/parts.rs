@@ -7,7 +7,7 @@ use glam::UVec2;
 
 use crate::base::settings::{Rule, settings};
 use crate::loss::{DepthBoxes, Weights};
-use crate::networks::{Denoiser, DenoiserSettings, Form, Tonemapper};
+use crate::networks::{Denoiser, DenoiserSettings, NetworkVariant, Tonemapper};
 use crate::splats::scene::Features;
 use crate::{Error, Result};
 
@@ -140,7 +140,7 @@ impl ModelConfig {
     }
 
     /// Says where the parts of a model see less than they are set to.
-    pub(super) fn say_what_parts_see(&self, sizes: &[UVec2]) {
+    pub(super) fn log_parts(&self, sizes: &[UVec2]) {
         let shortest = sizes.iter().map(|size| size.min_element()).min().unwrap_or_default();
         let boxes = DepthBoxes::new(UVec2::splat(shortest), self.depth_box);
         if self.depth && boxes.side < self.depth_box {
@@ -193,7 +193,7 @@ impl ModelConfig {
             depth: self.depth,
             structure: self.structure,
             // Beside the colours a noise map can say nothing: what it takes away the colours need not show.
-            noise: self.denoiser && self.network.form == Form::Paper,
+            noise: self.denoiser && self.network.variant == NetworkVariant::Paper,
             illumination: self.tonemapper,
         }
     }

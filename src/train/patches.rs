@@ -7,9 +7,9 @@ use std::ops::Range;
 
 use glam::UVec2;
 
-use super::config::LEAST_PATCH;
+use super::config::MIN_PATCH;
 use super::memory::MARGIN;
-use super::views::{Shown, TrainView, Views};
+use super::views::{ImageKind, TrainView, Views};
 use super::{TrainConfig, Trainer};
 use crate::camera::{Camera, Patch};
 use crate::gpu::Gpu;
@@ -49,16 +49,16 @@ impl Trainer {
         for patch in &patches {
             met = met.max(self.renderer.count_intersections(gaussians, patch)?);
         }
-        let share = f64::from(self.renderer.most_intersections()) / (MARGIN * f64::from(met));
+        let share = f64::from(self.renderer.max_intersections()) / (MARGIN * f64::from(met));
         let pixels = patches.iter().map(Patch::pixel_count).max().unwrap_or_default();
         let fewer = (share.min(1.0) * pixels as f64) as u64;
-        Ok((share < 1.0 && fewer >= LEAST_PATCH).then_some(fewer))
+        Ok((share < 1.0 && fewer >= MIN_PATCH).then_some(fewer))
     }
 }
 
 impl Views {
     /// Says which photographs are trained on in patches.
-    pub(super) fn say_what_is_cut(&self, gpu: &Gpu) {
+    pub(super) fn log_patches(&self, gpu: &Gpu) {
         let mut cut = self.photographs().filter(|view| !view.patch.is_whole());
         let Some(TrainView { name, place, patch, .. }) = cut.next() else { return };
         let own = self.whole().iter().filter(|view| view.place == *place).count();
@@ -77,7 +77,7 @@ impl Views {
     /// # Errors
     /// As [`Views::pictures`].
     pub(super) fn picture(&self, gpu: &Gpu, pseudo_gt: &PseudoGt, place: usize) -> Result<Image> {
-        let pictures = self.pictures(gpu, pseudo_gt, place..place + 1, Shown::Targets)?;
+        let pictures = self.pictures(gpu, pseudo_gt, place..place + 1, ImageKind::Targets)?;
         let gone = || Error::Usage(format!("there is no photograph {place} to train on"));
         pictures.into_iter().next().ok_or_else(gone)
     }
@@ -91,7 +91,7 @@ impl Views {
         gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         places: Range<usize>,
-        shown: Shown,
+        shown: ImageKind,
     ) -> Result<Vec<Image>> {
         let views = self.of_places(places);
         Ok(put_together(views, self.read(gpu, pseudo_gt, views, shown)?))

@@ -5,7 +5,7 @@ use std::path::Path;
 use toml::Value;
 
 use super::diagnose::{Diagnosis, Plan};
-use super::layers::{Layer, Origin, Settings};
+use super::layers::{Origin, Settings, SettingsLayer};
 use super::{Preset, TrainConfig, Trainer};
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, LoadOptions};
@@ -13,20 +13,20 @@ use crate::{Error, Result};
 
 /// What is said of a run beside its plan, from the weakest to the strongest.
 #[derive(Clone, Debug, Default)]
-pub struct Said {
+pub struct RequestedSettings {
     /// A trade of time for quality, or a benchmark; none: the defaults, which are balanced.
     pub preset: Option<Preset>,
     /// A configuration file.
-    pub file: Layer,
+    pub file: SettingsLayer,
     /// Options.
-    pub options: Layer,
+    pub options: SettingsLayer,
     /// `--set`.
-    pub set: Layer,
+    pub set: SettingsLayer,
 }
 
 /// What decides what is not said.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Planning<'a> {
+pub enum PlanSource<'a> {
     /// Nothing: it keeps the preset's values.
     Nothing,
     /// The plan in this file.
@@ -37,7 +37,7 @@ pub enum Planning<'a> {
 
 /// A run whose every setting is decided.
 #[derive(Debug)]
-pub struct Planned {
+pub struct PlannedRun {
     /// What it trains.
     pub config: TrainConfig,
     /// Where each value of that comes from.
@@ -48,14 +48,14 @@ pub struct Planned {
     pub dataset: Dataset,
 }
 
-impl Said {
+impl RequestedSettings {
     /// All that is said, and of what is not said what a plan says.
     ///
     /// # Errors
     /// A plan that was written by hand has a number out of its range.
     pub fn settings(&self, plan: Option<&Plan>) -> Result<Settings> {
-        let said = [&self.file, &self.options, &self.set];
-        let get = |key: &str| said.iter().rev().find_map(|layer| layer.get(key));
+        let requested = [&self.file, &self.options, &self.set];
+        let get = |key: &str| requested.iter().rev().find_map(|layer| layer.get(key));
         let mut settings = Settings::default();
         if let Some(preset) = self.preset {
             let curve = get("tone.curve").and_then(|name| name.as_str()?.parse().ok());
@@ -64,7 +64,7 @@ impl Said {
         }
         if let Some(plan) = plan {
             // Whoever says anything of how photographs are brightened has decided that.
-            let names_a_curve = said.iter().any(|layer| layer.names("tone."));
+            let names_a_curve = requested.iter().any(|layer| layer.names("tone."));
             // Exposures and the tonemapper exclude each other, and a plan never asks for both.
             let has_tonemapper = get("model.tonemapper") == Some(&Value::Boolean(true));
             let mut layer = plan.layer()?;
@@ -75,7 +75,7 @@ impl Said {
             });
             settings.merge(&layer);
         }
-        for layer in said {
+        for layer in requested {
             settings.merge(layer);
         }
         Ok(settings)
@@ -85,21 +85,21 @@ impl Said {
     ///
     /// # Errors
     /// A setting makes no sense, the dataset cannot be used, or the plan is that of another one.
-    pub fn planned(&self, planning: Planning<'_>, gpu: &Gpu) -> Result<Planned> {
+    pub fn planned(&self, planning: PlanSource<'_>, gpu: &Gpu) -> Result<PlannedRun> {
         let config = self.settings(None)?.config()?;
         config.check()?;
         let options = match planning {
-            Planning::Nothing => config.load_options(),
+            PlanSource::Nothing => config.load_options(),
             _ => diagnosed(&config),
         };
-        let (mut dataset, plan) = if planning == Planning::Diagnosis {
+        let (mut dataset, plan) = if planning == PlanSource::Diagnosis {
             let (dataset, diagnosis) = Diagnosis::load(&config.dataset, &options)?;
             (dataset, Some(planned(&diagnosis, &config, gpu)))
         } else {
             (Dataset::load(&config.dataset, &options)?, None)
         };
         let plan = match planning {
-            Planning::File(file) => Some(Plan::load(file, &dataset)?),
+            PlanSource::File(file) => Some(Plan::load(file, &dataset)?),
             _ => plan,
         };
         if let Some(plan) = &plan {
@@ -108,7 +108,7 @@ impl Said {
         let settings = self.settings(plan.as_ref())?;
         let config = settings.config()?;
         config.check()?;
-        Ok(Planned { config, settings, plan, dataset })
+        Ok(PlannedRun { config, settings, plan, dataset })
     }
 }
 
@@ -133,7 +133,9 @@ impl Preset {
     /// # Errors
     /// None for the presets that there are.
     pub fn load_options(self) -> Result<LoadOptions> {
-        let config = Said { preset: Some(self), ..Said::default() }.settings(None)?.config()?;
+        let config = RequestedSettings { preset: Some(self), ..RequestedSettings::default() }
+            .settings(None)?
+            .config()?;
         Ok(if self.is_planned() { diagnosed(&config) } else { config.load_options() })
     }
 }
@@ -145,18 +147,19 @@ impl Trainer {
     /// # Errors
     /// The dataset cannot be used, or the device is out of memory or lost.
     pub fn planned(gpu: &Gpu, dataset: &Dataset, preset: Preset) -> Result<Self> {
-        let mut said = Said { preset: Some(preset), ..Said::default() };
+        let mut requested =
+            RequestedSettings { preset: Some(preset), ..RequestedSettings::default() };
         let root = dataset.root.to_str().ok_or_else(|| {
             Error::input(&dataset.root, "is not Unicode; move it to a path that is")
         })?;
-        said.options.push("dataset", root.into(), Origin::Option("dataset"))?;
-        let config = said.settings(None)?.config()?;
+        requested.options.push("dataset", root.into(), Origin::Option("dataset"))?;
+        let config = requested.settings(None)?.config()?;
         if !preset.is_planned() {
             return Self::new(gpu, config, dataset);
         }
         let plan = planned(&Diagnosis::of(dataset, &diagnosed(&config))?, &config, gpu);
         let mut dataset = dataset.clone();
         dataset.leave_out(&plan.left_out);
-        Self::new(gpu, said.settings(Some(&plan))?.config()?, &dataset)
+        Self::new(gpu, requested.settings(Some(&plan))?.config()?, &dataset)
     }
 }

@@ -11,7 +11,7 @@ use crate::Result;
 use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu};
 use crate::photographs::pseudo_gt::Encoded;
-use crate::splats::halves::StorageFormat;
+use crate::splats::packed_sh::StorageFormat;
 
 settings! {
 "precision."

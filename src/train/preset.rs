@@ -8,7 +8,7 @@ use std::str::FromStr;
 use toml::Value;
 
 use super::TrainConfig;
-use super::layers::{Layer, Origin};
+use super::layers::{Origin, SettingsLayer};
 use crate::photographs::tone::ToneCurve;
 use crate::{Error, Result};
 
@@ -100,9 +100,9 @@ impl Preset {
     ///
     /// # Errors
     /// None for the presets that there are.
-    pub(super) fn layer(self, curve: Option<ToneCurve>, dataset: &Path) -> Result<Layer> {
+    pub(super) fn layer(self, curve: Option<ToneCurve>, dataset: &Path) -> Result<SettingsLayer> {
         let origin = Origin::Preset(self.name());
-        let mut layer = Layer::of_toml(self.toml(), &origin)?;
+        let mut layer = SettingsLayer::of_toml(self.toml(), &origin)?;
         let mut say = |key: &str, value: Value| layer.push(key, value, origin.clone());
         if let (false, Some(curve)) = (self.is_planned(), curve) {
             say("tone.curve", curve.name().into())?;
@@ -176,12 +176,12 @@ impl FromStr for Preset {
 mod tests {
     use super::*;
     use crate::loss::Weights;
-    use crate::networks::Form;
+    use crate::networks::NetworkVariant;
     use crate::photographs::tone::ToneSettings;
     use crate::splats::attributes::Attribute;
     use crate::splats::densify::DensityControl;
     use crate::splats::optimizer::Schedule;
-    use crate::splats::scene::init::Start;
+    use crate::splats::scene::init::Initialization;
     use crate::train::{DensityConfig, ModelConfig};
 
     fn applied(preset: Preset, scene: &str, curve: ToneCurve) -> TrainConfig {
@@ -203,8 +203,12 @@ mod tests {
             let is_paper = config.density.control == DensityControl::Paper;
             assert_eq!(is_paper, PAPER.contains(&preset), "{preset:?}");
             assert_eq!(is_paper, config.schedule.densify_after == 500, "{preset:?}");
-            assert_eq!(is_paper, config.start == Start::PAPER, "{preset:?}");
-            assert_eq!(is_paper, config.model.network.form == Form::Paper, "{preset:?}");
+            assert_eq!(is_paper, config.start == Initialization::PAPER, "{preset:?}");
+            assert_eq!(
+                is_paper,
+                config.model.network.variant == NetworkVariant::Paper,
+                "{preset:?}"
+            );
             assert_eq!(is_paper, config.model.weights == Weights::paper(), "{preset:?}");
             config.check().unwrap();
         }
@@ -221,7 +225,7 @@ mod tests {
         let expected = TrainConfig {
             dataset: "data/x".into(),
             tone: ToneSettings::default().with_curve(ToneCurve::Ap3),
-            start: Start::PAPER,
+            start: Initialization::PAPER,
             schedule: Schedule::paper(),
             density: DensityConfig::paper(),
             model,

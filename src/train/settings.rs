@@ -10,23 +10,23 @@ use super::{
 };
 use crate::Error;
 use crate::base::settings::{Rule, Setting};
-use crate::camera::Frame;
+use crate::camera::TrainingFrame;
 use crate::loss::exposure::ExposureRates;
 use crate::loss::{ParameterWeights, Weights};
 use crate::networks::DenoiserSettings;
 use crate::photographs::tone::ToneSettings;
 use crate::splats::optimizer::{LearningRates, Schedule};
-use crate::splats::scene::init::Start;
+use crate::splats::scene::init::Initialization;
 
 /// Every setting that there is, in the order of config.toml.
 pub static SETTINGS: LazyLock<Vec<Setting>> = LazyLock::new(|| {
     let rates: Vec<Setting> = LearningRates::settings().collect();
     [
         TrainConfig::SETTINGS,
-        Frame::SETTINGS,
+        TrainingFrame::SETTINGS,
         ToneSettings::SETTINGS,
         CheckConfig::SETTINGS,
-        Start::SETTINGS,
+        Initialization::SETTINGS,
         Schedule::SETTINGS,
         &rates,
         DensityConfig::SETTINGS,
@@ -249,7 +249,7 @@ mod tests {
             ("stepz", "steps"),
             ("density.gradient", "density.gradient_threshold"),
             ("density.foo", "density."),
-            ("densty.fill", "density.fill"),
+            ("densty.fill", "density.depth_seeding"),
             ("stop.not-finite", "stop.not_finite"),
             ("frame.scal", "frame.scale"),
         ] {

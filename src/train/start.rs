@@ -12,7 +12,7 @@ use super::masks::Masks;
 use super::measuring::TargetExposure;
 use super::model::Model;
 use super::passes::{Kernels, first_sh_degree};
-use super::submission::{MOST_STEPS, Submissions};
+use super::submission::{MAX_STEPS, Submissions};
 use super::supervision::Supervision;
 use super::target_views::TargetViews;
 use super::terms::NetworkTerms;
@@ -23,7 +23,7 @@ use crate::loss::exposure::Exposures;
 use crate::loss::{LossLog, ParameterTerms};
 use crate::photographs::dataset::{Dataset, Fingerprint, Original};
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::Scene;
+use crate::photographs::tone::SceneTone;
 use crate::splats::densify::DensityControl;
 use crate::splats::scene::{FEATURES, Gaussians, Shape, ply};
 use crate::{Error, Result};
@@ -85,7 +85,7 @@ impl Trainer {
             let mut trainer = Self::begin(gpu, config.clone(), dataset, gaussians)?;
             config.patch_pixels = match trainer.fewer_patch_pixels()? {
                 None => {
-                    trainer.supervision.views.say_what_is_cut(gpu);
+                    trainer.supervision.views.log_patches(gpu);
                     break Ok(trainer);
                 }
                 fewer => fewer,
@@ -102,7 +102,7 @@ impl Trainer {
         gaussians: Option<&Gaussians>,
     ) -> Result<Self> {
         config.check()?;
-        config.leave_out_what_is_missing(dataset);
+        config.disable_missing_parts(dataset);
         config.frame.get_or_insert_with(|| dataset.frame());
         thread::scope(|scope| {
             // The driver compiles on another thread while the views are uploaded and looked at.
@@ -133,7 +133,7 @@ impl Trainer {
         if let Some(TargetExposure { scene, .. }) = &target_exposure {
             tracing::info!("{}", scene.reason());
         }
-        config.model.say_what_parts_see(&sizes);
+        config.model.log_parts(&sizes);
         let starts = views.exposures(&pseudo_gt, dataset, &scene, &config)?;
         let gaussians = match gaussians {
             Some(gaussians) => given(gaussians, &config)?,
@@ -141,7 +141,7 @@ impl Trainer {
                 views.initial_gaussians(gpu, &pseudo_gt, dataset, &config, starts.as_deref())?
             }
         };
-        views.say_what_shows_nothing(&gaussians);
+        views.warn_of_empty_views(&gaussians);
         let masks = Masks::new(gpu, dataset, &views)?;
         let exposures = starts.map(|starts| Exposures::new(gpu, config.exposure.rates, &starts));
         let mut exposures = exposures.transpose()?;
@@ -155,7 +155,7 @@ impl Trainer {
         let networks = NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?;
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = config.render_settings().channels() * pixels.unwrap_or_default();
-        let pictures = views.most_values();
+        let pictures = views.largest_view_values();
         // Beside the target only networks look at the photograph.
         let photographs = if networks.is_some() { pictures } else { 0 };
         let supervision = Supervision {
@@ -171,7 +171,7 @@ impl Trainer {
             losses,
             parameter_terms: ParameterTerms::new(gpu, config.loss)?,
             d_render: gpu.uninit("d_render", values)?,
-            log: LossLog::new(gpu, MOST_STEPS as usize)?,
+            log: LossLog::new(gpu, MAX_STEPS as usize)?,
         };
         let mut trainer = Self {
             gpu: gpu.clone(),
@@ -183,7 +183,7 @@ impl Trainer {
             model: Model::upload(gpu, &gaussians, first_sh_degree(&config), &config.precision)?,
             renderer,
             optimizer: Optimizer { adam, finite, checked: 0 },
-            growth: Growth { densifier, probes, has_said_room: false },
+            growth: Growth { densifier, probes, has_logged_capacity: false },
             convergence,
             submissions: Submissions::default(),
             fixed_bytes: 0.0,
@@ -214,13 +214,13 @@ fn given(gaussians: &Gaussians, config: &TrainConfig) -> Result<Gaussians> {
 /// Training views that tell what a round of density control costs.
 const PROBES: usize = 8;
 /// The pixels of one: all take 100 MB of the host at the most.
-const MOST_PROBE_PIXELS: usize = 1 << 20;
+const MAX_PROBE_PIXELS: usize = 1 << 20;
 
 fn probes(
     pseudo_gt: &PseudoGt,
     dataset: &Dataset,
     config: &TrainConfig,
-    scene: &Scene,
+    scene: &SceneTone,
     sizes: &[UVec2],
 ) -> Result<TargetViews> {
     if config.density.control == DensityControl::Paper {
@@ -228,7 +228,7 @@ fn probes(
     }
     // No larger than what steps render.
     let largest = sizes.iter().map(|size| size.element_product() as usize).max();
-    let pixels = largest.unwrap_or_default().min(MOST_PROBE_PIXELS);
+    let pixels = largest.unwrap_or_default().min(MAX_PROBE_PIXELS);
     let frame = config.frame.unwrap_or_default();
     TargetViews::probes(pseudo_gt, dataset, &frame, scene, [PROBES, pixels])
 }

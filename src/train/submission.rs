@@ -16,11 +16,11 @@ use crate::splats::render::Status;
 use crate::{Error, Result};
 
 /// Steps that one submission holds at most.
-pub(super) const MOST_STEPS: u64 = 64;
+pub(super) const MAX_STEPS: u64 = 64;
 /// What a submission is to take.
 const SUBMISSION: Duration = Duration::from_millis(50);
 /// Whoever trains hears of it about this often.
-const STRETCH: Duration = Duration::from_millis(500);
+const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 /// The parameters are looked at for NaN after so many steps: a hundredth part of what Adam reads of them.
 const FINITE_STEPS: u64 = 50;
 /// One runs, one waits for it.
@@ -28,7 +28,7 @@ const IN_FLIGHT: usize = 2;
 
 /// How steps are grouped, by what the last submission took.
 #[derive(Debug)]
-pub(super) struct Pace {
+pub(super) struct StepBatching {
     in_flight: usize,
     /// As many steps always, where a test says so.
     steps: Option<u64>,
@@ -36,17 +36,17 @@ pub(super) struct Pace {
     last_done: Instant,
 }
 
-impl Default for Pace {
+impl Default for StepBatching {
     fn default() -> Self {
         Self { in_flight: IN_FLIGHT, steps: None, step: SUBMISSION, last_done: Instant::now() }
     }
 }
 
-impl Pace {
+impl StepBatching {
     /// Steps of the next submission.
     fn steps(&self) -> u64 {
         let fitting = SUBMISSION.as_secs_f64() / self.step.as_secs_f64().max(1e-6);
-        self.steps.unwrap_or(fitting as u64).clamp(1, MOST_STEPS)
+        self.steps.unwrap_or(fitting as u64).clamp(1, MAX_STEPS)
     }
 
     /// Takes the time of a submission that is done: from when the device was free for it.
@@ -60,7 +60,7 @@ impl Pace {
 /// How steps reach the device, and what became of the last that did.
 #[derive(Debug, Default)]
 pub(super) struct Submissions {
-    pub(super) pace: Pace,
+    pub(super) batching: StepBatching,
     /// What ended the last call after steps that were done.
     pub(super) failed: Option<Error>,
 }
@@ -76,8 +76,9 @@ struct Submitted {
 impl Trainer {
     /// Has always so many submissions in flight, of so many steps each; none: as long as suits the device.
     #[doc(hidden)]
-    pub fn set_pace(&mut self, in_flight: usize, steps: Option<u64>) {
-        self.submissions.pace = Pace { in_flight: in_flight.max(1), steps, ..Pace::default() };
+    pub fn set_batching(&mut self, in_flight: usize, steps: Option<u64>) {
+        self.submissions.batching =
+            StepBatching { in_flight: in_flight.max(1), steps, ..StepBatching::default() };
     }
 
     /// Trains up to `until`, to the next step of density control, or for about half a second.
@@ -89,7 +90,7 @@ impl Trainer {
             return Err(error);
         }
         let mut reports = vec![];
-        match self.train_stretch(until, &mut reports) {
+        match self.train_interval(until, &mut reports) {
             Err(error) if !reports.is_empty() => self.submissions.failed = Some(error),
             done => done?,
         }
@@ -100,7 +101,7 @@ impl Trainer {
         Ok(reports)
     }
 
-    fn train_stretch(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
+    fn train_interval(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
         // A run that goes on from where memory was out has that before it.
         self.control()?;
         self.train_steps(until, reports)?;
@@ -109,7 +110,7 @@ impl Trainer {
 
     /// Trains up to `until`, to the next step after which something is due, or for about half a second.
     pub(super) fn train_steps(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
-        self.make_room_for_degree()?;
+        self.allocate_sh_degree()?;
         let (begin, mut next) = (Instant::now(), self.step + 1);
         let until = until.min(self.last_step());
         // Density control may change the number of Gaussians, and another SH degree their memory.
@@ -123,15 +124,17 @@ impl Trainer {
         let last = (next..until).find(changes).unwrap_or(until);
         let (mut in_flight, mut sent) = (VecDeque::new(), Ok(()));
         loop {
-            while sent.is_ok() && next <= last && in_flight.len() < self.submissions.pace.in_flight
+            while sent.is_ok()
+                && next <= last
+                && in_flight.len() < self.submissions.batching.in_flight
             {
                 let has_news = !(reports.is_empty() && in_flight.is_empty());
-                if has_news && begin.elapsed() > STRETCH {
+                if has_news && begin.elapsed() > REPORT_INTERVAL {
                     break;
                 }
-                let steps = next..=last.min(next + self.submissions.pace.steps() - 1);
+                let steps = next..=last.min(next + self.submissions.batching.steps() - 1);
                 // Where one cannot be sent, those before it still change the model.
-                sent = self.bring_and_submit(steps).map(|submitted| {
+                sent = self.load_and_submit(steps).map(|submitted| {
                     next = submitted.steps.end() + 1;
                     in_flight.push_back(submitted);
                 });
@@ -174,9 +177,9 @@ impl Trainer {
         Ok(())
     }
 
-    fn bring_and_submit(&mut self, steps: RangeInclusive<u64>) -> Result<Submitted> {
+    fn load_and_submit(&mut self, steps: RangeInclusive<u64>) -> Result<Submitted> {
         let first = *steps.start();
-        let fitting = self.supervision.views.bring(&self.config, steps)?;
+        let fitting = self.supervision.views.make_resident(&self.config, steps)?;
         self.submit(first..=fitting)
     }
 
@@ -219,13 +222,13 @@ impl Trainer {
         let Submitted { steps, at, log, status } = submitted;
         let (log, status) = (log.wait()?, Status::from_words(&status.wait()?));
         let count = steps.end() - steps.start() + 1;
-        self.submissions.pace.measure(at, count);
+        self.submissions.batching.measure(at, count);
         // The steps from the first failed one on have changed nothing.
         let done = log.iter().take(count as usize).take_while(|losses| losses.status == 0).count();
         // That flag goes up behind the loss: of the step before the first that saw it.
         let done = if status.gradient_not_finite { done.saturating_sub(1) } else { done };
         let milliseconds =
-            self.submissions.pace.step.as_secs_f64() * 1e3 * count as f64 / done.max(1) as f64;
+            self.submissions.batching.step.as_secs_f64() * 1e3 * count as f64 / done.max(1) as f64;
         let losses = steps.zip(&log[..done]);
         reports.extend(losses.map(|(step, losses)| self.report(step, losses, milliseconds)));
         self.step += done as u64;
@@ -248,9 +251,9 @@ impl Trainer {
                 Ok(())
             });
         }
-        if status.crowd > 0 {
+        if status.splats_per_tile > 0 {
             let view = format!("step {step}, view {}", view());
-            return Err(self.renderer.too_crowded(view, status.crowd));
+            return Err(self.renderer.too_many_splats(view, status.splats_per_tile));
         }
         let what = match losses.first_not_finite() {
             Some(term) => term.name,

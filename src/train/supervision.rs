@@ -18,7 +18,7 @@ use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::loss::exposure::Exposures;
 use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, TermInputs};
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::Scene;
+use crate::photographs::tone::SceneTone;
 use crate::splats::optimizer::{Adam, Learnable};
 use crate::splats::render::Renderer;
 use crate::splats::scene::{COLOR_CHANNELS, Features};
@@ -28,7 +28,7 @@ use crate::splats::scene::{COLOR_CHANNELS, Features};
 pub(super) struct Supervision {
     pub(super) views: Views,
     /// What the curves of the photographs have in common.
-    pub(super) scene: Scene,
+    pub(super) scene: SceneTone,
     pub(super) target_exposure: Option<TargetExposure>,
     pub(super) pseudo_gt: PseudoGt,
     /// The target of a step's view, (3, H, W),
@@ -125,11 +125,12 @@ impl Supervision {
         pass: &mut Recorder<'_>,
         adam: &Adam,
         step: u64,
-        settling_rate: f64,
+        cooldown_factor: f64,
         status: &Buffer<u32>,
     ) -> Result<()> {
-        self.learnables()
-            .try_for_each(|learnable| adam.update(pass, step, settling_rate, learnable, status))?;
+        self.learnables().try_for_each(|learnable| {
+            adam.update(pass, step, cooldown_factor, learnable, status)
+        })?;
         match &mut self.exposures {
             Some(exposures) => exposures.center(pass, status),
             None => Ok(()),

@@ -3,18 +3,20 @@
 use glam::{DVec2, UVec2};
 
 use super::Trainer;
-use super::measuring::{TargetExposure, lifted_from, measured};
+use super::measuring::{TargetExposure, measured, tone_map_source};
 use super::terms::NetworkTerms;
-use super::views::Shown;
+use super::views::ImageKind;
 use crate::Result;
-use crate::camera::{Camera, Frame};
+use crate::camera::{Camera, TrainingFrame};
 use crate::gpu::Gpu;
 use crate::loss::exposure::{Affine, Exposures};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::{Image, Mask};
 use crate::photographs::metrics::psnr_of_counted;
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{LuminanceHistogram, Measured, Scene, ToneSettings, is_black};
+use crate::photographs::tone::{
+    LuminanceHistogram, MeasuredPhotograph, SceneTone, ToneSettings, is_black,
+};
 
 use super::rendered::Rendered;
 
@@ -41,12 +43,12 @@ impl TargetViews {
     pub(super) fn new<'a>(
         pseudo_gt: &PseudoGt,
         views: impl IntoIterator<Item = &'a View>,
-        frame: &Frame,
-        scene: &Scene,
+        frame: &TrainingFrame,
+        scene: &SceneTone,
     ) -> Result<Self> {
-        let (mut shown, lift_first) = (vec![], pseudo_gt.settings().lift_first);
+        let (mut shown, full_resolution) = (vec![], pseudo_gt.settings().full_resolution);
         for view in views {
-            let Some(photograph) = lifted_from(view, lift_first)? else { continue };
+            let Some(photograph) = tone_map_source(view, full_resolution)? else { continue };
             let counted = view.counted(&photograph);
             if counted.is_empty() || is_black(&LuminanceHistogram::of(&counted)) {
                 let name = &view.name;
@@ -70,8 +72,8 @@ impl TargetViews {
     pub(super) fn probes(
         pseudo_gt: &PseudoGt,
         dataset: &Dataset,
-        frame: &Frame,
-        scene: &Scene,
+        frame: &TrainingFrame,
+        scene: &SceneTone,
         [count, pixels]: [usize; 2],
     ) -> Result<Self> {
         let views: Vec<&View> =
@@ -140,11 +142,11 @@ fn target_of(
     pseudo_gt: &PseudoGt,
     view: &View,
     photograph: &Image,
-    scene: &Scene,
+    scene: &SceneTone,
 ) -> Result<Image> {
-    let measured = Measured::of(&view.counted(photograph)).seen_by(&view.camera);
-    let lift = pseudo_gt.settings().lift(scene, &measured);
-    let target = pseudo_gt.lifted(photograph, &lift)?;
+    let measured = MeasuredPhotograph::of(&view.counted(photograph)).seen_by(&view.camera);
+    let tone_mapping = pseudo_gt.settings().tone_mapping(scene, &measured);
+    let target = pseudo_gt.tone_mapped(photograph, &tone_mapping)?;
     Ok(target.resized(view.camera.width, view.camera.height))
 }
 
@@ -153,7 +155,7 @@ fn target_of(
 #[derive(Debug)]
 pub struct TestTargets {
     pseudo_gt: PseudoGt,
-    scene: Scene,
+    scene: SceneTone,
 }
 
 impl TestTargets {
@@ -171,7 +173,7 @@ impl TestTargets {
     ///
     /// # Errors
     /// The device is out of memory.
-    pub fn in_scene(gpu: &Gpu, tone: &ToneSettings, scene: &Scene) -> Result<Self> {
+    pub fn in_scene(gpu: &Gpu, tone: &ToneSettings, scene: &SceneTone) -> Result<Self> {
         Ok(Self { pseudo_gt: PseudoGt::new(gpu, tone)?, scene: scene.clone() })
     }
 
@@ -180,7 +182,7 @@ impl TestTargets {
     /// # Errors
     /// The photograph can no longer be read, or the device is out of memory or lost.
     pub fn of(&mut self, view: &View) -> Result<Option<Image>> {
-        let photograph = lifted_from(view, self.pseudo_gt.settings().lift_first)?;
+        let photograph = tone_map_source(view, self.pseudo_gt.settings().full_resolution)?;
         let target = |photograph| target_of(&self.pseudo_gt, view, photograph, &self.scene);
         photograph.as_deref().map(target).transpose()
     }
@@ -188,7 +190,7 @@ impl TestTargets {
 
 impl Trainer {
     /// What the curves of the training photographs have in common, for [`TestTargets::in_scene`].
-    pub(crate) fn scene(&self) -> &Scene {
+    pub(crate) fn scene(&self) -> &SceneTone {
         &self.supervision.scene
     }
 
@@ -225,9 +227,9 @@ impl Trainer {
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub(crate) fn leave_out_what_gains_nothing(&mut self) -> Result<()> {
+    pub(crate) fn drop_unused_degree(&mut self) -> Result<()> {
         /// Less on few views, dB, is chance.
-        const LEAST_GAIN: f64 = 0.05;
+        const MIN_GAIN: f64 = 0.05;
         if !self.supervision.networks.as_ref().is_some_and(NetworkTerms::follow_target) {
             return Ok(());
         }
@@ -243,7 +245,7 @@ impl Trainer {
         };
         let Some([colors, denoised]) = scores else { return Ok(()) };
         let gain = denoised - colors;
-        if gain >= LEAST_GAIN {
+        if gain >= MIN_GAIN {
             tracing::info!("the denoiser gains {gain:.2} dB on targets");
             return Ok(());
         }
@@ -265,7 +267,7 @@ impl Trainer {
                 &self.gpu,
                 &self.supervision.pseudo_gt,
                 views,
-                Shown::Targets,
+                ImageKind::Targets,
             )?;
             let UVec2 { x: width, y: height } = view.size();
             let target = Image { width, height, data: target.concat() };

@@ -9,11 +9,11 @@ use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ssim::RADIUS;
 use crate::loss::{
-    DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Gradient, Interior,
-    LogSlot, Loss, LossInputs, LossSettings, Term, TermInputs,
+    DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Gradient, LogSlot, Loss,
+    LossInputs, LossRegion, LossSettings, Term, TermInputs,
 };
-use crate::networks::window::Window;
-use crate::networks::{Denoiser, Form};
+use crate::networks::crop::PaddedCrop;
+use crate::networks::{Denoiser, NetworkVariant};
 use crate::splats::scene::{COLOR_CHANNELS, Feature};
 use crate::{Error, Result};
 
@@ -32,14 +32,14 @@ pub(super) struct Photographs<'a> {
 #[derive(Debug)]
 pub(super) struct NetworkTerms {
     pub(super) networks: Networks,
-    form: Form,
+    variant: NetworkVariant,
     /// Side of the random crop in pixels; 0: the whole view.
     crop: u32,
     crops: Stream,
     denoising: DenoisingLoss,
     low: Loss,
     /// None where no view has a mask.
-    masking: Option<WindowMask>,
+    masking: Option<CropMask>,
     /// Of the window, (3, h, w) each: inputs, then gradients.
     illumination: Buffer<f32>,
     /// What an output is held to.
@@ -54,13 +54,13 @@ pub(super) struct NetworkTerms {
 
 /// The mask of a window.
 #[derive(Debug)]
-struct WindowMask {
+struct CropMask {
     masking: Masking,
     /// (h, w)
     weights: Buffer<f32>,
 }
 
-impl WindowMask {
+impl CropMask {
     /// As [`Masking::shown`].
     fn shown(
         &mut self,
@@ -98,7 +98,7 @@ impl NetworkTerms {
         let networks = Networks::new(gpu, &config.model, config.model.features(), seed)?;
         let empty = |name| gpu.uninit(name, 0);
         let mut terms = Self {
-            form: config.model.network.form,
+            variant: config.model.network.variant,
             crop: *denoiser_crop,
             crops: Stream::new(config.seed, streams::CROPS),
             denoising: DenoisingLoss::new(
@@ -117,21 +117,21 @@ impl NetworkTerms {
                 },
             )?,
             masking: None,
-            illumination: empty("window_illumination")?,
-            photograph: empty("window_photograph")?,
-            d_colors: empty("d_window_colors")?,
-            d_denoised: empty("d_window_denoised")?,
-            d_noise: empty("d_window_noise")?,
-            d_illumination: empty("d_window_illumination")?,
-            d_output: empty("d_window_output")?,
+            illumination: empty("crop_illumination")?,
+            photograph: empty("crop_photograph")?,
+            d_colors: empty("d_crop_colors")?,
+            d_denoised: empty("d_crop_denoised")?,
+            d_noise: empty("d_crop_noise")?,
+            d_illumination: empty("d_crop_illumination")?,
+            d_output: empty("d_crop_output")?,
             networks,
         };
         sizes.iter().try_for_each(|&size| terms.reserve(gpu, size))?;
         if is_masked {
             let values = terms.photograph.len();
-            terms.masking = Some(WindowMask {
+            terms.masking = Some(CropMask {
                 masking: Masking::new(gpu, values)?,
-                weights: gpu.uninit("window_mask", values / COLOR_CHANNELS)?,
+                weights: gpu.uninit("crop_mask", values / COLOR_CHANNELS)?,
             });
         }
         Ok(Some(terms))
@@ -143,16 +143,17 @@ impl NetworkTerms {
     /// # Errors
     /// The device was lost.
     pub(super) fn keep_activations(&mut self, sizes: &[UVec2], most: u64) -> Result<()> {
-        let windows: Vec<UVec2> = sizes.iter().map(|&size| self.most_of(size)).collect();
+        let crops: Vec<UVec2> = sizes.iter().map(|&size| self.max_of(size)).collect();
         let Some(denoiser) = &mut self.networks.denoiser else { return Ok(()) };
-        let mut kept = windows.into_iter().map(|window| denoiser.keep_activations(window, most));
+        let mut kept =
+            crops.into_iter().map(|padded_crop| denoiser.keep_activations(padded_crop, most));
         let are_kept = kept.try_fold(true, |all, kept| Ok::<_, Error>(all & kept?))?;
         tracing::debug!("activations of every stage of the denoiser are kept: {are_kept}");
         Ok(())
     }
 
     /// The largest window of a view of `size`.
-    fn most_of(&self, size: UVec2) -> UVec2 {
+    fn max_of(&self, size: UVec2) -> UVec2 {
         match self.crop {
             0 => size,
             crop => size.min(UVec2::splat(crop.saturating_add(2 * self.margin()))),
@@ -161,7 +162,7 @@ impl NetworkTerms {
 
     /// Memory for the windows of views of `size`.
     fn reserve(&mut self, gpu: &Gpu, size: UVec2) -> Result<()> {
-        let size = self.most_of(size);
+        let size = self.max_of(size);
         self.networks.reserve(size)?;
         self.denoising.reserve(size)?;
         self.low.reserve(size)?;
@@ -192,7 +193,7 @@ impl NetworkTerms {
 
     /// Whether a network is held to the targets.
     pub(super) fn follow_target(&self) -> bool {
-        self.form == Form::Identity && self.networks.has_denoiser()
+        self.variant == NetworkVariant::Identity && self.networks.has_denoiser()
     }
 
     /// Records the networks' step: adds to `dL/dR_0` and writes the planes of noise and illumination in `d_render`,
@@ -205,45 +206,44 @@ impl NetworkTerms {
         d_render: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
-        let window = match self.crop {
-            0 => Window::whole(inputs.size),
-            crop => Window::random(inputs.size, crop, self.margin(), &self.crops, inputs.step),
+        let padded_crop = match self.crop {
+            0 => PaddedCrop::whole(inputs.size),
+            crop => PaddedCrop::random(inputs.size, crop, self.margin(), &self.crops, inputs.step),
         };
-        self.networks.denoise(pass, inputs.render, inputs.size, &window)?;
-        if let Some((mask, WindowMask { weights, .. })) =
-            photographs.mask.zip(self.masking.as_mut())
+        self.networks.denoise(pass, inputs.render, inputs.size, &padded_crop)?;
+        if let Some((mask, CropMask { weights, .. })) = photographs.mask.zip(self.masking.as_mut())
         {
-            self.networks.windows.gather(pass, mask, inputs.size, 0..1, &window, weights)?;
+            self.networks.crops.gather(pass, mask, inputs.size, 0..1, &padded_crop, weights)?;
         }
-        match self.form {
-            Form::Identity => {
+        match self.variant {
+            NetworkVariant::Identity => {
                 // What the denoiser learns is its own: the render stays what it would be without it.
-                self.record_denoising(pass, &window, photographs, inputs.size, log)?;
-                self.denoise_backward(pass, &window, inputs, d_render)?;
+                self.record_denoising(pass, &padded_crop, photographs, inputs.size, log)?;
+                self.denoise_backward(pass, &padded_crop, inputs, d_render)?;
                 pass.fill(&mut self.d_colors, 0);
-                self.record_low(pass, &window, inputs, photographs, d_render, log)?;
+                self.record_low(pass, &padded_crop, inputs, photographs, d_render, log)?;
             }
-            Form::Paper => {
+            NetworkVariant::Paper => {
                 pass.fill(&mut self.d_colors, 0);
-                self.record_denoising(pass, &window, photographs, inputs.size, log)?;
-                self.record_low(pass, &window, inputs, photographs, d_render, log)?;
-                self.denoise_backward(pass, &window, inputs, d_render)?;
+                self.record_denoising(pass, &padded_crop, photographs, inputs.size, log)?;
+                self.record_low(pass, &padded_crop, inputs, photographs, d_render, log)?;
+                self.denoise_backward(pass, &padded_crop, inputs, d_render)?;
             }
         }
-        let windows = &self.networks.windows;
-        windows.scatter(pass, &self.d_colors, &window, 0..COLOR_CHANNELS, inputs.size, d_render)
+        let crops = &self.networks.crops;
+        crops.scatter(pass, &self.d_colors, &padded_crop, 0..COLOR_CHANNELS, inputs.size, d_render)
     }
 
     /// R_K against the target, in the paper's form against R_0.
     fn record_denoising(
         &mut self,
         pass: &mut Recorder<'_>,
-        window: &Window,
+        padded_crop: &PaddedCrop,
         photographs: Photographs<'_>,
         size: UVec2,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
-        let Networks { denoiser: Some(denoiser), windows, colors, .. } = &self.networks else {
+        let Networks { denoiser: Some(denoiser), crops, colors, .. } = &self.networks else {
             return Ok(());
         };
         if !self.denoising.is_on() {
@@ -251,25 +251,25 @@ impl NetworkTerms {
             pass.fill(&mut self.d_colors, 0);
             return Ok(());
         }
-        let held_to = match self.form {
-            Form::Identity => {
+        let held_to = match self.variant {
+            NetworkVariant::Identity => {
                 let own = &mut self.photograph;
                 let target = photographs.target;
-                windows.gather(pass, target, size, 0..COLOR_CHANNELS, window, own)?;
+                crops.gather(pass, target, size, 0..COLOR_CHANNELS, padded_crop, own)?;
                 &*own
             }
-            Form::Paper => colors,
+            NetworkVariant::Paper => colors,
         };
         let mut mask = self.masking.as_mut().filter(|_| photographs.mask.is_some());
         let denoised = match &mut mask {
-            Some(mask) => mask.shown(pass, window.size, denoiser.denoised(), held_to)?,
+            Some(mask) => mask.shown(pass, padded_crop.size, denoiser.denoised(), held_to)?,
             None => denoiser.denoised(),
         };
         self.denoising.record(
             pass,
             DenoisingInputs {
-                size: window.size,
-                interior: interior(window),
+                size: padded_crop.size,
+                loss_region: loss_region(padded_crop),
                 denoised,
                 render: held_to,
             },
@@ -277,24 +277,24 @@ impl NetworkTerms {
             log,
         )?;
         let Some(mask) = mask else { return Ok(()) };
-        mask.hide(pass, window.size, &mut self.d_denoised)?;
-        mask.hide(pass, window.size, &mut self.d_colors)
+        mask.hide(pass, padded_crop.size, &mut self.d_denoised)?;
+        mask.hide(pass, padded_crop.size, &mut self.d_colors)
     }
 
     /// From `dL/dR_K` to the noise map, and to R_0 in `d_colors`.
     fn denoise_backward(
         &mut self,
         pass: &mut Recorder<'_>,
-        window: &Window,
+        padded_crop: &PaddedCrop,
         &TermInputs { size, features, .. }: &TermInputs<'_>,
         d_render: &mut Buffer<f32>,
     ) -> Result<()> {
-        let Networks { denoiser, windows, colors, noise, .. } = &mut self.networks;
+        let Networks { denoiser, crops, colors, noise, .. } = &mut self.networks;
         let Some(denoiser) = denoiser else { return Ok(()) };
         let planes = features.channels_of(Feature::Noise);
         denoiser.backward(
             pass,
-            window.size,
+            padded_crop.size,
             if planes.is_some() { noise } else { colors },
             colors,
             &self.d_denoised,
@@ -302,7 +302,7 @@ impl NetworkTerms {
             &mut self.d_colors,
         )?;
         match planes {
-            Some(planes) => windows.scatter(pass, &self.d_noise, window, planes, size, d_render),
+            Some(planes) => crops.scatter(pass, &self.d_noise, padded_crop, planes, size, d_render),
             None => Ok(()),
         }
     }
@@ -311,23 +311,23 @@ impl NetworkTerms {
     fn record_low(
         &mut self,
         pass: &mut Recorder<'_>,
-        window: &Window,
+        padded_crop: &PaddedCrop,
         &TermInputs { size: whole, features, render, .. }: &TermInputs<'_>,
         Photographs { mask, low, .. }: Photographs<'_>,
         d_render: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
-        let size = window.size;
-        let Networks { denoiser, tonemapper, windows, colors, .. } = &mut self.networks;
+        let size = padded_crop.size;
+        let Networks { denoiser, tonemapper, crops, colors, .. } = &mut self.networks;
         let Some((tonemapper, planes)) =
             tonemapper.as_mut().zip(features.channels_of(Feature::Illumination))
         else {
             return Ok(());
         };
-        windows.gather(pass, render, whole, planes.clone(), window, &mut self.illumination)?;
-        windows.gather(pass, low, whole, 0..COLOR_CHANNELS, window, &mut self.photograph)?;
+        crops.gather(pass, render, whole, planes.clone(), padded_crop, &mut self.illumination)?;
+        crops.gather(pass, low, whole, 0..COLOR_CHANNELS, padded_crop, &mut self.photograph)?;
         let (denoised, d_denoised) = match denoiser.as_ref() {
-            Some(denoiser) if self.form == Form::Paper => {
+            Some(denoiser) if self.variant == NetworkVariant::Paper => {
                 (denoiser.denoised(), &mut self.d_denoised)
             }
             _ => (&*colors, &mut self.d_colors),
@@ -342,7 +342,7 @@ impl NetworkTerms {
             pass,
             LossInputs {
                 size,
-                interior: interior(window),
+                loss_region: loss_region(padded_crop),
                 render: output,
                 target: &self.photograph,
             },
@@ -362,11 +362,11 @@ impl NetworkTerms {
             d_illumination,
             d_denoised,
         )?;
-        windows.scatter(pass, d_illumination, window, planes, whole, d_render)
+        crops.scatter(pass, d_illumination, padded_crop, planes, whole, d_render)
     }
 }
 
 /// The pixels of a window that the terms count.
-fn interior(window: &Window) -> Interior {
-    Interior { origin: window.crop_origin, size: window.crop_size }
+fn loss_region(padded_crop: &PaddedCrop) -> LossRegion {
+    LossRegion { origin: padded_crop.crop_origin, size: padded_crop.crop_size }
 }

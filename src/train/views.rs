@@ -12,14 +12,14 @@ use super::epochs::Epochs;
 use super::measuring::{TargetExposure, measured, photographs};
 use super::precision::Encoder;
 use crate::Result;
-use crate::camera::{Frame, Patch};
+use crate::camera::{Patch, TrainingFrame};
 use crate::gpu::{Buffer, Download, Gpu, Recorder};
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
 use crate::photographs::dataset::Dataset;
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::Scene;
+use crate::photographs::tone::SceneTone;
 use crate::splats::render::{Viewpoint, Viewpoints};
 use crate::splats::scene::COLOR_CHANNELS;
 
@@ -84,9 +84,9 @@ impl Views {
         gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         dataset: &Dataset,
-        frame: &Frame,
+        frame: &TrainingFrame,
         config: &TrainConfig,
-    ) -> Result<(Self, Scene, Option<TargetExposure>)> {
+    ) -> Result<(Self, SceneTone, Option<TargetExposure>)> {
         let settings = pseudo_gt.settings().clone();
         let keeps_photographs = config.model.denoiser || config.model.tonemapper;
         let (scene, measured) = measured(&settings, dataset)?;
@@ -97,18 +97,19 @@ impl Views {
         views.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
         let (mut gains, mut curves) = (BTreeMap::new(), vec![]);
         for (place, ((index, view), measured)) in photographs(dataset).zip(&measured).enumerate() {
-            let lift = settings.lift(&scene, measured);
-            gains.extend(lift.gain.map(|gain| (view.name.clone(), gain)));
-            curves.push(lift.parameters);
+            let tone_mapping = settings.tone_mapping(&scene, measured);
+            gains.extend(tone_mapping.gain.map(|gain| (view.name.clone(), gain)));
+            curves.push(tone_mapping.parameters);
             let Some(image) = view.loaded()? else { continue };
             let own = UVec2::new(image.width, image.height);
             let sizes = (0..views.len()).map(|level| shrunk(own, level as u32));
             let sizes: Vec<UVec2> = sizes.collect();
             // What is trained on at its own size gets its curve in every step.
-            let own = view.own_size().filter(|_| settings.lift_first);
+            let own = view.own_size().filter(|_| settings.full_resolution);
             let is_larger = own.filter(|own| sizes.iter().any(|size| size != own));
             let whole = if is_larger.is_some() { view.photograph()? } else { None };
-            let whole = whole.map(|whole| pseudo_gt.lifted(&whole, &lift)).transpose()?;
+            let whole =
+                whole.map(|whole| pseudo_gt.tone_mapped(&whole, &tone_mapping)).transpose()?;
             for (views, size) in views.iter_mut().zip(sizes) {
                 let resized = |whole: &Image| view.blacked_out(whole.resized(size.x, size.y));
                 let camera = frame.camera(&view.camera).resized(size.x, size.y);
@@ -116,7 +117,7 @@ impl Views {
                 let is_as_loaded =
                     size == UVec2::new(image.width, image.height) && patches.len() == 1;
                 let depth = view.depth.as_ref().filter(|_| !is_as_loaded);
-                let print = Print {
+                let print = LevelImage {
                     name: &view.name,
                     place,
                     index,
@@ -152,7 +153,7 @@ impl Views {
     ///
     /// # Errors
     /// Photographs that wait in a file cannot be read, or the device is out of memory or lost.
-    pub(super) fn bring(
+    pub(super) fn make_resident(
         &mut self,
         config: &TrainConfig,
         steps: RangeInclusive<u64>,
@@ -177,7 +178,7 @@ impl Views {
             }
             last = step;
         }
-        self.cache.bring(&wanted)?;
+        self.cache.make_resident(&wanted)?;
         Ok(last)
     }
 
@@ -236,13 +237,13 @@ impl Views {
         gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         views: &[TrainView],
-        shown: Shown,
+        kind: ImageKind,
     ) -> Result<Vec<Vec<f32>>> {
         let (mut stored, mut scratch) = (vec![], vec![]);
         for view in views {
-            let slot = view.photograph.filter(|_| shown == Shown::Photographs);
+            let slot = view.photograph.filter(|_| kind == ImageKind::Photographs);
             let photograph = self.cache.load(slot.unwrap_or(view.stored))?;
-            let curve = self.curve(view).filter(|_| shown == Shown::Targets);
+            let curve = self.curve(view).filter(|_| kind == ImageKind::Targets);
             scratch.push(gpu.uninit("target", photograph.value_count)?);
             stored.push((photograph, curve));
         }
@@ -324,7 +325,7 @@ impl Views {
     }
 
     /// How many floats the largest view has.
-    pub(super) fn most_values(&self) -> usize {
+    pub(super) fn largest_view_values(&self) -> usize {
         let values = |view: &TrainView| COLOR_CHANNELS * view.size().element_product() as usize;
         self.all().map(values).max().unwrap_or_default()
     }
@@ -347,7 +348,7 @@ impl Views {
 
 /// What is looked at of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Shown {
+pub(super) enum ImageKind {
     /// What it is held to.
     Targets,
     /// What it was made of; only where that is kept.
@@ -355,7 +356,7 @@ pub(super) enum Shown {
 }
 
 /// A photograph at the size of a level.
-struct Print<'a> {
+struct LevelImage<'a> {
     name: &'a str,
     place: usize,
     index: usize,
@@ -368,7 +369,7 @@ struct Print<'a> {
     depth: Option<Vec<f32>>,
 }
 
-impl Print<'_> {
+impl LevelImage<'_> {
     fn view(&self, patch: Patch, encoder: &mut Encoder, cache: &mut Cache) -> Result<TrainView> {
         let mut upload =
             |name, image: &Image| cache.keep(encoder.upload(name, &patch.cut(&image.data))?);

@@ -29,9 +29,9 @@ fn json_holds_every_requirement_of_every_device_and_the_choice() {
 #[test]
 fn a_schedulers_variables_that_name_no_device_are_one_line() {
     for (variable, value) in [("CUDA_VISIBLE_DEVICES", "99"), ("ROCR_VISIBLE_DEVICES", "GPU-ff")] {
-        let said = [&format!("{variable}={value}"), "which Vulkan does not have", "--device"];
+        let message = [&format!("{variable}={value}"), "which Vulkan does not have", "--device"];
         for command in ["doctor", "bench"] {
-            refused_with(command, &[(variable, value)], 4, &said.map(|part| part as &str));
+            refused_with(command, &[(variable, value)], 4, &message.map(|part| part as &str));
         }
     }
     for choice in ["uuid:fedcba98", "pci:ffff:ff:1f.7", "no such device"] {
@@ -47,9 +47,9 @@ fn a_subgroup_that_the_device_does_not_have_is_one_line_with_those_that_it_has()
     let chosen = &printed["devices"][printed["chosen"].as_u64().unwrap() as usize];
     let sizes = chosen["subgroup_sizes"].as_array().unwrap();
     assert!(sizes.contains(&chosen["subgroup_size"]), "{chosen}");
-    let said =
+    let message =
         ["NIGHTSPLAT_SUBGROUP on", "`48` is no size", &format!("{} lanes", sizes.last().unwrap())];
-    refused_with("bench", &[("NIGHTSPLAT_SUBGROUP", "48")], 2, &said);
+    refused_with("bench", &[("NIGHTSPLAT_SUBGROUP", "48")], 2, &message);
 }
 
 #[test]

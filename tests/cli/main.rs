@@ -97,11 +97,20 @@ fn a_run_directory_has_its_four_files_and_metrics_their_shape() {
     }
     assert!(file_names(&run).iter().all(|name| !name.ends_with(".partial")));
     let metrics = json(run.join("metrics.json"));
-    let leftover = "leftover_transmittance";
-    let known = ["mean", "views", "seconds", "gaussians", "steps", leftover, "spent", "ended"];
+    let residual_transmittance = "residual_transmittance";
+    let known = [
+        "mean",
+        "views",
+        "seconds",
+        "gaussians",
+        "steps",
+        residual_transmittance,
+        "spent",
+        "ended",
+    ];
     assert_eq!(keys(&metrics), known);
-    assert_eq!(keys(&metrics[leftover]), ["mean", "views"]);
-    assert_eq!(keys(&metrics[leftover]["views"]["008"]), ["mean", "q99"]);
+    assert_eq!(keys(&metrics[residual_transmittance]), ["mean", "views"]);
+    assert_eq!(keys(&metrics[residual_transmittance]["views"]["008"]), ["mean", "q99"]);
     assert_eq!(keys(&metrics["mean"]), ["psnr", "psnr_channel_mean", "ssim"]);
     assert_eq!(keys(&metrics["views"]), ["000", "008"]);
     assert_eq!(keys(&metrics["views"]["008"]), ["psnr", "psnr_channel_mean", "ssim"]);
@@ -211,8 +220,8 @@ fn eval_scores_lpips_where_it_is_given_the_weights() {
         let of = |name: &str| scores["views"][name][key].as_f64().unwrap();
         let mean = scores["mean"][key].as_f64().unwrap();
         assert!((mean - (of("000") + of("008")) / 2.0).abs() < 1e-12 && mean > 0.0, "{scores}");
-        let said = serde_json::json!({ "network": network.name(), "range": range, "key": key });
-        assert_eq!(scores["lpips"], said);
+        let message = serde_json::json!({ "network": network.name(), "range": range, "key": key });
+        assert_eq!(scores["lpips"], message);
         let keys = keys(&scores["mean"]);
         assert_eq!(keys.iter().filter(|key| key.starts_with("lpips")).count(), 1, "{keys:?}");
         let table = succeed(&eval);
@@ -236,10 +245,10 @@ fn a_set_without_references_and_photographs_of_test_views_scores_nothing() {
     let (root, run) = (set.path().display(), set.path().join("run"));
     succeed(&format!("train {root} --out {} --steps 2", run.display()));
     assert_eq!(json(run.join("metrics.json"))["mean"], Value::Null);
-    let (printed, said) = common::command::run(&format!("eval {} --json", run.display()), 0);
+    let (printed, message) = common::command::run(&format!("eval {} --json", run.display()), 0);
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!((&printed["mean"], keys(&printed["views"]).len()), (&Value::Null, 0));
-    assert!(said.contains("no test view has a reference image or a photograph"), "{said}");
+    assert!(message.contains("no test view has a reference image or a photograph"), "{message}");
     assert_eq!(succeed(&format!("eval {}", run.display())).lines().count(), 1);
 }
 

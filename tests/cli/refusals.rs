@@ -191,7 +191,7 @@ fn every_setting_is_explained_with_who_says_it_and_nothing_is_trained() {
         let train = format!("train {} --out {} --explain", fixture().set(), run.display());
         crate::common::command::run(&format!("{train} {options}"), 0).0
     };
-    let said = explained("--preset draft --seed 4 --set stop.margin=1");
+    let message = explained("--preset draft --seed 4 --set stop.margin=1");
     for line in [
         "steps = 400  (preset draft)\n",
         "seed = 4  (--seed)\n",
@@ -199,13 +199,14 @@ fn every_setting_is_explained_with_who_says_it_and_nothing_is_trained() {
         "exposure.learn = \"off\"  (plan)\n",
         "ssim_weight = 0.2  (default)\n    Weight of 1 - SSIM",
     ] {
-        assert!(said.contains(line), "no {line} in {said}");
+        assert!(message.contains(line), "no {line} in {message}");
     }
-    let said = explained(&format!("--preset draft --config {} --steps 5", file.display()));
-    assert!(said.contains(&format!("near = 0.2  ({})\n", file.display())), "{said}");
+    let message = explained(&format!("--preset draft --config {} --steps 5", file.display()));
+    assert!(message.contains(&format!("near = 0.2  ({})\n", file.display())), "{message}");
     assert!(
-        said.contains("steps = 5  (--steps)\n") && said.contains("sh_degree = 0  (preset draft)"),
-        "{said}"
+        message.contains("steps = 5  (--steps)\n")
+            && message.contains("sh_degree = 0  (preset draft)"),
+        "{message}"
     );
     assert!(!run.exists());
 }

@@ -74,7 +74,7 @@ fn every_input_of_the_table_is_named_once() {
 }
 
 /// Beyond so many Gaussians times pixels the whole render is not compared in f64, which goes through all of them.
-const MOST_FRAGMENTS: usize = 40_000_000;
+const MAX_FRAGMENTS: usize = 40_000_000;
 
 /// What came of a case.
 struct Row {
@@ -198,7 +198,7 @@ impl Case {
         } else if !largest(&after.parameters).is_finite() && largest(&before.parameters).is_finite()
         {
             Some("a parameter became what is not finite".to_owned())
-        } else if !row.render_error.is_none_or(|error| error <= MOST_RENDER_ERROR) {
+        } else if !row.render_error.is_none_or(|error| error <= MAX_RENDER_ERROR) {
             Some(format!("the render is off by {:?}", row.render_error))
         } else {
             match self.expect {
@@ -217,7 +217,7 @@ impl Case {
 }
 
 /// A splat whose alpha lies at 1/255 may count or not, and two may.
-const MOST_RENDER_ERROR: f64 = 2.0 / 255.0;
+const MAX_RENDER_ERROR: f64 = 2.0 / 255.0;
 
 /// Every parameter of some Gaussians.
 fn of_gaussians(gaussians: &Gaussians, wanted: &Range<usize>) -> Vec<f32> {
@@ -238,7 +238,7 @@ fn render_error(
     gaussians: &Gaussians,
 ) -> nightsplat::Result<Option<f64>> {
     let pixels = camera.width as usize * camera.height as usize;
-    if gaussians.count * pixels > MOST_FRAGMENTS {
+    if gaussians.count * pixels > MAX_FRAGMENTS {
         return Ok(None);
     }
     let render = trainer.render(camera)?.colors;

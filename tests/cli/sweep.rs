@@ -184,10 +184,10 @@ fn a_sweep_killed_twice_ends_as_one_that_a_scheduler_ran() {
 #[test]
 fn a_point_that_fails_is_reported_and_the_others_finish() {
     let sweep = Sweep::new("--steps 2 --grid device=\"\",voodoo,0");
-    let (shown, said) = run(&sweep.arguments, 1);
+    let (shown, message) = run(&sweep.arguments, 1);
     assert!(shown.contains("voodoo"), "{shown}");
     for part in ["device=voodoo failed", "there are: ", "error: 1 of 3 points failed", "log.txt"] {
-        assert!(said.contains(part), "no `{part}` in: {said}");
+        assert!(message.contains(part), "no `{part}` in: {message}");
     }
     let [csv, markdown, html] = sweep.leaderboard();
     assert_eq!(csv.lines().filter(|line| line.ends_with(",1")).count(), 2, "{csv}");
@@ -278,8 +278,8 @@ fn misuse_is_refused_before_anything_is_trained() {
     refused("--curves all --reference nowhere", 3, &["nowhere"]);
     let nowhere = tempfile::tempdir().unwrap().path().join("set");
     let arguments = format!("sweep {0} --out {0}/out --curves all", nowhere.display());
-    let (_, said) = run(&arguments, 3);
-    assert!(said.contains("is not a folder") && !nowhere.exists(), "{said}");
+    let (_, message) = run(&arguments, 3);
+    assert!(message.contains("is not a folder") && !nowhere.exists(), "{message}");
 
     // A set of one photograph has none to score.
     let one = tempfile::tempdir().unwrap();
@@ -291,8 +291,8 @@ fn misuse_is_refused_before_anything_is_trained() {
         fs::write(path, list.to_string()).unwrap();
     }
     let sweep = Sweep::of(one.path(), "--steps 2 --curves ap3");
-    let (_, said) = run(&sweep.arguments, 3);
-    let line = said.lines().last().unwrap();
+    let (_, message) = run(&sweep.arguments, 3);
+    let line = message.lines().last().unwrap();
     assert!(line.contains(one.path().to_str().unwrap()), "{line}");
     assert!(line.contains("no held-out view to score"), "{line}");
     assert!(!sweep.path("sweep.toml").exists());
@@ -404,8 +404,8 @@ fn train_sets_any_setting_by_its_path() {
     let folder = tempfile::tempdir().unwrap();
     let (set, out) = (set().display(), folder.path().join("run"));
     let train = format!("train {set} --out {}", out.display());
-    let (_, said) = run(&format!("{train} --set density.grad=1"), 2);
-    assert!(said.contains("density.grad") && said.contains("nearest"), "{said}");
+    let (_, message) = run(&format!("{train} --set density.grad=1"), 2);
+    assert!(message.contains("density.grad") && message.contains("nearest"), "{message}");
     run(&format!("{train} --steps 9 --set steps=1 --set tone.alpha=0.2 --set background=black"), 0);
     let config = fs::read_to_string(out.join("config.toml")).unwrap();
     for line in

@@ -129,18 +129,18 @@ fn a_file_of_another_driver_and_a_damaged_one_are_ignored_with_one_line() {
     let mut other = tuning(unusual());
     other["driver"] = json!("of another year");
     place.write(&other);
-    let said = |run: &str, part: &str| {
+    let message = |run: &str, part: &str| {
         let (stderr, tile) = place.train(run, "--steps 1");
         assert_eq!(tile, built_in(), "{stderr}");
         let lines: Vec<&str> = stderr.lines().filter(|line| line.contains("tiles.json")).collect();
         assert!(lines.len() == 1 && lines[0].contains(part), "{stderr}");
         assert!(lines[0].contains("bench --tune"), "{stderr}");
     };
-    said("driver", "of another year");
+    message("driver", "of another year");
     fs::write(place.path("tiles.json"), "{\"device\": ").unwrap();
-    said("damaged", "is damaged");
+    message("damaged", "is damaged");
     place.write(&tuning([3, 3].into()));
-    said("unsuitable", "3x3 tiles do not suit");
+    message("unsuitable", "3x3 tiles do not suit");
 }
 
 #[test]

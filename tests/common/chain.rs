@@ -124,7 +124,7 @@ impl<'a> Chain<'a> {
         let (channels, pixels, background) =
             (self.setup.channels(), self.setup.pixels(), self.background());
         let record = RECORD_HEAD as usize + channels;
-        let mut records = vec![0.0; record * ids.len()];
+        let mut gradient_records = vec![0.0; record * ids.len()];
         let mut results = Results {
             render: vec![0.0; channels * pixels],
             transmittances: vec![],
@@ -137,7 +137,7 @@ impl<'a> Chain<'a> {
         for (at, (center, d)) in self.pixels().enumerate() {
             let (values, transmittance) =
                 blend_pixel(&splats, &colors, &background, center, alpha_max);
-            let list = &mut records;
+            let list = &mut gradient_records;
             let (alpha, shaping) = (alpha_max, channels);
             blend_pixel_backward(&splats, &colors, &values, &d, center, alpha, shaping, list);
             for c in 0..channels {
@@ -148,7 +148,8 @@ impl<'a> Chain<'a> {
         }
         let planes = self.setup.planes();
         for (j, &i) in ids.iter().enumerate() {
-            let d_splat = self.d_splat(&records[record * j..][..record], &colors[channels * j..]);
+            let d_splat =
+                self.d_splat(&gradient_records[record * j..][..record], &colors[channels * j..]);
             let gaussian = planes.load(parameters, i);
             let degree = self.setup.options.sh_degree;
             let d = project_gaussian_backward(&camera, degree, &gaussian, &splats[j], &d_splat);

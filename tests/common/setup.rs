@@ -121,8 +121,8 @@ impl Setup {
         let margin = JACOBIAN_MARGIN * size;
         let model = match model {
             CameraModel::Pinhole => Model::Pinhole(Pinhole {
-                least_slope: -(principal_point + margin) / focal,
-                most_slope: (size - principal_point + margin) / focal,
+                min_slope: -(principal_point + margin) / focal,
+                max_slope: (size - principal_point + margin) / focal,
             }),
             CameraModel::Fisheye(lens) => Model::Fisheye(Fisheye {
                 distortion: lens.coefficients,

@@ -21,7 +21,7 @@ use nightsplat::splats::scene::Gaussians;
 fn a_borrowed_device_renders_the_same_and_comes_back_alive_and_clean() {
     // A device without the extension has its descriptors in sets, and the bits are the same.
     lend_and_take_back(&[]);
-    if gpu().properties().pushes_descriptors {
+    if gpu().properties().has_push_descriptors {
         lend_and_take_back(&[khr::push_descriptor::NAME]);
     }
 }
@@ -231,12 +231,12 @@ impl Host {
         unsafe {
             let buffer = self.device.create_buffer(&info, None).unwrap();
             let needed = self.device.get_buffer_memory_requirements(buffer);
-            let offered = self.instance.get_physical_device_memory_properties(self.physical);
+            let supported = self.instance.get_physical_device_memory_properties(self.physical);
             let suits = |&i: &u32| {
                 needed.memory_type_bits >> i & 1 == 1
-                    && offered.memory_types[i as usize].property_flags.contains(flags)
+                    && supported.memory_types[i as usize].property_flags.contains(flags)
             };
-            let index = (0..offered.memory_type_count).find(suits).unwrap();
+            let index = (0..supported.memory_type_count).find(suits).unwrap();
             let info = vk::MemoryAllocateInfo::default()
                 .allocation_size(needed.size)
                 .memory_type_index(index);

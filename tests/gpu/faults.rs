@@ -12,7 +12,7 @@ use nightsplat::gpu::testing::{allocations, fail_allocation, lose_at_submission}
 use nightsplat::gpu::{DeviceChoice, Gpu};
 use nightsplat::networks::Denoiser;
 use nightsplat::photographs::dataset::Dataset;
-use nightsplat::results::run::{self, Event, HeldRun, Trained};
+use nightsplat::results::run::{self, Event, IfExists, RunSummary};
 use nightsplat::splats::densify::DensityControl;
 use nightsplat::train::{MemoryEstimate, ModelConfig, Part, TrainConfig};
 
@@ -50,7 +50,7 @@ fn train(
     config: &TrainConfig,
     dataset: &Dataset,
     out: &Path,
-    held: HeldRun,
+    held: IfExists,
 ) -> (Option<Error>, u64) {
     let mut last = 0;
     let trained = run::train(gpu, config, dataset, out, held, |event| {
@@ -67,7 +67,7 @@ fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
     let folder = tempfile::tempdir().unwrap();
     let straight = folder.path().join("straight");
     fail_allocation(&gpu, 0);
-    assert!(train(&gpu, &config, &dataset, &straight, HeldRun::Refuse).0.is_none());
+    assert!(train(&gpu, &config, &dataset, &straight, IfExists::Refuse).0.is_none());
     let names = allocations(&gpu);
     let expected = std::fs::read(straight.join("model.ply")).unwrap();
     // The first and the last of every name.
@@ -88,7 +88,7 @@ fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
     for index in numbers {
         let (name, out) = (&names[index], folder.path().join(format!("run{index}")));
         fail_allocation(&gpu, index as u64 + 1);
-        let (error, last) = train(&gpu, &config, &dataset, &out, HeldRun::Refuse);
+        let (error, last) = train(&gpu, &config, &dataset, &out, IfExists::Refuse);
         let asked = allocations(&gpu).len();
         fail_allocation(&gpu, 0);
         let Some(error) = error else {
@@ -103,7 +103,7 @@ fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
         let is_saved = out.join("checkpoint.safetensors").exists();
         assert!(is_saved || last == 0, "{name} ({index}): {last} steps are lost");
         if is_saved {
-            let (again, _) = train(&gpu, &config, &dataset, &out, HeldRun::Resume);
+            let (again, _) = train(&gpu, &config, &dataset, &out, IfExists::Resume);
             assert!(again.is_none(), "{name} ({index}), {error}: {again:?}");
             let model = std::fs::read(out.join("model.ply")).unwrap();
             assert!(model == expected, "{name} ({index}), {error}: another model");
@@ -118,21 +118,21 @@ fn a_device_that_is_lost_anywhere_leaves_the_last_checkpoint_to_go_on_from() {
     let (dataset, config) = (dataset(5, [24, 20]), config());
     let folder = tempfile::tempdir().unwrap();
     let straight = folder.path().join("straight");
-    assert!(train(&gpu(), &config, &dataset, &straight, HeldRun::Refuse).0.is_none());
+    assert!(train(&gpu(), &config, &dataset, &straight, IfExists::Refuse).0.is_none());
     let expected = std::fs::read(straight.join("model.ply")).unwrap();
     let mut resumed = 0;
     for number in [1, 40, 80, 95, 105, 115, 125] {
         let out = folder.path().join(format!("run{number}"));
         let lost = gpu();
         lose_at_submission(&lost, number);
-        let (error, _) = train(&lost, &config, &dataset, &out, HeldRun::Refuse);
+        let (error, _) = train(&lost, &config, &dataset, &out, IfExists::Refuse);
         drop(lost);
         let Some(error) = error else { continue };
         assert!(matches!(error, Error::DeviceLost { .. }), "{number}: {error}");
         assert_eq!(error.exit_code(), 4);
         assert!(!out.join("done.json").exists() && !out.join("metrics.json").exists());
         if out.join("config.toml").exists() {
-            let (error, _) = train(&gpu(), &config, &dataset, &out, HeldRun::Resume);
+            let (error, _) = train(&gpu(), &config, &dataset, &out, IfExists::Resume);
             assert!(error.is_none(), "{number}: {error:?}");
             assert!(std::fs::read(out.join("model.ply")).unwrap() == expected, "{number}");
             resumed += 1;
@@ -142,7 +142,7 @@ fn a_device_that_is_lost_anywhere_leaves_the_last_checkpoint_to_go_on_from() {
 }
 
 /// A growing run on nine views, and what it said that it was going to take.
-fn foreseen(gpu: &Gpu, config: &TrainConfig) -> (MemoryEstimate, Trained) {
+fn foreseen(gpu: &Gpu, config: &TrainConfig) -> (MemoryEstimate, RunSummary) {
     let (dataset, folder) = (dataset(9, [100, 75]), tempfile::tempdir().unwrap());
     let mut foreseen = None;
     let observe = |event: Event<'_>| {
@@ -151,7 +151,7 @@ fn foreseen(gpu: &Gpu, config: &TrainConfig) -> (MemoryEstimate, Trained) {
         }
     };
     let out = folder.path().join("run");
-    let trained = run::train(gpu, config, &dataset, &out, HeldRun::Refuse, observe).unwrap();
+    let trained = run::train(gpu, config, &dataset, &out, IfExists::Refuse, observe).unwrap();
     (foreseen.unwrap(), trained)
 }
 
@@ -186,13 +186,13 @@ fn memory_is_foreseen_to_a_fifth() {
         config.model.network.stages = stages.max(1);
         let (own, trained) = foreseen(&gpu, &config);
         assert_eq!(trained.trainer.gaussian_count(), 9000);
-        assert_eq!(own.most_gaussians, 9000);
+        assert_eq!(own.peak_gaussians, 9000);
         let spent = &trained.spent;
-        let share = own.most_device as f64 / spent.device_bytes as f64;
+        let share = own.peak_device as f64 / spent.device_bytes as f64;
         assert!((0.8..=1.2).contains(&share), "{own:?}, and {spent:?} came");
         if let Some(host) = spent.host_bytes {
             // Other tests of this process have left their peak; what is foreseen is no less than what is there.
-            assert!(own.most_host as f64 <= 1.2 * host as f64, "{own:?}, and {spent:?} came");
+            assert!(own.peak_host as f64 <= 1.2 * host as f64, "{own:?}, and {spent:?} came");
         }
     }
 }
@@ -209,7 +209,7 @@ fn activations_are_kept_within_a_fraction_of_max_vram_and_change_no_bit_of_the_m
     let vram = 4 * kept - 4;
     let mut run = |max_vram: Option<u64>| {
         config.max_vram = max_vram.map(|bytes| bytes.to_string().parse().unwrap());
-        let (foreseen, Trained { trainer, spent, .. }) = foreseen(&gpu, &config);
+        let (foreseen, RunSummary { trainer, spent, .. }) = foreseen(&gpu, &config);
         gpu.limit_memory(u64::MAX);
         let model = trainer.gaussians().unwrap();
         (foreseen.device, spent.device_bytes, model)
@@ -228,9 +228,9 @@ fn growth_stops_at_the_memory_that_it_may_have_and_at_the_same_number_every_time
     config.max_vram = vram.to_string().parse().ok();
     let counts = [0; 2].map(|_| {
         let (foreseen, trained) = foreseen(&gpu, &config);
-        let Trained { trainer, spent, .. } = trained;
+        let RunSummary { trainer, spent, .. } = trained;
         assert!(spent.device_bytes <= vram, "{} of {vram}", spent.device_bytes);
-        assert!(trainer.gaussian_count() <= foreseen.most_gaussians);
+        assert!(trainer.gaussian_count() <= foreseen.peak_gaussians);
         trainer.gaussian_count()
     });
     gpu.limit_memory(u64::MAX);
@@ -238,5 +238,5 @@ fn growth_stops_at_the_memory_that_it_may_have_and_at_the_same_number_every_time
     config.max_vram = None;
     config.max_ram = "260M".parse().ok();
     let (foreseen, trained) = foreseen(&gpu, &config);
-    assert!(trained.trainer.gaussian_count() <= foreseen.most_gaussians.max(counts[0]));
+    assert!(trained.trainer.gaussian_count() <= foreseen.peak_gaussians.max(counts[0]));
 }

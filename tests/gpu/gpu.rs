@@ -85,9 +85,9 @@ fn what_validation_says_fails_the_process_and_names_the_test() {
         [&output.stdout, &output.stderr].map(|text| String::from_utf8_lossy(text));
     assert!(stdout.contains("1 passed"), "the test itself must not notice: {stdout}");
     assert_eq!(output.status.code(), Some(101), "{stderr}");
-    let said = format!("{NAME}: ");
+    let prefix = format!("{NAME}: ");
     // Newer layers take more than a line.
-    let message = stderr.split_once(&said).unwrap_or_default().1;
+    let message = stderr.split_once(&prefix).unwrap_or_default().1;
     assert!(message.contains("VUID-VkBufferCreateInfo-size-00912"), "{stderr}");
 }
 
@@ -278,8 +278,8 @@ fn more_workgroups_than_fit_along_x_are_folded_and_none_is_lost() {
     let (counts, sorted_tiles) =
         (gpu.zeros("counts", 1).unwrap(), gpu.zeros("sorted_tiles", 0).unwrap());
     let mut status = gpu.zeros("status", 3).unwrap();
-    let (sorted_slots, owners) =
-        (gpu.zeros("sorted_slots", 0).unwrap(), gpu.zeros("owners", 0).unwrap());
+    let (sorted_intersections, gaussian_ids) =
+        (gpu.zeros("sorted_intersections", 0).unwrap(), gpu.zeros("gaussian_ids", 0).unwrap());
     let (splats, colors) = (gpu.zeros("splats", 0).unwrap(), gpu.zeros("colors", 0).unwrap());
     let mut render = gpu.zeros("render", 3 * pixels).unwrap();
     let mut transmittances = gpu.zeros("transmittances", pixels).unwrap();
@@ -289,8 +289,8 @@ fn more_workgroups_than_fit_along_x_are_folded_and_none_is_lost() {
             sorted_tiles: sorted_tiles.slice(),
             tile_ranges: tile_ranges.slice_mut(),
             status: status.slice_mut(),
-            sorted_slots: sorted_slots.slice(),
-            owners: owners.slice(),
+            sorted_intersections: sorted_intersections.slice(),
+            gaussian_ids: gaussian_ids.slice(),
             splats: splats.slice(),
             colors: colors.slice(),
             render: render.slice_mut(),

@@ -35,7 +35,7 @@ fn stem(path: &Path) -> &str {
     path.file_stem().unwrap().to_str().unwrap()
 }
 
-/// The module a file of `src` belongs to: `render` for `src/splats/render.rs` and `src/splats/render/frame.rs`.
+/// The module a file of `src` belongs to: `render` for `src/splats/render.rs` and `src/splats/render/buffers.rs`.
 fn module(path: &Path) -> &str {
     Path::new(path.iter().nth(1).unwrap()).file_stem().unwrap().to_str().unwrap()
 }

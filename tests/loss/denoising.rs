@@ -5,7 +5,7 @@ use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::denoising;
 use nightsplat::loss::{
-    DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Interior, Term,
+    DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, LossRegion, Term,
 };
 
 use super::{
@@ -16,10 +16,10 @@ use super::{
 const WEIGHTS: DenoisingWeights = DenoisingWeights { mse: 0.7, total_variation: 1.3 };
 
 /// Views and the interiors that count in them.
-fn cases() -> Vec<(UVec2, Interior)> {
-    let whole = |size: [u32; 2]| (size.into(), Interior::whole(size.into()));
+fn cases() -> Vec<(UVec2, LossRegion)> {
+    let whole = |size: [u32; 2]| (size.into(), LossRegion::whole(size.into()));
     let inside = |size: [u32; 2], origin: [u32; 2], own: [u32; 2]| {
-        (size.into(), Interior { origin: origin.into(), size: own.into() })
+        (size.into(), LossRegion { origin: origin.into(), size: own.into() })
     };
     vec![
         whole([1, 1]),
@@ -36,7 +36,7 @@ fn cases() -> Vec<(UVec2, Interior)> {
 }
 
 /// Both terms by their definition, in double precision, means over the interior.
-fn loss_of(size: UVec2, Interior { origin, size: own }: Interior, a: &[f64], b: &[f64]) -> f64 {
+fn loss_of(size: UVec2, LossRegion { origin, size: own }: LossRegion, a: &[f64], b: &[f64]) -> f64 {
     let (mut squares, mut vertical, mut horizontal) = (0.0, 0.0, 0.0);
     let at = |channel: u32, x: u32, y: u32| {
         ((channel * size.y + origin.y + y) * size.x + origin.x + x) as usize
@@ -69,7 +69,7 @@ struct Outcome {
 fn evaluate(
     gpu: &Gpu,
     weights: DenoisingWeights,
-    (size, interior): (UVec2, Interior),
+    (size, loss_region): (UVec2, LossRegion),
     [denoised, render]: [&[f32]; 2],
 ) -> Outcome {
     let [mut d_denoised, mut d_render] =
@@ -79,7 +79,7 @@ fn evaluate(
     let mut loss = DenoisingLoss::new(gpu, weights).unwrap();
     loss.reserve(size).unwrap();
     let logged = log_step(gpu, |pass, log| {
-        let inputs = DenoisingInputs { size, interior, denoised: &denoised, render: &render };
+        let inputs = DenoisingInputs { size, loss_region, denoised: &denoised, render: &render };
         let gradients = DenoisingGradients { d_denoised: &mut d_denoised, d_render: &mut d_render };
         loss.record(pass, inputs, gradients, log)
     })
@@ -91,16 +91,16 @@ fn evaluate(
 #[test]
 fn the_terms_match_their_reference_and_finite_differences() {
     let gpu = gpu();
-    for (size, interior) in cases() {
+    for (size, loss_region) in cases() {
         let values = 3 * size.element_product() as usize;
         let (denoised, render) = (noise(1, values, 0.0, 1.0), noise(2, values, -0.2, 1.2));
-        let own = interior.size;
+        let own = loss_region.size;
         let pair_scale = |pairs: u32| if pairs == 0 { 0.0 } else { 2.0 / (3 * pairs) as f32 };
         let params = denoising::Params {
             width: size.x,
             height: size.y,
-            interior_begin: interior.origin,
-            interior_end: interior.origin + own,
+            loss_begin: loss_region.origin,
+            loss_end: loss_region.origin + own,
             mse_weight: WEIGHTS.mse as f32,
             tv_weight: WEIGHTS.total_variation as f32,
             mean_scale: 1.0 / (3 * own.element_product()) as f32,
@@ -119,12 +119,12 @@ fn the_terms_match_their_reference_and_finite_differences() {
         );
         if values < 3000 {
             let (a, b) = (widen(&denoised), widen(&render));
-            let numeric = central_differences(&a, |a| loss_of(size, interior, a, &b));
+            let numeric = central_differences(&a, |a| loss_of(size, loss_region, a, &b));
             assert_gradient("d_denoised", &d_denoised, &numeric);
-            let numeric = central_differences(&b, |b| loss_of(size, interior, &a, b));
+            let numeric = central_differences(&b, |b| loss_of(size, loss_region, &a, b));
             assert_gradient("d_render", &d_render, &numeric);
         }
-        let actual = evaluate(&gpu, WEIGHTS, (size, interior), [&denoised, &render]);
+        let actual = evaluate(&gpu, WEIGHTS, (size, loss_region), [&denoised, &render]);
         let close = |what: &str, actual: &[f32], expected: &[f32]| {
             assert_close(what, actual, expected, 1e-5 * largest(expected));
         };
@@ -144,7 +144,7 @@ fn the_terms_are_those_of_pytorch() {
     let images = [torch.get("denoising.denoised"), torch.get("denoising.rendered")];
     let evaluate = |mse: f64, total_variation: f64| {
         let weights = DenoisingWeights { mse, total_variation };
-        evaluate(&gpu, weights, (size, Interior::whole(size)), images)
+        evaluate(&gpu, weights, (size, LossRegion::whole(size)), images)
     };
     let (mse, tv) = (evaluate(1.0, 0.0), evaluate(0.0, 1.0));
     torch.assert_agrees("denoising.mse.value", &[mse.logged.losses.get(Term::DENOISING)]);
@@ -159,7 +159,7 @@ fn the_terms_are_those_of_pytorch() {
 fn a_constant_image_that_is_the_render_costs_nothing() {
     let size = UVec2::new(20, 21);
     let image = vec![0.3; 3 * 420];
-    let outcome = evaluate(&gpu(), WEIGHTS, (size, Interior::whole(size)), [&image, &image]);
+    let outcome = evaluate(&gpu(), WEIGHTS, (size, LossRegion::whole(size)), [&image, &image]);
     assert_eq!(outcome.logged.losses.get(Term::DENOISING), 0.0);
     assert_eq!(outcome.logged.losses.get(Term::TOTAL_VARIATION), 0.0);
     assert!([outcome.d_denoised, outcome.d_render].concat().iter().all(|&d| d == 0.0));
@@ -169,7 +169,7 @@ fn a_constant_image_that_is_the_render_costs_nothing() {
 fn a_value_that_is_not_finite_reaches_the_log_if_it_counts() {
     let gpu = gpu();
     let size = UVec2::splat(20);
-    let interior = Interior { origin: UVec2::splat(5), size: UVec2::splat(10) };
+    let loss_region = LossRegion { origin: UVec2::splat(5), size: UVec2::splat(10) };
     let image = noise(3, 1200, 0.0, 1.0);
     let with_nan = |x: usize| {
         let mut image = image.clone();
@@ -177,7 +177,7 @@ fn a_value_that_is_not_finite_reaches_the_log_if_it_counts() {
         image
     };
     let broken = |images: [&[f32]; 2]| {
-        let Logged { losses, status } = evaluate(&gpu, WEIGHTS, (size, interior), images).logged;
+        let Logged { losses, status } = evaluate(&gpu, WEIGHTS, (size, loss_region), images).logged;
         assert_eq!(status, if losses.first_not_finite().is_some() { NOT_FINITE } else { 0 });
         [Term::DENOISING, Term::TOTAL_VARIATION].map(|term| !losses.get(term).is_finite())
     };
@@ -194,7 +194,8 @@ fn the_same_step_leaves_the_same_bits() {
     let values = 3 * size.element_product() as usize;
     let (denoised, render) = (noise(1, values, 0.0, 1.0), noise(2, values, 0.0, 1.0));
     let step = || {
-        let outcome = evaluate(&gpu, WEIGHTS, (size, Interior::whole(size)), [&denoised, &render]);
+        let outcome =
+            evaluate(&gpu, WEIGHTS, (size, LossRegion::whole(size)), [&denoised, &render]);
         let terms = [Term::DENOISING, Term::TOTAL_VARIATION];
         let values = terms.map(|term| outcome.logged.losses.get(term));
         (bits(&values), bits(&outcome.d_denoised), bits(&outcome.d_render))
@@ -211,10 +212,10 @@ fn what_does_not_fit_is_refused() {
     }
     let mut loss = DenoisingLoss::new(&gpu, WEIGHTS).unwrap();
     loss.reserve(UVec2::splat(8)).unwrap();
-    let whole = |size: [u32; 2]| (size.into(), Interior::whole(size.into()));
-    let outside = Interior { origin: UVec2::splat(1), size: UVec2::splat(8) };
+    let whole = |size: [u32; 2]| (size.into(), LossRegion::whole(size.into()));
+    let outside = LossRegion { origin: UVec2::splat(1), size: UVec2::splat(8) };
     // Buffers of 8 x 8 pixels, and some that are longer than the scratch memory is for.
-    for (len, (size, interior), why) in [
+    for (len, (size, loss_region), why) in [
         (192, whole([0, 8]), "0 x 8"),
         (192, whole([9, 8]), "9 x 8"),
         (190, whole([8, 8]), "holds 190 values, the view has 192"),
@@ -224,12 +225,12 @@ fn what_does_not_fit_is_refused() {
         let image = gpu.zeros("image", len).unwrap();
         let [mut d_denoised, mut d_render] = [0; 2].map(|_| gpu.zeros("d", len).unwrap());
         let logged = log_step(&gpu, |pass, log| {
-            let inputs = DenoisingInputs { size, interior, denoised: &image, render: &image };
+            let inputs = DenoisingInputs { size, loss_region, denoised: &image, render: &image };
             let gradients =
                 DenoisingGradients { d_denoised: &mut d_denoised, d_render: &mut d_render };
             loss.record(pass, inputs, gradients, log)
         });
         let refused = logged.err().unwrap().to_string();
-        assert!(refused.contains(why), "{size} {interior:?}: {refused}");
+        assert!(refused.contains(why), "{size} {loss_region:?}: {refused}");
     }
 }

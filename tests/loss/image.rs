@@ -4,7 +4,7 @@ use glam::UVec2;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, Reference, Threads};
 use nightsplat::kernels::{l1, ssim};
-use nightsplat::loss::{Gradient, Interior, Loss, LossInputs, LossSettings, Term};
+use nightsplat::loss::{Gradient, Loss, LossInputs, LossRegion, LossSettings, Term};
 use nightsplat::reference::ssim::{gradient, ssim};
 
 use super::{NOT_FINITE, Torch, assert_close, bits, central_differences, largest, log_step};
@@ -39,14 +39,14 @@ fn settings(ssim_weight: f64) -> LossSettings {
 }
 
 fn evaluate(gpu: &Gpu, weight: f64, size: [u32; 2], images: &[Vec<f32>; 2]) -> Outcome {
-    evaluate_interior(gpu, weight, size, Interior::whole(size.into()), images)
+    evaluate_loss_region(gpu, weight, size, LossRegion::whole(size.into()), images)
 }
 
-fn evaluate_interior(
+fn evaluate_loss_region(
     gpu: &Gpu,
     weight: f64,
     size: [u32; 2],
-    interior: Interior,
+    loss_region: LossRegion,
     [render, target]: &[Vec<f32>; 2],
 ) -> Outcome {
     let size = UVec2::from_array(size);
@@ -56,7 +56,7 @@ fn evaluate_interior(
         .map(|(name, data)| gpu.buffer(name, data).unwrap());
     let mut d_render = gpu.buffer("d_render", &vec![f32::NAN; render.len()]).unwrap();
     let logged = log_step(gpu, |pass, log| {
-        let inputs = LossInputs { size, interior, render: &render, target: &target };
+        let inputs = LossInputs { size, loss_region, render: &render, target: &target };
         loss.record(pass, inputs, &mut d_render, log)
     })
     .unwrap();
@@ -66,7 +66,7 @@ fn evaluate_interior(
 
 /// Holds the SSIM kernel to its reference, a lane taking so many columns, a subgroup so many rows, and loads and stores so
 /// many floats where rows begin at as many.
-fn check_ssim(shape: [u32; 3], size: [u32; 2], interior: Interior) -> Vec<f32> {
+fn check_ssim(shape: [u32; 3], size: [u32; 2], loss_region: LossRegion) -> Vec<f32> {
     let ([columns, rows, alignment], [width, height]) = (shape, size);
     let [render, target] = images(size);
     let scale = 1.0 / render.len() as f32;
@@ -84,8 +84,8 @@ fn check_ssim(shape: [u32; 3], size: [u32; 2], interior: Interior) -> Vec<f32> {
         ssim::Params {
             width,
             height,
-            interior_begin: interior.origin,
-            interior_end: interior.origin + interior.size,
+            loss_begin: loss_region.origin,
+            loss_end: loss_region.origin + loss_region.size,
             l1_scale: 0.8 * scale,
             ssim_scale: 0.2 * scale,
         },
@@ -99,28 +99,28 @@ fn check_ssim(shape: [u32; 3], size: [u32; 2], interior: Interior) -> Vec<f32> {
 #[test]
 fn the_kernel_of_ssim_matches_its_reference_at_every_size() {
     for size in SIZES {
-        check_ssim([16, 64, 1], size, Interior::whole(size.into()));
+        check_ssim([16, 64, 1], size, LossRegion::whole(size.into()));
     }
 }
 
 #[test]
 fn the_shape_of_the_strips_does_not_matter() {
     for shape in [[2, 32, 1], [4, 1, 1], [5, 7, 1]] {
-        check_ssim(shape, [37, 41], Interior::whole([37, 41].into()));
+        check_ssim(shape, [37, 41], LossRegion::whole([37, 41].into()));
     }
 }
 
 /// A vector that is stored for a column too many overwrites what another subgroup leaves there.
 #[test]
 fn whole_vectors_leave_what_single_values_do() {
-    for (size, interior) in [
-        ([4, 3], Interior::whole([4, 3].into())),
-        ([40, 41], Interior { origin: UVec2::new(2, 1), size: UVec2::new(31, 7) }),
-        ([132, 20], Interior::whole([132, 20].into())),
+    for (size, loss_region) in [
+        ([4, 3], LossRegion::whole([4, 3].into())),
+        ([40, 41], LossRegion { origin: UVec2::new(2, 1), size: UVec2::new(31, 7) }),
+        ([132, 20], LossRegion::whole([132, 20].into())),
     ] {
         for rows in [7, 64] {
-            let whole = check_ssim([4, rows, 4], size, interior);
-            let single = check_ssim([5, rows, 1], size, interior);
+            let whole = check_ssim([4, rows, 4], size, loss_region);
+            let single = check_ssim([5, rows, 1], size, loss_region);
             // Compilers contract the arithmetic of each shape in a way of its own.
             assert_close(&format!("{size:?} {rows}"), &whole, &single, 1e-8);
         }
@@ -138,8 +138,8 @@ fn l1_matches_its_reference() {
             l1_scale: 1.0 / count as f32,
             width: size[0],
             height: size[1],
-            interior_begin: UVec2::ZERO,
-            interior_end: size.into(),
+            loss_begin: UVec2::ZERO,
+            loss_end: size.into(),
         };
         let constants = l1::Constants::default();
         let (mut expected, mut sum) = (vec![0.0; count as usize], [0.0]);
@@ -160,7 +160,7 @@ fn l1_matches_its_reference() {
 /// (1 - w) mean|a - b| + w (1 - mean SSIM) of one channel, means over the interior.
 fn loss_of(
     [width, height]: [usize; 2],
-    interior: Interior,
+    loss_region: LossRegion,
     weight: f64,
     a: &[f64],
     b: &[f64],
@@ -168,7 +168,7 @@ fn loss_of(
     let ssim = ssim(width, height, a, b);
     let (mut l1_sum, mut ssim_sum, mut count) = (0.0, 0.0, 0.0);
     for i in 0..a.len() {
-        if contains(interior, i % width, i / width) {
+        if contains(loss_region, i % width, i / width) {
             l1_sum += (a[i] - b[i]).abs();
             ssim_sum += ssim[i].value;
             count += 1.0;
@@ -177,15 +177,15 @@ fn loss_of(
     (1.0 - weight) * l1_sum / count + weight * (1.0 - ssim_sum / count)
 }
 
-fn contains(Interior { origin, size }: Interior, x: usize, y: usize) -> bool {
+fn contains(LossRegion { origin, size }: LossRegion, x: usize, y: usize) -> bool {
     let pixel = UVec2::new(x as u32, y as u32);
     pixel.cmpge(origin).all() && pixel.cmplt(origin + size).all()
 }
 
 /// Views with interiors: all of it, the middle, a corner, one pixel.
-fn interiors() -> Vec<([u32; 2], Interior)> {
+fn loss_regions() -> Vec<([u32; 2], LossRegion)> {
     let inside = |size, origin: [u32; 2], own: [u32; 2]| {
-        (size, Interior { origin: origin.into(), size: own.into() })
+        (size, LossRegion { origin: origin.into(), size: own.into() })
     };
     vec![
         inside([1, 1], [0, 0], [1, 1]),
@@ -200,25 +200,25 @@ fn interiors() -> Vec<([u32; 2], Interior)> {
 
 #[test]
 fn the_reference_gradient_is_that_of_finite_differences() {
-    let whole = |size: [u32; 2]| (size, Interior::whole(size.into()));
+    let whole = |size: [u32; 2]| (size, LossRegion::whole(size.into()));
     let mut cases = vec![whole([1, 1]), whole([3, 1]), whole([5, 7]), whole([13, 17])];
-    cases.extend(interiors().into_iter().filter(|(size, _)| size[0] < 40));
-    for (size, interior) in cases {
+    cases.extend(loss_regions().into_iter().filter(|(size, _)| size[0] < 40));
+    for (size, loss_region) in cases {
         let size = size.map(|extent| extent as usize);
         let count = size[0] * size[1];
         let weight = 0.2;
         let b: Vec<f64> = (0..count).map(|i| 0.5 + 0.4 * (i as f64 * 0.7).sin()).collect();
         // Away from a = b, where |a - b| has no derivative.
         let a: Vec<f64> = (0..count).map(|i| b[i] + if i % 3 == 0 { 0.2 } else { -0.3 }).collect();
-        let mean_scale = 1.0 / f64::from(interior.size.element_product());
+        let mean_scale = 1.0 / f64::from(loss_region.size.element_product());
         let scales = [(1.0 - weight) * mean_scale, weight * mean_scale];
-        let rectangle = [interior.origin, interior.origin + interior.size];
+        let rectangle = [loss_region.origin, loss_region.origin + loss_region.size];
         let analytic = gradient(size, rectangle, scales, &a, &b);
-        let numeric = central_differences(&a, |a| loss_of(size, interior, weight, a, &b));
+        let numeric = central_differences(&a, |a| loss_of(size, loss_region, weight, a, &b));
         for i in 0..count {
             assert!(
                 (numeric[i] - analytic[i]).abs() < 1e-8,
-                "{size:?} {interior:?} at {i}: {} {}",
+                "{size:?} {loss_region:?} at {i}: {} {}",
                 numeric[i],
                 analytic[i]
             );
@@ -229,23 +229,23 @@ fn the_reference_gradient_is_that_of_finite_differences() {
 #[test]
 fn the_kernels_match_their_references_with_an_interior() {
     let gpu = gpu();
-    for (size, interior) in interiors() {
-        check_ssim([16, 64, 1], size, interior);
-        check_ssim([2, 32, 1], size, interior);
+    for (size, loss_region) in loss_regions() {
+        check_ssim([16, 64, 1], size, loss_region);
+        check_ssim([2, 32, 1], size, loss_region);
         let [render, target] = images(size);
-        let constants = l1::Constants { with_interior: true, ..Default::default() };
+        let constants = l1::Constants { with_loss_region: true, ..Default::default() };
         let params = l1::Params {
             value_count: render.len() as u32,
-            l1_scale: 1.0 / (3 * interior.size.element_product()) as f32,
+            l1_scale: 1.0 / (3 * loss_region.size.element_product()) as f32,
             width: size[0],
             height: size[1],
-            interior_begin: interior.origin,
-            interior_end: interior.origin + interior.size,
+            loss_begin: loss_region.origin,
+            loss_end: loss_region.origin + loss_region.size,
         };
         let (d_render, partials) = (vec![0.0f32; render.len()], vec![0.0f32]);
         let (expected, sum) =
             run_reference!(l1, constants, params, [render, target], [d_render, partials]);
-        let outcome = evaluate_interior(&gpu, 0.0, size, interior, &[render, target]);
+        let outcome = evaluate_loss_region(&gpu, 0.0, size, loss_region, &[render, target]);
         assert_close("d_render", &outcome.d_render, &expected, 0.0);
         assert!((outcome.l1 - sum[0] * params.l1_scale).abs() < 1e-6);
     }
@@ -255,12 +255,12 @@ fn the_kernels_match_their_references_with_an_interior() {
 #[test]
 fn outside_the_interior_the_value_ignores_the_render_but_ssim_does_not() {
     let gpu = gpu();
-    let (size, interior) =
-        ([40, 40], Interior { origin: UVec2::splat(15), size: UVec2::splat(10) });
+    let (size, loss_region) =
+        ([40, 40], LossRegion { origin: UVec2::splat(15), size: UVec2::splat(10) });
     let [render, target] = images(size);
     let evaluate = |weight: f64, render: &[f32]| {
         let images = [render.to_vec(), target.clone()];
-        evaluate_interior(&gpu, weight, size, interior, &images)
+        evaluate_loss_region(&gpu, weight, size, loss_region, &images)
     };
     let distance = |i: usize| {
         let axis = |at: usize| 15usize.saturating_sub(at).max(at.saturating_sub(24));
@@ -285,13 +285,14 @@ fn outside_the_interior_the_value_ignores_the_render_but_ssim_does_not() {
 #[test]
 fn a_nan_beyond_every_window_of_the_interior_changes_nothing() {
     let gpu = gpu();
-    let (size, interior) = ([40, 40], Interior { origin: UVec2::splat(8), size: UVec2::splat(10) });
+    let (size, loss_region) =
+        ([40, 40], LossRegion { origin: UVec2::splat(8), size: UVec2::splat(10) });
     let images = images(size);
     let mut spoilt = images.clone();
     spoilt[0][39 * 40 + 39] = f32::NAN;
     for weight in [0.0, 0.2] {
         let [whole, spoilt] = [&images, &spoilt]
-            .map(|images| evaluate_interior(&gpu, weight, size, interior, images));
+            .map(|images| evaluate_loss_region(&gpu, weight, size, loss_region, images));
         assert!(whole.l1.is_finite() && spoilt.status == 0);
         assert_eq!((spoilt.l1, spoilt.ssim), (whole.l1, whole.ssim));
         assert!(spoilt.d_render == whole.d_render, "the gradient with SSIM of weight {weight}");
@@ -306,11 +307,11 @@ fn an_interior_that_is_not_inside_is_refused() {
     loss.reserve(size).unwrap();
     let image = gpu.zeros("image", 3 * 64).unwrap();
     for (origin, own) in [([0, 0], [0, 8]), ([1, 0], [8, 8]), ([9, 0], [1, 1]), ([0, 0], [8, 9])] {
-        let interior = Interior { origin: origin.into(), size: own.into() };
-        let inputs = LossInputs { size, interior, render: &image, target: &image };
+        let loss_region = LossRegion { origin: origin.into(), size: own.into() };
+        let inputs = LossInputs { size, loss_region, render: &image, target: &image };
         let mut d_render = gpu.zeros("d_render", 3 * 64).unwrap();
         let logged = log_step(&gpu, |pass, log| loss.record(pass, inputs, &mut d_render, log));
-        assert!(logged.is_err(), "{interior:?}");
+        assert!(logged.is_err(), "{loss_region:?}");
     }
 }
 
@@ -318,8 +319,8 @@ fn an_interior_that_is_not_inside_is_refused() {
 fn l1_and_ssim_are_those_of_pytorch() {
     let (gpu, torch) = (gpu(), Torch::read());
     let images = [torch.get("image.render").to_vec(), torch.get("image.target").to_vec()];
-    let whole = Interior::whole([23, 19].into());
-    let evaluate = |weight: f64| evaluate_interior(&gpu, weight, [23, 19], whole, &images);
+    let whole = LossRegion::whole([23, 19].into());
+    let evaluate = |weight: f64| evaluate_loss_region(&gpu, weight, [23, 19], whole, &images);
     let [l1, ssim] = [0.0, 1.0].map(evaluate);
     torch.assert_agrees("image.l1.value", &[l1.l1]);
     torch.assert_agrees("image.l1.d_render", &l1.d_render);
@@ -330,10 +331,10 @@ fn l1_and_ssim_are_those_of_pytorch() {
 #[test]
 fn the_gradient_of_both_is_that_of_each_by_its_weight() {
     let gpu = gpu();
-    for (size, interior) in interiors() {
+    for (size, loss_region) in loss_regions() {
         let images = images(size);
         let [l1, ssim, both] = [0.0, 1.0, 0.3]
-            .map(|weight| evaluate_interior(&gpu, weight, size, interior, &images).d_render);
+            .map(|weight| evaluate_loss_region(&gpu, weight, size, loss_region, &images).d_render);
         let expected: Vec<f32> =
             l1.iter().zip(&ssim).map(|(l1, ssim)| 0.7 * l1 + 0.3 * ssim).collect();
         assert_close("d_render", &both, &expected, 1e-6);
@@ -444,8 +445,8 @@ fn a_view_that_does_not_fit_is_refused() {
         let mut d_render = gpu.zeros("d_render", 3 * 256).unwrap();
         let result = log_step(&gpu, |pass, log| {
             let size = UVec2::from_array(size);
-            let interior = Interior::whole(size);
-            let inputs = LossInputs { size, interior, render: &image, target: &image };
+            let loss_region = LossRegion::whole(size);
+            let inputs = LossInputs { size, loss_region, render: &image, target: &image };
             log.slot = slot;
             loss.record(pass, inputs, &mut d_render, log)
         });
@@ -468,8 +469,8 @@ fn a_second_term_adds_to_the_gradient_of_the_first() {
         let [render, target] = images.map(|image| gpu.buffer("image", &image).unwrap());
         let mut d_render = gpu.buffer("d_render", &first).unwrap();
         log_step(&gpu, |pass, log| {
-            let interior = Interior::whole(size);
-            let inputs = LossInputs { size, interior, render: &render, target: &target };
+            let loss_region = LossRegion::whole(size);
+            let inputs = LossInputs { size, loss_region, render: &render, target: &target };
             loss.record(pass, inputs, &mut d_render, log)
         })
         .unwrap();

@@ -3,12 +3,12 @@
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::networks::{DenoiserSettings, Form};
+use nightsplat::networks::{DenoiserSettings, NetworkVariant};
 use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::image::{Image, Mask};
 use nightsplat::photographs::metrics::{Scores, psnr_of_counted};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat::train::{Learning, Part, TrainConfig, Trainer};
+use nightsplat::train::{OnOff, Part, TrainConfig, Trainer};
 
 use crate::common::train::{advance, train};
 
@@ -62,11 +62,11 @@ fn what_is_hidden_leaves_no_trace_in_the_model() {
 
 #[test]
 fn what_is_hidden_leaves_no_trace_in_the_networks() {
-    for form in [Form::Identity, Form::Paper] {
+    for variant in [NetworkVariant::Identity, NetworkVariant::Paper] {
         let mut config = TrainConfig { steps: 6, ..config(ToneSettings::new(ToneCurve::Ap3)) };
         config.model.set_parts(&[Part::Denoiser, Part::Tonemapper]);
         config.model.network =
-            DenoiserSettings { channels: 4, stages: 2, form, ..Default::default() };
+            DenoiserSettings { channels: 4, stages: 2, variant, ..Default::default() };
         config.model.denoiser_crop = 24;
         let denoised = |dataset: &Dataset| {
             let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
@@ -76,8 +76,8 @@ fn what_is_hidden_leaves_no_trace_in_the_networks() {
         };
         let one = denoised(&masked(dataset(), None));
         let other = denoised(&masked(dataset(), Some([0.9, 0.0, 0.3])));
-        assert_eq!(one, other, "{form:?}");
-        assert_ne!(one, denoised(&dataset()), "{form:?}");
+        assert_eq!(one, other, "{variant:?}");
+        assert_ne!(one, denoised(&dataset()), "{variant:?}");
     }
 }
 
@@ -87,7 +87,7 @@ fn every_pass_of_a_masked_step_agrees_with_its_reference() {
     with_parts.model.set_parts(&[Part::Structure, Part::Denoiser, Part::Tonemapper]);
     with_parts.model.network = DenoiserSettings { channels: 4, stages: 2, ..Default::default() };
     let mut with_exposures = config(ToneSettings::default());
-    with_exposures.exposure.learn = Learning::On;
+    with_exposures.exposure.learn = OnOff::On;
     for config in [with_parts, with_exposures] {
         let mut trainer = Trainer::new(&gpu(), config, &masked(dataset(), None)).unwrap();
         for _ in 0..2 {

@@ -15,9 +15,9 @@ use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::image::{linear_from_srgb, srgb_from_linear};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat::results::run::{self, HeldRun};
+use nightsplat::results::run::{self, IfExists};
 use nightsplat::splats::optimizer::{Adam, Learnable};
-use nightsplat::train::{Learning, Part, TrainConfig, Trainer};
+use nightsplat::train::{OnOff, Part, TrainConfig, Trainer};
 
 use crate::common::Random;
 use crate::common::chain::Chain;
@@ -184,9 +184,9 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     assert!(gradients[..WIDTH].iter().chain(&gradients[2 * WIDTH..]).all(|&d| d == 0.0));
 
     // Of the Gaussians: the chain behind the gradient that the exposure passes on, against differences of all of it.
-    let mut behind = Chain::new(&setup);
-    behind.d_render = d_render;
-    let gradient = behind.run(&parameters).gradient;
+    let mut downstream = Chain::new(&setup);
+    downstream.d_render = d_render;
+    let gradient = downstream.run(&parameters).gradient;
     let mut exposed = Chain::new(&setup);
     for (i, weight) in exposed.d_render.iter_mut().enumerate() {
         *weight *= own.gain[i / pixels];
@@ -277,7 +277,7 @@ fn varied(folder: &Path) -> (TrainConfig, Dataset) {
     let mut config = TrainConfig { steps: 300, sh_degree: 0, tone, ..TrainConfig::bare() };
     config.schedule.densify_before = 0;
     config.schedule.resolution_steps = [0, 40];
-    config.exposure.learn = Learning::On;
+    config.exposure.learn = OnOff::On;
     let mut dataset = Dataset::load(folder, &config.load_options()).unwrap();
     for (at, view) in dataset.views.iter_mut().filter(|view| view.is_train()).enumerate() {
         let image = view.image.as_mut().unwrap();
@@ -318,7 +318,7 @@ fn exposures_explain_photographs_that_differ_in_brightness_and_their_mean_is_exa
     assert!(quarter < half && half < one && one < two, "{quarter} {half} {one} {two}");
     let with = l1_of_last_steps(&config, &dataset);
     let mut config = config;
-    config.exposure.learn = Learning::Off;
+    config.exposure.learn = OnOff::Off;
     let without = l1_of_last_steps(&config, &dataset);
     assert!(with < 0.6 * without, "L1 is {with} with exposures and {without} without");
 }
@@ -329,7 +329,7 @@ fn exposures_that_are_off_leave_no_kernel_and_no_file() {
     let (mut config, dataset) = varied(&folder.path().join("set"));
     config.steps = 2;
     let out = folder.path().join("run");
-    for learn in [Learning::On, Learning::Off] {
+    for learn in [OnOff::On, OnOff::Off] {
         config.exposure.learn = learn;
         let gpu = gpu();
         let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
@@ -337,12 +337,12 @@ fn exposures_that_are_off_leave_no_kernel_and_no_file() {
         reports.unwrap();
         checked.agree().unwrap();
         let own = checked.passes.iter().filter(|pass| pass.kernel.starts_with("expos")).count();
-        assert_eq!(own, if learn == Learning::On { 4 } else { 0 });
-        run::train(&gpu, &config, &dataset, &out, HeldRun::Replace, |_| {}).unwrap();
+        assert_eq!(own, if learn == OnOff::On { 4 } else { 0 });
+        run::train(&gpu, &config, &dataset, &out, IfExists::Replace, |_| {}).unwrap();
         let exposures = run::load_exposures(&out).unwrap();
         let metrics = std::fs::read_to_string(out.join("metrics.json")).unwrap();
         let metrics: serde_json::Value = serde_json::from_str(&metrics).unwrap();
-        if learn == Learning::On {
+        if learn == OnOff::On {
             let learned = trainer.exposures().unwrap().unwrap();
             assert_eq!(exposures.len(), learned.len());
             assert!(metrics["exposure"].as_str().unwrap().starts_with("neutral"));
@@ -381,7 +381,7 @@ fn a_run_with_exposures_goes_on_bit_for_bit() {
     assert!(state(&mut whole, "whole") == state(&mut resumed, "resumed"));
     assert_eq!(whole.exposures().unwrap(), resumed.exposures().unwrap());
     let mut off = config.clone();
-    off.exposure.learn = Learning::Off;
+    off.exposure.learn = OnOff::Off;
     let mut off = Trainer::new(&gpu, off, &dataset).unwrap();
     let error = off.restore(&folder.path().join("checkpoint")).unwrap_err().to_string();
     assert!(error.contains("exposure.learn"), "{error}");

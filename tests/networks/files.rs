@@ -3,7 +3,9 @@
 use std::path::Path;
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::networks::{Denoiser, DenoiserSettings, Form, Precision, Tonemapper, load, save};
+use nightsplat::networks::{
+    Denoiser, DenoiserSettings, NetworkVariant, Precision, Tonemapper, load, save,
+};
 use safetensors::SafeTensors;
 
 const SMALL: DenoiserSettings = DenoiserSettings {
@@ -11,14 +13,14 @@ const SMALL: DenoiserSettings = DenoiserSettings {
     repeats: 1,
     channels: 4,
     precision: Precision::Single,
-    form: Form::Paper,
+    variant: NetworkVariant::Paper,
 };
 
 fn networks(settings: DenoiserSettings, seed: u64) -> (Denoiser, Tonemapper) {
     let gpu = gpu();
     (
         Denoiser::new(&gpu, settings, seed).unwrap(),
-        Tonemapper::new(&gpu, Form::Paper, seed).unwrap(),
+        Tonemapper::new(&gpu, NetworkVariant::Paper, seed).unwrap(),
     )
 }
 

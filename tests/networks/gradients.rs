@@ -1,6 +1,6 @@
 //! The networks' gradients in double precision against central differences.
 
-use nightsplat::networks::{DenoiserSettings, Form};
+use nightsplat::networks::{DenoiserSettings, NetworkVariant};
 
 use super::model::{Denoiser, Gradients, Tonemapper};
 use crate::common::Random;
@@ -41,10 +41,12 @@ fn check_all(forward: Forward<'_>, gradients: &Gradients, [values, first, second
 #[test]
 fn the_gradient_of_the_denoiser_is_that_of_finite_differences() {
     let sizes = [([4, 3], 1), ([3, 5], 2), ([4, 4], 3)];
-    let forms = [Form::Identity, Form::Paper];
-    for ((size, stages), form) in sizes.into_iter().flat_map(|s| forms.map(|form| (s, form))) {
+    let variants = [NetworkVariant::Identity, NetworkVariant::Paper];
+    for ((size, stages), variant) in
+        sizes.into_iter().flat_map(|s| variants.map(|variant| (s, variant)))
+    {
         let settings =
-            DenoiserSettings { stages, repeats: 2, channels: 4, form, ..Default::default() };
+            DenoiserSettings { stages, repeats: 2, channels: 4, variant, ..Default::default() };
         let denoiser = Denoiser { settings, size };
         let mut random = Random::new(11 + u64::from(stages));
         let mut draw = |count: usize, low: f64, high: f64| -> Vec<f64> {
@@ -60,7 +62,7 @@ fn the_gradient_of_the_denoiser_is_that_of_finite_differences() {
         let denoised = denoiser.forward(&values, &noise, &render);
         let clamped = denoised.iter().filter(|r| **r == 0.0 || **r == 1.0).count();
         let clamps = (1..2 * pixels).contains(&clamped);
-        assert_eq!(clamps, form == Form::Paper, "{clamped} of {} clamp", 3 * pixels);
+        assert_eq!(clamps, variant == NetworkVariant::Paper, "{clamped} of {} clamp", 3 * pixels);
         let gradients = denoiser.backward(&values, &noise, &render, &d);
         let forward =
             |values: &[f64], noise: &[f64], render: &[f64]| denoiser.forward(values, noise, render);
@@ -70,8 +72,8 @@ fn the_gradient_of_the_denoiser_is_that_of_finite_differences() {
 
 #[test]
 fn the_gradient_of_the_tonemapper_is_that_of_finite_differences() {
-    for form in [Form::Identity, Form::Paper] {
-        check_tonemapper(Tonemapper { form, size: [4, 3] });
+    for variant in [NetworkVariant::Identity, NetworkVariant::Paper] {
+        check_tonemapper(Tonemapper { variant, size: [4, 3] });
     }
 }
 

@@ -15,6 +15,6 @@ mod model;
 mod networks;
 mod torch;
 
-mod window;
+mod crop;
 
 use common::{largest, narrow, widen};

@@ -1,11 +1,11 @@
 //! Both networks in double precision, put together from the references of their kernels.
 
-use nightsplat::networks::{DenoiserSettings, Form};
+use nightsplat::networks::{DenoiserSettings, NetworkVariant};
 use nightsplat::reference::conv3x3::{activate, conv3x3, data_gradient};
 use nightsplat::reference::conv3x3_weight_gradient::weight_gradient;
 use nightsplat::reference::norm::{self, Affine, Statistics};
 use nightsplat::reference::residual::residual;
-use nightsplat::reference::residual_backward::behind_clamp;
+use nightsplat::reference::residual_backward::clamp_backward;
 
 /// A convolution in the flat array of a network's parameters.
 #[derive(Clone, Copy)]
@@ -119,12 +119,12 @@ impl Denoiser {
                 convolved.push(z);
             }
             let v = conv_out.forward(self.size, values, features.last().unwrap());
-            let (update, denoised): (Vec<f64>, Vec<f64>) = match self.settings.form {
-                Form::Identity => {
+            let (update, denoised): (Vec<f64>, Vec<f64>) = match self.settings.variant {
+                NetworkVariant::Identity => {
                     let denoised = input.iter().zip(&v).map(|(input, v)| input - v).collect();
                     (v, denoised)
                 }
-                Form::Paper => {
+                NetworkVariant::Paper => {
                     let update: Vec<f64> = v.into_iter().map(|v| activate(2, v)).collect();
                     let end = |i: usize| residual(render[i], input[i], update[i]);
                     let denoised = (0..3 * pixels).map(end).collect();
@@ -153,10 +153,10 @@ impl Denoiser {
         let (mut d, mut d_render) = (d_denoised.to_vec(), vec![0.0; render.len()]);
         for (k, stage) in self.stages(values, noise, render).iter().enumerate().rev() {
             let ([conv_in, conv, conv_out], norm) = self.convs(k);
-            let is_paper = self.settings.form == Form::Paper;
+            let is_paper = self.settings.variant == NetworkVariant::Paper;
             if is_paper {
                 for i in 0..d.len() {
-                    d[i] = behind_clamp(render[i] - (stage.input[i] + stage.update[i]), d[i]);
+                    d[i] = clamp_backward(render[i] - (stage.input[i] + stage.update[i]), d[i]);
                 }
                 add(&mut d_render, &d);
             }
@@ -194,7 +194,7 @@ impl Denoiser {
 /// The tonemapper for views of one size.
 #[derive(Clone, Copy)]
 pub(crate) struct Tonemapper {
-    pub(crate) form: Form,
+    pub(crate) variant: NetworkVariant,
     pub(crate) size: [usize; 2],
 }
 
@@ -215,7 +215,7 @@ impl Tonemapper {
         let first = relu(conv1.forward(self.size, values, &product));
         let second = relu(conv2.forward(self.size, values, &first));
         let mut output = conv3.forward(self.size, values, &second);
-        if self.form == Form::Identity {
+        if self.variant == NetworkVariant::Identity {
             add(&mut output, &product);
         }
         [product, first, second, output]
@@ -247,7 +247,7 @@ impl Tonemapper {
         let mut d_first = conv2.backward(self.size, values, &first, &d_second, &mut parameters);
         relu_backward(&mut d_first, &first);
         let mut d_product = conv1.backward(self.size, values, &product, &d_first, &mut parameters);
-        if self.form == Form::Identity {
+        if self.variant == NetworkVariant::Identity {
             add(&mut d_product, d_output);
         }
         let times = |by: &[f64]| d_product.iter().zip(by).map(|(d, by)| d * by).collect();

@@ -3,7 +3,9 @@
 use glam::UVec2;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{CheckReport, DeviceChoice, Gpu};
-use nightsplat::networks::{Denoiser, DenoiserSettings, Form, Parameters, Precision, Tonemapper};
+use nightsplat::networks::{
+    Denoiser, DenoiserSettings, NetworkVariant, Parameters, Precision, Tonemapper,
+};
 
 use super::model;
 use super::{largest, narrow, widen};
@@ -123,7 +125,7 @@ fn in_the_identity_form_a_render_comes_out_bit_for_bit_until_something_is_learne
         assert_eq!(outcome.output, second);
         assert!(outcome.parameters.iter().any(|d| *d != 0.0), "nothing would ever be learned");
     }
-    let mut tonemapper = Tonemapper::new(&gpu, Form::Identity, 1).unwrap();
+    let mut tonemapper = Tonemapper::new(&gpu, NetworkVariant::Identity, 1).unwrap();
     let outcome = run_tonemapper(&mut tonemapper, size, [&first, &second, &d]);
     let product: Vec<f32> = first.iter().zip(&second).map(|(l, r)| l * r).collect();
     assert_eq!(outcome.output, product);
@@ -147,15 +149,15 @@ fn the_denoiser_matches_its_reference_forward_and_backward() {
             vec![[5, 7]],
         ),
     ];
-    let forms = [Form::Identity, Form::Paper];
+    let variants = [NetworkVariant::Identity, NetworkVariant::Paper];
     let all = all.into_iter().flat_map(|(settings, sizes)| {
-        forms.map(|form| (DenoiserSettings { form, ..settings }, sizes.clone()))
+        variants.map(|variant| (DenoiserSettings { variant, ..settings }, sizes.clone()))
     });
     for (settings, sizes) in all {
         // One network for all sizes: its memory serves smaller views too.
         let mut denoiser = Denoiser::new(&gpu, settings, 7).unwrap();
         assert_eq!(denoiser.margin(), settings.stages * (settings.repeats + 2));
-        if settings.form == Form::Identity {
+        if settings.variant == NetworkVariant::Identity {
             draw_weights(denoiser.parameters_mut(), 5);
         }
         let values = widen(&gpu.read(&denoiser.parameters().values).unwrap());
@@ -175,11 +177,11 @@ fn the_denoiser_matches_its_reference_forward_and_backward() {
 
 #[test]
 fn the_tonemapper_matches_its_reference_forward_and_backward() {
-    for form in [Form::Identity, Form::Paper] {
+    for variant in [NetworkVariant::Identity, NetworkVariant::Paper] {
         let gpu = gpu();
-        let mut tonemapper = Tonemapper::new(&gpu, form, 7).unwrap();
+        let mut tonemapper = Tonemapper::new(&gpu, variant, 7).unwrap();
         assert_eq!(tonemapper.margin(), 3);
-        if form == Form::Identity {
+        if variant == NetworkVariant::Identity {
             draw_weights(tonemapper.parameters_mut(), 5);
         }
         let values = widen(&gpu.read(&tonemapper.parameters().values).unwrap());
@@ -187,12 +189,12 @@ fn the_tonemapper_matches_its_reference_forward_and_backward() {
         for size in [[33, 17], [1, 1], [3, 1], [5, 7]].map(UVec2::from_array) {
             let [illumination, denoised, d] = images(size, 5);
             let actual = run_tonemapper(&mut tonemapper, size, [&illumination, &denoised, &d]);
-            let model = model::Tonemapper { form, size: size.to_array().map(|n| n as usize) };
+            let model = model::Tonemapper { variant, size: size.to_array().map(|n| n as usize) };
             let [illumination, denoised, d] =
                 [illumination, denoised, d].map(|image| widen(&image));
             let output = model.forward(&values, &illumination, &denoised);
             let gradients = model.backward(&values, &illumination, &denoised, &d);
-            let what = format!("{form:?} {size}");
+            let what = format!("{variant:?} {size}");
             assert_outcome(&what, tonemapper.parameters(), &actual, &output, &gradients);
         }
     }
@@ -209,7 +211,7 @@ fn a_value_that_is_not_a_number_reaches_the_output() {
     let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
     let outcome = run_denoiser(&mut denoiser, size, [&first, &second, &d]);
     assert!(outcome.output[100].is_nan());
-    let mut tonemapper = Tonemapper::new(&gpu, Form::Paper, 1).unwrap();
+    let mut tonemapper = Tonemapper::new(&gpu, NetworkVariant::Paper, 1).unwrap();
     let outcome = run_tonemapper(&mut tonemapper, size, [&first, &second, &d]);
     assert!(outcome.output[100].is_nan());
 }
@@ -225,7 +227,7 @@ fn two_runs_give_the_same_bits() {
         run_denoiser(&mut denoiser, size, [&first, &second, &d])
     };
     let tone = |_| {
-        let mut tonemapper = Tonemapper::new(&gpu, Form::Paper, 1).unwrap();
+        let mut tonemapper = Tonemapper::new(&gpu, NetworkVariant::Paper, 1).unwrap();
         run_tonemapper(&mut tonemapper, size, [&first, &second, &d])
     };
     let ([a, b], [c, d]) = ([0, 1].map(denoise), [0, 1].map(tone));
@@ -243,8 +245,8 @@ fn where_activations_are_kept_no_stage_is_computed_again_and_no_bit_changes() {
     let (gpu, size) = (gpu(), UVec2::new(21, 9));
     let [first, second, d] = images(size, 9);
     let [stages, repeats] = [3, 2];
-    let form = Form::Paper;
-    let settings = DenoiserSettings { stages, repeats, channels: 8, form, ..Default::default() };
+    let variant = NetworkVariant::Paper;
+    let settings = DenoiserSettings { stages, repeats, channels: 8, variant, ..Default::default() };
     let most = Denoiser::kept_bytes(settings, size);
     let run = |kept: UVec2, most| {
         let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
@@ -285,9 +287,9 @@ fn activations_are_not_kept_where_the_device_has_no_room_for_them() {
 #[test]
 fn half_precision_stays_near_single_at_every_magnitude() {
     let gpu = gpu();
-    let form = Form::Paper;
+    let variant = NetworkVariant::Paper;
     let single =
-        DenoiserSettings { stages: 2, repeats: 3, channels: 24, form, ..Default::default() };
+        DenoiserSettings { stages: 2, repeats: 3, channels: 24, variant, ..Default::default() };
     let half = DenoiserSettings { precision: Precision::Half, ..single };
     let size = UVec2::new(37, 26);
     let [first, second, d] = images(size, 4);
@@ -356,9 +358,9 @@ fn the_paper_s_denoiser_has_its_parameters_and_fits_a_gigabyte() {
 #[test]
 fn weights_begin_as_in_pytorch_and_follow_the_seed() {
     let gpu = gpu();
-    let form = Form::Paper;
+    let variant = NetworkVariant::Paper;
     let settings =
-        DenoiserSettings { stages: 2, repeats: 1, channels: 16, form, ..Default::default() };
+        DenoiserSettings { stages: 2, repeats: 1, channels: 16, variant, ..Default::default() };
     let values = |seed| {
         let denoiser = Denoiser::new(&gpu, settings, seed).unwrap();
         (gpu.read(&denoiser.parameters().values).unwrap(), denoiser.parameters().tensors().to_vec())
@@ -400,7 +402,7 @@ fn misuse_is_told_in_one_line() {
     }
     let settings = DenoiserSettings { stages: 1, repeats: 1, channels: 4, ..Default::default() };
     let mut denoiser = Denoiser::new(&gpu, settings, 0).unwrap();
-    let mut tonemapper = Tonemapper::new(&gpu, Form::Identity, 0).unwrap();
+    let mut tonemapper = Tonemapper::new(&gpu, NetworkVariant::Identity, 0).unwrap();
     let size = UVec2::new(6, 5);
     let (image, short) = (gpu.zeros("image", 90).unwrap(), gpu.zeros("short", 89).unwrap());
     let [mut d_first, mut d_second] = [(); 2].map(|()| gpu.zeros("d", 90).unwrap());

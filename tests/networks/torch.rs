@@ -4,7 +4,7 @@ use std::path::Path;
 
 use glam::UVec2;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::networks::{Denoiser, DenoiserSettings, Form, Parameters, Tonemapper};
+use nightsplat::networks::{Denoiser, DenoiserSettings, NetworkVariant, Parameters, Tonemapper};
 use safetensors::SafeTensors;
 
 use super::largest;
@@ -64,9 +64,9 @@ impl Fixture {
 #[test]
 fn a_denoiser_stage_is_pytorch_s() {
     let fixture = Fixture::new("stage");
-    let form = Form::Paper;
+    let variant = NetworkVariant::Paper;
     let settings =
-        DenoiserSettings { stages: 1, repeats: 3, channels: 8, form, ..Default::default() };
+        DenoiserSettings { stages: 1, repeats: 3, channels: 8, variant, ..Default::default() };
     let mut denoiser = Denoiser::new(&gpu(), settings, 0).unwrap();
     let values = fixture.layers(denoiser.parameters(), "");
     gpu().write(&mut denoiser.parameters_mut().values, &values).unwrap();
@@ -78,7 +78,7 @@ fn a_denoiser_stage_is_pytorch_s() {
 #[test]
 fn the_tonemapper_is_pytorch_s() {
     let fixture = Fixture::new("tonemapper");
-    let mut tonemapper = Tonemapper::new(&gpu(), Form::Paper, 0).unwrap();
+    let mut tonemapper = Tonemapper::new(&gpu(), NetworkVariant::Paper, 0).unwrap();
     let values = fixture.layers(tonemapper.parameters(), "");
     gpu().write(&mut tonemapper.parameters_mut().values, &values).unwrap();
     let [illumination, denoised, d] = fixture.images(["illumination", "denoised", "d_low"]);

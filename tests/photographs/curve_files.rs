@@ -43,7 +43,7 @@ fn tables_are_read_from_csv_and_cube() {
     assert_eq!(table.y, [[0.0, 0.4, 0.8, 1.0]]);
     let of_x = load("b.csv", "x,r,g,b\n0,0,0,0\n1,1,0.5,0.2\n").unwrap().table.unwrap();
     assert_eq!((of_x.input, of_x.y.len()), (TableInput::X, 3));
-    let cube = "TITLE \"lift\"\nLUT_1D_SIZE 3\nDOMAIN_MIN 0 0 0\nDOMAIN_MAX 2 2 2\n0 0 0\n0.5 0.6 0.7\n1 1 1\n";
+    let cube = "TITLE \"brighter\"\nLUT_1D_SIZE 3\nDOMAIN_MIN 0 0 0\nDOMAIN_MAX 2 2 2\n0 0 0\n0.5 0.6 0.7\n1 1 1\n";
     let settings = load("c.cube", cube).unwrap();
     let table = settings.table.unwrap();
     assert_eq!((table.input, table.x.as_slice()), (TableInput::X, &[0.0, 1.0, 2.0][..]));

@@ -10,7 +10,7 @@ mod profile;
 use nightsplat::Error;
 use nightsplat::base::random::Stream;
 use nightsplat::photographs::fit::{
-    Channels, Fit, FitOptions, Pair, Scene, Weighting, cross_validate, fit, psnr,
+    Channels, Fit, FitOptions, FitScene, Pair, Weighting, cross_validate, fit, psnr,
 };
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::tone::{FAMILIES, Family, Statistics, ToneCurve, ToneSettings, White};
@@ -129,7 +129,7 @@ fn black_level_gain_and_aim_come_back_where_curves_adapt() {
         let mut truth = ToneSettings { theta: 0.42, ..ToneSettings::new(family.curve) };
         if family.white == White::P90 {
             (truth.alpha, truth.gain_c) = (0.1, 1.7);
-            if family.law == nightsplat::photographs::tone::Law::Rescaled {
+            if family.law == nightsplat::photographs::tone::OffsetMode::Rescaled {
                 truth.base_gain = 0.9;
             }
         }
@@ -393,13 +393,13 @@ fn pairs_that_say_nothing_have_a_defined_end() {
     }
     assert!(fit(ToneCurve::None.family(), &[&one], &PLAIN).is_err());
     assert!(fit(ToneCurve::Softexp.family(), &[], &PLAIN).is_err());
-    let scene = Scene { name: "one".to_owned(), pairs: vec![one] };
+    let scene = FitScene { name: "one".to_owned(), pairs: vec![one] };
     assert!(cross_validate(ToneCurve::Softexp.family(), &[scene], 5, &PLAIN).is_err());
 }
 
 /// AP3's form, black level, gain and cubic all free, drawn to the published cubic as if it were as many photographs as
 /// there are: on every pair left out in turn its squared error is less than AP3's and than the cubic's.
-fn assert_beats_the_published_constants(scene: Scene) {
+fn assert_beats_the_published_constants(scene: FitScene) {
     let (count, scene) = (scene.pairs.len(), [scene]);
     let options = FitOptions { adapt: true, prior: count as f64, ..FitOptions::default() };
     let held_out =
@@ -420,7 +420,7 @@ fn constants_fitted_to_some_pairs_beat_the_published_ones_on_others() {
         let dark = dark(48, 0.03 + 0.01 * seed as f64, 0.004 * seed as f64, seed);
         pair(&settings, &dark, 0.02, seed)
     });
-    let scene = Scene { name: "synthetic".to_owned(), pairs: pairs.collect() };
+    let scene = FitScene { name: "synthetic".to_owned(), pairs: pairs.collect() };
     assert_beats_the_published_constants(scene);
 }
 
@@ -429,7 +429,7 @@ fn constants_fitted_to_some_pairs_beat_the_published_ones_on_others() {
 #[test]
 fn constants_fitted_to_real_pairs_beat_the_published_ones_on_others() {
     let Some(folder) = crate::common::shared("data/pairs_lol") else { return };
-    let scene = Scene::load(&folder, None).unwrap();
+    let scene = FitScene::load(&folder, None).unwrap();
     assert_eq!(scene.pairs.len(), 15);
     let pairs: Vec<&Pair> = scene.pairs.iter().collect();
     let options = FitOptions { adapt: true, ..FitOptions::default() };

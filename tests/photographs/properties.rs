@@ -6,7 +6,7 @@
 use std::path::Path;
 
 use glam::{DAffine3, DMat2, DQuat, DVec2, DVec3, EulerRot};
-use nightsplat::camera::{Camera, CameraModel, Distortion, Frame};
+use nightsplat::camera::{Camera, CameraModel, Distortion, TrainingFrame};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::dataset::{Dataset, LoadOptions};
 use nightsplat::photographs::tone::{FAMILIES, Table, ToneSettings};
@@ -105,7 +105,7 @@ proptest! {
     fn a_frame_shows_the_same_pixels_and_leads_back(
         camera in camera(), center in position(1e6), extent in 1e-6..1e6_f64, at in position(5.0),
     ) {
-        let frame = Frame::new(center, extent);
+        let frame = TrainingFrame::new(center, extent);
         let world = center + extent * at;
         let back = frame.unframed(frame.framed(world));
         prop_assert!(back.distance(world) <= 1e-9 * (world.length() + extent), "{back}, not {world}");

@@ -6,7 +6,9 @@ use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat::kernels::ToneParameters;
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::tone::{Lift, Measured, Scene, ToneCurve, ToneSettings};
+use nightsplat::photographs::tone::{
+    MeasuredPhotograph, SceneTone, ToneCurve, ToneMapping, ToneSettings,
+};
 
 use crate::common::{assert_close, fixture, shared};
 
@@ -41,10 +43,11 @@ fn a_curve_follows_the_host_from_tiny_to_huge_values() {
 }
 
 /// The lift of one photograph of its own, and the target on the device.
-fn lifted(gpu: &Gpu, settings: &ToneSettings, photograph: &Image) -> (Lift, Image) {
-    let lift = settings.lift(&Scene::default(), &Measured::of(&photograph.data));
+fn tone_mapped(gpu: &Gpu, settings: &ToneSettings, photograph: &Image) -> (ToneMapping, Image) {
+    let tone_mapping =
+        settings.tone_mapping(&SceneTone::default(), &MeasuredPhotograph::of(&photograph.data));
     let pseudo_gt = PseudoGt::new(gpu, settings).unwrap();
-    (lift, pseudo_gt.lifted(photograph, &lift).unwrap())
+    (tone_mapping, pseudo_gt.tone_mapped(photograph, &tone_mapping).unwrap())
 }
 
 #[test]
@@ -71,9 +74,11 @@ fn a_photograph_maps_on_the_device_as_on_the_host() {
     for path in committed.into_iter().chain(shared("data/lom/chair/low/1.JPG")) {
         let photograph = Image::load(path).unwrap();
         for curve in [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Hybrid] {
-            let (lift, target) = lifted(&gpu(), &ToneSettings::new(curve), &photograph);
+            let (tone_mapping, target) =
+                tone_mapped(&gpu(), &ToneSettings::new(curve), &photograph);
             let values = photograph.data.iter();
-            let mapped: Vec<f32> = values.map(|&x| curve.apply(x, &lift.parameters)).collect();
+            let mapped: Vec<f32> =
+                values.map(|&x| curve.apply(x, &tone_mapping.parameters)).collect();
             assert_close(curve.name(), &target.data, &mapped, |_, _| 5e-6);
         }
     }
@@ -83,9 +88,9 @@ fn a_photograph_maps_on_the_device_as_on_the_host() {
 fn a_photograph_that_no_binding_spans_is_mapped_in_tiles_to_the_same_bits() {
     let photograph = Image::load(fixture("lom/low/000.png")).unwrap();
     let settings = ToneSettings::new(ToneCurve::Ap3);
-    let (_, whole) = lifted(&gpu(), &settings, &photograph);
+    let (_, whole) = tone_mapped(&gpu(), &settings, &photograph);
     // The last tile is shorter.
     let bytes = size_of_val(&*photograph.data) as u64 / 3 + 48;
-    let (_, in_tiles) = lifted(&gpu_that_binds(bytes), &settings, &photograph);
+    let (_, in_tiles) = tone_mapped(&gpu_that_binds(bytes), &settings, &photograph);
     assert_eq!(whole, in_tiles);
 }

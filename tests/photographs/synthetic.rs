@@ -263,8 +263,8 @@ fn a_fisheye_set_trains_renders_scores_and_exports() {
     let [set, native, undistorted] =
         ["set", "native", "undistorted"].map(|name| dir.path().join(name).display().to_string());
     run(&format!("synth {set} --fisheye --views 10 --width 48 --height 36"), 0);
-    let said = run(&format!("train {set} --out {native} --steps 200 --seed 1"), 0).1;
-    assert!(!said.contains("cropped"), "{said}");
+    let message = run(&format!("train {set} --out {native} --steps 200 --seed 1"), 0).1;
+    assert!(!message.contains("cropped"), "{message}");
     run(&format!("train {set} --out {undistorted} --steps 1 --undistort"), 0);
     let scores = run(&format!("eval {native} --json"), 0).0;
     let scores: serde_json::Value = serde_json::from_str(&scores).unwrap();

@@ -369,9 +369,9 @@ fn a_curve_alone_reaches_its_known_psnr_on_the_test_views() {
 fn a_gain_replaces_the_choice_of_one_and_leaves_what_was_lifted_first() {
     let ap3 = ToneSettings::new(ToneCurve::Ap3);
     let auto = ap3.clone().with_gain(GainChoice::Auto);
-    assert!(auto.auto_gain && auto.lift_first);
+    assert!(auto.auto_gain && auto.full_resolution);
     let own = |settings: ToneSettings| settings.with_gain(GainChoice::C(2.0));
     assert_eq!(own(auto), ToneSettings { gain_c: 2.0, ..ap3.clone() });
-    let lifted = ToneSettings { lift_first: true, ..ap3 };
-    assert_eq!(own(lifted.clone()), ToneSettings { gain_c: 2.0, ..lifted });
+    let tone_mapped = ToneSettings { full_resolution: true, ..ap3 };
+    assert_eq!(own(tone_mapped.clone()), ToneSettings { gain_c: 2.0, ..tone_mapped });
 }

@@ -70,7 +70,7 @@ fn trained(repetition: usize, [one, other]: &mut [Trainer; 2], folder: &Path) ->
     let checkpoint = folder.join("checkpoint.safetensors");
     let mut trainer = one;
     trainer.restore(&folder.join("begin.safetensors")).unwrap();
-    trainer.set_pace(1 + repetition % 3, [None, Some(1), Some(3), Some(64)][repetition % 4]);
+    trainer.set_batching(1 + repetition % 3, [None, Some(1), Some(3), Some(64)][repetition % 4]);
     match repetition % 5 {
         1 => {
             // A profiled step is one like others; it may have to be done again with more memory.
@@ -135,7 +135,7 @@ fn tiny_run() -> (tempfile::TempDir, PathBuf) {
     succeed(&format!(
         "train {} --out {} --plan none --model plain --curve ap3 --steps 60 --hash-every 20 --set tile=[16,8] \
          --set schedule.densify_after=10 --set schedule.densify_interval=10 --max-gaussians 2000 --background black \
-         --set density.fill=0 --set precision.rest=32 --set precision.moments=32 --set schedule.settle_steps=0",
+         --set density.depth_seeding=0 --set precision.rest=32 --set precision.moments=32 --set schedule.cooldown_steps=0",
         set.display(),
         run.display()
     ));

@@ -26,9 +26,9 @@ fn every_format_is_one_file_of_the_run_and_begins_as_its_readers_expect() {
         ("sog", b"PK\x03\x04"),
         ("html", b"<!DOCTYPE html>"),
     ] {
-        let said = succeed(&format!("export {run} --to {format}"));
+        let message = succeed(&format!("export {run} --to {format}"));
         let path = Path::new(&run).join(format!("model.{format}"));
-        assert!(said.contains("Gaussians in"), "{said}");
+        assert!(message.contains("Gaussians in"), "{message}");
         assert!(std::fs::read(&path).unwrap().starts_with(magic), "{format}");
     }
     let html = std::fs::read_to_string(Path::new(&run).join("model.html")).unwrap();

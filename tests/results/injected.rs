@@ -40,7 +40,7 @@ fn a_lost_device_and_memory_that_is_out_end_with_4_and_the_run_goes_on() {
     let place = Place::new();
     let options = "--steps 40 --checkpoint-every 10";
     succeed(&place.train("straight", options));
-    for (fault, said) in
+    for (fault, message) in
         [("submission:60", "was lost while"), ("allocation:100", "out of device memory")]
     {
         let name = fault.replace(':', "-");
@@ -48,7 +48,7 @@ fn a_lost_device_and_memory_that_is_out_end_with_4_and_the_run_goes_on() {
         let output = command(&train).env("NIGHTSPLAT_FAULT", fault).output().unwrap();
         let stderr = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(4), "{fault}: {stderr}");
-        assert!(stderr.lines().last().is_some_and(|line| line.contains(said)), "{stderr}");
+        assert!(stderr.lines().last().is_some_and(|line| line.contains(message)), "{stderr}");
         assert!(!place.path(&name).join("done.json").exists());
         succeed(&place.train(&name, &format!("{options} --resume")));
         assert!(place.model(&name) == place.model("straight"), "{fault}");
@@ -61,7 +61,7 @@ fn a_lost_device_and_memory_that_is_out_end_with_4_and_the_run_goes_on() {
 fn a_full_disk_is_said_and_what_was_there_stays_whole() {
     let place = Place::new();
     // Runs of other lengths begin alike where none settles before its end.
-    let options = "--steps 40 --checkpoint-every 10 --set schedule.settle_steps=0";
+    let options = "--steps 40 --checkpoint-every 10 --set schedule.cooldown_steps=0";
     succeed(&place.train("run", &options.replace("40", "10")));
     let before = place.model("run");
     // No file may grow beyond so many blocks, as on a disk with no more left; the checkpoint needs more.

@@ -53,14 +53,14 @@ fn log(run: &Path) -> Vec<String> {
 fn a_signal_saves_and_stops_and_the_run_goes_on_to_the_same_bits() {
     let place = Place::new();
     succeed(&place.train("straight", "--steps 400"));
-    for (signal, code, said) in [("-INT", 130, "interrupted"), ("-TERM", 143, "told to end")] {
+    for (signal, code, message) in [("-INT", 130, "interrupted"), ("-TERM", 143, "told to end")] {
         let name = format!("stopped{signal}");
         let mut child = begun(&place.train(&name, "--steps 400"));
         send(signal, &child);
         let _ = child.stdout.take();
         let (status, stderr) = ended(child);
         assert_eq!(status, code, "{stderr}");
-        assert!(stderr.contains(said) && stderr.contains("--resume"), "{stderr}");
+        assert!(stderr.contains(message) && stderr.contains("--resume"), "{stderr}");
         assert!(
             !place.path(&name).join("metrics.json").exists(),
             "the run ended before the signal"

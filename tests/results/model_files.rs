@@ -81,8 +81,8 @@ fn a_model_file_is_scored_shown_and_exported_without_its_run() {
     fs::copy(place.path("run/model.ply"), &model).unwrap();
     let (model, set) = (model.display(), set.display());
 
-    let (scores, said) = run(&format!("eval {model} --dataset {set} --json"), 0);
-    assert!(said.contains("its training is unknown"), "{said}");
+    let (scores, message) = run(&format!("eval {model} --dataset {set} --json"), 0);
+    assert!(message.contains("its training is unknown"), "{message}");
     let psnr = |json: &str| {
         let json: serde_json::Value = serde_json::from_str(json).unwrap();
         json["mean"]["psnr"].as_f64().unwrap()

@@ -41,12 +41,12 @@ fn without_references_test_views_are_scored_against_what_they_would_be_trained_o
     assert_eq!(json(path("with/metrics.json")).get("against"), None);
     fs::remove_dir_all(path("set/high")).unwrap();
     for (out, curve, label) in [
-        ("lifted", "--curve ap3", "against their own pseudo-GT"),
+        ("tone-mapped", "--curve ap3", "against their own pseudo-GT"),
         ("plain", "--curve none", "against the photographs themselves"),
     ] {
         let options = format!("--steps 4 --eval-every 2 --progress plain {curve}");
-        let (said, on_the_way) = run(&train(folder.path(), out, &options), 0);
-        assert!(said.contains(label), "{said}");
+        let (message, on_the_way) = run(&train(folder.path(), out, &options), 0);
+        assert!(message.contains(label), "{message}");
         assert!(on_the_way.contains("test views against their"), "{on_the_way}");
         let metrics = json(path(out).join("metrics.json"));
         assert!(metrics["against"].as_str().unwrap().starts_with(label), "{metrics}");
@@ -100,31 +100,34 @@ fn scores_on_the_way_are_rows_and_a_resumed_run_has_each_once() {
 fn a_run_says_at_its_start_what_it_trains_and_why() {
     let folder = folder();
     let start = |out: &str, options: &str| succeed(&train(folder.path(), out, options));
-    let said = start("a", "--steps 1 --progress none");
+    let message = start("a", "--steps 1 --progress none");
     for part in [
         "8 views of 48x32 to train on",
         "2 test views (as the transforms files say) scored against reference images",
         "points; on ",
         "curve auto: as bright as",
     ] {
-        assert!(said.contains(part), "no `{part}` in: {said}");
+        assert!(message.contains(part), "no `{part}` in: {message}");
     }
     // Nothing is held out of eight views but one, and nothing of seven.
-    let said = start("d", "--progress none --preset balanced --set steps=30");
+    let message = start("d", "--progress none --preset balanced --set steps=30");
     for part in [
         "30 steps at most: the run settles for 10 and ends once 1 held-out view has converged",
         "30 steps are too few to settle for 250 (a third of them at most)",
     ] {
-        assert!(said.contains(part), "no `{part}` in: {said}");
+        assert!(message.contains(part), "no `{part}` in: {message}");
     }
-    assert!(said.contains("ended at step 30: all steps are done"), "{said}");
-    let said = start("e", "--progress none --preset balanced --set steps=3 --test-every 3");
-    assert!(said.contains("no early end: 6 training views are too few to hold one out"), "{said}");
-    let said = start("b", "--steps 1 --progress none --plan none --curve AP3 --test-every 5");
-    assert!(said.contains("curve ap3: as asked for"), "{said}");
-    assert!(said.contains("2 test views (every 5th by name, as asked for)"), "{said}");
-    let said = start("c", "--steps 1 --progress json --curve none");
-    let first: Value = serde_json::from_str(said.lines().next().unwrap()).unwrap();
+    assert!(message.contains("ended at step 30: all steps are done"), "{message}");
+    let message = start("e", "--progress none --preset balanced --set steps=3 --test-every 3");
+    assert!(
+        message.contains("no early end: 6 training views are too few to hold one out"),
+        "{message}"
+    );
+    let message = start("b", "--steps 1 --progress none --plan none --curve AP3 --test-every 5");
+    assert!(message.contains("curve ap3: as asked for"), "{message}");
+    assert!(message.contains("2 test views (every 5th by name, as asked for)"), "{message}");
+    let message = start("c", "--steps 1 --progress json --curve none");
+    let first: Value = serde_json::from_str(message.lines().next().unwrap()).unwrap();
     assert_eq!(first["event"], "started");
     assert_eq!((&first["train_views"], &first["curve"]), (&8.into(), &"none".into()));
     assert!(!first["device"].as_str().unwrap().is_empty());
@@ -134,8 +137,11 @@ fn a_run_says_at_its_start_what_it_trains_and_why() {
 fn another_split_is_asked_for_said_and_kept() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
-    let (_, said) = run(&train(folder.path(), "run", "--steps 2 --test-every 3"), 0);
-    assert!(said.contains("its transforms files split the views") && said.contains("3"), "{said}");
+    let (_, message) = run(&train(folder.path(), "run", "--steps 2 --test-every 3"), 0);
+    assert!(
+        message.contains("its transforms files split the views") && message.contains("3"),
+        "{message}"
+    );
     let views = |run: &str| -> Vec<String> {
         let metrics = json(path(run).join("metrics.json"));
         metrics["views"].as_object().unwrap().keys().cloned().collect()
@@ -173,14 +179,14 @@ fn a_run_that_was_stopped_is_rendered_scored_and_made_longer_with_a_lower_cap() 
     fs::copy(path("run/checkpoint.before.safetensors"), checkpoint).unwrap();
     assert_eq!(stopped_at(&path("run")), Some(10));
     let run_folder = path("run").display().to_string();
-    let (printed, said) = run(&format!("eval {run_folder} --json"), 0);
-    assert!(said.contains("stopped at step 10 of 12"), "{said}");
+    let (printed, message) = run(&format!("eval {run_folder} --json"), 0);
+    assert!(message.contains("stopped at step 10 of 12"), "{message}");
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!(printed["steps"], 10);
     assert_eq!(printed["mean"], json(path("ten/metrics.json"))["mean"]);
     let shown = path("shown").display().to_string();
-    let (_, said) = run(&format!("render {run_folder} --split test --out {shown}"), 0);
-    assert!(said.contains("stopped at step 10 of 12") && file_count(&shown) == 2, "{said}");
+    let (_, message) = run(&format!("render {run_folder} --split test --out {shown}"), 0);
+    assert!(message.contains("stopped at step 10 of 12") && file_count(&shown) == 2, "{message}");
 
     succeed(&train(folder.path(), "run", &format!("--steps 12 --resume {options}")));
     assert!(model("run") == whole);
@@ -200,10 +206,10 @@ fn a_planned_run_is_made_longer_on_the_views_that_it_began_with() {
     let set = folder.path().join("set").display().to_string();
     succeed(&format!("synth {set} --views 20 --width 32 --height 24"));
     let short = "--set steps=6 --checkpoint-every 3 --progress none";
-    let said = succeed(&train(folder.path(), "run", short));
-    assert!(said.contains("held-out view"), "{said}");
-    let said = succeed(&train(folder.path(), "run", "--steps 9 --resume --progress none"));
-    assert!(said.contains("9 steps"), "{said}");
+    let message = succeed(&train(folder.path(), "run", short));
+    assert!(message.contains("held-out view"), "{message}");
+    let message = succeed(&train(folder.path(), "run", "--steps 9 --resume --progress none"));
+    assert!(message.contains("9 steps"), "{message}");
 }
 
 #[test]
@@ -219,8 +225,8 @@ fn a_model_is_written_with_every_checkpoint() {
     child.kill().unwrap();
     child.wait().unwrap();
     assert!(stopped_at(&out).unwrap() >= 5);
-    let (_, said) = run(&format!("eval {}", out.display()), 0);
-    assert!(said.contains("stopped at step"), "{said}");
+    let (_, message) = run(&format!("eval {}", out.display()), 0);
+    assert!(message.contains("stopped at step"), "{message}");
 }
 
 fn copy(from: &Path, to: &Path) {
@@ -245,14 +251,14 @@ fn a_run_is_opened_with_another_copy_of_its_dataset_and_what_differs_is_said() {
     let [run_folder, copied, shown] =
         ["run", "copy", "shown"].map(|name| path(name).display().to_string());
     refused(&format!("eval {run_folder}"), 3, &["set", "--dataset"]);
-    let (printed, said) = run(&format!("eval {run_folder} --json --dataset {copied}"), 0);
+    let (printed, message) = run(&format!("eval {run_folder} --json --dataset {copied}"), 0);
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!(printed, json(path("run/metrics.json")));
-    assert!(!said.contains("is not what"), "{said}");
+    assert!(!message.contains("is not what"), "{message}");
     fs::remove_file(path("copy/low/004.png")).unwrap();
     let arguments = format!("render {run_folder} --split test --out {shown} --dataset {copied}");
-    let (_, said) = run(&arguments, 0);
-    assert!(said.contains("is not what") && said.contains("004,train,48,32"), "{said}");
+    let (_, message) = run(&arguments, 0);
+    assert!(message.contains("is not what") && message.contains("004,train,48,32"), "{message}");
 }
 
 /// The pictures of a path, as files.
@@ -338,8 +344,8 @@ fn tensorboard_gets_its_events_and_changes_no_bit() {
 #[test]
 fn options_of_what_a_run_has_not_are_said_with_what_switches_it_on() {
     let folder = folder();
-    let said = |out: &str, options: &str| run(&train(folder.path(), out, options), 0).1;
-    let plain = said("a", "--steps 1 --model plain --denoiser-channels 8 --depth-is-disparity");
+    let message = |out: &str, options: &str| run(&train(folder.path(), out, options), 0).1;
+    let plain = message("a", "--steps 1 --model plain --denoiser-channels 8 --depth-is-disparity");
     for part in [
         "--denoiser-channels",
         "no denoiser",
@@ -349,15 +355,15 @@ fn options_of_what_a_run_has_not_are_said_with_what_switches_it_on() {
     ] {
         assert!(plain.contains(part), "no `{part}` in: {plain}");
     }
-    let with = said("b", "--steps 1 --parts denoiser --denoiser-channels 4 --denoiser-crop 16");
+    let with = message("b", "--steps 1 --parts denoiser --denoiser-channels 4 --denoiser-crop 16");
     assert!(!with.contains("no effect"), "{with}");
     let gains = "--steps 1 --set stop.growth_gain=0.3 --set stop.degree_gain=0.02";
-    let without = said("c", gains);
+    let without = message("c", gains);
     for gain in ["stop.growth_gain has no effect", "stop.degree_gain has no effect", "stop.views=N"]
     {
         assert!(without.contains(gain), "no `{gain}` in: {without}");
     }
-    let with = said("d", &format!("{gains} --set stop.views=1"));
+    let with = message("d", &format!("{gains} --set stop.views=1"));
     assert!(!with.contains("no effect"), "{with}");
 }
 
@@ -366,13 +372,16 @@ fn large_photographs_shrink_to_a_limit_that_is_said_and_recorded() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
     let views = |out: &str| fs::read_to_string(path(out).join("views.csv")).unwrap();
-    let (_, said) = run(&train(folder.path(), "run", "--steps 2 --max-resolution 24"), 0);
-    assert!(said.contains("48x32 are trained on at 24x16"), "{said}");
+    let (_, message) = run(&train(folder.path(), "run", "--steps 2 --max-resolution 24"), 0);
+    assert!(message.contains("48x32 are trained on at 24x16"), "{message}");
     assert!(views("run").contains("001,train,24,16"), "{}", views("run"));
     // Behind another factor, which does more by itself.
-    let (_, said) =
+    let (_, message) =
         run(&train(folder.path(), "both", "--steps 2 --max-resolution 40 --downscale 2"), 0);
-    assert!(!said.contains("trained on at") && views("both").contains("001,train,24,16"), "{said}");
+    assert!(
+        !message.contains("trained on at") && views("both").contains("001,train,24,16"),
+        "{message}"
+    );
     succeed(&train(folder.path(), "none", "--steps 2 --max-resolution none"));
     assert!(views("none").contains("001,train,48,32"));
     let config = fs::read_to_string(path("none/config.toml")).unwrap();

@@ -7,7 +7,7 @@ use glam::{DVec3, Vec3};
 use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat::photographs::dataset::Dataset;
-use nightsplat::splats::halves::StorageFormat;
+use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::{Gaussians, Layout, Shape, width};
 use nightsplat::train::{TrainConfig, Trainer};
@@ -147,8 +147,9 @@ fn what_lies_beyond_a_binding_is_rendered() {
     let seen = Setup::new(500, [64, 48], shape, 5);
     let own = seen.gaussians();
     let mut all = Gaussians::zeros(hidden + seen.count, shape);
-    let behind = seen.camera.view_from_world.inverse().transform_point3(DVec3::NEG_Z).as_vec3();
-    all.means_mut()[..hidden].fill(behind);
+    let behind_camera =
+        seen.camera.view_from_world.inverse().transform_point3(DVec3::NEG_Z).as_vec3();
+    all.means_mut()[..hidden].fill(behind_camera);
     let copies: [fn(&mut Gaussians, &Gaussians, usize); 6] = [
         |all, own, at| all.means_mut()[at..].copy_from_slice(own.means()),
         |all, own, at| all.quats_mut()[at..].copy_from_slice(own.quats()),
@@ -173,7 +174,7 @@ fn what_lies_beyond_a_binding_is_rendered() {
 fn what_a_device_cannot_bind_is_refused_and_growth_ends_before_it() {
     let gpu = gpu_that_binds(LITTLE);
     let settings = RenderSettings::default();
-    assert_eq!(settings.most_gaussians(&gpu), 16_384);
+    assert_eq!(settings.peak_gaussians(&gpu), 16_384);
     let mut renderer = Renderer::new(&gpu, settings).unwrap();
     let camera = Setup::new(1, [32, 24], 0, 1).camera;
     let refused = renderer.reserve(16_385, [&camera]).unwrap_err().to_string();

@@ -10,7 +10,7 @@ use nightsplat::Error;
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::{Defect, gpu, is_checked, with_defect};
 use nightsplat::gpu::{CheckReport, Gpu};
-use nightsplat::networks::Form;
+use nightsplat::networks::NetworkVariant;
 use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::image::Image;
@@ -121,10 +121,10 @@ fn every_pass_of_the_whole_model_agrees_with_its_reference_on_a_crop() {
     config.model.denoiser_crop = 9;
     config.model.raw_colors = true;
     config.ssim_weight = 0.0;
-    for form in [Form::Identity, Form::Paper] {
-        config.model.network.form = form;
+    for variant in [NetworkVariant::Identity, NetworkVariant::Paper] {
+        config.model.network.variant = variant;
         let kernels = assert_steps_agree("the whole model", &config);
-        assert!(kernels.contains("window_scatter") && kernels.contains("denoising"), "{kernels:?}");
+        assert!(kernels.contains("crop_scatter") && kernels.contains("denoising"), "{kernels:?}");
     }
 }
 

@@ -63,9 +63,9 @@ fn errors_of(count: usize) -> [f64; 2] {
     let splats: Vec<Splat> = splats[..count].iter().map(Splat::from).collect();
     let colors = widen(bytemuck::cast_slice(&gpu().read(&frame.colors).unwrap()[..count]));
     // The view is one tile, so that every layer has one slot.
-    let slots = gpu().read(&frame.emitted).unwrap();
-    let stored = gpu().read(&frame.records).unwrap();
-    let sums: Vec<f32> = slots[..count]
+    let intersection_ids = gpu().read(&frame.intersection_ranges).unwrap();
+    let stored = gpu().read(&frame.gradient_records).unwrap();
+    let sums: Vec<f32> = intersection_ids[..count]
         .iter()
         .flat_map(|slot| {
             stored[3 * slot.x as usize..3 * slot.y as usize].iter().flat_map(Vec3::to_array)
@@ -74,7 +74,7 @@ fn errors_of(count: usize) -> [f64; 2] {
     let (pixels, alpha_max) = (setup.pixels(), f64::from(setup.settings.max_alpha));
     let background: Vec<f64> = widen(&setup.background());
     let largest_color = colors.iter().chain(&background).fold(1.0f64, |most, c| most.max(c.abs()));
-    let (mut records, mut forward) = (vec![0.0; RECORD * count], 0.0f64);
+    let (mut gradient_records, mut forward) = (vec![0.0; RECORD * count], 0.0f64);
     for at in 0..pixels {
         let width = setup.camera.width as usize;
         let center = DVec2::new((at % width) as f64, (at / width) as f64) + 0.5;
@@ -84,13 +84,22 @@ fn errors_of(count: usize) -> [f64; 2] {
             let error = (f64::from(rendered.render[c * pixels + at]) - value).abs();
             forward = forward.max(error / largest_color);
         }
-        blend_pixel_backward(&splats, &colors, &values, &d, center, alpha_max, 3, &mut records);
+        blend_pixel_backward(
+            &splats,
+            &colors,
+            &values,
+            &d,
+            center,
+            alpha_max,
+            3,
+            &mut gradient_records,
+        );
     }
     let backward = (0..RECORD).map(|k| {
         let own = |values: &dyn Fn(usize) -> f64| {
             (0..count).map(|i| values(RECORD * i + k).abs()).fold(0.0, f64::max)
         };
-        own(&|at| f64::from(sums[at]) - records[at]) / own(&|at| records[at])
+        own(&|at| f64::from(sums[at]) - gradient_records[at]) / own(&|at| gradient_records[at])
     });
     [forward / UNIT, backward.fold(0.0, f64::max) / UNIT]
 }

@@ -10,7 +10,7 @@ use glam::{DVec2, DVec3, UVec2, Vec2, Vec3};
 use nightsplat::camera::Patch;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Threads, Tile};
-use nightsplat::kernels::status::STATUS_CROWDED;
+use nightsplat::kernels::status::STATUS_TILE_LIMIT;
 use nightsplat::kernels::{
     self, ProjectedSplat, blend_forward, emit, order_counts, project_backward,
 };
@@ -36,7 +36,7 @@ fn the_most_intersections_that_can_be_counted_are_an_overflow() {
         let gaussian_count = tile_counts.len() as u32;
         let constants = order_counts::Constants { partition_size: 2 };
         let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
-        let (slots_before, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
+        let (intersection_offsets, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
         let (counts, status) = (vec![7], vec![before[0], before[1], 0]);
         let (_, _, counts, after, arrivals) = run_kernel!(
             order_counts,
@@ -44,7 +44,7 @@ fn the_most_intersections_that_can_be_counted_are_an_overflow() {
             order_counts::Params { gaussian_count, capacity: 5 },
             Threads::Workgroups([3, 1, 1]),
             [sorted_ids, tile_counts],
-            [slots_before, sums, counts, status, arrivals]
+            [intersection_offsets, sums, counts, status, arrivals]
         );
         assert_eq!(counts[0], if flag == 0 { total } else { 0 });
         assert_eq!(after, [before[0] | flag, before[1].max(total), 0]);
@@ -55,7 +55,7 @@ fn the_most_intersections_that_can_be_counted_are_an_overflow() {
 #[test]
 fn memory_for_intersections_grows_to_what_the_device_can_bind_and_no_further() {
     let mut renderer = Setup::new(1, [32, 32], 0, 1).render().renderer;
-    let most = renderer.most_intersections();
+    let most = renderer.max_intersections();
     // Where a device binds gigabytes, allocating them is no test.
     if most > 1 << 23 {
         eprintln!("not run: this device binds {most} intersections at once");
@@ -64,7 +64,7 @@ fn memory_for_intersections_grows_to_what_the_device_can_bind_and_no_further() {
     renderer.grow(most - most / 4).unwrap();
     renderer.grow(most).unwrap();
     let message = renderer.grow(most + 1).unwrap_err().to_string();
-    assert!(message.contains("records"), "{message}");
+    assert!(message.contains("gradient_records"), "{message}");
 }
 
 /// What `blend_forward` finds of the runs of `sorted_tiles` in a view of 5 x 24 tiles, and the status.
@@ -72,7 +72,7 @@ fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>, Vec<u32>)
     let setup = Setup::new(1, [32, 32], 0, 1);
     let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
     let (count, size) = (sorted_tiles.len() as u32, UVec2::new(5 * 16, 24 * 16));
-    let (counts, sorted_slots, owners) =
+    let (counts, sorted_intersections, gaussian_ids) =
         (vec![count], (0..count).collect::<Vec<_>>(), vec![0; count as usize]);
     let (colors, pixels) = (vec![Vec3::splat(0.5)], size.element_product() as usize);
     let (render, transmittances) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
@@ -84,7 +84,7 @@ fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>, Vec<u32>)
         blend_forward::Constants::default(),
         params,
         Threads::Workgroups([120, 1, 1]),
-        [counts, sorted_slots, owners, splats, colors, sorted_tiles],
+        [counts, sorted_intersections, gaussian_ids, splats, colors, sorted_tiles],
         [render, transmittances, tile_ranges, status]
     );
     (ranges, status)
@@ -119,20 +119,20 @@ fn a_count_that_wrapped_around_writes_no_slot_beyond_the_counted() {
     let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
     // As if the offsets of later ranks had run past the total.
     let (counts, sorted_ids, tile_counts) = (vec![2], vec![0, 1, 2], vec![4, 4, u32::MAX - 5]);
-    let (sums, slots_before) = (vec![0], vec![0, 4, 8]);
-    let [tiles, slots, owners] = [0; 3].map(|_| vec![7u32; 16]);
-    let emitted = vec![UVec2::splat(7); 3];
-    let (tiles, slots, owners, emitted) = run_kernel!(
+    let (sums, intersection_offsets) = (vec![0], vec![0, 4, 8]);
+    let [tiles, intersection_ids, gaussian_ids] = [0; 3].map(|_| vec![7u32; 16]);
+    let intersection_ranges = vec![UVec2::splat(7); 3];
+    let (tiles, intersection_ids, gaussian_ids, intersection_ranges) = run_kernel!(
         emit,
         emit::Constants { partition_size: 256, ..Default::default() },
         emit::Params { size: UVec2::new(32, 32), gaussian_count: 3, tile_columns: 2 },
         Threads::Exactly([3, 1, 1]),
-        [counts, sorted_ids, slots_before, sums, splats, tile_counts],
-        [tiles, slots, owners, emitted]
+        [counts, sorted_ids, intersection_offsets, sums, splats, tile_counts],
+        [tiles, intersection_ids, gaussian_ids, intersection_ranges]
     );
-    let untouched = |slots: &[u32]| slots[2..].iter().all(|&slot| slot == 7);
-    assert!(untouched(&tiles) && untouched(&slots) && untouched(&owners));
-    assert!(emitted.iter().all(|range| range.x == range.y));
+    let untouched = |intersection_ids: &[u32]| intersection_ids[2..].iter().all(|&slot| slot == 7);
+    assert!(untouched(&tiles) && untouched(&intersection_ids) && untouched(&gaussian_ids));
+    assert!(intersection_ranges.iter().all(|range| range.x == range.y));
 }
 
 /// Splats that cover an image whole, `extra` slots more reserved than they need, and what `emit` makes of them.
@@ -150,18 +150,18 @@ fn emit_wide(count: u32, size: UVec2, extra: u32) -> (Vec<u32>, Vec<UVec2>, u32)
     let (splats, sorted_ids) = (vec![splat; count as usize], (0..count).rev().collect::<Vec<_>>());
     let (counts, sums) = (vec![count * per_splat], vec![0; 1 + count as usize / 256]);
     let tile_counts = vec![per_splat; count as usize];
-    let slots_before: Vec<u32> = (0..count).map(|rank| rank * per_splat).collect();
-    let [tiles_, slots, owners] = [0; 3].map(|_| vec![7u32; counts[0] as usize]);
-    let (tiles, emitted) = (tiles_, vec![UVec2::ZERO; count as usize]);
-    let (tiles, _, _, emitted) = run_kernel!(
+    let intersection_offsets: Vec<u32> = (0..count).map(|rank| rank * per_splat).collect();
+    let [tiles_, intersection_ids, gaussian_ids] = [0; 3].map(|_| vec![7u32; counts[0] as usize]);
+    let (tiles, intersection_ranges) = (tiles_, vec![UVec2::ZERO; count as usize]);
+    let (tiles, _, _, intersection_ranges) = run_kernel!(
         emit,
         constants,
         emit::Params { size, gaussian_count: count, tile_columns: size.x.div_ceil(tile.x) },
         Threads::Exactly([count, 1, 1]),
-        [counts, sorted_ids, slots_before, sums, splats, tile_counts],
-        [tiles, slots, owners, emitted]
+        [counts, sorted_ids, intersection_offsets, sums, splats, tile_counts],
+        [tiles, intersection_ids, gaussian_ids, intersection_ranges]
     );
-    (tiles, emitted, per_splat)
+    (tiles, intersection_ranges, per_splat)
 }
 
 /// A record of four channels.
@@ -169,8 +169,8 @@ type Record = [Vec3; 4];
 
 /// Sums the records of Gaussians with one feature, all in one place, whose slots are these: the gradients of the features
 /// are the sums of the last channel.
-fn sums(emitted: Vec<UVec2>, records: &[Record]) -> Vec<f32> {
-    let (count, shape) = (emitted.len(), Shape { sh_degree: 3, features: features(4) });
+fn sums(intersection_ranges: Vec<UVec2>, gradient_records: &[Record]) -> Vec<f32> {
+    let (count, shape) = (intersection_ranges.len(), Shape { sh_degree: 3, features: features(4) });
     let mut setup = Setup::new(count, [32, 32], shape, 1);
     for i in 0..count {
         setup.set(i, &Gaussian { mean: setup.at_pixel(DVec2::splat(16.0), 2.0), ..setup.get(0) });
@@ -179,7 +179,7 @@ fn sums(emitted: Vec<UVec2>, records: &[Record]) -> Vec<f32> {
     let frame = rendered.renderer.frame();
     let (splats, colors) = (gpu().read(&frame.splats).unwrap(), gpu().read(&frame.colors).unwrap());
     let (parameters, tile_counts, status) = (setup.parameters.clone(), vec![1; count], vec![0; 3]);
-    let records: Vec<Vec3> = records.concat();
+    let gradient_records: Vec<Vec3> = gradient_records.concat();
     let gradients = vec![f32::NAN; parameters.len()];
     let (grad_norm_sums, visit_counts) = (vec![0.0f32; count], vec![0; count]);
     let cameras = vec![kernels::Camera::from(&Patch::from(&setup.camera))];
@@ -195,7 +195,7 @@ fn sums(emitted: Vec<UVec2>, records: &[Record]) -> Vec<f32> {
             damping_depth: 1.0,
         },
         Threads::Exactly([count as u32, 1, 1]),
-        [parameters, splats, colors, tile_counts, emitted, records, cameras],
+        [parameters, splats, colors, tile_counts, intersection_ranges, gradient_records, cameras],
         [status, gradients, grad_norm_sums, visit_counts]
     );
     (0..count).map(|i| setup.planes().load(&gradients, i).features[0] as f32).collect()
@@ -205,27 +205,27 @@ fn sums(emitted: Vec<UVec2>, records: &[Record]) -> Vec<f32> {
 fn gaussians_that_cover_the_whole_of_a_large_image_fill_their_slots_and_are_summed() {
     // More tiles than a loop of some devices has turns, for every lane of a subgroup.
     let size = UVec2::new(4096, 2176);
-    let (tiles, emitted, per_splat) = emit_wide(9, size, 0);
+    let (tiles, intersection_ranges, per_splat) = emit_wide(9, size, 0);
     assert!(per_splat > 32_000 && tiles.len() == 9 * per_splat as usize);
     assert!(tiles.chunks(per_splat as usize).all(|own| (0..per_splat).eq(own.iter().copied())));
     let mut random = Random::new(3);
     let mut number = || random.between(-1.0, 1.0) as f32;
     let mut record = || array::from_fn(|_| Vec3::new(number(), number(), number()));
-    let records: Vec<Record> = tiles.iter().map(|_| record()).collect();
-    sums(emitted, &records);
+    let gradient_records: Vec<Record> = tiles.iter().map(|_| record()).collect();
+    sums(intersection_ranges, &gradient_records);
 }
 
 #[test]
 fn slots_that_no_tile_fills_are_padding_and_leave_no_trace_in_the_sums() {
     // Few slots, which their lane walks alone, and many, which all lanes share.
     for size in [UVec2::new(40, 20), UVec2::new(400, 200)] {
-        let (tiles, emitted, per_splat) = emit_wide(11, size, 5);
+        let (tiles, intersection_ranges, per_splat) = emit_wide(11, size, 5);
         let is_padding = |slot: usize| slot as u32 % per_splat >= per_splat - 5;
         assert!((0..tiles.len()).all(|slot| (tiles[slot] == emit::NO_TILE) == is_padding(slot)));
         // No tile has written the records of padding.
         let record = |slot: usize| [if is_padding(slot) { Vec3::NAN } else { Vec3::ONE }; 4];
-        let records: Vec<Record> = (0..tiles.len()).map(record).collect();
-        assert_eq!(sums(emitted, &records), [(per_splat - 5) as f32; 11]);
+        let gradient_records: Vec<Record> = (0..tiles.len()).map(record).collect();
+        assert_eq!(sums(intersection_ranges, &gradient_records), [(per_splat - 5) as f32; 11]);
     }
 }
 
@@ -258,9 +258,12 @@ fn a_view_has_at_most_the_tiles_that_a_subgroup_of_gaussians_that_cover_them_all
 
     let lanes = gpu().properties().subgroup_size;
     let tiles = most - 64 - 2 * lanes;
-    let slots = (tiles * lanes) as usize;
-    let emitted: Vec<_> = (0..lanes).map(|i| UVec2::new(i, i + 1) * tiles).collect();
-    assert_eq!(sums(emitted, &vec![[Vec3::ONE; 4]; slots]), vec![tiles as f32; lanes as usize]);
+    let intersection_ids = (tiles * lanes) as usize;
+    let intersection_ranges: Vec<_> = (0..lanes).map(|i| UVec2::new(i, i + 1) * tiles).collect();
+    assert_eq!(
+        sums(intersection_ranges, &vec![[Vec3::ONE; 4]; intersection_ids]),
+        vec![tiles as f32; lanes as usize]
+    );
 }
 
 /// What the refusal of a view names as the longest side is one that fits, and not much less than could.
@@ -283,7 +286,7 @@ fn a_refused_view_names_a_longest_side_that_fits() {
 }
 
 /// So many faint splats, one behind the other, on one pixel.
-fn crowd(count: usize) -> Setup {
+fn splats_per_tile(count: usize) -> Setup {
     let mut setup = Setup::new(count, [16, 8], 0, 5);
     let size = setup.camera().size;
     for i in 0..count {
@@ -301,7 +304,7 @@ fn crowd(count: usize) -> Setup {
 
 #[test]
 fn a_hundred_thousand_splats_on_one_pixel_are_blended_as_the_references_say() {
-    let mut setup = crowd(100_000);
+    let mut setup = splats_per_tile(100_000);
     // Where four subgroups share a tile, each turns over its parts as well.
     let shared = Tile { size: [16, 16], subgroups: 4 };
     for tile in [None, Some(shared).filter(|&tile| gpu().properties().suits_tile(tile))] {
@@ -322,12 +325,12 @@ fn a_hundred_thousand_splats_on_one_pixel_are_blended_as_the_references_say() {
 fn more_splats_on_a_tile_than_the_device_follows_are_an_error_that_says_so() {
     let (ranges, status) = tile_runs(vec![0, 0, 0, 0, 2, 2, 2], 3);
     assert_eq!(ranges[..3], [UVec2::ZERO, UVec2::splat(4), UVec2::new(4, 7)]);
-    assert_eq!(status, [STATUS_CROWDED, 0, 4]);
-    assert_eq!(Status::from_words(&status).crowd, 4);
+    assert_eq!(status, [STATUS_TILE_LIMIT, 0, 4]);
+    assert_eq!(Status::from_words(&status).splats_per_tile, 4);
     if gpu().properties().max_loop_iterations == u32::MAX {
         return;
     }
-    let setup = crowd(300_000);
+    let setup = splats_per_tile(300_000);
     let gaussians = setup.upload();
     let mut renderer = Renderer::new(&gpu(), setup.settings).unwrap();
     renderer.reserve(setup.count, [&setup.camera]).unwrap();

@@ -14,7 +14,7 @@ use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::reference::splat::{Splat, splat_columns};
-use nightsplat::splats::halves::StorageFormat;
+use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::{Attribute, Features, Gaussians, Shape};
 
@@ -172,10 +172,12 @@ fn needles(count: usize) -> Setup {
 /// Every intersection of a render: the tile and the Gaussian.
 fn intersections(rendered: &Rendered<'_>) -> Vec<(u32, u32)> {
     let frame = rendered.renderer.frame();
-    let [tiles, slots, owners, counts] = [&frame.tiles, &frame.slots, &frame.owners, &frame.counts]
-        .map(|buffer| gpu().read(buffer).unwrap());
-    let owners = slots[..counts[0] as usize].iter().map(|&slot| owners[slot as usize]);
-    tiles.into_iter().zip(owners).collect()
+    let [tiles, intersection_ids, gaussian_ids, counts] =
+        [&frame.tiles, &frame.intersection_ids, &frame.gaussian_ids, &frame.counts]
+            .map(|buffer| gpu().read(buffer).unwrap());
+    let gaussian_ids =
+        intersection_ids[..counts[0] as usize].iter().map(|&slot| gaussian_ids[slot as usize]);
+    tiles.into_iter().zip(gaussian_ids).collect()
 }
 
 /// Those of the tiles that subgroups of this device can own.
@@ -402,9 +404,9 @@ fn gaussians_of_another_shape_or_storage_are_refused() {
 fn what_is_drawn_are_the_gaussians_given_whatever_was_reserved() {
     let gpu = gpu();
     let setup = Setup::new(100, [32, 24], 0, 1);
-    let mut few = setup.gaussians();
+    let mut subset = setup.gaussians();
     // Of every plane the first: those of fewer Gaussians.
-    few = Gaussians { count: 10, parameters: vec![], ..few };
+    subset = Gaussians { count: 10, parameters: vec![], ..subset };
     for (attribute, width) in [
         (Attribute::Means, 3),
         (Attribute::Quats, 4),
@@ -413,7 +415,7 @@ fn what_is_drawn_are_the_gaussians_given_whatever_was_reserved() {
         (Attribute::Dc, 3),
     ] {
         let all = setup.gaussians();
-        few.parameters.extend(&all.parameters[all.plane(attribute)][..10 * width]);
+        subset.parameters.extend(&all.parameters[all.plane(attribute)][..10 * width]);
     }
     let render = |renderer: &mut Renderer, gaussians: &Gaussians| {
         let gaussians = gaussians.upload(&gpu).unwrap();
@@ -424,11 +426,11 @@ fn what_is_drawn_are_the_gaussians_given_whatever_was_reserved() {
         renderer.reserve(10, [&setup.camera]).unwrap();
         renderer
     };
-    let expected = render(&mut alone(), &few);
+    let expected = render(&mut alone(), &subset);
     let mut renderer = Renderer::new(&gpu, setup.settings).unwrap();
     renderer.reserve(300, [&setup.camera]).unwrap();
     let all = render(&mut renderer, &setup.gaussians());
-    assert!(render(&mut renderer, &few) == expected && all != expected);
+    assert!(render(&mut renderer, &subset) == expected && all != expected);
     let too_many = setup.gaussians().upload(&gpu).unwrap();
     let refused = alone().render_image(&too_many, &setup.camera, &setup.options).unwrap_err();
     assert_eq!(refused.to_string(), "100 Gaussians exceed the 10 that the renderer reserved");

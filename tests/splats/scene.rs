@@ -7,7 +7,7 @@ use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::photographs::dataset::{Point, Split, View};
 use nightsplat::photographs::image::Image;
 use nightsplat::splats::attributes::planes;
-use nightsplat::splats::scene::init::Start;
+use nightsplat::splats::scene::init::Initialization;
 use nightsplat::splats::scene::{
     ATTRIBUTES, Features, Gaussians, SH_C0, Shape, init, ply, rest_coefficients, width,
 };
@@ -97,7 +97,8 @@ mod from_points {
 
     fn scales(positions: &[DVec3]) -> Vec<f32> {
         let colors = vec![Vec3::ZERO; positions.len()];
-        let gaussians = Gaussians::from_points(positions, &colors, 0, &Start::PAPER, 0).unwrap();
+        let gaussians =
+            Gaussians::from_points(positions, &colors, 0, &Initialization::PAPER, 0).unwrap();
         gaussians.log_scales().iter().map(|log_scale| log_scale.x.exp()).collect()
     }
 
@@ -105,7 +106,8 @@ mod from_points {
     fn every_attribute_begins_as_in_3dgs() {
         let positions = [DVec3::ZERO, DVec3::X, DVec3::Y * 2.0, DVec3::Z * 3.0];
         let colors = [Vec3::new(0.1, 0.5, 0.9); 4];
-        let gaussians = Gaussians::from_points(&positions, &colors, 2, &Start::PAPER, 0).unwrap();
+        let gaussians =
+            Gaussians::from_points(&positions, &colors, 2, &Initialization::PAPER, 0).unwrap();
         assert_eq!((gaussians.count, gaussians.shape), (4, 2.into()));
         assert_eq!(gaussians.means()[2], Vec3::new(0.0, 2.0, 0.0));
         assert_eq!(gaussians.quats(), [[1.0, 0.0, 0.0, 0.0]; 4]);
@@ -126,7 +128,7 @@ mod from_points {
         let place = |i: i32| DVec3::ONE + right * f64::from(i % 9) + up * f64::from(i / 9);
         let positions: Vec<DVec3> = (0..81).map(place).collect();
         let colors = vec![Vec3::ONE; positions.len()];
-        let start = Start { opacity: 0.3, scale: 0.5, thinnest: 0.2 };
+        let start = Initialization { opacity: 0.3, scale: 0.5, min_axis_ratio: 0.2 };
         let gaussians = Gaussians::from_points(&positions, &colors, 0, &start, 0).unwrap();
         // In the middle of the grid, where neighbours lie on all sides.
         let middle = 40;
@@ -148,7 +150,7 @@ mod from_points {
         for count in [2, 3, 20] {
             let positions: Vec<DVec3> = (0..count).map(|i| DVec3::X * f64::from(i)).collect();
             let colors = vec![Vec3::ONE; positions.len()];
-            let start = Start::default();
+            let start = Initialization::default();
             let gaussians = Gaussians::from_points(&positions, &colors, 0, &start, 0).unwrap();
             assert!(gaussians.parameters.iter().all(|value| value.is_finite()), "{count}");
             for quat in gaussians.quats() {
@@ -161,9 +163,12 @@ mod from_points {
     #[test]
     fn a_start_that_makes_no_gaussian_is_refused_by_name() {
         for (start, name) in [
-            (Start { opacity: 1.0, ..Start::PAPER }, "start.opacity"),
-            (Start { scale: 0.0, ..Start::PAPER }, "start.scale"),
-            (Start { thinnest: f64::NAN, ..Start::PAPER }, "start.thinnest"),
+            (Initialization { opacity: 1.0, ..Initialization::PAPER }, "start.opacity"),
+            (Initialization { scale: 0.0, ..Initialization::PAPER }, "start.scale"),
+            (
+                Initialization { min_axis_ratio: f64::NAN, ..Initialization::PAPER },
+                "start.min_axis_ratio",
+            ),
         ] {
             let message = Gaussians::from_points(&[], &[], 0, &start, 0).unwrap_err().to_string();
             assert!(message.contains(name), "{message}");
@@ -226,7 +231,7 @@ mod from_points {
     #[test]
     fn points_that_are_not_finite_or_lack_a_color_are_refused() {
         let refused = |positions: &[DVec3], colors: &[Vec3]| {
-            Gaussians::from_points(positions, colors, 0, &Start::PAPER, 0).is_err()
+            Gaussians::from_points(positions, colors, 0, &Initialization::PAPER, 0).is_err()
         };
         assert!(refused(&[DVec3::new(0.0, f64::NAN, 0.0)], &[Vec3::ZERO]));
         assert!(refused(&[DVec3::ZERO], &[Vec3::splat(f32::INFINITY)]));

@@ -7,7 +7,9 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::tone::{GainChoice, Measured, Table, ToneCurve, ToneSettings};
+use nightsplat::photographs::tone::{
+    GainChoice, MeasuredPhotograph, Table, ToneCurve, ToneSettings,
+};
 use nightsplat::train::{TargetExposure, TrainConfig, Trainer};
 
 /// The losses of the first steps, and the parameters after them.
@@ -41,7 +43,7 @@ fn every_kind_of_curve_trains_and_a_recorded_configuration_repeats_it() {
         ToneSettings::default(),
         ToneSettings { colour: 0.0, brightness: Some(0.4), ..ToneSettings::default() },
         ToneSettings::new(ToneCurve::Ap3).with_gain(GainChoice::Auto),
-        ToneSettings { lift_first: true, ..ToneSettings::new(ToneCurve::Ap3) },
+        ToneSettings { full_resolution: true, ..ToneSettings::new(ToneCurve::Ap3) },
         ToneSettings::of_table(dense_table(ToneCurve::Rational)),
         ToneSettings::of_profile(crate::common::setup::profile()),
     ];
@@ -160,19 +162,21 @@ fn photographs_are_lifted_before_they_are_shrunk() {
         .map(|view| (view.name.clone(), view.photograph().unwrap().unwrap().into_owned()));
     let photographs: Vec<(String, Image)> = photographs.collect();
     let seen = photographs.iter().zip(shrunk.train_views());
-    let measured: Vec<_> =
-        seen.map(|((_, image), view)| Measured::of(&image.data).seen_by(&view.camera)).collect();
+    let measured: Vec<_> = seen
+        .map(|((_, image), view)| MeasuredPhotograph::of(&image.data).seen_by(&view.camera))
+        .collect();
     let scene = settings.scene(&measured).unwrap();
     for ((name, photograph), measured) in photographs.iter().zip(&measured) {
-        let lifted = pseudo_gt.lifted(photograph, &settings.lift(&scene, measured)).unwrap();
-        lifted.save_png16(folder.path().join("low").join(format!("{name}.png"))).unwrap();
+        let tone_mapped =
+            pseudo_gt.tone_mapped(photograph, &settings.tone_mapping(&scene, measured)).unwrap();
+        tone_mapped.save_png16(folder.path().join("low").join(format!("{name}.png"))).unwrap();
     }
     let elsewhere = train(&config(ToneSettings::new(ToneCurve::None)), &load()).0;
     for (a, b) in own.iter().zip(&elsewhere) {
         assert!((a - b).abs() < 1e-4, "{own:?} and {elsewhere:?}");
     }
     let late =
-        train(&config(ToneSettings { lift_first: false, ..settings }), &load_dark(&options)).0;
+        train(&config(ToneSettings { full_resolution: false, ..settings }), &load_dark(&options)).0;
     assert_ne!(own, late);
 }
 

@@ -115,7 +115,7 @@ fn injected_darkening_is_found_within_a_tenth() {
     for darkening in [4.0, 25.0] {
         let dark = diagnosis(&Capture { darkening, ..Capture::clean() }).scene;
         close(dark.darkening / light.darkening, darkening, "darkening");
-        assert!(dark.lift > light.lift && dark.code_values < light.code_values);
+        assert!(dark.brightening > light.brightening && dark.code_values < light.code_values);
     }
     let noisy = diagnosis(&Capture::default()).scene;
     close(noisy.darkening / light.darkening, Capture::default().darkening, "darkening with noise");
@@ -293,10 +293,10 @@ fn the_command_prints_json_writes_a_page_and_a_plan_that_train_keeps() {
     let gaussians = written.split("[max_gaussians]\nvalue = ").nth(1).unwrap();
     let gaussians = gaussians.split_whitespace().next().unwrap();
     fs::write(&plan, written.replace(&format!("value = {gaussians}"), "value = 3210")).unwrap();
-    let said = succeed(&format!(
+    let message = succeed(&format!(
         "train {root} --out {out} --plan {plan} --steps 9 --parts structure --set schedule.densify_after=99"
     ));
-    assert!(said.contains("3210") && said.contains("views of 96x72"), "{said}");
+    assert!(message.contains("3210") && message.contains("views of 96x72"), "{message}");
     let config = fs::read_to_string(set.path().join("run/config.toml")).unwrap();
     for line in ["max_gaussians = 3210", "structure = true", "denoiser = false"] {
         assert!(config.contains(line), "no `{line}` in {config}");
@@ -335,7 +335,7 @@ fn a_run_without_a_length_ends_when_held_out_views_have_converged() {
     let (root, out) = (set.path().display(), set.path().join("run"));
     // Whatever is learned is too little.
     let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 \
-                   --set schedule.resolution_steps=[0,0] --set schedule.settle_steps=5 --set checkpoint_every=10";
+                   --set schedule.resolution_steps=[0,0] --set schedule.cooldown_steps=5 --set checkpoint_every=10";
     let train = format!("train {root} --out {} {options}", out.display());
     succeed(&train);
     let scores = fs::read_to_string(out.join("held_out.csv")).unwrap();
@@ -377,30 +377,36 @@ fn a_run_that_has_ended_early_goes_on_from_its_end() {
     let set = written(&Capture::default());
     let (root, out) = (set.path().display(), set.path().join("run"));
     let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 \
-                   --set schedule.resolution_steps=[0,0] --set schedule.settle_steps=6";
+                   --set schedule.resolution_steps=[0,0] --set schedule.cooldown_steps=6";
     let train = |more: &str| {
         succeed(&format!("train {root} --out {} {options} --progress json {more}", out.display()))
     };
-    let said = train("");
+    let message = train("");
     for event in [
         r#""event":"last_step","step":15,"last":21"#,
         r#""ended":{"reason":"converged","step":21,"best_step":21}"#,
     ] {
-        assert!(said.contains(event), "no {event} in {said}");
+        assert!(message.contains(event), "no {event} in {message}");
     }
-    assert!(said.contains(r#""may_end_early":true"#));
+    assert!(message.contains(r#""may_end_early":true"#));
     // Done is done, whatever would have been the most steps.
     assert!(train("--resume").contains("is done: 21 steps"));
     // A resumed run may change the stopping rule, with a warning, but not which views are held out.
     let again = format!("train {root} --out {} {options} --resume --set", out.display());
-    let (_, said) = run(&format!("{again} stop.gain=80"), 0);
-    assert!(said.contains("stop.gain was 90 and is 80: it decides from step 21 on"), "{said}");
+    let (_, message) = run(&format!("{again} stop.gain=80"), 0);
+    assert!(
+        message.contains("stop.gain was 90 and is 80: it decides from step 21 on"),
+        "{message}"
+    );
     refused(&format!("{again} stop.views=0"), 3, &["was made with stop.views = 1, not 0"]);
-    let said = train("--resume --steps 27");
+    let message = train("--resume --steps 27");
     let steps =
         |event: &&str| event.contains(r#""event":"started""#) && event.contains(r#""step":21"#);
-    assert!(said.lines().any(|line| steps(&line)), "{said}");
-    assert!(said.contains(r#""ended":{"reason":"steps","step":27,"best_step":27}"#), "{said}");
+    assert!(message.lines().any(|line| steps(&line)), "{message}");
+    assert!(
+        message.contains(r#""ended":{"reason":"steps","step":27,"best_step":27}"#),
+        "{message}"
+    );
     let log = fs::read_to_string(out.join("train.csv")).unwrap();
     assert_eq!(log.lines().count(), 28);
 }
@@ -422,8 +428,11 @@ fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
     let plan = plan_of(set.path());
     assert_eq!(plan.left_out, ["003", "005"]);
     let (root, out) = (set.path().display(), set.path().join("run"));
-    let (said, warned) = run(&format!("train {root} --out {} --steps 2", out.display()), 0);
-    assert!(said.contains("8 views") && warned.contains("2 as good as black"), "{said} {warned}");
+    let (message, warned) = run(&format!("train {root} --out {} --steps 2", out.display()), 0);
+    assert!(
+        message.contains("8 views") && warned.contains("2 as good as black"),
+        "{message} {warned}"
+    );
     let log = fs::read_to_string(out.join("train.csv")).unwrap();
     assert!(!log.contains(",003,") && !log.contains(",005,"));
     black(|_| true);

@@ -10,7 +10,7 @@ use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::image::{Image, Mask};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::scene::Gaussians;
-use nightsplat::train::{DensityConfig, Learning, Part, TrainConfig, Trainer};
+use nightsplat::train::{DensityConfig, OnOff, Part, TrainConfig, Trainer};
 
 use crate::common::train::{advance, train};
 
@@ -28,7 +28,7 @@ fn config() -> TrainConfig {
     let mut config = TrainConfig { steps: 60, ..TrainConfig::bare() };
     config.schedule.densify_after = 8;
     config.schedule.densify_interval = 20;
-    config.density.fill = 300;
+    config.density.depth_seeding = 300;
     config
 }
 
@@ -52,7 +52,7 @@ fn few_points_become_as_many_gaussians_as_asked_for_nearer_to_the_surfaces_than_
     assert_eq!(trainer.gaussian_count(), 30);
     let first = trainer.gaussians().unwrap();
     let estimate = trainer.memory_estimate().unwrap();
-    assert!(estimate.most_gaussians >= 300, "{estimate:?}");
+    assert!(estimate.peak_gaussians >= 300, "{estimate:?}");
     advance(&mut trainer, 19);
     assert_eq!(trainer.gaussian_count(), 30);
     advance(&mut trainer, 20);
@@ -70,7 +70,7 @@ fn the_views_are_shown_better_after_as_many_steps() {
     let (_, dataset) = dataset(20);
     let loss = |fill| {
         let mut config = config();
-        config.density.fill = fill;
+        config.density.depth_seeding = fill;
         let (reports, _) = train(&config, &dataset);
         reports[45..].iter().map(|report| report.loss).sum::<f64>() / 15.0
     };
@@ -81,8 +81,11 @@ fn the_views_are_shown_better_after_as_many_steps() {
 #[test]
 fn many_points_the_papers_control_and_a_setting_of_zero_change_nothing() {
     let with = |fill: usize, density: DensityConfig, points: usize| {
-        let config =
-            TrainConfig { steps: 40, density: DensityConfig { fill, ..density }, ..config() };
+        let config = TrainConfig {
+            steps: 40,
+            density: DensityConfig { depth_seeding: fill, ..density },
+            ..config()
+        };
         train(&config, &dataset(points).1).1
     };
     let default = DensityConfig::default();
@@ -95,14 +98,14 @@ fn many_points_the_papers_control_and_a_setting_of_zero_change_nothing() {
 #[test]
 fn small_views_have_a_gaussian_for_eight_of_their_pixels_at_most() {
     let mut config = TrainConfig { steps: 40, ..config() };
-    config.density.fill = 5_000;
+    config.density.depth_seeding = 5_000;
     let mut trainer = Trainer::new(&gpu(), config, &dataset(20).1).unwrap();
     assert_eq!(trainer.gaussian_count(), 500);
     advance(&mut trainer, 20);
     // There are more already: the round is one like others.
     assert!(trainer.gaussian_count() < 1000);
     let config = TrainConfig {
-        density: DensityConfig { fill: 1000, ..DensityConfig::default() },
+        density: DensityConfig { depth_seeding: 1000, ..DensityConfig::default() },
         steps: 40,
         ..self::config()
     };
@@ -132,7 +135,7 @@ fn a_training_of_every_part_fills_to_the_same_bits_however_it_is_submitted_and_i
         config.model.network.stages = 2;
         config.model.network.repeats = 2;
         config.model.denoiser_crop = 16;
-        config.exposure.learn = if parts.is_empty() { Learning::On } else { Learning::Off };
+        config.exposure.learn = if parts.is_empty() { OnOff::On } else { OnOff::Off };
         let gpu = gpu();
         let new = || Trainer::new(&gpu, config.clone(), &dataset).unwrap();
         let end = |mut trainer: Trainer| {
@@ -143,7 +146,7 @@ fn a_training_of_every_part_fills_to_the_same_bits_however_it_is_submitted_and_i
         };
         let expected = end(new());
         let mut one_by_one = new();
-        one_by_one.set_pace(1, Some(1));
+        one_by_one.set_batching(1, Some(1));
         assert!(end(one_by_one) == expected, "{parts:?}: one by one");
         for step in [7, 20, 33] {
             let checkpoint = folder.path().join("checkpoint.safetensors");

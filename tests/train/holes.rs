@@ -12,7 +12,9 @@ use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOption
 use nightsplat::photographs::dataset::{Dataset, View};
 use nightsplat::photographs::image::{Image, Mask};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat::results::eval::{self, Leftover, MOST_LEFTOVER, Player};
+use nightsplat::results::eval::{
+    self, MAX_RESIDUAL_TRANSMITTANCE, ModelRenderer, ResidualTransmittance,
+};
 use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 
 use serde_json::Value;
@@ -81,9 +83,10 @@ fn left_over(background: Background, dataset: &Dataset) -> (Vec<f64>, Option<Str
     let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
     advance(&mut trainer, config.steps);
     let scored = eval::score(dataset, |view| trainer.render(&view.camera)).unwrap();
-    let views = scored.iter().map(|view| (view.name.as_str(), view.leftover.unwrap()));
+    let views =
+        scored.iter().map(|view| (view.name.as_str(), view.residual_transmittance.unwrap()));
     let warning = eval::hole_warning(views.clone(), background);
-    (views.map(|(_, leftover)| leftover.mean).collect(), warning)
+    (views.map(|(_, residual_transmittance)| residual_transmittance.mean).collect(), warning)
 }
 
 #[test]
@@ -91,11 +94,11 @@ fn a_dark_room_is_hollow_before_black_which_is_said_and_whole_before_random_colo
     let folder = dark_room();
     let dataset = load(folder.path());
     let (hollow, warning) = left_over(Background::Black, &dataset);
-    assert!(hollow.iter().all(|&mean| mean > 1.5 * MOST_LEFTOVER), "{hollow:?}");
+    assert!(hollow.iter().all(|&mean| mean > 1.5 * MAX_RESIDUAL_TRANSMITTANCE), "{hollow:?}");
     let warning = warning.unwrap();
     assert!(warning.contains("in 2 of 2 views") && warning.contains("--background random"));
     let (whole, warning) = left_over(Background::Random, &dataset);
-    assert!(whole.iter().all(|&mean| mean < 0.2 * MOST_LEFTOVER), "{whole:?}");
+    assert!(whole.iter().all(|&mean| mean < 0.2 * MAX_RESIDUAL_TRANSMITTANCE), "{whole:?}");
     assert_eq!(warning, None);
 }
 
@@ -123,13 +126,13 @@ fn what_a_mask_hides_is_no_hole() {
     assert!(!empty.is_empty() && !covered.is_empty());
     let masked = |hidden: &[usize]| {
         let mask = Mask::hiding(&rendered.colors, hidden);
-        Leftover::of(&rendered, &View { mask, ..view.clone() })
+        ResidualTransmittance::of(&rendered, &View { mask, ..view.clone() })
     };
     assert!(masked(&[]).unwrap().q99 > 0.9, "{:?}", masked(&[]));
     assert!(masked(&empty).unwrap().q99 <= 0.5 && masked(&covered).unwrap().mean > 0.5);
     assert_eq!(masked(&[empty, covered].concat()), None);
     // A picture that no Gaussian made has none.
-    assert_eq!(Leftover::of(&rendered.colors.clone().into(), view), None);
+    assert_eq!(ResidualTransmittance::of(&rendered.colors.clone().into(), view), None);
 }
 
 #[test]
@@ -142,8 +145,8 @@ fn a_denoiser_and_patches_leave_the_transmittances_as_they_are() {
     let rendered = trainer.render(&view.camera).unwrap();
     assert!(rendered.denoised.is_some());
     let (gaussians, plain) = (trainer.gaussians().unwrap(), TrainConfig::bare());
-    let mut player = Player::new(&gpu(), &gaussians, &plain, None).unwrap();
-    let whole = player.render(view).unwrap();
+    let mut model_renderer = ModelRenderer::new(&gpu(), &gaussians, &plain, None).unwrap();
+    let whole = model_renderer.render(view).unwrap();
     let [in_parts, whole] = [rendered, whole].map(|own| own.transmittances.unwrap());
     assert_eq!(in_parts.len(), 64 * 48);
     let far = in_parts.iter().zip(&whole).filter(|(own, whole)| (*own - *whole).abs() > 1e-3);
@@ -165,12 +168,12 @@ fn holes_are_said_by_train_eval_and_diagnose() {
     let (scored, warned) = command::run(&format!("eval {run} --json"), 0);
     assert_eq!(warning(&warned), 1, "{warned}");
     let scored: Value = serde_json::from_str(&scored).unwrap();
-    let leftover = &scored["leftover_transmittance"];
-    assert_eq!(*leftover, trained["leftover_transmittance"]);
+    let residual_transmittance = &scored["residual_transmittance"];
+    assert_eq!(*residual_transmittance, trained["residual_transmittance"]);
     let of = |what: &Value| [&what["mean"], &what["q99"]].map(|value| value.as_f64().unwrap());
-    let [mean, q99] = of(&leftover["mean"]);
-    assert!(mean > MOST_LEFTOVER && q99 > mean, "{leftover}");
-    assert_eq!(leftover["views"].as_object().unwrap().len(), 2);
+    let [mean, q99] = of(&residual_transmittance["mean"]);
+    assert!(mean > MAX_RESIDUAL_TRANSMITTANCE && q99 > mean, "{residual_transmittance}");
+    assert_eq!(residual_transmittance["views"].as_object().unwrap().len(), 2);
     let table = succeed(&format!("eval {run}"));
     for part in ["leftover", "99 %", &format!("{mean:.4}"), &format!("{q99:.4}")] {
         assert!(table.contains(part), "no {part} in {table}");
@@ -181,12 +184,12 @@ fn holes_are_said_by_train_eval_and_diagnose() {
     let (_, warned) = command::run(&all, 0);
     assert!(warning(&warned) == 1 && warned.contains("of 6 views"), "{warned}");
 
-    let (said, _) = command::run(&format!("diagnose {set} --run {run}"), 0);
-    assert!(said.contains("note: view ") && warning(&said) == 1, "{said}");
+    let (message, _) = command::run(&format!("diagnose {set} --run {run}"), 0);
+    assert!(message.contains("note: view ") && warning(&message) == 1, "{message}");
     let json: Value =
         serde_json::from_str(&succeed(&format!("diagnose {set} --run {run} --json"))).unwrap();
-    let views = json["leftover_transmittance"].as_object().unwrap();
+    let views = json["residual_transmittance"].as_object().unwrap();
     assert_eq!(views.len(), SET.views);
-    assert_eq!(of(&views["000"]), of(&leftover["views"]["000"]));
+    assert_eq!(of(&views["000"]), of(&residual_transmittance["views"]["000"]));
     assert!(!succeed(&format!("diagnose {set} --json")).contains("leftover"));
 }

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use nightsplat::gpu::testing::gpu;
 use nightsplat::loss::Term;
-use nightsplat::networks::{DenoiserSettings, Form};
+use nightsplat::networks::{DenoiserSettings, NetworkVariant};
 use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::image::Image;
@@ -94,7 +94,7 @@ fn paper(parts: &[Part]) -> TrainConfig {
     let (network, rates) = (config.model.network, config.model.rates);
     config.model.follow_paper();
     config.model.rates = rates;
-    config.model.network = DenoiserSettings { form: Form::Paper, ..network };
+    config.model.network = DenoiserSettings { variant: NetworkVariant::Paper, ..network };
     config
 }
 

@@ -6,14 +6,14 @@ use std::fs;
 
 use glam::DVec3;
 
-use nightsplat::camera::Frame;
+use nightsplat::camera::TrainingFrame;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::dataset::{Dataset, Split, View};
 use nightsplat::photographs::image::{Image, Mask};
 use nightsplat::photographs::metrics::Scores;
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer};
-use nightsplat::train::{Learning, Part, Rendered, TrainConfig, Trainer};
+use nightsplat::train::{OnOff, Part, Rendered, TrainConfig, Trainer};
 
 use crate::common::Random;
 use crate::common::command::{command, refused, succeed};
@@ -175,7 +175,7 @@ fn every_part_of_the_model_trains_on_patches_and_two_runs_have_the_same_bits() {
     let mut config = TrainConfig { steps: 12, ..config(Some(800)) };
     config.schedule.resolution_steps = [0, 5];
     let mut exposed = config.clone();
-    exposed.exposure.learn = Learning::On;
+    exposed.exposure.learn = OnOff::On;
     config.model.set_parts(&Part::ALL);
     config.model.network.channels = 4;
     config.model.network.stages = 2;
@@ -230,8 +230,8 @@ fn a_run_on_patches_says_so_is_resumed_to_the_same_bits_and_scored() {
     let place = Place::new();
     let output =
         command(&place.train("straight", "--steps 30 --patch-pixels 600")).output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(said.contains("40x30, in 2 of about 20x30"), "{said}");
+    let message = String::from_utf8_lossy(&output.stderr);
+    assert!(message.contains("40x30, in 2 of about 20x30"), "{message}");
     let config = String::from_utf8(place.read("straight/config.toml")).unwrap();
     assert!(config.contains("patch_pixels = 600"));
     let stopped = "--steps 30 --patch-pixels 600 --hash-every 7 --max-minutes 1e-7";
@@ -270,7 +270,7 @@ fn covering(count: usize, size: [u32; 2]) -> Setup {
 fn more_intersections_than_the_device_binds_are_rendered_in_halves() {
     let own = covering(300, [1440, 1280]);
     let mut renderer = renderer(&own);
-    let most = renderer.most_intersections();
+    let most = renderer.max_intersections();
     if most > 1 << 22 {
         eprintln!("not run: this device binds {most} intersections at once");
         return;
@@ -289,7 +289,7 @@ fn more_intersections_than_the_device_binds_are_rendered_in_halves() {
 #[test]
 fn training_takes_patches_of_which_the_device_follows_every_intersection() {
     let own = covering(300, [1440, 1280]);
-    if renderer(&own).most_intersections() > 1 << 22 {
+    if renderer(&own).max_intersections() > 1 << 22 {
         eprintln!("not run: this device binds more intersections at once");
         return;
     }
@@ -303,7 +303,7 @@ fn training_takes_patches_of_which_the_device_follows_every_intersection() {
     };
     let gaussians = own.gaussians();
     let mut config = TrainConfig { steps: 8, sh_degree: 0, ..config(None) };
-    config.frame = Some(Frame::WORLD);
+    config.frame = Some(TrainingFrame::WORLD);
     config.schedule.resolution_steps = [0, 0];
     let mut trainer = Trainer::from_gaussians(&gpu(), config, &dataset, &gaussians).unwrap();
     // Four quarters of each, with room for twice the intersections.

@@ -41,7 +41,7 @@ fn photographs_in_as_few_bits_as_are_exact_train_to_the_same_bits_in_less_memory
         (ToneSettings::new(ToneCurve::Ap3), false, true),
         (ToneSettings::new(ToneCurve::None), true, true),
         (ToneSettings::default(), false, false),
-        (ToneSettings { lift_first: true, ..ToneSettings::new(ToneCurve::Ase) }, true, true),
+        (ToneSettings { full_resolution: true, ..ToneSettings::new(ToneCurve::Ase) }, true, true),
     ] {
         let run = |bits| {
             let mut config = config(tone.clone(), bits);

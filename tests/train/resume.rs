@@ -12,7 +12,7 @@ use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, Split, View};
 use nightsplat::photographs::image::Image;
-use nightsplat::results::run::{self, Event, HeldRun};
+use nightsplat::results::run::{self, Event, IfExists};
 use nightsplat::splats::scene::Attribute;
 use nightsplat::train::{Background, EndReason, Part, StepReport, TrainConfig, Trainer};
 use safetensors::SafeTensors;
@@ -143,7 +143,7 @@ fn early(folder: &Path) -> (Dataset, TrainConfig) {
     config.steps = 60;
     config.schedule.resolution_steps = [0, 0];
     (config.stop.views, config.stop.every, config.stop.gain) = (1, 7, 90.0);
-    config.schedule.settle_steps = 9;
+    config.schedule.cooldown_steps = 9;
     (Dataset::load(folder, &config.load_options()).unwrap(), config)
 }
 
@@ -167,7 +167,10 @@ fn a_run_that_converges_settles_and_ends_and_so_does_one_that_was_killed() {
     // Rounds follow steps 10 and 20. Scores that fall in the ten steps after one wait for the end of these.
     let steps: Vec<u64> = whole.held_out_scores().map(|(step, _)| step).collect();
     assert_eq!(steps, [7, 20, 30, 39]);
-    assert_eq!((whole.settles_after(), whole.steps_done(), whole.may_end_early()), (30, 39, false));
+    assert_eq!(
+        (whole.cooldown_begin(), whole.steps_done(), whole.may_end_early()),
+        (30, 39, false)
+    );
     let rate = |step| whole.learning_rates(step)[Attribute::Quats];
     assert!(rate(30) > 0.99 * rate(29) && rate(39) < 0.06 * rate(30));
     let refused = whole.advance(60).unwrap_err().to_string();
@@ -265,10 +268,10 @@ fn a_run_tells_its_observer_everything_in_order() {
     make_set(&folder.path().join("set"));
     let config = TrainConfig { eval_every: 12, checkpoint_every: 20, ..config(&[]) };
     let dataset = Dataset::load(folder.path().join("set"), &config.load_options()).unwrap();
-    let train = |config: &TrainConfig, held| {
+    let train = |config: &TrainConfig, if_exists| {
         let mut told = vec![];
         let out = folder.path().join("run");
-        let trained = run::train(&gpu(), config, &dataset, &out, held, |event| {
+        let trained = run::train(&gpu(), config, &dataset, &out, if_exists, |event| {
             told.push(match event {
                 Event::Started { step, steps, .. } => format!("started {step} of {steps}"),
                 Event::Step(report) => format!("step {}", report.step),
@@ -289,12 +292,12 @@ fn a_run_tells_its_observer_everything_in_order() {
     }
     let end = ["checkpointed 30", "ended 30", "evaluated 30: 2", "finished 2"];
     expected.extend(end.map(str::to_owned));
-    let (steps, told) = train(&config, HeldRun::Refuse);
+    let (steps, told) = train(&config, IfExists::Refuse);
     assert_eq!((steps.unwrap(), told), (30, expected));
 
-    let (refused, told) = train(&config, HeldRun::Refuse);
+    let (refused, told) = train(&config, IfExists::Refuse);
     assert!(refused.unwrap_err().to_string().contains("already holds a run") && told.is_empty());
-    let (steps, told) = train(&TrainConfig { steps: 33, ..config }, HeldRun::Resume);
+    let (steps, told) = train(&TrainConfig { steps: 33, ..config }, IfExists::Resume);
     assert_eq!((steps.unwrap(), told[0].as_str()), (3, "started 30 of 33"));
 }
 

@@ -5,7 +5,7 @@
 use glam::{DVec2, UVec2, Vec3};
 use nightsplat::Error;
 use nightsplat::photographs::dataset::{Dataset, Split};
-use nightsplat::results::eval::{self, Player};
+use nightsplat::results::eval::{self, ModelRenderer};
 use nightsplat::splats::densify::DensityControl;
 
 use nightsplat::gpu::testing::{gpu, recorded};
@@ -13,7 +13,7 @@ use nightsplat::gpu::{DeviceChoice, Gpu};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::metrics::Scores;
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat::splats::halves::StorageFormat;
+use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::{Gaussians, Shape};
 use nightsplat::train::{Background, StepReport, TrainConfig, Trainer};
 
@@ -35,8 +35,9 @@ fn config() -> TrainConfig {
 }
 
 fn mean_psnr(dataset: &Dataset, gaussians: &Gaussians) -> f64 {
-    let mut player = Player::new(&gpu(), gaussians, &TrainConfig::bare(), None).unwrap();
-    let scored = eval::score(dataset, |view| player.render(view)).unwrap();
+    let mut model_renderer =
+        ModelRenderer::new(&gpu(), gaussians, &TrainConfig::bare(), None).unwrap();
+    let scored = eval::score(dataset, |view| model_renderer.render(view)).unwrap();
     let scores: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
     Scores::mean(&scores).unwrap().psnr
 }
@@ -131,7 +132,7 @@ fn steps_that_outgrow_their_memory_are_redone_and_nothing_is_lost() {
     let run = |reserved: u32, in_flight: usize| {
         let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
         trainer.set_intersection_capacity(reserved).unwrap();
-        trainer.set_pace(in_flight, Some(3));
+        trainer.set_batching(in_flight, Some(3));
         let mut reports = vec![];
         let mut interruptions = 0;
         while trainer.steps_done() < config.steps {
@@ -157,7 +158,7 @@ fn how_steps_are_submitted_changes_no_bit() {
     let dataset = dataset();
     let run = |in_flight: usize, steps: Option<u64>| {
         let mut trainer = Trainer::new(&gpu(), config(), &dataset).unwrap();
-        trainer.set_pace(in_flight, steps);
+        trainer.set_batching(in_flight, steps);
         let losses: Vec<f64> = advance(&mut trainer, 60).iter().map(|report| report.loss).collect();
         (losses, trainer.gaussians().unwrap())
     };
@@ -190,7 +191,7 @@ fn recorded_for_a_step(config: TrainConfig) -> [u64; 2] {
     let (gpu, dataset) = (Gpu::new(&DeviceChoice::Best).unwrap(), dataset());
     let mut trainer = Trainer::new(&gpu, config, &dataset).unwrap();
     trainer.set_intersection_capacity(100_000).unwrap();
-    trainer.set_pace(1, Some(64));
+    trainer.set_batching(1, Some(64));
     let mut recorded_in = |until: u64| {
         let before = recorded(&gpu);
         assert_eq!(trainer.advance(until).unwrap().last().unwrap().step, until);
@@ -332,7 +333,8 @@ fn a_render_shows_what_its_model_was_trained_to() {
     advance(&mut trainer, 60);
     let view = &dataset.views[0];
     let in_training = trainer.render(&view.camera).unwrap();
-    let mut player =
-        Player::new(&gpu(), &trainer.gaussians().unwrap(), &TrainConfig::bare(), None).unwrap();
-    assert_eq!(in_training.colors.data, player.render(view).unwrap().colors.data);
+    let mut model_renderer =
+        ModelRenderer::new(&gpu(), &trainer.gaussians().unwrap(), &TrainConfig::bare(), None)
+            .unwrap();
+    assert_eq!(in_training.colors.data, model_renderer.render(view).unwrap().colors.data);
 }

@@ -3,12 +3,12 @@
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use glam::{DAffine3, DVec3};
-use nightsplat::camera::Frame;
+use nightsplat::camera::TrainingFrame;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::metrics::Scores;
-use nightsplat::results::eval::{self, Player, ViewScore};
-use nightsplat::results::run::{self, HeldRun};
+use nightsplat::results::eval::{self, ModelRenderer, ViewScore};
+use nightsplat::results::run::{self, IfExists};
 use nightsplat::splats::scene::ply;
 use nightsplat::train::{TrainConfig, Trainer};
 
@@ -69,13 +69,13 @@ fn a_run_in_any_world_is_scored_as_it_was_trained_and_its_model_lies_in_that_wor
         let there = moved(&dataset, scale, offset);
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("run");
-        let trained = run::train(&gpu(), &config, &there, &out, HeldRun::Refuse, |_| {}).unwrap();
+        let trained = run::train(&gpu(), &config, &there, &out, IfExists::Refuse, |_| {}).unwrap();
         let recorded = run::load_config(&out).unwrap();
         let frame = recorded.frame.unwrap();
-        assert_ne!(frame, Frame::WORLD);
+        assert_ne!(frame, TrainingFrame::WORLD);
         let gaussians = run::load_model(&out, false).unwrap();
-        let mut player = Player::new(&gpu(), &gaussians, &recorded, None).unwrap();
-        let scored = eval::score(&there, |view| player.render(view)).unwrap();
+        let mut model_renderer = ModelRenderer::new(&gpu(), &gaussians, &recorded, None).unwrap();
+        let scored = eval::score(&there, |view| model_renderer.render(view)).unwrap();
         let (again, then) = (mean_psnr(&scored), mean_psnr(&trained.scored));
         assert!((again - then).abs() < 0.01, "{scale} at {offset}: {again}, not {then}");
 
@@ -132,18 +132,18 @@ fn a_resumed_run_stays_in_its_frame_and_an_old_one_in_its_world() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("run");
     let config = TrainConfig { steps: 6, checkpoint_every: 5, ..config() };
-    run::train(&gpu(), &config, &dataset, &out, HeldRun::Refuse, |_| {}).unwrap();
+    run::train(&gpu(), &config, &dataset, &out, IfExists::Refuse, |_| {}).unwrap();
     let longer = TrainConfig { steps: 8, ..config };
-    let resumed = run::train(&gpu(), &longer, &dataset, &out, HeldRun::Resume, |_| {}).unwrap();
+    let resumed = run::train(&gpu(), &longer, &dataset, &out, IfExists::Resume, |_| {}).unwrap();
     assert_eq!(*resumed.trainer.frame(), dataset.frame());
-    assert_ne!(dataset.frame(), Frame::WORLD);
+    assert_ne!(dataset.frame(), TrainingFrame::WORLD);
     // As a version wrote it that knew no frames.
     let path = out.join("config.toml");
     let text = std::fs::read_to_string(&path).unwrap();
-    let (before, behind) = text.split_once("[frame]\n").unwrap();
-    let behind = behind.split_once("\n[").map_or("", |(_, behind)| behind);
-    std::fs::write(&path, format!("{before}[{behind}")).unwrap();
+    let (before, after) = text.split_once("[frame]\n").unwrap();
+    let after = after.split_once("\n[").map_or("", |(_, after)| after);
+    std::fs::write(&path, format!("{before}[{after}")).unwrap();
     let longer = TrainConfig { steps: 9, ..longer };
-    let old = run::train(&gpu(), &longer, &dataset, &out, HeldRun::Resume, |_| {}).unwrap();
-    assert_eq!(*old.trainer.frame(), Frame::WORLD);
+    let old = run::train(&gpu(), &longer, &dataset, &out, IfExists::Resume, |_| {}).unwrap();
+    assert_eq!(*old.trainer.frame(), TrainingFrame::WORLD);
 }

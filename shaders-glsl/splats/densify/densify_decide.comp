@@ -2,7 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 #include "gaussian.glsl"
-#include "fate.glsl"
+#include "densify_action.glsl"
 
 //! Densify decide: one thread per place in the order of the keys settles the fate of the Gaussian there.
 //!
@@ -19,7 +19,7 @@ layout(push_constant) uniform Params {
     uint  max_gaussians;
     uint  rounds_left;      // this one included; at least 1
     float split_log_scale;  // ln of the largest standard deviation of a clone
-    uint  most_added;       // of all batches
+    uint  max_added;       // of all batches
 };
 
 layout(constant_id = 0) const bool CONSERVING = false;  // every candidate is split
@@ -27,15 +27,15 @@ layout(constant_id = 0) const bool CONSERVING = false;  // every candidate is sp
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };      // planes of the batch
 layout(binding = 1) readonly  buffer SortedKeys { uint sorted_keys[]; };      // (gaussian_count), KEY_*
 layout(binding = 2) readonly  buffer SortedIds  { uint sorted_ids[]; };       // (gaussian_count)
-layout(binding = 3) buffer Tally { uint tally[]; };                           // TALLY_*
-layout(binding = 4) writeonly buffer Fates      { uint fates[]; };            // (gaussian_count), FATE_*
-layout(binding = 5) writeonly buffer Offspring  { uint offspring_counts[]; }; // (gaussian_count)
+layout(binding = 3) buffer Counters { uint counters[]; };                           // TALLY_*
+layout(binding = 4) writeonly buffer Actions      { uint actions[]; };            // (gaussian_count), FATE_*
+layout(binding = 5) writeonly buffer ChildCounts  { uint child_counts[]; }; // (gaussian_count)
 
 // How many may multiply; each adds one Gaussian.
-uint room() {
-    uint kept = gaussian_count - tally[TALLY_PRUNED];
+uint available() {
+    uint kept = gaussian_count - counters[COUNTER_PRUNED];
     uint free = max(max_gaussians, kept) - kept;
-    return min(most_added, free / rounds_left + (free % rounds_left > 0 ? 1 : 0));
+    return min(max_added, free / rounds_left + (free % rounds_left > 0 ? 1 : 0));
 }
 
 bool is_small(uint i) {
@@ -50,16 +50,16 @@ void main() {
     uint i = sorted_ids[place], key = sorted_keys[place];
     // Unsigned: what lies before the batch wraps beyond its end.
     if (i - first_gaussian >= batch_count) return;
-    uint first_without = room();
-    uint end = tally[TALLY_CANDIDATES] > first_without ? sorted_keys[first_without] : KEY_KEEP;
-    uint fate = key == KEY_PRUNE ? FATE_PRUNE : FATE_KEEP;
-    if (key < end) fate = is_small(i) ? FATE_CLONE : FATE_SPLIT;
-    fates[i] = fate;
-    offspring_counts[i] = offspring(fate);
-    uint cloned = subgroupAdd(fate == FATE_CLONE ? 1u : 0u);
-    uint split = subgroupAdd(fate == FATE_SPLIT ? 1u : 0u);
+    uint first_without = available();
+    uint end = counters[COUNTER_CANDIDATES] > first_without ? sorted_keys[first_without] : KEY_KEEP;
+    uint action = key == KEY_PRUNE ? ACTION_PRUNE : ACTION_KEEP;
+    if (key < end) action = is_small(i) ? ACTION_CLONE : ACTION_SPLIT;
+    actions[i] = action;
+    child_counts[i] = child_count(action);
+    uint cloned = subgroupAdd(action == ACTION_CLONE ? 1u : 0u);
+    uint split = subgroupAdd(action == ACTION_SPLIT ? 1u : 0u);
     if (subgroupElect()) {
-        atomicAdd(tally[TALLY_CLONED], cloned);
-        atomicAdd(tally[TALLY_SPLIT], split);
+        atomicAdd(counters[COUNTER_CLONED], cloned);
+        atomicAdd(counters[COUNTER_SPLIT], split);
     }
 }

@@ -2,7 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 #include "gaussian.glsl"
-#include "fate.glsl"
+#include "densify_action.glsl"
 
 //! Densify moments: one thread per Gaussian writes the moments of what comes of it to the new planes.
 //!
@@ -21,19 +21,19 @@ layout(push_constant) uniform Params {
 };
 
 layout(binding = 0) readonly  buffer Moments    { uint moments[]; };      // planes, of whatever a word holds
-layout(binding = 1) readonly  buffer Fates      { uint fates[]; };        // (gaussian_count), FATE_*
+layout(binding = 1) readonly  buffer Actions      { uint actions[]; };        // (gaussian_count), FATE_*
 layout(binding = 2) readonly  buffer Offsets    { uint offsets[]; };      // (gaussian_count), first output
 layout(binding = 3) writeonly buffer NewMoments { uint new_moments[]; };  // planes
 
 void main() {
     uint i = THREAD_INDEX;
     if (i >= gaussian_count) return;
-    uint fate = fates[i];
-    for (uint copy_index = 0; copy_index < offspring(fate); ++copy_index) {
+    uint action = actions[i];
+    for (uint copy_index = 0; copy_index < child_count(action); ++copy_index) {
         // Unsigned: what lies before the batch wraps beyond its end.
         uint to = offsets[i] + copy_index - first_new_gaussian;
         if (to >= new_gaussian_count) continue;
-        bool begins = is_new(fate, copy_index);
+        bool begins = is_new(action, copy_index);
         for (uint plane = 0; plane < PLANE_COUNT; ++plane) {
             uint column = plane_column(plane, feature_count, column_count);
             uint width = plane_column(plane + 1, feature_count, column_count) - column;

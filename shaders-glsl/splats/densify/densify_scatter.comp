@@ -3,7 +3,7 @@
 #include "kernel.glsl"
 #include "gaussian.glsl"
 #include "rotation.glsl"
-#include "fate.glsl"
+#include "densify_action.glsl"
 #include "random.glsl"
 
 //! Densify scatter: one thread per Gaussian writes the parameters of what comes of it to the new planes.
@@ -29,7 +29,7 @@ layout(push_constant) uniform Params {
 layout(constant_id = 0) const bool CONSERVING = false;
 
 layout(binding = 0) readonly  buffer Parameters    { float parameters[]; };     // planes
-layout(binding = 1) readonly  buffer Fates         { uint fates[]; };           // (gaussian_count), FATE_*
+layout(binding = 1) readonly  buffer Actions         { uint actions[]; };           // (gaussian_count), FATE_*
 layout(binding = 2) readonly  buffer Offsets       { uint offsets[]; };         // (gaussian_count), first output
 layout(binding = 3) writeonly buffer NewParameters { float new_parameters[]; }; // planes
 
@@ -78,21 +78,21 @@ Shape half_of(Shape parent, mat3 axes, uint copy_index) {
 void main() {
     uint i = THREAD_INDEX;
     if (i >= gaussian_count) return;
-    uint fate = fates[i];
+    uint action = actions[i];
     Shape parent;
     parent.mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
     parent.log_scales = LOAD_VEC3(parameters, LOG_SCALES_COLUMN, gaussian_count, i);
     parent.raw_opacity = parameters[RAW_OPACITIES_COLUMN * gaussian_count + i];
     mat3 axes = rotation(unit_quat(LOAD_VEC4(parameters, QUATS_COLUMN, gaussian_count, i)));
-    for (uint copy_index = 0; copy_index < offspring(fate); ++copy_index) {
+    for (uint copy_index = 0; copy_index < child_count(action); ++copy_index) {
         // Unsigned: what lies before the batch wraps beyond its end.
         uint to = offsets[i] + copy_index - first_new_gaussian;
         if (to >= new_gaussian_count) continue;
         copy(i, to);
-        if (!is_new(fate, copy_index)) continue;
+        if (!is_new(action, copy_index)) continue;
         Shape child;
         if (CONSERVING) child = half_of(parent, axes, copy_index);
-        else child = drawn(i, parent, axes, fate == FATE_SPLIT, copy_index);
+        else child = drawn(i, parent, axes, action == ACTION_SPLIT, copy_index);
         for (uint k = 0; k < 3; ++k) {
             new_parameters[MEANS_COLUMN * new_gaussian_count + 3 * to + k] = child.mean[k];
             new_parameters[LOG_SCALES_COLUMN * new_gaussian_count + 3 * to + k] = child.log_scales[k];

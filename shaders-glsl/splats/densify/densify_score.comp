@@ -6,7 +6,7 @@
 #include "camera.glsl"
 #include "rotation.glsl"
 #include "splat.glsl"
-#include "fate.glsl"
+#include "densify_action.glsl"
 
 //! Densify score: one thread per Gaussian makes the key that orders it by how much it asks to multiply.
 //!
@@ -34,7 +34,7 @@ layout(binding = 1) readonly  buffer GradNormSums { float grad_norm_sums[]; };  
 layout(binding = 2) readonly  buffer VisitCounts  { uint visit_counts[]; };     // (gaussian_count)
 layout(binding = 3) writeonly buffer Keys         { uint keys[]; };             // (gaussian_count), KEY_*
 layout(binding = 4) writeonly buffer Ids          { uint ids[]; };              // (gaussian_count)
-layout(binding = 5) buffer Tally { uint tally[]; };                             // TALLY_*, zero before
+layout(binding = 5) buffer Counters { uint counters[]; };                             // TALLY_*, zero before
 layout(binding = 6) readonly  buffer Cameras      { Camera cameras[]; };        // (camera_count)
 
 // Positive phrasing: a NaN fails the test.
@@ -103,7 +103,7 @@ void main() {
     uint candidates = subgroupAdd(key < KEY_KEEP ? 1u : 0u);
     uint pruned = subgroupAdd(key == KEY_PRUNE ? 1u : 0u);
     if (subgroupElect()) {
-        atomicAdd(tally[TALLY_CANDIDATES], candidates);
-        atomicAdd(tally[TALLY_PRUNED], pruned);
+        atomicAdd(counters[COUNTER_CANDIDATES], candidates);
+        atomicAdd(counters[COUNTER_PRUNED], pruned);
     }
 }

@@ -52,7 +52,7 @@ void main() {
     uvec4 i = 4 * quad + uvec4(0, 1, 2, 3);
     // The last quad can reach into a column that takes no part.
     bvec4 takes_part = lessThan(i, uvec4(end));
-    vec4 gradient = tame(gradients[quad]);
+    vec4 gradient = clamp_gradient(gradients[quad]);
     Moments moments;
     if (HALF_MOMENTS) moments = from_halves(floatBitsToUint(both_moments[quad]));
     else moments = Moments(first_moments[quad], second_moments[quad]);

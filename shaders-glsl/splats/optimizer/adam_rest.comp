@@ -58,7 +58,7 @@ void main() {
         }
     }
     if (HALF_MOMENTS) moments = from_halves(both);
-    moments = updated(moments, tame(gradient));
+    moments = updated(moments, clamp_gradient(gradient));
 
     vec4 value = vec4(halves_at(word, true), halves_at(word + 1, count > 2));
     uvec4 chance = chance_of(value, moments, step);

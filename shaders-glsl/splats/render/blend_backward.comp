@@ -20,14 +20,14 @@ layout(constant_id = 8) const uint SHAPING_CHANNELS = 3;
 layout(push_constant, scalar) uniform Params { uvec2 size; uint tile_columns; };
 
 layout(binding = 0) readonly  buffer Ranges  { uvec2 tile_ranges[]; };
-layout(binding = 1) readonly  buffer Slots   { uint sorted_slots[]; };
-layout(binding = 2) readonly  buffer Owners  { uint owners[]; };
+layout(binding = 1) readonly  buffer IntersectionIds   { uint sorted_intersections[]; };
+layout(binding = 2) readonly  buffer GaussianIds  { uint gaussian_ids[]; };
 layout(binding = 3) readonly  buffer Splats  { ProjectedSplat splats[]; };
 layout(binding = 4) readonly  buffer Colors  { vec3 colors[]; };  // (Gaussians, COLOR_VECTORS)
 layout(binding = 5) readonly  buffer Render  { float render[]; };    // (CHANNELS, H, W)
 layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNELS, H, W)
 // (slots, RECORD_VECTORS): mean2d 2, conic 3, opacity 1, colour CHANNELS, zeros
-layout(binding = 7) writeonly buffer Records { vec3 records[]; };
+layout(binding = 7) writeonly buffer GradientRecords { vec3 gradient_records[]; };
 
 // What every part but the first adds to the records of a batch; a tile of one part has room for one that is not used.
 shared float shares[(SUBGROUPS_PER_TILE - 1 + 1 / SUBGROUPS_PER_TILE) * RECORD * SUBGROUP_SIZE];
@@ -76,8 +76,8 @@ void main() [[subgroup_uniform_control_flow]] {
         if (!tile_any(alive)) break;
 
         uint batch = min(SUBGROUP_SIZE, range.y - first);
-        uint slot = sorted_slots[first + min(lane, batch - 1)];
-        uint id = owners[slot];
+        uint slot = sorted_intersections[first + min(lane, batch - 1)];
+        uint id = gaussian_ids[slot];
         ProjectedSplat mine = splats[id];
         vec3 my_color[COLOR_VECTORS];
         [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) my_color[k] = colors[COLOR_VECTORS * id + k];
@@ -177,12 +177,12 @@ void main() [[subgroup_uniform_control_flow]] {
                 [[unroll]] for (uint k = 0; k < RECORD; k++) record[k] += shares[share + k * SUBGROUP_SIZE];
             }
             [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++)
-                records[RECORD_VECTORS * slot + k] = vec3(record[3 * k], record[3 * k + 1], record[3 * k + 2]);
+                gradient_records[RECORD_VECTORS * slot + k] = vec3(record[3 * k], record[3 * k + 1], record[3 * k + 2]);
         }
     }
     // Behind a tile that is done every gradient is zero.
     for (uint i = first + gl_LocalInvocationIndex; i < range.y; i += SUBGROUP_SIZE * SUBGROUPS_PER_TILE) {
-        uint at = RECORD_VECTORS * sorted_slots[i];
-        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) records[at + k] = vec3(0.0);
+        uint at = RECORD_VECTORS * sorted_intersections[i];
+        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) gradient_records[at + k] = vec3(0.0);
     }
 }

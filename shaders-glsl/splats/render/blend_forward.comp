@@ -22,8 +22,8 @@ layout(push_constant, scalar) uniform Params {
 };
 
 layout(binding = 0) readonly  buffer Counts     { uint counts[]; };        // [0]: intersections
-layout(binding = 1) readonly  buffer Slots      { uint sorted_slots[]; };
-layout(binding = 2) readonly  buffer Owners     { uint owners[]; };
+layout(binding = 1) readonly  buffer IntersectionIds      { uint sorted_intersections[]; };
+layout(binding = 2) readonly  buffer GaussianIds     { uint gaussian_ids[]; };
 layout(binding = 3) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 4) readonly  buffer Colors     { vec3 colors[]; };      // (Gaussians, COLOR_VECTORS)
 layout(binding = 5) writeonly buffer Render     { float render[]; };  // (CHANNELS, H, W)
@@ -61,7 +61,7 @@ void main() [[subgroup_uniform_control_flow]] {
 
         uint batch = min(SUBGROUP_SIZE, range.y - first);
         // Lanes beyond the batch load its last splat, which counts on no pixel without opacity.
-        uint id = owners[sorted_slots[first + min(lane, batch - 1)]];
+        uint id = gaussian_ids[sorted_intersections[first + min(lane, batch - 1)]];
         ProjectedSplat mine = splats[id];
         vec3 my_color[COLOR_VECTORS];
         [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) my_color[k] = colors[COLOR_VECTORS * id + k];

@@ -5,7 +5,7 @@
 #include "camera.glsl"
 #include "rotation.glsl"
 #include "splat.glsl"
-#include "shared_slots.glsl"
+#include "shared_intersections.glsl"
 
 //! Camera backward: one lane per Gaussian, from the records of its slots to its share of the camera's gradient.
 //!
@@ -24,13 +24,13 @@ layout(push_constant, scalar) uniform Params {
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // planes
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer TileCounts { uint tile_counts[]; };
-layout(binding = 3) readonly  buffer Emitted    { uvec2 emitted[]; };     // first slot, one past the last
-layout(binding = 4) readonly  buffer Records    { vec3 records[]; };      // (slots, RECORD_VECTORS)
+layout(binding = 3) readonly  buffer IntersectionRanges    { uvec2 intersection_ranges[]; };     // first slot, one past the last
+layout(binding = 4) readonly  buffer GradientRecords    { vec3 gradient_records[]; };      // (slots, RECORD_VECTORS)
 layout(binding = 5) readonly  buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
 layout(binding = 6) readonly  buffer Cameras    { Camera cameras[]; };
 layout(binding = 7) writeonly buffer Shares     { float shares[]; };      // (gaussian_count, CAMERA_WIDTH)
 
-#include "records.glsl"
+#include "gradient_records.glsl"
 #include "conic.glsl"
 
 #define STORE(at, v, width) \
@@ -40,7 +40,7 @@ void main() {
     uint i = THREAD_INDEX;
     bool is_seen = i < gaussian_count && tile_counts[i] > 0;
     vec3 sum[RECORD_VECTORS];
-    sum_records(is_seen ? emitted[i] : uvec2(0), sum);
+    sum_gradient_records(is_seen ? intersection_ranges[i] : uvec2(0), sum);
     if (i >= gaussian_count) return;
     if (!is_seen) {
         [[unroll]] for (uint k = 0; k < CAMERA_WIDTH; k++) shares[CAMERA_WIDTH * i + k] = 0.0;

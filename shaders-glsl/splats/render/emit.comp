@@ -3,7 +3,7 @@
 #include "kernel.glsl"
 #include "partition.glsl"
 #include "splat.glsl"
-#include "shared_slots.glsl"
+#include "shared_intersections.glsl"
 
 //! Emit: one lane per depth rank writes the tiles of its Gaussian into the slots reserved for it.
 //!
@@ -18,13 +18,13 @@ layout(push_constant, scalar) uniform Params { uvec2 size; uint gaussian_count; 
 
 layout(binding = 0) readonly  buffer Counts  { uint counts[]; };       // [0]: intersections; 0 after an overflow
 layout(binding = 1) readonly  buffer Ids     { uint sorted_ids[]; };
-layout(binding = 2) readonly  buffer Before  { uint slots_before[]; };  // by rank, within its partition
+layout(binding = 2) readonly  buffer Before  { uint intersection_offsets[]; };  // by rank, within its partition
 layout(binding = 3) readonly  buffer Sums    { uint sums[]; };          // what precedes each partition of ranks
 layout(binding = 4) readonly  buffer Splats  { ProjectedSplat splats[]; };
 layout(binding = 5) writeonly buffer Tiles   { uint tiles[]; };        // tile of each slot
-layout(binding = 6) writeonly buffer Slots   { uint slots[]; };        // 0, 1, 2, ...
-layout(binding = 7) writeonly buffer Owners  { uint owners[]; };       // Gaussian of each slot
-layout(binding = 8) writeonly buffer Emitted { uvec2 emitted[]; };      // by Gaussian: first slot, one past the last
+layout(binding = 6) writeonly buffer IntersectionIds   { uint intersection_ids[]; };        // 0, 1, 2, ...
+layout(binding = 7) writeonly buffer GaussianIds  { uint gaussian_ids[]; };       // Gaussian of each slot
+layout(binding = 8) writeonly buffer IntersectionRanges { uvec2 intersection_ranges[]; };      // by Gaussian: first slot, one past the last
 layout(binding = 9) readonly  buffer TileCounts { uint tile_counts[]; };  // by Gaussian
 
 const uint NO_TILE = 0xffffffffu;
@@ -33,8 +33,8 @@ const uint TILES_PER_TURN = 2;
 
 void write_slot(uint slot, uint tile, uint id) {
     tiles[slot] = tile;
-    slots[slot] = slot;
-    owners[slot] = id;
+    intersection_ids[slot] = slot;
+    gaussian_ids[slot] = id;
 }
 
 // The tiles of a row into slots from `slot` to before `end`.
@@ -50,13 +50,13 @@ void main() {
     if (rank - lane >= gaussian_count) return;
     bool is_rank = rank < gaussian_count;
     uint id = is_rank ? sorted_ids[rank] : 0;
-    uint begin = is_rank ? sums[rank / PARTITION_SIZE] + slots_before[rank] : 0;
+    uint begin = is_rank ? sums[rank / PARTITION_SIZE] + intersection_offsets[rank] : 0;
     // No slot beyond those that were counted is ever written, not even where the sum of all counts wrapped around.
     uint end = begin + (is_rank ? tile_counts[id] : 0);
     if (end > counts[0] || end < begin) end = begin;
     ProjectedSplat splat = splats[id];
     uvec2 rows = end > begin ? splat_tile_rows(splat, size.y) : uvec2(0);
-    bool is_shared = end - begin > SHARED_SLOTS;
+    bool is_shared = end - begin > SHARED_INTERSECTIONS;
     uvec4 sharing = subgroupBallot(is_shared);
 
     // First every lane its own splat, then all together those that are shared, a row for each: in one loop, for a device
@@ -92,7 +92,7 @@ void main() {
         row = subgroupShuffle(rows.x, owner) + lane;
         walked_rows = subgroupShuffle(rows.y, owner);
     }
-    if (is_rank) emitted[id] = uvec2(begin, last);
+    if (is_rank) intersection_ranges[id] = uvec2(begin, last);
     // Counting and emitting share one function; should a compiler still make them disagree, nothing is left unwritten.
     for (; last < end; last++) write_slot(last, NO_TILE, id);
 }

@@ -21,7 +21,7 @@ layout(push_constant) uniform Params {
 
 layout(binding = 0) readonly  buffer Ids        { uint sorted_ids[]; };   // by depth
 layout(binding = 1) readonly  buffer TileCounts { uint tile_counts[]; };  // by Gaussian
-layout(binding = 2) writeonly buffer Before     { uint slots_before[]; };  // by rank, within its partition
+layout(binding = 2) writeonly buffer Before     { uint intersection_offsets[]; };  // by rank, within its partition
 layout(binding = 3) coherent  buffer Sums       { uint sums[]; };    // (partitions), exclusive prefix sums
 layout(binding = 4) writeonly buffer Counts     { uint counts[]; };  // [0]: intersections to blend
 layout(binding = 5)           buffer Status     { uint status[]; };
@@ -42,7 +42,7 @@ void main() {
         uint rank = first + lane;
         uint count = rank < end ? tile_counts[sorted_ids[rank]] : 0;
         uint inclusive = subgroup_inclusive_sum(count);
-        if (rank < end) slots_before[rank] = sum + inclusive - count;
+        if (rank < end) intersection_offsets[rank] = sum + inclusive - count;
         sum += subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
     }
     if (subgroupElect()) sums[part] = sum;

@@ -7,7 +7,7 @@
 #include "sh.glsl"
 #include "splat.glsl"
 #include "status.glsl"
-#include "shared_slots.glsl"
+#include "shared_intersections.glsl"
 
 //! Project backward: one lane per Gaussian, from the records of its slots to the gradients of its attributes.
 //!
@@ -37,8 +37,8 @@ layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // pla
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer Colors     { vec3 colors[]; };       // (gaussian_count, COLOR_VECTORS)
 layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
-layout(binding = 4) readonly  buffer Emitted    { uvec2 emitted[]; };     // first slot, one past the last
-layout(binding = 5) readonly  buffer Records    { vec3 records[]; };      // (slots, RECORD_VECTORS)
+layout(binding = 4) readonly  buffer IntersectionRanges    { uvec2 intersection_ranges[]; };     // first slot, one past the last
+layout(binding = 5) readonly  buffer GradientRecords    { vec3 gradient_records[]; };      // (slots, RECORD_VECTORS)
 layout(binding = 6)           buffer Status     { uint status[]; };
 layout(binding = 7) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
 layout(binding = 8) buffer GradNormSums { float grad_norm_sums[]; };
@@ -48,7 +48,7 @@ layout(binding = 10) readonly buffer Cameras { Camera cameras[]; };
 const uint FEATURE_COUNT = CHANNELS - 3;
 
 #include "rest.glsl"
-#include "records.glsl"
+#include "gradient_records.glsl"
 #include "conic.glsl"
 
 #define STORE_VEC3(column, i, v) { \
@@ -111,7 +111,7 @@ void main() {
     uint i = THREAD_INDEX;
     bool is_seen = i < gaussian_count && tile_counts[i] > 0;
     vec3 sum[RECORD_VECTORS];
-    sum_records(is_seen ? emitted[i] : uvec2(0), sum);
+    sum_gradient_records(is_seen ? intersection_ranges[i] : uvec2(0), sum);
     if (i >= gaussian_count) return;
     if (!is_seen) {
         store_zero(i);

@@ -17,7 +17,7 @@ use crate::train::{Part, TrainConfig, Trainer};
 
 /// Gaussians before a camera that looks along z from the origin.
 #[derive(Clone, Debug)]
-pub struct Scene {
+pub struct BenchScene {
     /// At the origin.
     pub camera: Camera,
     /// In the camera's view.
@@ -33,7 +33,7 @@ const LOG_PIXELS: [f64; 2] = [0.545, 0.8];
 /// Random draws per Gaussian; each normal one takes two counters.
 const DRAWS: u64 = 32;
 
-impl Scene {
+impl BenchScene {
     /// As many Gaussians in a view of these pixels.
     pub fn new(width: u32, height: u32, count: usize) -> Self {
         let camera = camera(width, height);
@@ -66,7 +66,7 @@ pub(super) struct Trainers {
 
 /// # Errors
 /// The device is out of memory or lost.
-pub(super) fn trainers(gpu: &Gpu, scene: &Scene) -> Result<Trainers> {
+pub(super) fn trainers(gpu: &Gpu, scene: &BenchScene) -> Result<Trainers> {
     let plain = plain(gpu, scene)?;
     let (lita, lita_begins) = gpu.checked(|| lita(gpu));
     Ok(Trainers { plain, lita: lita?, lita_begins, intersections: intersections(gpu, scene)? })
@@ -76,7 +76,7 @@ pub(super) fn trainers(gpu: &Gpu, scene: &Scene) -> Result<Trainers> {
 fn config() -> TrainConfig {
     let mut config = TrainConfig { tone: ToneSettings::new(ToneCurve::Ap3), ..TrainConfig::bare() };
     config.schedule.sh_degree_interval = 1;
-    config.schedule.boost = 1.0;
+    config.schedule.initial_rate_factor = 1.0;
     config.schedule.densify_after = i64::MAX as u64;
     config.schedule.resolution_steps = [0, 0];
     config
@@ -86,7 +86,7 @@ fn config() -> TrainConfig {
 ///
 /// # Errors
 /// The device is out of memory or lost.
-pub fn plain(gpu: &Gpu, scene: &Scene) -> Result<Trainer> {
+pub fn plain(gpu: &Gpu, scene: &BenchScene) -> Result<Trainer> {
     let dataset = scene.dataset();
     let mut trainer = Trainer::from_gaussians(gpu, config(), &dataset, &scene.gaussians)?;
     while trainer.steps_done() < 3 {
@@ -106,11 +106,11 @@ fn lita(gpu: &Gpu) -> Result<Trainer> {
     config.model.network.stages = 2;
     config.model.network.repeats = 2;
     (config.schedule.densify_after, config.schedule.densify_interval) = (0, 1);
-    Trainer::new(gpu, config, &Scene::new(96, 72, 500).dataset())
+    Trainer::new(gpu, config, &BenchScene::new(96, 72, 500).dataset())
 }
 
 /// How often a splat meets a tile.
-fn intersections(gpu: &Gpu, Scene { camera, gaussians, .. }: &Scene) -> Result<u32> {
+fn intersections(gpu: &Gpu, BenchScene { camera, gaussians, .. }: &BenchScene) -> Result<u32> {
     let mut renderer = Renderer::new(gpu, RenderSettings::default())?;
     renderer.reserve(gaussians.count, [camera])?;
     let parameters = gaussians.upload(gpu)?;

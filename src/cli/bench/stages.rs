@@ -24,7 +24,7 @@ pub(super) struct Stages {
 /// # Errors
 /// The device is out of memory or lost.
 pub(super) fn check(bench: &Bench, trainers: &mut Trainers) -> Result<CheckReport> {
-    let mut photograph = Photograph::new(&bench.gpu)?;
+    let mut photograph = BenchPhotograph::new(&bench.gpu)?;
     let (done, mut report) =
         bench.gpu.checked(|| bench.gpu.run("pseudo-GT", |pass| photograph.record(pass)));
     done?;
@@ -49,7 +49,7 @@ pub(super) fn time_kernels(
     bench: &Bench,
     trainers: &mut Trainers,
 ) -> Result<BTreeMap<&'static str, f64>> {
-    let mut photograph = Photograph::new(&bench.gpu)?;
+    let mut photograph = BenchPhotograph::new(&bench.gpu)?;
     let mut kernels = BTreeMap::new();
     let Trainers { plain, lita, .. } = trainers;
     for times in [
@@ -88,7 +88,7 @@ pub(super) fn time(bench: &Bench, trainers: &mut Trainers) -> Result<Stages> {
     let steps = repeated(bench, || trainers.plain.profile_step())?;
     let of_step = |names: &[&str]| median(steps.iter().map(|t| of_kernels(t, names)).collect());
     let loss_kernels = ["ssim", "loss_log"];
-    let mut photograph = Photograph::new(&bench.gpu)?;
+    let mut photograph = BenchPhotograph::new(&bench.gpu)?;
     let times = repeated(bench, || photograph.profile(&bench.gpu))?;
     let full_hd = median(times.iter().map(|times| total(times)).collect());
     let group = |name, milliseconds, bound| Timing { name, milliseconds, bound };
@@ -136,14 +136,14 @@ fn sort(bench: &Bench) -> Result<f64> {
 }
 
 /// A Full-HD photograph and its pseudo-GT.
-struct Photograph {
+struct BenchPhotograph {
     image: Buffer<f32>,
     pseudo_gt: PseudoGt,
     parameters: Buffer<ToneParameters>,
     target: Buffer<f32>,
 }
 
-impl Photograph {
+impl BenchPhotograph {
     fn new(gpu: &Gpu) -> Result<Self> {
         let image = gpu.buffer("low", &scene::dark(1920, 1080).data)?;
         Ok(Self {

@@ -30,11 +30,11 @@ const MEAN_DIFFERENCE: f64 = 1e-5;
 struct Case {
     channels: usize,
     size: [u32; 2],
-    tiles: Vec<Measured>,
+    tiles: Vec<TileTiming>,
 }
 
 /// What one tile took.
-struct Measured {
+struct TileTiming {
     tile: Tile,
     intersections: u32,
     /// Largest and mean difference from the render of the first tile.
@@ -84,7 +84,7 @@ pub(super) fn run(
     for case in &cases {
         writeln!(out, "{}", case.as_text(gaussians))?;
     }
-    if !bench.gpu.properties().tells_statistics {
+    if !bench.gpu.properties().has_pipeline_statistics {
         writeln!(out, "registers and spills: the driver does not tell them")?;
     }
     let tile = |TunedTile { channels, tile }: &TunedTile| format!("{tile} at {channels} channels");
@@ -114,7 +114,7 @@ fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
 /// A renderer for one tile, what it rendered and the passes it took so far.
 struct Candidate {
     renderer: Renderer,
-    measured: Measured,
+    measured: TileTiming,
     times: Vec<[f64; 3]>,
 }
 
@@ -144,7 +144,7 @@ impl Case {
             renderer.reserve(gaussians, [&camera])?;
             let render = renderer.render_channels(&on_device, &camera, &OPTIONS)?;
             let first = first.get_or_insert_with(|| render.clone());
-            let measured = Measured {
+            let measured = TileTiming {
                 tile,
                 intersections: 0,
                 differences: differences(&render, first),
@@ -179,7 +179,7 @@ impl Case {
             "channels": self.channels,
             "width": self.size[0],
             "height": self.size[1],
-            "tiles": self.tiles.iter().map(Measured::as_json).collect::<Vec<_>>(),
+            "tiles": self.tiles.iter().map(TileTiming::as_json).collect::<Vec<_>>(),
         })
     }
 
@@ -188,7 +188,7 @@ impl Case {
         let head = ["tile", "blend forward", "backward", "rasteriser, ms", "intersections", ""];
         let mut rows = vec![head.map(str::to_owned).to_vec()];
         rows.extend(self.tiles.iter().map(|measured| {
-            let Measured { tile, intersections, .. } = measured;
+            let TileTiming { tile, intersections, .. } = measured;
             let note = match measured.agrees() {
                 false => "renders otherwise",
                 true if measured.rasteriser == self.least() => "fastest",
@@ -200,7 +200,7 @@ impl Case {
             row.extend([intersections.to_string(), note.to_owned()]);
             row
         }));
-        let registers: String = self.tiles.iter().filter_map(Measured::registers).collect();
+        let registers: String = self.tiles.iter().filter_map(TileTiming::registers).collect();
         format!(
             "{channels} channels, {width}x{height} pixels, {gaussians} Gaussians\n{}{registers}",
             table::aligned(&rows)
@@ -258,16 +258,16 @@ impl Pass {
 }
 
 impl Candidate {
-    fn finish(self, bench: &Bench) -> crate::Result<Measured> {
+    fn finish(self, bench: &Bench) -> crate::Result<TileTiming> {
         let status = Status::from_words(&bench.gpu.read(self.renderer.status())?);
         let [forward, backward, rasteriser] =
             [0, 1, 2].map(|part| median(self.times.iter().map(|times| times[part]).collect()));
         let intersections = status.intersections;
-        Ok(Measured { intersections, forward, backward, rasteriser, ..self.measured })
+        Ok(TileTiming { intersections, forward, backward, rasteriser, ..self.measured })
     }
 }
 
-impl Measured {
+impl TileTiming {
     /// Positive phrasing: a NaN does not agree.
     fn agrees(&self) -> bool {
         self.differences.0 <= LARGEST_DIFFERENCE && self.differences.1 <= MEAN_DIFFERENCE
@@ -322,7 +322,7 @@ mod tests {
     use super::*;
 
     fn case(channels: usize, times: &[([u32; 2], f64, f32)]) -> Case {
-        let measured = |&(size, rasteriser, difference): &([u32; 2], _, _)| Measured {
+        let measured = |&(size, rasteriser, difference): &([u32; 2], _, _)| TileTiming {
             tile: size.into(),
             intersections: 0,
             differences: (difference, 0.0),

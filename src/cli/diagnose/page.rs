@@ -17,16 +17,18 @@ const SHOWN: usize = 12;
 pub(super) fn html(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> String {
     let views: Vec<&View> = dataset.train_views().filter(|view| view.has_photograph()).collect();
     let exposure = exposure(&views);
-    let (mut dark, mut lifted) = (Distribution::new("photographs"), Distribution::new("lifted"));
+    let (mut dark, mut tone_mapped) =
+        (Distribution::new("photographs"), Distribution::new("tone-mapped"));
     let stride = views.len().div_ceil(SHOWN).max(1);
     let mut rows = vec![];
     for view in views.iter().step_by(stride) {
         // One that can no longer be read has no picture.
         let Ok(Some(image)) = view.loaded() else { continue };
         let image = image.as_ref();
-        let target = exposure.as_ref().map_or_else(|| image.clone(), |found| lift(image, found));
+        let target =
+            exposure.as_ref().map_or_else(|| image.clone(), |found| brightening(image, found));
         dark.add(&image.data);
-        lifted.add(&target.data);
+        tone_mapped.add(&target.data);
         rows.push(comparison(&view.name, image, &target));
     }
     let mut intro = vec![format!(
@@ -49,7 +51,7 @@ pub(super) fn html(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
             Facts { title: "The set".to_owned(), rows: measured.collect() },
         ],
         tables: vec![table(diagnosis)],
-        plots: vec![distributions(&[dark, lifted])],
+        plots: vec![distributions(&[dark, tone_mapped])],
         comparisons: rows,
     }
     .html()
@@ -64,7 +66,7 @@ fn exposure(views: &[&View]) -> Option<Exposure> {
 }
 
 /// About what `--curve auto` makes of a photograph.
-fn lift(image: &Image, exposure: &Exposure) -> Image {
+fn brightening(image: &Image, exposure: &Exposure) -> Image {
     let gain = exposure.gain_of(&LuminanceHistogram::of(&image.data), None);
     let weight = exposure.weight();
     let value = |&x: &f32| {
@@ -83,13 +85,13 @@ fn comparison(name: &str, image: &Image, target: &Image) -> Comparison {
     let width = image.width.min(PICTURE_WIDTH);
     let height =
         (u64::from(image.height) * u64::from(width) / u64::from(image.width.max(1))) as u32;
-    let [dark, lifted] = [image, target].map(|image| image.resized(width, height));
-    let histograms = histogram([&dark, &lifted], width, height);
+    let [dark, tone_mapped] = [image, target].map(|image| image.resized(width, height));
+    let histograms = histogram([&dark, &tone_mapped], width, height);
     Comparison {
         title: name.to_owned(),
         pictures: vec![
             picture("photograph", dark),
-            picture("lifted", lifted),
+            picture("tone-mapped", tone_mapped),
             picture("luminance: dark before, light after", histograms),
         ],
     }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 
 use super::tool::Tool;
-use super::{PoseArgs, create, lifted};
+use super::{PoseArgs, create, tone_mapped};
 use crate::photographs::dataset::Dataset;
 use crate::photographs::image::files::photographs_in;
 
@@ -81,11 +81,11 @@ impl<'a> Reconstruction<'a> {
     /// A program fails.
     pub(super) fn models(
         mut self,
-        lifted: &Path,
+        tone_mapped: &Path,
         say: impl Fn(&str) -> Result<()>,
     ) -> Result<PathBuf> {
-        self.attempt(lifted, &say)?;
-        let all = photographs_in(lifted)?.len();
+        self.attempt(tone_mapped, &say)?;
+        let all = photographs_in(tone_mapped)?.len();
         let placed = placed_in(&self.models)?;
         if 10 * placed >= 9 * all {
             return Ok(self.models);
@@ -96,7 +96,7 @@ impl<'a> Reconstruction<'a> {
         self.database.set_file_name("guided.db");
         self.models.set_file_name("guided");
         create(&self.models)?;
-        match self.attempt(lifted, &say) {
+        match self.attempt(tone_mapped, &say) {
             // What the first comparison came to is there.
             Err(error) if placed > 0 => {
                 tracing::warn!("{error}; the cameras are those of the first comparison");
@@ -107,14 +107,14 @@ impl<'a> Reconstruction<'a> {
         Ok(if placed_in(&self.models)? > placed { self.models } else { first })
     }
 
-    fn attempt(&self, lifted: &Path, say: &impl Fn(&str) -> Result<()>) -> Result<()> {
-        self.extract(lifted)?;
+    fn attempt(&self, tone_mapped: &Path, say: &impl Fn(&str) -> Result<()>) -> Result<()> {
+        self.extract(tone_mapped)?;
         say("features extracted")?;
         self.compare()?;
         say("features matched")?;
         // It fails where it found nothing to begin with, which is said of the photographs.
-        match self.place(lifted) {
-            Err(_) if NOTHING.iter().any(|words| self.colmap.said(words)) => {}
+        match self.place(tone_mapped) {
+            Err(_) if NOTHING.iter().any(|words| self.colmap.printed(words)) => {}
             outcome => outcome?,
         }
         say("cameras placed")
@@ -122,7 +122,7 @@ impl<'a> Reconstruction<'a> {
 
     fn extract(&self, photographs: &Path) -> crate::Result<()> {
         let command = "feature_extractor";
-        let is_one_camera = if lifted::are_of_one_size(photographs) { "1" } else { "0" };
+        let is_one_camera = if tone_mapped::are_of_one_size(photographs) { "1" } else { "0" };
         self.colmap.run(
             command,
             &[

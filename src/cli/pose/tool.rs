@@ -85,19 +85,20 @@ impl<'a> Tool<'a> {
         if status.success() {
             return Ok(());
         }
-        let said = std::fs::read(self.log).unwrap_or_default();
-        let said = String::from_utf8_lossy(said.get(begin..).unwrap_or_default()).into_owned();
+        let printed = std::fs::read(self.log).unwrap_or_default();
+        let printed =
+            String::from_utf8_lossy(printed.get(begin..).unwrap_or_default()).into_owned();
         let lines: Vec<&str> =
-            said.lines().skip(1).map(str::trim).filter(|line| !line.is_empty()).collect();
+            printed.lines().skip(1).map(str::trim).filter(|line| !line.is_empty()).collect();
         let last = lines[lines.len().saturating_sub(LAST_LINES)..].join(" | ");
         let last = if last.is_empty() { "it said nothing".to_owned() } else { last };
         Err(Error::input(self.path, format!("{command} ended with {status}: {last}")))
     }
 
     /// Whether it said something, in any of its runs.
-    pub(super) fn said(&self, what: &str) -> bool {
-        let said = std::fs::read(self.log).unwrap_or_default();
-        String::from_utf8_lossy(&said).contains(what)
+    pub(super) fn printed(&self, what: &str) -> bool {
+        let printed = std::fs::read(self.log).unwrap_or_default();
+        String::from_utf8_lossy(&printed).contains(what)
     }
 }
 

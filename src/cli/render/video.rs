@@ -55,8 +55,8 @@ pub(super) fn make(video: &Path, folder: &Path, files: &[PathBuf], fps: u16) -> 
     match ffmpeg {
         Ok(output) if output.status.success() => Ok(()),
         Ok(output) => {
-            let said = String::from_utf8_lossy(&output.stderr);
-            let last = said.lines().next_back().unwrap_or("it said nothing").to_owned();
+            let printed = String::from_utf8_lossy(&output.stderr);
+            let last = printed.lines().next_back().unwrap_or("it said nothing").to_owned();
             Err(Error::output(video, format!("ffmpeg failed: {last}; it was `{command}`")))
         }
         Err(error) if error.kind() == ErrorKind::NotFound => {

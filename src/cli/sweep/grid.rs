@@ -29,7 +29,7 @@ const CHANGES: [(&str, &[&str]); 8] = [
     ("stop.gain", &["0.02", "0.1"]),
     // Steps at a quarter and at half the size of the views; the schedule of `balanced` has 0 and 200.
     ("schedule.resolution_steps", &["[0,0]", "[0,1000]"]),
-    ("schedule.boost", &["1"]),
+    ("schedule.initial_rate_factor", &["1"]),
     ("max_gaussians", &["2000", "4000"]),
     ("sh_degree", &["0", "1"]),
     ("density.gradient_threshold", &["2e-4", "8e-4"]),

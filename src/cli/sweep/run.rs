@@ -10,7 +10,7 @@ use crate::cli::train::TrainArgs;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::View;
 use crate::photographs::image::Image;
-use crate::results::eval::Player;
+use crate::results::eval::ModelRenderer;
 use crate::results::run;
 use crate::train::TrainConfig;
 use crate::train::diagnose::Plan;
@@ -100,8 +100,8 @@ impl Run {
         let gaussians = run::load_model(&self.folder, config.model.raw_colors)?;
         let networks =
             run::load_networks(gpu, &self.folder, &config.model, gaussians.shape.features)?;
-        let mut player = Player::new(gpu, &gaussians, &config, networks)?;
-        Ok(player.render(view)?.output().clone())
+        let mut model_renderer = ModelRenderer::new(gpu, &gaussians, &config, networks)?;
+        Ok(model_renderer.render(view)?.output().clone())
     }
 
     /// The command as a shell takes it, which may be given any number of times.

@@ -144,8 +144,8 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
     if stops.iter().any(|stop| status.code() == Some(stop.exit_code().into())) {
         return Ok(Outcome::Saved);
     }
-    let said = std::fs::read(&log).unwrap_or_default();
-    let reason = last_words(&String::from_utf8_lossy(&said), status);
+    let printed = std::fs::read(&log).unwrap_or_default();
+    let reason = last_words(&String::from_utf8_lossy(&printed), status);
     Err(Error::output(&run.folder, format!("{reason}; log.txt says more")))
 }
 

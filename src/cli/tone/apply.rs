@@ -19,8 +19,8 @@ use crate::photographs::image::{Image, Mask};
 use crate::photographs::metrics::Scores;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
-    CurveChoice, Exposure, GainChoice, Measured, Profile, Scene, Statistics, ToneCurve,
-    ToneSettings, all_black,
+    CurveChoice, Exposure, GainChoice, MeasuredPhotograph, Profile, SceneTone, Statistics,
+    ToneCurve, ToneSettings, all_black,
 };
 use crate::results::eval;
 use crate::results::report::Distribution;
@@ -299,7 +299,7 @@ fn settings(args: &ApplyArgs, curve: &CurveChoice) -> Result<ToneSettings> {
 /// A curve, and what the photographs of a set have in common for it.
 struct CurveOnSet {
     pseudo_gt: PseudoGt,
-    scene: Scene,
+    scene: SceneTone,
     /// Masks hide what is white.
     inverted: bool,
 }
@@ -318,7 +318,7 @@ impl CurveOnSet {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
                 // What cannot be used is named where it would be mapped.
                 let Ok((photograph, gaps)) = loaded(listed, inverted) else { continue };
-                measured.push(Measured::of(&without(&photograph, &gaps)));
+                measured.push(MeasuredPhotograph::of(&without(&photograph, &gaps)));
             }
             if measured.is_empty() && settings.scene_statistics {
                 let problem = "--scene-statistics needs training photographs; there are none";
@@ -327,7 +327,7 @@ impl CurveOnSet {
         }
         let scene = match settings.scene(&measured) {
             Some(scene) => scene,
-            None if measured.is_empty() => Scene::default(),
+            None if measured.is_empty() => SceneTone::default(),
             None => return Err(all_black(input)),
         };
         Ok(Self { pseudo_gt, scene, inverted })
@@ -339,9 +339,13 @@ impl CurveOnSet {
         photograph: &Image,
         gaps: &[usize],
     ) -> Result<(Statistics, Image, Option<f64>)> {
-        let measured = Measured::of(&without(photograph, gaps));
-        let lift = self.pseudo_gt.settings().lift(&self.scene, &measured);
-        Ok((measured.statistics, self.pseudo_gt.lifted(photograph, &lift)?, lift.gain))
+        let measured = MeasuredPhotograph::of(&without(photograph, gaps));
+        let tone_mapping = self.pseudo_gt.settings().tone_mapping(&self.scene, &measured);
+        Ok((
+            measured.statistics,
+            self.pseudo_gt.tone_mapped(photograph, &tone_mapping)?,
+            tone_mapping.gain,
+        ))
     }
 }
 

@@ -9,8 +9,8 @@ use serde::Serialize;
 use crate::base::output::write_whole;
 use crate::cli::table::aligned;
 use crate::photographs::fit::{
-    Channels, Estimate, Fit, FitOptions, HeldOut, Pair, Scene, Scores, Weighting, cross_validate,
-    fit,
+    Channels, Estimate, Fit, FitOptions, FitScene, HeldOut, Pair, Scores, Weighting,
+    cross_validate, fit,
 };
 use crate::photographs::tone::{FAMILIES, Family, ToneCurve};
 use crate::{Error, Result};
@@ -201,8 +201,8 @@ pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
         bounded: args.bounded,
         adapt: args.adapt,
     };
-    let scenes = args.pairs.iter().map(|folder| Scene::load(folder, args.normal.as_deref()));
-    let scenes = scenes.collect::<Result<Vec<Scene>>>()?;
+    let scenes = args.pairs.iter().map(|folder| FitScene::load(folder, args.normal.as_deref()));
+    let scenes = scenes.collect::<Result<Vec<FitScene>>>()?;
     let pairs: Vec<&Pair> = scenes.iter().flat_map(|scene| &scene.pairs).collect();
     let families: Vec<&'static Family> = match args.family {
         FamilyChoice::One(curve) => vec![curve.family()],

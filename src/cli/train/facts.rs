@@ -5,7 +5,7 @@ use serde::Serialize;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, Split};
 use crate::photographs::tone::ToneCurve;
-use crate::results::eval::Yardstick;
+use crate::results::eval::ScoreReference;
 use crate::train::TrainConfig;
 use crate::train::diagnose::Plan;
 
@@ -23,7 +23,7 @@ pub(super) struct Facts {
     /// The most steps that the run takes.
     steps: u64,
     /// The last steps, in which the model settles.
-    settling_steps: u64,
+    effective_cooldown_steps: u64,
     /// What a run that was to end early, or to settle for longer, does instead.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     notes: Vec<String>,
@@ -60,7 +60,7 @@ impl Facts {
             test_views: of(Split::Test),
             held_out_views: of(Split::HeldOut),
             steps: config.steps,
-            settling_steps: config.settling_steps(),
+            effective_cooldown_steps: config.effective_cooldown_steps(),
             notes: notes(config, dataset),
             split: Dataset::split_rule(&config.dataset, &config.load_options()),
             points: dataset.points.len(),
@@ -69,13 +69,13 @@ impl Facts {
                 Some(planned) if why.is_empty() => planned,
                 _ => why.to_owned(),
             },
-            against: Yardstick::kind(&config.tone, dataset).name(),
+            against: ScoreReference::kind(&config.tone, dataset).name(),
         }
     }
 
     pub(super) fn text(&self) -> String {
         let Self { dataset, device, size: [width, height], train_views, points, .. } = self;
-        let length = match (self.held_out_views, self.settling_steps) {
+        let length = match (self.held_out_views, self.effective_cooldown_steps) {
             (0, 0) => format!("{} steps", self.steps),
             (0, settling) => format!("{} steps, of which the last {settling} settle", self.steps),
             (views, settling) => format!(
@@ -99,7 +99,7 @@ impl Facts {
 
 /// A line for each thing that was asked of the length of a run and cannot be.
 fn notes(config: &TrainConfig, dataset: &Dataset) -> Vec<String> {
-    let (steps, asked) = (config.steps, config.schedule.settle_steps);
+    let (steps, asked) = (config.steps, config.schedule.cooldown_steps);
     let views = dataset.views.iter().filter(|view| view.is_for_training()).count();
     let is_held_out = dataset.views.iter().any(|view| view.split == Split::HeldOut);
     let none = (config.stop.views > 0 && !is_held_out).then(|| {
@@ -107,7 +107,7 @@ fn notes(config: &TrainConfig, dataset: &Dataset) -> Vec<String> {
             "no early end: {views} training views are too few to hold one out (one of eight is)"
         )
     });
-    let short = (config.settling_steps() < asked).then(|| {
+    let short = (config.effective_cooldown_steps() < asked).then(|| {
         format!("{steps} steps are too few to settle for {asked} (a third of them at most)")
     });
     none.into_iter().chain(short).collect()

@@ -10,7 +10,9 @@ use crate::base::settings::{Rule, Setting};
 use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneSettings};
 use crate::train::diagnose::Plan;
 use crate::train::settings::SETTINGS;
-use crate::train::{Layer, ModelName, Origin, Part, Preset, Said, TrainConfig};
+use crate::train::{
+    ModelName, Origin, Part, Preset, RequestedSettings, SettingsLayer, TrainConfig,
+};
 use crate::{Error, Result};
 
 /// The options of a run; each wins over the configuration file.
@@ -176,28 +178,29 @@ impl TrainOptions {
 
     /// The configuration, with what a plan says of what no option says.
     pub(crate) fn config(&self, dataset: &Path, plan: Option<&Plan>) -> Result<TrainConfig> {
-        let config = self.said(dataset)?.settings(plan)?.config()?;
+        let config = self.requested(dataset)?.settings(plan)?.config()?;
         config.check()?;
         Ok(config)
     }
 
     /// What the command line and its files say.
-    pub(crate) fn said(&self, dataset: &Path) -> Result<Said> {
+    pub(crate) fn requested(&self, dataset: &Path) -> Result<RequestedSettings> {
         let several = &self.several;
-        let mut said = Said { preset: several.preset, ..Said::default() };
+        let mut requested =
+            RequestedSettings { preset: several.preset, ..RequestedSettings::default() };
         if let Some(file) = &several.config {
-            said.file = Layer::load(file)?;
+            requested.file = SettingsLayer::load(file)?;
         }
         for assignment in &several.set {
-            said.set.assign(assignment)?;
+            requested.set.assign(assignment)?;
         }
-        let options = &mut said.options;
+        let options = &mut requested.options;
         let dataset = dataset
             .to_str()
             .ok_or_else(|| Error::input(dataset, "is not Unicode; move it to a path that is"))?;
         options.push("dataset", dataset.into(), Origin::Option("argument"))?;
-        several.say_tone(options)?;
-        several.say_parts(options)?;
+        several.push_tone(options)?;
+        several.push_parts(options)?;
         if self.gives("exposure.start") {
             options.push("exposure.learn", "on".into(), Origin::Option("--exposures"))?;
         }
@@ -214,12 +217,12 @@ impl TrainOptions {
             // Whoever says how long a run is to be wants neither less nor views kept from it.
             options.push("stop.views", 0.into(), Origin::Option("--steps"))?;
         }
-        Ok(said)
+        Ok(requested)
     }
 }
 
 impl SeveralSettings {
-    fn say_tone(&self, options: &mut Layer) -> Result<()> {
+    fn push_tone(&self, options: &mut SettingsLayer) -> Result<()> {
         let from_file = match (&self.curve, &self.profile) {
             (_, Some(file)) => Some((ToneSettings::of_profile(Profile::load(file)?), "--profile")),
             (Some(CurveChoice::Named(curve)), _) => {
@@ -251,7 +254,7 @@ impl SeveralSettings {
         }
     }
 
-    fn say_parts(&self, options: &mut Layer) -> Result<()> {
+    fn push_parts(&self, options: &mut SettingsLayer) -> Result<()> {
         let mut set_parts = |parts: &[Part], option| {
             Part::ALL.into_iter().try_for_each(|part| {
                 let key = format!("model.{}", part.name());

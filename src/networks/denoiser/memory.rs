@@ -12,7 +12,7 @@ use crate::gpu::{Buffer, Gpu};
 
 /// What decides how long the buffers are.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Extent {
+pub(super) struct DenoiserExtent {
     pub(super) pixels: usize,
     /// Partial sums of the gradient of the inner convolution.
     partials: usize,
@@ -20,7 +20,7 @@ pub(super) struct Extent {
     packed: usize,
 }
 
-impl Extent {
+impl DenoiserExtent {
     pub(super) fn of(settings: DenoiserSettings, size: UVec2) -> Self {
         let DenoiserSettings { channels, precision, .. } = settings;
         let ends = [[RGB, channels], [channels, RGB]];
@@ -31,7 +31,7 @@ impl Extent {
             partials: inner.max(ends[0]).max(ends[1]),
             packed: match precision {
                 Precision::Single => 0,
-                Precision::Half => PackedMap::eights(size, channels),
+                Precision::Half => PackedMap::packed_count(size, channels),
             },
         }
     }
@@ -61,7 +61,7 @@ impl Extent {
         }
     }
 
-    /// What [`Memory::new`] takes.
+    /// What [`DenoiserMemory::new`] takes.
     #[cfg(feature = "testing")]
     pub(super) fn bytes(self, settings: DenoiserSettings) -> u64 {
         let images = settings.stages as usize + 3;
@@ -127,8 +127,8 @@ impl Activations {
         if repeat == 0 { 0 } else { 1 + (repeat - 1) % (self.features.len() - 1) }
     }
 
-    fn new(gpu: &Gpu, settings: DenoiserSettings, extent: Extent) -> Result<Self> {
-        let Extent { pixels, packed, .. } = extent;
+    fn new(gpu: &Gpu, settings: DenoiserSettings, extent: DenoiserExtent) -> Result<Self> {
+        let DenoiserExtent { pixels, packed, .. } = extent;
         let repeats = settings.repeats as usize;
         let map = |name| gpu.uninit(name, settings.channels() * pixels);
         Ok(Self {
@@ -142,8 +142,8 @@ impl Activations {
         })
     }
 
-    fn bytes(settings: DenoiserSettings, extent: Extent) -> u64 {
-        let (Extent { pixels, packed, .. }, repeats) = (extent, settings.repeats as usize);
+    fn bytes(settings: DenoiserSettings, extent: DenoiserExtent) -> u64 {
+        let (DenoiserExtent { pixels, packed, .. }, repeats) = (extent, settings.repeats as usize);
         let maps = feature_maps(settings) + repeats;
         let per_pixel = maps * settings.channels() + RGB as usize;
         let norm = NormMemory::floats(pixels, settings.channels(), repeats);
@@ -167,27 +167,31 @@ pub(super) struct Repeat<'a> {
 
 /// The activations of the stages before the last, as many as are kept.
 #[derive(Debug, Default)]
-pub(super) struct Earlier {
+pub(super) struct EarlierStages {
     /// What they are long enough for.
-    extent: Extent,
+    extent: DenoiserExtent,
     stages: Vec<Activations>,
 }
 
-impl Earlier {
+impl EarlierStages {
     /// # Errors
     /// The device is out of memory.
-    pub(super) fn new(gpu: &Gpu, settings: DenoiserSettings, extent: Extent) -> Result<Self> {
+    pub(super) fn new(
+        gpu: &Gpu,
+        settings: DenoiserSettings,
+        extent: DenoiserExtent,
+    ) -> Result<Self> {
         let stages = (1..settings.stages).map(|_| Activations::new(gpu, settings, extent));
         Ok(Self { extent, stages: stages.collect::<Result<_>>()? })
     }
 
-    pub(super) fn bytes(settings: DenoiserSettings, extent: Extent) -> u64 {
+    pub(super) fn bytes(settings: DenoiserSettings, extent: DenoiserExtent) -> u64 {
         let each = Activations::bytes(settings, extent);
         u64::from(settings.stages - 1).saturating_mul(each)
     }
 
     /// What they are long enough for.
-    pub(super) fn extent(&self) -> Extent {
+    pub(super) fn extent(&self) -> DenoiserExtent {
         self.extent
     }
 
@@ -195,7 +199,7 @@ impl Earlier {
     pub(super) fn of<'a>(
         &'a mut self,
         k: usize,
-        extent: Extent,
+        extent: DenoiserExtent,
         shared: &'a mut Activations,
     ) -> &'a mut Activations {
         let own = if extent.fits(self.extent) { self.stages.get_mut(k) } else { None };
@@ -205,7 +209,7 @@ impl Earlier {
 
 /// The memory of one view.
 #[derive(Debug)]
-pub(super) struct Memory {
+pub(super) struct DenoiserMemory {
     /// Of the last stage, and of those before it that have none of their own.
     pub(super) activations: Activations,
     /// `R_1` to `R_K`, each (3, H, W).
@@ -220,11 +224,15 @@ pub(super) struct Memory {
     pub(super) partials: Buffer<f32>,
 }
 
-impl Memory {
+impl DenoiserMemory {
     /// # Errors
     /// The device is out of memory.
-    pub(super) fn new(gpu: &Gpu, settings: DenoiserSettings, extent: Extent) -> Result<Self> {
-        let Extent { pixels, partials, packed } = extent;
+    pub(super) fn new(
+        gpu: &Gpu,
+        settings: DenoiserSettings,
+        extent: DenoiserExtent,
+    ) -> Result<Self> {
+        let DenoiserExtent { pixels, partials, packed } = extent;
         let map = |name| gpu.uninit(name, settings.channels() * pixels);
         let image = |name| gpu.uninit(name, RGB as usize * pixels);
         Ok(Self {

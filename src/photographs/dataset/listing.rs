@@ -33,7 +33,7 @@ pub(super) fn list(root: &Path, files: &Files) -> Result<Listing> {
             format!("has no usable view ({first}); export the cameras anew"),
         ));
     }
-    names::tell_apart(&mut listing.frames);
+    names::disambiguate(&mut listing.frames);
     refuse_two_of_one_name(root, &listing.frames)?;
     listing.frames.sort_by(|a, b| a.name.cmp(&b.name));
     listing.remarks.extend(unused::remarks(root, &listing.frames));

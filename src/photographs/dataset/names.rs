@@ -24,7 +24,7 @@ pub(super) fn possible(path: &str) -> [String; 3] {
 }
 
 /// Puts the folder into every name where two photographs in different folders have one.
-pub(super) fn tell_apart(frames: &mut [ListedView]) {
+pub(super) fn disambiguate(frames: &mut [ListedView]) {
     let mut names = BTreeSet::new();
     if !frames.iter().all(|frame| names.insert(frame.name.as_str())) {
         frames.iter_mut().for_each(|frame| frame.name = flat(&frame.below));

@@ -13,7 +13,7 @@ use crate::Result;
 use crate::base::hash::Hasher;
 use crate::camera::Lens;
 use crate::photographs::image::{Image, Orientation, PictureFile};
-use crate::photographs::tone::Measured;
+use crate::photographs::tone::MeasuredPhotograph;
 
 /// A photograph that was shrunk on loading, or is not kept.
 #[derive(Clone, Debug)]
@@ -26,7 +26,7 @@ pub struct Original {
     /// From what is stored to what the camera took.
     orientation: Orientation,
     /// The statistics of the photograph, and of which size.
-    pub(super) measured: Option<(MeasuredSize, Measured)>,
+    pub(super) measured: Option<(MeasuredSize, MeasuredPhotograph)>,
     /// Of the pixels as they are loaded, where they are not kept.
     pub(super) checksum: Option<Hasher>,
     /// The photograph at its own size, if memory allows, until it is released.
@@ -67,7 +67,7 @@ impl Original {
     }
 
     /// The statistics at a size, if they were measured while the photograph was decoded.
-    pub(crate) fn measured(&self, size: MeasuredSize) -> Option<&Measured> {
+    pub(crate) fn measured(&self, size: MeasuredSize) -> Option<&MeasuredPhotograph> {
         self.measured.as_ref().filter(|(own, _)| *own == size).map(|(_, measured)| measured)
     }
 

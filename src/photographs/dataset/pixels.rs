@@ -11,14 +11,14 @@ use super::depth::depth_map;
 use super::original::Original;
 use super::packed::Packed;
 use super::prepare::{Preparation, check_size, disagreement, pixel_count};
-use super::source::{MOST_READ, Source};
+use super::source::{MAX_READ, Source};
 use super::turns::{Header, Turns};
 use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
 use crate::camera::{Camera, Lens};
 use crate::photographs::image::{Image, Mask, PictureFile};
-use crate::photographs::tone::Measured;
+use crate::photographs::tone::MeasuredPhotograph;
 use crate::{Error, Result};
 
 /// The shortest side that leaves something to train on, pixels.
@@ -37,7 +37,7 @@ pub(super) fn load(
     look: Option<Look<'_>>,
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
-    let memory = Allowance::new(MOST_READ);
+    let memory = Allowance::new(MAX_READ);
     let fitted = sources.into_par_iter().map(|mut source| {
         let headers = source.headers(&memory);
         source.fit(headers)?;
@@ -230,7 +230,7 @@ struct Decoded {
 
 /// What memory holds of a photograph or reference image: its pixels as they are loaded, and its file where those are not
 /// all of it.
-type Kept = (Option<Image>, Option<Original>);
+type CachedImage = (Option<Image>, Option<Original>);
 
 impl ViewLoader<'_> {
     fn load(&self, source: Source) -> Result<Loaded> {
@@ -308,7 +308,12 @@ impl ViewLoader<'_> {
     }
 
     /// The photograph of a view; one for training is measured as the options say.
-    fn photograph(&self, decoded: Decoded, mask: Option<&Mask>, is_training: bool) -> Result<Kept> {
+    fn photograph(
+        &self,
+        decoded: Decoded,
+        mask: Option<&Mask>,
+        is_training: bool,
+    ) -> Result<CachedImage> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
         let Decoded { path, image, turns, .. } = decoded;
@@ -320,8 +325,8 @@ impl ViewLoader<'_> {
         }
         let mut original = Original::new(path, *preparation.lens, options.undistort, turns);
         let measured = |image: &Image| match mask {
-            Some(mask) => Measured::of(&mask.counted(image)),
-            None => Measured::of(&image.data),
+            Some(mask) => MeasuredPhotograph::of(&mask.counted(image)),
+            None => MeasuredPhotograph::of(&image.data),
         };
         let at = if is_training { options.measured } else { MeasuredSize::None };
         if at == MeasuredSize::Own {
@@ -346,7 +351,7 @@ impl ViewLoader<'_> {
         Ok((None, Some(original)))
     }
 
-    fn reference_image(&self, decoded: Decoded) -> Result<Kept> {
+    fn reference_image(&self, decoded: Decoded) -> Result<CachedImage> {
         let Self { preparation, loading, .. } = self;
         let Decoded { path, image, turns, .. } = decoded;
         if loading.options.keep == Some(0) {

@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use super::{Dataset, View};
-use crate::camera::{Camera, Frame, frame, upwards};
+use crate::camera::{Camera, TrainingFrame, frame, upwards};
 
 impl Dataset {
     /// The scene's size as 3DGS takes it: 1.1 times the largest distance of a training camera to their mean, world units.
@@ -15,9 +15,9 @@ impl Dataset {
 
     /// Where the scene is trained.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn frame(&self) -> Frame {
+    pub(crate) fn frame(&self) -> TrainingFrame {
         let (center, extent) = self.place();
-        Frame::new(center, extent)
+        TrainingFrame::new(center, extent)
     }
 
     /// What is up in the world, a unit vector: across what the training cameras hold level.
@@ -45,11 +45,11 @@ impl Dataset {
     /// Leaves out the points that no number of the device holds or that lie a million extents away: they are of no use, and
     /// what they are made of would not stay finite.
     pub(super) fn leave_out_far_points(&mut self) {
-        const MOST_EXTENTS: f64 = 1e6;
+        const MAX_EXTENTS: f64 = 1e6;
         let (center, extent) = self.place();
         let before = self.points.len();
         // Positive phrasing: a NaN fails the test too.
-        self.points.retain(|point| point.position.distance(center) <= MOST_EXTENTS * extent);
+        self.points.retain(|point| point.position.distance(center) <= MAX_EXTENTS * extent);
         let gone = before - self.points.len();
         if gone > 0 {
             tracing::warn!(
@@ -61,7 +61,7 @@ impl Dataset {
     }
 
     /// Says which training cameras stand far from all others.
-    pub(super) fn say_what_stands_elsewhere(&self) {
+    pub(super) fn warn_of_other_worlds(&self) {
         let (center, extent) = self.place();
         for view in self.train_views() {
             let own = view.camera.center();

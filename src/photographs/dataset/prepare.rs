@@ -154,12 +154,12 @@ pub(super) fn check_size(path: &Path, file: &PictureFile, turns: Turns, lens: &L
 /// # Errors
 /// The picture has far more pixels than its camera.
 pub(super) fn check_excess(path: &Path, size: (u32, u32), lens: &Lens) -> Result<()> {
-    const MOST_TIMES: u64 = 64;
-    if pixel_count(size) > MOST_TIMES * pixel_count((lens.width, lens.height)) {
+    const MAX_TIMES: u64 = 64;
+    if pixel_count(size) > MAX_TIMES * pixel_count((lens.width, lens.height)) {
         let (width, height) = size;
         let (w, h) = (lens.width, lens.height);
         let problem = format!(
-            "is {width}x{height}, over {MOST_TIMES} times the pixels of its view's {w}x{h}; shrink it"
+            "is {width}x{height}, over {MAX_TIMES} times the pixels of its view's {w}x{h}; shrink it"
         );
         return Err(Error::input(path, problem));
     }

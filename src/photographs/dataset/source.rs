@@ -62,4 +62,4 @@ impl Source {
 }
 
 /// What files may take that are read before they are decoded, bytes: those beyond are opened once for their size, and again.
-pub(super) const MOST_READ: u64 = 1 << 28;
+pub(super) const MAX_READ: u64 = 1 << 28;

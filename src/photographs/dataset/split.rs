@@ -57,7 +57,7 @@ pub(super) fn split(
 }
 
 /// Says where the dataset has a split that is asked to give way to another.
-pub(super) fn say_whose_split_gives_way(root: &Path, frames: &[ListedView], options: &LoadOptions) {
+pub(super) fn log_split(root: &Path, frames: &[ListedView], options: &LoadOptions) {
     let own = if frames.iter().any(|frame| frame.split.is_some()) {
         Some("its transforms files")
     } else {

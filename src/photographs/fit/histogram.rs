@@ -55,12 +55,12 @@ pub struct Histogram {
 
 /// A column that is being filled.
 #[derive(Clone)]
-struct Open {
+struct OpenColumn {
     sums: [f64; 3],
     counts: [f64; LEVELS],
 }
 
-impl Open {
+impl OpenColumn {
     const EMPTY: Self = Self { sums: [0.0; 3], counts: [0.0; LEVELS] };
 
     fn closed(&self) -> Option<Column> {
@@ -86,7 +86,7 @@ impl Histogram {
             *column = used;
             used += 1;
         }
-        let mut open = vec![Open::EMPTY; used as usize];
+        let mut open = vec![OpenColumn::EMPTY; used as usize];
         for (&x, &y) in dark.iter().zip(reference) {
             let column = &mut open[columns[key(x)] as usize];
             let y = measurable(y).min(1.0);
@@ -96,7 +96,7 @@ impl Histogram {
                 *sum += value;
             }
         }
-        Self { columns: open.iter().filter_map(Open::closed).collect() }
+        Self { columns: open.iter().filter_map(OpenColumn::closed).collect() }
     }
 
     /// Several histograms in one of `bins` columns, each with a factor for its dark values and a weight for its counts.
@@ -104,7 +104,7 @@ impl Histogram {
     /// Of a value t the bin is that of t / (1 + t): fine in the shadows, and the few values far above 1 have bins of
     /// their own instead of deciding the width of all.
     pub fn pooled<'a>(parts: impl IntoIterator<Item = (&'a Self, [f64; 2])>, bins: usize) -> Self {
-        let mut open = vec![Open::EMPTY; bins];
+        let mut open = vec![OpenColumn::EMPTY; bins];
         for (histogram, [factor, weight]) in parts {
             for column in &histogram.columns {
                 let t = column.x * factor;
@@ -119,7 +119,7 @@ impl Histogram {
                 }
             }
         }
-        Self { columns: open.iter().filter_map(Open::closed).collect() }
+        Self { columns: open.iter().filter_map(OpenColumn::closed).collect() }
     }
 
     /// How many pixels it counts.

@@ -2,14 +2,14 @@
 
 use super::{FitOptions, Pair};
 use crate::photographs::tone::{
-    Constant, Dual, Family, Law, Numbers, PhotographCurve, Real, Statistics, ToneSettings, White,
-    clamped, curve_at, law,
+    Constant, CurveInputs, Dual, Family, OffsetMode, PhotographCurve, Real, Statistics,
+    ToneSettings, White, clamped, curve_at, law,
 };
 use crate::{Error, Result};
 
 /// Where a number belongs among the [`ToneSettings`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Place {
+enum SettingSlot {
     Shape(usize),
     Theta,
     Alpha,
@@ -30,7 +30,7 @@ const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
 #[derive(Clone, Debug)]
 pub(super) struct Model {
     pub(super) family: &'static Family,
-    places: Vec<Place>,
+    places: Vec<SettingSlot>,
     /// In the order of every vector of values.
     pub(super) free: Vec<Constant>,
 }
@@ -69,18 +69,19 @@ impl Model {
     /// # Errors
     /// [`Error::Usage`] where the family has nothing to fit.
     pub(super) fn new(family: &'static Family, options: &FitOptions) -> Result<Self> {
-        let mut places: Vec<Place> = (0..family.constants.len()).map(Place::Shape).collect();
+        let mut places: Vec<SettingSlot> =
+            (0..family.constants.len()).map(SettingSlot::Shape).collect();
         match family.white {
             White::One => {}
             White::P90 if options.adapt || family.alpha > 0.0 || family.gain_c > 0.0 => {
-                places.extend([Place::Alpha, Place::GainC]);
-                if family.law == Law::Rescaled {
-                    places.push(Place::BaseGain);
+                places.extend([SettingSlot::Alpha, SettingSlot::GainC]);
+                if family.law == OffsetMode::Rescaled {
+                    places.push(SettingSlot::BaseGain);
                 }
             }
             White::P90 => {}
             White::Mean | White::P80 | White::MeanLuminance | White::ChannelMeans => {
-                places.push(Place::Theta);
+                places.push(SettingSlot::Theta);
             }
         }
         if places.is_empty() {
@@ -93,18 +94,18 @@ impl Model {
         let own =
             |constant: Constant, value: f64| Constant { default: value, start: value, ..constant };
         let free = places.iter().map(|&place| match place {
-            Place::Shape(index) => family.constants[index],
-            Place::Theta => own(THETA, settings.theta),
-            Place::Alpha => own(ALPHA, settings.alpha),
-            Place::GainC => own(GAIN_C, settings.gain_c),
-            Place::BaseGain => own(BASE_GAIN, settings.base_gain),
+            SettingSlot::Shape(index) => family.constants[index],
+            SettingSlot::Theta => own(THETA, settings.theta),
+            SettingSlot::Alpha => own(ALPHA, settings.alpha),
+            SettingSlot::GainC => own(GAIN_C, settings.gain_c),
+            SettingSlot::BaseGain => own(BASE_GAIN, settings.base_gain),
         });
         Ok(Self { free: free.collect(), family, places })
     }
 
     /// Whether photographs with different statistics have different curves of t.
     pub(super) fn differs_by_photograph(&self) -> bool {
-        self.places.iter().any(|place| !matches!(place, Place::Shape(_)))
+        self.places.iter().any(|place| !matches!(place, SettingSlot::Shape(_)))
     }
 
     /// Whether the channels of a photograph have different curves.
@@ -122,11 +123,11 @@ impl Model {
         let mut settings = ToneSettings::new(self.family.curve);
         for (&place, &value) in self.places.iter().zip(values) {
             match place {
-                Place::Shape(index) => settings.constants[index] = value,
-                Place::Theta => settings.theta = value,
-                Place::Alpha => settings.alpha = value,
-                Place::GainC => settings.gain_c = value,
-                Place::BaseGain => settings.base_gain = value,
+                SettingSlot::Shape(index) => settings.constants[index] = value,
+                SettingSlot::Theta => settings.theta = value,
+                SettingSlot::Alpha => settings.alpha = value,
+                SettingSlot::GainC => settings.gain_c = value,
+                SettingSlot::BaseGain => settings.base_gain = value,
             }
         }
         settings
@@ -134,20 +135,20 @@ impl Model {
 
     /// What a photograph of this exposure gets with these values.
     pub(super) fn curve(&self, values: &[f64], exposure: &Exposure) -> Curve<f64> {
-        self.curve_of(&Numbers::from(&self.settings(values)), exposure)
+        self.curve_of(&CurveInputs::from(&self.settings(values)), exposure)
     }
 
     /// The same with its derivatives by every value.
     pub(super) fn slopes(&self, values: &[f64], exposure: &Exposure) -> Slopes {
-        let numbers = Numbers::<Dual>::from(&self.settings(values));
-        let by = |&place: &Place| {
+        let numbers = CurveInputs::<Dual>::from(&self.settings(values));
+        let by = |&place: &SettingSlot| {
             let mut numbers = numbers;
             let variable = match place {
-                Place::Shape(index) => &mut numbers.constants[index],
-                Place::Theta => &mut numbers.theta,
-                Place::Alpha => &mut numbers.alpha,
-                Place::GainC => &mut numbers.gain_c,
-                Place::BaseGain => &mut numbers.base_gain,
+                SettingSlot::Shape(index) => &mut numbers.constants[index],
+                SettingSlot::Theta => &mut numbers.theta,
+                SettingSlot::Alpha => &mut numbers.alpha,
+                SettingSlot::GainC => &mut numbers.gain_c,
+                SettingSlot::BaseGain => &mut numbers.base_gain,
             };
             variable.derivative = 1.0;
             self.curve_of(&numbers, exposure)
@@ -155,7 +156,7 @@ impl Model {
         Slopes(self.places.iter().map(by).collect())
     }
 
-    fn curve_of<T: Real>(&self, numbers: &Numbers<T>, exposure: &Exposure) -> Curve<T> {
+    fn curve_of<T: Real>(&self, numbers: &CurveInputs<T>, exposure: &Exposure) -> Curve<T> {
         let family = self.family;
         let curve = law(family, family.white, numbers, &exposure.statistics);
         let white = match family.white {
@@ -212,7 +213,7 @@ fn counted(number: Dual) -> f64 {
 /// The PSNR over all pixels and channels of what `settings` makes of the dark photograph, dB.
 pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
     let model = Model { family: settings.curve.family(), places: vec![], free: vec![] };
-    let numbers = Numbers::<f64>::from(settings);
+    let numbers = CurveInputs::<f64>::from(settings);
     let [mut count, mut squares] = [0.0; 2];
     for (channel, histogram) in pair.channels.iter().enumerate() {
         let exposure = Exposure::of(pair.statistics, channel);
@@ -242,7 +243,7 @@ mod tests {
             let settings = ToneSettings::new(family.curve);
             let parameters = settings.parameters(&statistics);
             let model = Model { family, places: vec![], free: vec![] };
-            let numbers = Numbers::<f64>::from(&settings);
+            let numbers = CurveInputs::<f64>::from(&settings);
             for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
                 for channel in 0..3 {
                     let exposure = Exposure::of(statistics, channel);

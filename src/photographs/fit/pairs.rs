@@ -18,7 +18,7 @@ const NORMAL_FOLDERS: [&str; 3] = ["high", "normal", "images"];
 
 /// Pairs that were taken in one place.
 #[derive(Clone, Debug)]
-pub struct Scene {
+pub struct FitScene {
     /// The folder's name.
     pub name: String,
     /// By name; none of them black.
@@ -79,7 +79,7 @@ impl Pair {
     }
 }
 
-impl Scene {
+impl FitScene {
     /// Pairs by file name without extension: the photographs of `normal` with those of `folder`, or, without it, those
     /// of `folder`'s subfolders `low` and `high`, `normal` or `images`.
     ///
@@ -122,7 +122,7 @@ pub(super) fn name_of(folder: &Path) -> String {
 /// The pairs of a scene by name, never none, and the folder of the dark photographs.
 ///
 /// # Errors
-/// As [`Scene::load`], but for what is in the files.
+/// As [`FitScene::load`], but for what is in the files.
 pub(super) fn files_of(folder: &Path, normal: Option<&Path>) -> Result<(Vec<Files>, PathBuf)> {
     let (dark, normal) = match normal {
         Some(normal) => (folder.to_owned(), normal.to_owned()),

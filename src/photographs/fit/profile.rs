@@ -37,7 +37,7 @@ const BEND: f64 = 1e-5;
 /// Of a channel's u, what lies below 0 and above 1 together.
 const CUT: f64 = 1e-3;
 /// Least scale of the residuals, as for curves.
-const LEAST_SCALE: f64 = 0.25 / 255.0;
+const MIN_SCALE: f64 = 0.25 / 255.0;
 /// The file's digits: 4 behind the point, a fortieth of a code value. More are not determined by 8-bit references.
 const UNITS: f64 = 1e4;
 
@@ -81,7 +81,7 @@ pub struct ProfileFold {
 }
 
 impl ColourScene {
-    /// Pairs as [`super::Scene::load`] finds them.
+    /// Pairs as [`super::FitScene::load`] finds them.
     ///
     /// # Errors
     /// As there.
@@ -214,7 +214,7 @@ impl Channel {
             let mut sizes: Vec<f64> = fitted.residuals(inputs, outputs).map(f64::abs).collect();
             let middle = sizes.len() / 2;
             let median = *sizes.select_nth_unstable_by(middle, f64::total_cmp).1;
-            let limit = huber * (1.4826 * median).max(LEAST_SCALE);
+            let limit = huber * (1.4826 * median).max(MIN_SCALE);
             weights =
                 fitted.residuals(inputs, outputs).map(|r| (limit / r.abs()).min(1.0)).collect();
             if round + 1 < ROUNDS {

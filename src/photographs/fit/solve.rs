@@ -99,7 +99,7 @@ const STRENGTHS: [f64; 3] = [1e1, 1e3, 1e5];
 /// Where constraints are held to, points of t.
 const GRID: usize = 128;
 /// Constraints hold at least up to this t.
-const LEAST_END: f64 = 3.0;
+const MIN_END: f64 = 3.0;
 /// Random places that are looked at, and the best of them that a fit begins from, beside the table's start.
 const PLACES: usize = 24;
 const STARTS: usize = 3;
@@ -111,7 +111,7 @@ const SCALE_ROUNDS: usize = 6;
 /// A round that moves no constant by more than this share of its range is the last.
 const SETTLED: f64 = 1e-6;
 /// The least scale of the residuals: a quarter of an 8-bit code value, as rounding leaves it.
-const LEAST_SCALE: f64 = 0.25 / 255.0;
+const MIN_SCALE: f64 = 0.25 / 255.0;
 
 pub(super) struct Solver<'a> {
     model: &'a Model,
@@ -133,7 +133,7 @@ impl<'a> Solver<'a> {
             Exposure::POOLED
         };
         let last = groups.iter().filter_map(|group| group.histogram.columns.last());
-        let end = last.map(|column| column.x).fold(LEAST_END, f64::max);
+        let end = last.map(|column| column.x).fold(MIN_END, f64::max);
         // Evenly in t / (1 + t), as the columns.
         let t = |i: usize| {
             let share = i as f64 / (GRID - 1) as f64 * end / (1.0 + end);
@@ -180,7 +180,7 @@ impl<'a> Solver<'a> {
     fn weights(&self, values: &[f64]) -> Vec<f64> {
         let of_pair = |pair: &&Pair| {
             let (count, squares) = pair_residuals(self.model, values, pair, self.options.channels);
-            (count, 1.0 / (squares[1] / count).max(LEAST_SCALE * LEAST_SCALE))
+            (count, 1.0 / (squares[1] / count).max(MIN_SCALE * MIN_SCALE))
         };
         let weights: Vec<(f64, f64)> = self.pairs.iter().map(of_pair).collect();
         let mean = weights.iter().map(|(count, weight)| count * weight).sum::<f64>()
@@ -190,7 +190,7 @@ impl<'a> Solver<'a> {
 
     /// The residuals' scale: 1.4826 times the median of their sizes, the standard deviation were they normal.
     fn scale(&self, values: &[f64]) -> f64 {
-        (1.4826 * quantile(&mut self.sizes(values), 0.5)).max(LEAST_SCALE)
+        (1.4826 * quantile(&mut self.sizes(values), 0.5)).max(MIN_SCALE)
     }
 
     /// The size of every cell's residual, with its count.

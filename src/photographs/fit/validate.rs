@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::{FitOptions, Pair, Scene, Scores, fit, mean_psnr, mean_squared_error};
+use super::{FitOptions, FitScene, Pair, Scores, fit, mean_psnr, mean_squared_error};
 use crate::photographs::tone::Family;
 use crate::{Error, Result};
 
@@ -36,7 +36,7 @@ pub struct HeldOut {
 /// [`Error::Usage`] where there is a single pair, or fewer than two folds; those of [`fit`].
 pub fn cross_validate(
     family: &'static Family,
-    scenes: &[Scene],
+    scenes: &[FitScene],
     folds: usize,
     options: &FitOptions,
 ) -> Result<HeldOut> {
@@ -66,7 +66,7 @@ pub fn cross_validate(
     Ok(HeldOut { folds, psnr, squared_error })
 }
 
-fn split(scenes: &[Scene], folds: usize) -> Result<Vec<(String, Vec<&Pair>)>> {
+fn split(scenes: &[FitScene], folds: usize) -> Result<Vec<(String, Vec<&Pair>)>> {
     if let [scene] = scenes {
         let count = scene.pairs.len().min(folds);
         if count < 2 {

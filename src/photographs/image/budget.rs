@@ -8,10 +8,10 @@ use super::source::{Source, reader};
 use crate::{Error, Result};
 
 /// More than any camera takes: 16 384 x 16 384.
-const MOST_PIXELS: u64 = 1 << 28;
+const MAX_PIXELS: u64 = 1 << 28;
 
 /// What the samples of all layers of an EXR file may take, bytes; it decodes to all of them at once.
-const MOST_BYTES: u64 = 1 << 33;
+const MAX_BYTES: u64 = 1 << 33;
 
 /// Refuses a file that declares more than that.
 ///
@@ -34,7 +34,7 @@ pub(super) fn check(path: &Path, bytes: &[u8]) -> Result<()> {
 }
 
 fn excess_of_size(width: u64, height: u64) -> Option<String> {
-    let is_more = width.saturating_mul(height) > MOST_PIXELS;
+    let is_more = width.saturating_mul(height) > MAX_PIXELS;
     is_more.then(|| format!("says that it is {width}x{height}, more than 268 megapixels"))
 }
 
@@ -54,7 +54,7 @@ fn excess_of_exr(bytes: &[u8]) -> Option<String> {
         excess_of_size(width, height)
     });
     let gigabytes = total >> 30;
-    let is_more = total > MOST_BYTES;
+    let is_more = total > MAX_BYTES;
     pixels.or(is_more.then(|| format!("says that its layers take {gigabytes} GiB, more than 8")))
 }
 

@@ -41,7 +41,7 @@ mod tests {
         tiff.extend(26u32.to_le_bytes());
         tiff.extend(0u32.to_le_bytes());
         tiff.extend((tags.len() as u16).to_le_bytes());
-        let behind = tiff.len() + 12 * tags.len() + 4;
+        let after = tiff.len() + 12 * tags.len() + 4;
         let mut values = vec![];
         for &(tag, [numerator, denominator]) in tags {
             tiff.extend(tag.to_le_bytes());
@@ -50,7 +50,7 @@ mod tests {
                 tiff.extend(numerator.to_le_bytes());
             } else {
                 tiff.extend([5, 0, 1, 0, 0, 0]);
-                tiff.extend(((behind + values.len()) as u32).to_le_bytes());
+                tiff.extend(((after + values.len()) as u32).to_le_bytes());
                 values.extend([numerator, denominator].map(u32::to_le_bytes).concat());
             }
         }

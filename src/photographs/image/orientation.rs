@@ -31,12 +31,12 @@ impl Orientation {
 
     /// What the bytes of a file say; upright where they say nothing.
     pub(super) fn read(file: &mut (impl BufRead + Seek)) -> Self {
-        let mut said = || {
+        let mut tagged = || {
             let exif = Reader::new().read_from_container(file).ok()?;
             let value = exif.get_field(Tag::Orientation, In::PRIMARY)?.value.get_uint(0)?;
             u8::try_from(value).ok().filter(|value| (1..=8).contains(value))
         };
-        said().map_or(Self::UPRIGHT, Self)
+        tagged().map_or(Self::UPRIGHT, Self)
     }
 
     /// Width and height behind turning.

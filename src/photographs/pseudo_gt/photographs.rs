@@ -4,15 +4,15 @@ use super::PseudoGt;
 use crate::Result;
 use crate::gpu::{Buffer, Download};
 use crate::photographs::image::Image;
-use crate::photographs::tone::Lift;
+use crate::photographs::tone::ToneMapping;
 
 impl PseudoGt {
     /// The target that a photograph becomes, of its own size.
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub fn lifted(&self, photograph: &Image, lift: &Lift) -> Result<Image> {
-        let parameters = self.gpu.buffer("tone parameters", &[lift.parameters])?;
+    pub fn tone_mapped(&self, photograph: &Image, tone_mapping: &ToneMapping) -> Result<Image> {
+        let parameters = self.gpu.buffer("tone parameters", &[tone_mapping.parameters])?;
         let Image { width, height, .. } = *photograph;
         let pixels = photograph.pixel_count();
         let (mut data, mut first) = (vec![0.0; photograph.data.len()], 0);

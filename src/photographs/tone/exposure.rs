@@ -23,7 +23,7 @@ use serde::Serialize;
 
 use super::histogram::LuminanceHistogram;
 use super::real::Real;
-use crate::camera::{Camera, Places};
+use crate::camera::{Camera, CameraPoses};
 
 /// The black level of [`soft`].
 pub(super) const BLACK_LEVEL: f64 = 0.075;
@@ -38,7 +38,7 @@ const MEANS: [f64; 2] = [0.44, 0.54];
 const GAINS: [f64; 2] = [1e-3, 128.0];
 
 /// The least weight of a view's own gain where cameras are not known.
-const LEAST_SHARE: f64 = 0.75;
+const MIN_SHARE: f64 = 0.75;
 
 /// The spread of ln gain between views, or between those near each other, at which their own gains have half the weight.
 const NOISE: f64 = 0.1;
@@ -47,7 +47,7 @@ const NOISE: f64 = 0.1;
 const REACH: f64 = 0.15;
 
 /// Of a larger scene the cameras at even distances in the list, at most this many, say what gain its surroundings have: the time is linear in the photographs.
-const MOST_PLACES: usize = 1024;
+const MAX_POSES: usize = 1024;
 
 /// Lifts up to the first leave the photograph as it is; from the second on the curve has its whole weight.
 const WELL_LIT: [f64; 2] = [1.5, 2.0];
@@ -62,7 +62,7 @@ pub fn soft(x: f64, gain: f64) -> f64 {
 
 /// What the rule finds for a set of photographs.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-#[serde(into = "Written")]
+#[serde(into = "SerializedExposure")]
 pub struct Exposure {
     /// The gain of all training photographs together, those that are black left out.
     pub gain: f64,
@@ -79,23 +79,23 @@ pub struct Exposure {
     /// The mean luminance that was asked for in place of the rule's.
     brightness: Option<f64>,
     /// The views' own gains by their cameras, where these are known.
-    around: Option<Around>,
+    around: Option<NeighbourGains>,
 }
 
 /// Gains by where they were found.
 #[derive(Clone, Debug, PartialEq)]
-struct Around {
-    places: Places,
+struct NeighbourGains {
+    poses: CameraPoses,
     /// ln gain of each place.
     gains: Vec<f64>,
     /// s: the weight of a view's own gain.
     own: f64,
 }
 
-impl Around {
+impl NeighbourGains {
     /// around(v): the mean of ln gain over the places near a camera, the nearest of which always counts.
     fn ln_gain(&self, camera: &Camera) -> f64 {
-        let squares: Vec<f64> = self.places.squared_distances(camera).collect();
+        let squares: Vec<f64> = self.poses.squared_distances(camera).collect();
         let nearest = squares.iter().copied().fold(f64::INFINITY, f64::min);
         let weight = |square: &f64| (-(square - nearest) / (2.0 * REACH * REACH)).exp();
         let weights: Vec<f64> = squares.iter().map(weight).collect();
@@ -152,9 +152,10 @@ impl Exposure {
             return self;
         }
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-        let every = gains.len().div_ceil(MOST_PLACES);
-        let (places, at) = (Places::new(&cameras), gains.iter().step_by(every).copied().collect());
-        let mut around = Around { places: places.every(every), gains: at, own: 0.0 };
+        let every = gains.len().div_ceil(MAX_POSES);
+        let (poses, at) =
+            (CameraPoses::new(&cameras), gains.iter().step_by(every).copied().collect());
+        let mut around = NeighbourGains { poses: poses.every(every), gains: at, own: 0.0 };
         let smooth: Vec<f64> = cameras.iter().map(|camera| around.ln_gain(camera)).collect();
         let squares = gains.iter().zip(&smooth).map(|(own, smooth)| (own - smooth).powi(2));
         let variance = mean(&squares.collect::<Vec<_>>());
@@ -193,7 +194,7 @@ impl Exposure {
     }
 
     /// How many times brighter the targets are than the photographs, on the mean.
-    pub fn lift(&self) -> f64 {
+    pub fn brightening(&self) -> f64 {
         self.target / self.mean
     }
 
@@ -204,14 +205,14 @@ impl Exposure {
         if self.brightness.is_some() {
             1.0
         } else {
-            ((self.lift() - none) / (whole - none)).clamp(0.0, 1.0)
+            ((self.brightening() - none) / (whole - none)).clamp(0.0, 1.0)
         }
     }
 
     /// What was found, and why, in a sentence.
     pub fn reason(&self) -> String {
         let Self { gain, target, mean, spread, black, .. } = self;
-        let lift = self.lift();
+        let brightening = self.brightening();
         let verdict = match self.weight() {
             0.0 => "well lit, no curve".to_owned(),
             1.0 => format!("gain {gain:.1}"),
@@ -226,7 +227,7 @@ impl Exposure {
             count => format!("; {count} as good as black, left out of the measurement"),
         };
         format!(
-            "mean luminance {mean:.3}, {lift:.1} times that is {target:.2}: {verdict}{varies}{left_out}"
+            "mean luminance {mean:.3}, {brightening:.1} times that is {target:.2}: {verdict}{varies}{left_out}"
         )
     }
 }
@@ -245,11 +246,11 @@ pub fn exposed_anew([from, to]: [f64; 2], weight: f64) -> Vec<[f32; 2]> {
 
 /// The exposure as JSON has it.
 #[derive(Serialize)]
-struct Written {
+struct SerializedExposure {
     gain: f64,
     target: f64,
     mean: f64,
-    lift: f64,
+    brightening: f64,
     weight: f64,
     spread: f64,
     share: f64,
@@ -257,11 +258,12 @@ struct Written {
     reason: String,
 }
 
-impl From<Exposure> for Written {
+impl From<Exposure> for SerializedExposure {
     fn from(exposure: Exposure) -> Self {
-        let (lift, weight, reason) = (exposure.lift(), exposure.weight(), exposure.reason());
+        let (brightening, weight, reason) =
+            (exposure.brightening(), exposure.weight(), exposure.reason());
         let Exposure { gain, target, mean, spread, share, black, .. } = exposure;
-        Self { gain, target, mean, lift, weight, spread, share, black, reason }
+        Self { gain, target, mean, brightening, weight, spread, share, black, reason }
     }
 }
 
@@ -274,7 +276,7 @@ pub(crate) fn all_black(path: &std::path::Path) -> crate::Error {
 
 /// The weight of a view's own gain beside the scene's, by the variance of ln gain over the views.
 fn share_without_cameras(variance: f64) -> f64 {
-    LEAST_SHARE.max(variance / (variance + NOISE * NOISE))
+    MIN_SHARE.max(variance / (variance + NOISE * NOISE))
 }
 
 /// Whether a photograph shows next to nothing.

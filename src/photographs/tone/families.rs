@@ -9,7 +9,7 @@ pub use catalogue::{FAMILIES, ToneCurve};
 
 /// How black level and gain join a curve's shape f.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Law {
+pub enum OffsetMode {
     /// delta0 + b f(t), b = 1 + c Y: AP3's.
     Added,
     /// delta0 + (1 - delta0) f(g t), g = g0 + c Y: ASE's.
@@ -72,7 +72,7 @@ pub struct Family {
     #[cfg_attr(not(feature = "testing"), expect(dead_code, reason = "what tests hold a curve to"))]
     pub identifiable: bool,
     /// How black level and gain join the shape.
-    pub law: Law,
+    pub law: OffsetMode,
     /// The value that t = 1 stands for.
     pub white: White,
     /// alpha where none is given: the highest black level.

@@ -3,13 +3,13 @@
 //! kernels' references.
 
 use super::Statistics;
-use super::families::{Constants, Family, Law, White, curve_shape};
+use super::families::{Constants, Family, OffsetMode, White, curve_shape};
 use super::real::{Real, within};
 use crate::kernels::ToneParameters;
 use crate::kernels::curves::*;
 
 /// The least value that linear scaling maps to 1: it keeps a black photograph black.
-const LEAST_WHITE: f64 = 1e-12;
+const MIN_WHITE: f64 = 1e-12;
 
 /// Added to a mean before it divides.
 const EPSILON: f64 = 1e-6;
@@ -19,7 +19,7 @@ const GAINS: [f64; 2] = [1.0, 6.0];
 
 /// The numbers of [`ToneSettings`].
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Numbers<T> {
+pub(crate) struct CurveInputs<T> {
     pub(crate) theta: T,
     pub(crate) alpha: T,
     pub(crate) beta: f64,
@@ -43,7 +43,7 @@ pub(crate) struct PhotographCurve<T> {
 pub(crate) fn law<T: Real>(
     family: &Family,
     white: White,
-    numbers: &Numbers<T>,
+    numbers: &CurveInputs<T>,
     statistics: &Statistics,
 ) -> PhotographCurve<T> {
     let [zero, one, epsilon] = [0.0, 1.0, EPSILON].map(T::of);
@@ -56,7 +56,7 @@ pub(crate) fn law<T: Real>(
         White::One => [one, zero, one],
         White::Mean => {
             let white = measured(statistics.mean) / numbers.theta;
-            [white.at_least(T::of(LEAST_WHITE)), zero, one]
+            [white.at_least(T::of(MIN_WHITE)), zero, one]
         }
         White::MeanLuminance => [one, zero, bounded_gain(mean_luminance + epsilon)],
         White::ChannelMeans => {
@@ -68,8 +68,8 @@ pub(crate) fn law<T: Real>(
         White::P80 => [one / bounded_gain(measured(statistics.p80)), zero, one],
         White::P90 => {
             let least = match family.law {
-                Law::Added => one,
-                Law::Rescaled => numbers.base_gain,
+                OffsetMode::Added => one,
+                OffsetMode::Rescaled => numbers.base_gain,
             };
             [
                 measured(statistics.p90),

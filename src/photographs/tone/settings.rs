@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::exposure::BLACK_LEVEL;
 use super::families::{White, padded};
-use super::law::{Numbers, black_level, law};
+use super::law::{CurveInputs, black_level, law};
 use super::real::Real;
 use super::{Profile, Statistics, Table, ToneCurve, ToneParameters};
 use crate::base::settings::{self, Rule, Setting};
@@ -24,7 +24,7 @@ const LARGEST_SHAPE: f64 = 1e8;
 ///
 /// In TOML everything but `curve` may be left out; where there are `[constants]`, all of the family's must be there.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "Written", into = "Written")]
+#[serde(try_from = "SerializedToneSettings", into = "SerializedToneSettings")]
 pub struct ToneSettings {
     /// The family.
     pub curve: ToneCurve,
@@ -50,7 +50,7 @@ pub struct ToneSettings {
     pub colour: f64,
     /// Whether a photograph is lifted at its own size and shrunk behind that. References were shrunk behind their own tone
     /// curve, and the mean of a curve is not the curve of a mean.
-    pub lift_first: bool,
+    pub full_resolution: bool,
     /// The family's constants in the order of its formula.
     pub constants: Vec<f64>,
     /// The values of [`ToneCurve::Table`].
@@ -64,9 +64,9 @@ const MOST: f64 = 1e30;
 
 /// Settings that belong to a curve: they do not outlast the choice of another one.
 pub(crate) const OF_CURVE: [&str; 8] =
-    ["gain_c", "alpha", "auto_gain", "colour", "lift_first", "constants", "table", "profile"];
+    ["gain_c", "alpha", "auto_gain", "colour", "full_resolution", "constants", "table", "profile"];
 
-impl<T: Real> From<&ToneSettings> for Numbers<T> {
+impl<T: Real> From<&ToneSettings> for CurveInputs<T> {
     fn from(settings: &ToneSettings) -> Self {
         Self {
             theta: T::of(settings.theta),
@@ -103,7 +103,7 @@ impl ToneSettings {
         /// lambda: how much of the curve auto keeps the ratios of the channels.
         colour => Rule::SHARE, "--colour L";
         /// A photograph is lifted at its own size and shrunk after that.
-        lift_first, "as auto_gain" => Rule::Flag;
+        full_resolution, "as auto_gain" => Rule::Flag;
         /// The constants of the curve's formula, by name.
         constants, "the curve's" => Rule::Table("a table with every constant of the curve");
         /// The values of the curve `table`, as --curve reads them from a .csv or .cube file.
@@ -129,7 +129,7 @@ impl ToneSettings {
             auto_gain: is_exposed,
             brightness: None,
             colour: COLOUR,
-            lift_first: is_exposed,
+            full_resolution: is_exposed,
             constants: family.defaults(),
             table: None,
             profile: None,
@@ -153,9 +153,9 @@ impl ToneSettings {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn with_gain(self, gain: GainChoice) -> Self {
         match gain {
-            GainChoice::Auto => Self { auto_gain: true, lift_first: true, ..self },
+            GainChoice::Auto => Self { auto_gain: true, full_resolution: true, ..self },
             GainChoice::C(gain_c) if self.auto_gain => {
-                Self { gain_c, auto_gain: false, lift_first: false, ..self }
+                Self { gain_c, auto_gain: false, full_resolution: false, ..self }
             }
             GainChoice::C(gain_c) => Self { gain_c, ..self },
         }
@@ -313,7 +313,7 @@ impl ToneSettings {
     }
 
     /// The curve that these settings give a photograph with these statistics; where the gain follows from the exposure, it
-    /// is another ([`Self::lift`]).
+    /// is another ([`Self::tone_mapping`]).
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn parameters(&self, statistics: &Statistics) -> ToneParameters {
         if self.curve == ToneCurve::Profile {
@@ -330,7 +330,7 @@ impl ToneSettings {
             let offset = self.alpha as f32;
             return ToneParameters { white: 1.0, offset, gain: 1.0, weight: 1.0, constants };
         }
-        let numbers = Numbers::<f64>::from(self);
+        let numbers = CurveInputs::<f64>::from(self);
         let curve = law(self.curve.family(), self.white(), &numbers, statistics);
         ToneParameters {
             white: curve.white as f32,
@@ -413,7 +413,7 @@ impl Default for ToneSettings {
 /// The settings as TOML has them.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Written {
+struct SerializedToneSettings {
     curve: Option<ToneCurve>,
     /// What `curve` was called once.
     #[serde(skip_serializing)]
@@ -428,7 +428,7 @@ struct Written {
     #[serde(skip_serializing_if = "Option::is_none")]
     brightness: Option<f64>,
     colour: Option<f64>,
-    lift_first: Option<bool>,
+    full_resolution: Option<bool>,
     #[serde(skip_serializing_if = "Option::is_none")]
     constants: Option<BTreeMap<String, f64>>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -437,18 +437,18 @@ struct Written {
     profile: Option<Profile>,
 }
 
-impl TryFrom<Written> for ToneSettings {
+impl TryFrom<SerializedToneSettings> for ToneSettings {
     type Error = String;
 
-    fn try_from(written: Written) -> Result<Self, String> {
+    fn try_from(written: SerializedToneSettings) -> Result<Self, String> {
         let given = match (&written.table, &written.profile) {
             (Some(_), _) => ToneCurve::Table,
             (None, Some(_)) => ToneCurve::Profile,
             (None, None) => ToneCurve::Auto,
         };
         if written.family.is_some() {
-            static SAID: std::sync::Once = std::sync::Once::new();
-            SAID.call_once(|| {
+            static WARNED: std::sync::Once = std::sync::Once::new();
+            WARNED.call_once(|| {
                 tracing::warn!("`family` of a curve is called `curve` now; the old name is read");
             });
             if written.curve.is_some() {
@@ -493,7 +493,7 @@ impl TryFrom<Written> for ToneSettings {
             auto_gain,
             brightness: written.brightness,
             colour: written.colour.unwrap_or(defaults.colour),
-            lift_first: written.lift_first.unwrap_or(auto_gain),
+            full_resolution: written.full_resolution.unwrap_or(auto_gain),
             constants,
             table: written.table,
             profile: written.profile,
@@ -503,7 +503,7 @@ impl TryFrom<Written> for ToneSettings {
     }
 }
 
-impl From<ToneSettings> for Written {
+impl From<ToneSettings> for SerializedToneSettings {
     fn from(settings: ToneSettings) -> Self {
         let names = settings.curve.family().constants.iter();
         let constants: BTreeMap<String, f64> =
@@ -520,7 +520,7 @@ impl From<ToneSettings> for Written {
             auto_gain: Some(settings.auto_gain),
             brightness: settings.brightness,
             colour: Some(settings.colour),
-            lift_first: Some(settings.lift_first),
+            full_resolution: Some(settings.full_resolution),
             constants: Some(constants).filter(|constants| !constants.is_empty()),
             table: settings.table,
             profile: settings.profile,

@@ -2,7 +2,7 @@
 
 use glam::{DVec2, DVec3};
 
-use super::Place;
+use super::ImagePoint;
 
 /// What is seen at the angle t off the axis lies `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)` from the principal point.
 #[derive(Clone, Debug)]
@@ -67,14 +67,14 @@ impl Fisheye {
         }
     }
 
-    pub(super) fn place(&self, point: DVec3) -> Place {
+    pub(super) fn place(&self, point: DVec3) -> ImagePoint {
         let Ray { distance, across: n, sine, cosine, radius, slope, stretch, .. } = self.ray(point);
         let row = |axis: DVec2| {
             let along = axis.dot(n);
             let plane = stretch * (axis - along * n) + slope * cosine * along * n;
             plane.extend(-slope * sine * along) / distance
         };
-        Place { at: radius * n, jacobian: [row(DVec2::X), row(DVec2::Y)] }
+        ImagePoint { at: radius * n, jacobian: [row(DVec2::X), row(DVec2::Y)] }
     }
 
     /// By distance, angle and turn about the axis.

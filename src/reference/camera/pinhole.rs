@@ -2,28 +2,28 @@
 
 use glam::{DVec2, DVec3};
 
-use super::Place;
+use super::ImagePoint;
 
 /// x / z and y / z.
 #[derive(Clone, Debug)]
 pub struct Pinhole {
     /// Where the Jacobian of the projection is taken at the least.
-    pub least_slope: DVec2,
+    pub min_slope: DVec2,
     /// And at the most.
-    pub most_slope: DVec2,
+    pub max_slope: DVec2,
 }
 
 impl Pinhole {
     /// x / z and y / z, no farther than the Jacobian is taken.
     pub fn clamped_slope(&self, point: DVec3) -> DVec2 {
         let slope = point.truncate() / point.z;
-        slope.max(self.least_slope).min(self.most_slope)
+        slope.max(self.min_slope).min(self.max_slope)
     }
 
-    pub(super) fn place(&self, point: DVec3) -> Place {
+    pub(super) fn place(&self, point: DVec3) -> ImagePoint {
         let slope = self.clamped_slope(point);
         let rows = [DVec3::new(1.0, 0.0, -slope.x), DVec3::new(0.0, 1.0, -slope.y)];
-        Place { at: point.truncate() / point.z, jacobian: rows.map(|row| row / point.z) }
+        ImagePoint { at: point.truncate() / point.z, jacobian: rows.map(|row| row / point.z) }
     }
 
     pub(super) fn backward(&self, point: DVec3, d_place: DVec2, d_rows: [DVec3; 2]) -> DVec3 {

@@ -141,9 +141,9 @@ mod tests {
 
     #[test]
     fn values_that_are_few_are_kept_and_many_lie_near_their_code() {
-        let few = codebook([3.0, -1.0, 3.0, 0.5].into_iter());
+        let small = codebook([3.0, -1.0, 3.0, 0.5].into_iter());
         for value in [3.0, -1.0, 0.5] {
-            assert_eq!(few[usize::from(nearest(&few, value))], value);
+            assert_eq!(small[usize::from(nearest(&small, value))], value);
         }
         let many: Vec<f32> = (0..10_000).map(|i| (i as f32 / 10_000.0).powi(3)).collect();
         let codes = codebook(many.iter().copied());

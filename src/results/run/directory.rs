@@ -26,7 +26,7 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use super::aside::{self, Aside};
+use super::backup::{self, Backup};
 use super::files::*;
 use super::generations;
 use super::ledger;
@@ -55,8 +55,8 @@ pub struct RunDirectory {
     /// Whether what it replaces is still there.
     is_new: bool,
     /// The run that was here before; back in its place if this is dropped before [`RunDirectory::settle`].
-    aside: Aside,
-    /// Behind `aside`: nobody else begins before that is in order.
+    backup: Backup,
+    /// Behind `backup`: nobody else begins before that is in order.
     _lock: RunLock,
 }
 
@@ -103,7 +103,7 @@ impl RunDirectory {
     pub(super) fn lock(path: &Path) -> Result<RunLock> {
         std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
         let lock = RunLock::take(path)?;
-        aside::recover(path)?;
+        backup::recover(path)?;
         Ok(lock)
     }
 
@@ -121,8 +121,8 @@ impl RunDirectory {
         if let Some(file) = FILES.iter().find(|file| path.join(file).exists() && !overwrite) {
             return Err(held(path, file));
         }
-        let aside = Aside::set(path)?;
-        let mut run = Self::open(path, config, "", 0.0, aside, lock)?;
+        let backup = Backup::set(path)?;
+        let mut run = Self::open(path, config, "", 0.0, backup, lock)?;
         let columns: String = run.terms.iter().map(|term| format!("{},", term.column)).collect();
         run.log_line(&format!("step,view,loss,{columns}gaussians,milliseconds"))?;
         Ok(run)
@@ -133,7 +133,7 @@ impl RunDirectory {
     /// # Errors
     /// The directory cannot be written.
     pub fn settle(&mut self) -> Result<()> {
-        self.aside.give_up()?;
+        self.backup.give_up()?;
         if std::mem::take(&mut self.is_new) { remove_events(&self.path) } else { Ok(()) }
     }
 
@@ -162,7 +162,7 @@ impl RunDirectory {
         let milliseconds = |line: &&str| line.trim_end().rsplit(',').next()?.parse::<f64>().ok();
         let seconds_before = lines.iter().filter_map(milliseconds).sum::<f64>() / 1e3;
         remove(path, &[DONE, "metrics.json", "model.ply", NETWORKS, EXPOSURES])?;
-        Self::open(path, config, &lines.concat(), seconds_before, Aside::default(), lock)
+        Self::open(path, config, &lines.concat(), seconds_before, Backup::default(), lock)
     }
 
     /// Writes the configuration and what the log begins with.
@@ -171,7 +171,7 @@ impl RunDirectory {
         config: &TrainConfig,
         log: &str,
         seconds_before: f64,
-        aside: Aside,
+        backup: Backup,
         lock: RunLock,
     ) -> Result<Self> {
         let recorded = config.clone().with_absolute_paths();
@@ -183,7 +183,7 @@ impl RunDirectory {
         let terms = config.loss().terms();
         let (raw_colors, is_new) = (config.model.raw_colors, log.is_empty());
         let path = path.to_owned();
-        Ok(Self { path, log: file, terms, seconds_before, raw_colors, is_new, aside, _lock: lock })
+        Ok(Self { path, log: file, terms, seconds_before, raw_colors, is_new, backup, _lock: lock })
     }
 
     /// Writes the scores of the held-out views: step, PSNR in dB.
@@ -257,7 +257,7 @@ impl RunDirectory {
     /// The disk is full or gone, the device was lost, or a parameter is not finite.
     pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
-        let newest = generations::make_room(&self.path)?;
+        let newest = generations::rotate(&self.path)?;
         trainer.save_checkpoint(&newest)?;
         self.save_trained(trainer)
     }

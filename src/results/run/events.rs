@@ -1,6 +1,6 @@
 //! What a run tells its observer.
 
-use super::meter::Spent;
+use super::meter::ResourceUsage;
 use crate::results::eval::ViewScore;
 use crate::train::{Ended, MemoryEstimate, StepReport, Trainer};
 
@@ -50,12 +50,12 @@ pub enum Event<'a> {
         scored: &'a [ViewScore],
     },
     /// The run directory is whole.
-    Finished(&'a Trained),
+    Finished(&'a RunSummary),
 }
 
 /// What a run made.
 #[derive(Debug)]
-pub struct Trained {
+pub struct RunSummary {
     /// The model and its networks, on the device.
     pub trainer: Trainer,
     /// How it ended.
@@ -65,5 +65,5 @@ pub struct Trained {
     /// The loss of every step of this call.
     pub losses: Vec<f64>,
     /// What the steps took, without loading and scoring; the seconds before a resumed run included.
-    pub spent: Spent,
+    pub spent: ResourceUsage,
 }

@@ -53,7 +53,7 @@ pub(crate) const SPENT: &str = "spent";
 pub(crate) const ENDED: &str = "ended";
 
 /// The last scores of the held-out views and their spread, in `metrics.json`.
-pub(crate) const HELD_OUT_COURSE: &str = "held_out";
+pub(crate) const HELD_OUT_CURVE: &str = "held_out";
 
 /// Gain and bias of the training views.
 pub(super) const EXPOSURES: &str = "exposures.csv";

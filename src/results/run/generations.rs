@@ -38,7 +38,7 @@ pub(super) fn keep_whole(run: &Path) -> Result<()> {
 }
 
 /// Where the next one is to be written: the newest becomes the one before, and stays if that fails.
-pub(super) fn make_room(run: &Path) -> Result<PathBuf> {
+pub(super) fn rotate(run: &Path) -> Result<PathBuf> {
     let [newest, before] = both(run);
     if newest.exists() {
         std::fs::rename(&newest, before).map_err(|error| unwritable(&newest, &error))?;

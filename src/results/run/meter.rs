@@ -11,7 +11,7 @@ use serde::Serialize;
 
 /// What the steps of a run took; none where the system does not say, or a part was taken by a process before this one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Spent {
+pub struct ResourceUsage {
     /// On the wall.
     #[serde(skip)]
     pub seconds: f64,
@@ -27,20 +27,24 @@ pub struct Spent {
 
 /// Adds up what pieces of work take.
 #[derive(Debug)]
-pub(super) struct Meter {
+pub(super) struct ResourceMeter {
     counters: Vec<Counter>,
-    spent: Spent,
+    spent: ResourceUsage,
 }
 
-impl Meter {
+impl ResourceMeter {
     /// One that goes on after `seconds_before` of another process, whose other figures nobody knows.
     pub(super) fn new(seconds_before: f64) -> Self {
         let is_whole = seconds_before == 0.0;
         let counters = Counter::all(Path::new("/sys"));
         let joules = (is_whole && !counters.is_empty()).then_some(0.0);
         let processor_seconds = processor_seconds().filter(|_| is_whole).map(|_| 0.0);
-        let spent =
-            Spent { seconds: seconds_before, processor_seconds, joules, ..Spent::default() };
+        let spent = ResourceUsage {
+            seconds: seconds_before,
+            processor_seconds,
+            joules,
+            ..ResourceUsage::default()
+        };
         Self { counters, spent }
     }
 
@@ -60,8 +64,8 @@ impl Meter {
     }
 
     /// What the work so far took, and what the process had in memory at most.
-    pub(super) fn spent(&self, device_bytes: u64) -> Spent {
-        Spent { device_bytes, host_bytes: host_bytes(), ..self.spent }
+    pub(super) fn spent(&self, device_bytes: u64) -> ResourceUsage {
+        ResourceUsage { device_bytes, host_bytes: host_bytes(), ..self.spent }
     }
 }
 
@@ -189,7 +193,7 @@ mod tests {
     #[test]
     #[cfg(target_os = "linux")]
     fn work_takes_time_and_memory_and_idling_takes_no_processor() {
-        let mut meter = Meter::new(0.0);
+        let mut meter = ResourceMeter::new(0.0);
         meter.of(|| std::thread::sleep(std::time::Duration::from_millis(60)));
         let idle = meter.spent(7);
         assert!(idle.seconds >= 0.06 && idle.processor_seconds.unwrap() < 60.0, "{idle:?}");
@@ -198,6 +202,10 @@ mod tests {
         meter.of(|| while processor_seconds().unwrap() < begin + 0.05 {});
         let busy = meter.spent(7).processor_seconds.unwrap() - idle.processor_seconds.unwrap();
         assert!(busy >= 0.04, "{busy}");
-        assert_eq!(Meter::new(1.0).spent(0).processor_seconds, None, "another process took a part");
+        assert_eq!(
+            ResourceMeter::new(1.0).spent(0).processor_seconds,
+            None,
+            "another process took a part"
+        );
     }
 }

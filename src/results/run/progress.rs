@@ -1,6 +1,6 @@
 //! The rows of `evals.csv`: how a run came to where it is.
 
-use super::meter::Spent;
+use super::meter::ResourceUsage;
 use crate::photographs::metrics::Scores;
 
 /// The scores of the test views at one step of a run, and what the steps up to it took.
@@ -35,7 +35,7 @@ impl Progress {
         gaussians: usize,
         views: usize,
         scores: &Scores,
-        spent: &Spent,
+        spent: &ResourceUsage,
     ) -> Self {
         Self {
             step,

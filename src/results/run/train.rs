@@ -4,21 +4,21 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use super::directory::Progress;
-use super::files::{ENDED, HELD_OUT_COURSE, SPENT, TARGET_EXPOSURE};
-use super::meter::{Meter, Spent};
+use super::files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE};
+use super::meter::{ResourceMeter, ResourceUsage};
 use super::tensorboard::EventFile;
-use super::{Event, Requests, RunDirectory, Trained, done, generations, load};
+use super::{Event, Requests, RunDirectory, RunSummary, done, generations, load};
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, View};
-use crate::results::eval::{self, Compared, ViewScore, Yardstick};
+use crate::results::eval::{self, ScoreReference, ScoredImages, ViewScore};
 use crate::splats::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::train::diagnose::Plan;
-use crate::train::{Ended, Learning, MemoryEstimate, Settings, StepReport, TrainConfig, Trainer};
+use crate::train::{Ended, MemoryEstimate, OnOff, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
 /// What becomes of a run that the directory already holds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum HeldRun {
+pub enum IfExists {
     /// It stays: nothing is trained.
     #[default]
     Refuse,
@@ -36,7 +36,7 @@ pub struct Session<'a> {
     /// Where the configuration's values come from; config.toml says so.
     pub settings: Option<&'a Settings>,
     /// What becomes of a run that is there.
-    pub held: HeldRun,
+    pub if_exists: IfExists,
     /// What is asked of it on the way.
     pub requests: Requests,
 }
@@ -46,7 +46,7 @@ pub struct Session<'a> {
 /// `observe` is told every [`Event`] on the calling thread. `dataset` is what [`TrainConfig::load_options`] loads.
 ///
 /// # Errors
-/// The directory holds a run that `held` keeps, or cannot be written; the configuration makes no sense or is not that of
+/// The directory holds a run that `if_exists` keeps, or cannot be written; the configuration makes no sense or is not that of
 /// the run that is to go on; a loss is not finite; the device is out of memory or lost.
 ///
 /// ```no_run
@@ -71,10 +71,10 @@ pub fn train(
     config: &TrainConfig,
     dataset: &Dataset,
     out: &Path,
-    held: HeldRun,
+    if_exists: IfExists,
     observe: impl FnMut(Event<'_>),
-) -> Result<Trained> {
-    train_in(gpu, config, dataset, out, &Session { held, ..Session::default() }, observe)
+) -> Result<RunSummary> {
+    train_in(gpu, config, dataset, out, &Session { if_exists, ..Session::default() }, observe)
 }
 
 /// As [`train`], in a [`Session`].
@@ -88,7 +88,7 @@ pub fn train_in(
     out: &Path,
     session: &Session<'_>,
     mut observe: impl FnMut(Event<'_>),
-) -> Result<Trained> {
+) -> Result<RunSummary> {
     gpu.reset_peak_memory();
     let stamp = Dataset::stamp(&dataset.root, &config.load_options()).ok();
     let (mut directory, mut trainer) = begin(gpu, config, dataset, out, session)?;
@@ -97,20 +97,21 @@ pub fn train_in(
     }
     directory.save_views(dataset)?;
     let memory = trainer.memory_estimate()?;
-    say_what_is_short(gpu, &memory);
+    warn_of_memory(gpu, &memory);
     observe(Event::Started {
         step: trainer.steps_done(),
         steps: trainer.last_step(),
         may_end_early: trainer.may_end_early(),
         memory: &memory,
     });
-    let mut course = Course::new(gpu, config, dataset, &directory, &trainer);
+    let mut train_loop = TrainLoop::new(gpu, config, dataset, &directory, &trainer);
     let requests = &session.requests;
-    let losses = course.train_to_the_end(&mut trainer, &mut directory, requests, &mut observe);
-    let losses = losses.inspect_err(|error| course.rescue(error, &mut trainer, &mut directory))?;
-    let finished = course.finish(&mut trainer, &mut directory, &mut observe);
-    let (ended, scored, spent) =
-        finished.inspect_err(|error| course.rescue(error, &mut trainer, &mut directory))?;
+    let losses = train_loop.train_to_end(&mut trainer, &mut directory, requests, &mut observe);
+    let losses = losses
+        .inspect_err(|error| train_loop.save_on_error(error, &mut trainer, &mut directory))?;
+    let finished = train_loop.finish(&mut trainer, &mut directory, &mut observe);
+    let (ended, scored, spent) = finished
+        .inspect_err(|error| train_loop.save_on_error(error, &mut trainer, &mut directory))?;
     let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
     let mut metrics = eval::metrics(&scored, spent.seconds, gaussians, steps);
     metrics[SPENT] = serde_json::json!(spent);
@@ -118,30 +119,30 @@ pub fn train_in(
     if let Some(exposure) = trainer.target_exposure() {
         metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
     }
-    if config.exposure.learn == Learning::On {
+    if config.exposure.learn == OnOff::On {
         eval::add_exposure(&mut metrics, &scored);
     }
     metrics[ENDED] = serde_json::json!(ended);
-    if let Some(course) = held_out_course(&trainer) {
-        metrics[HELD_OUT_COURSE] = course;
+    if let Some(curve) = held_out_curve(&trainer) {
+        metrics[HELD_OUT_CURVE] = curve;
     }
     directory.save_metrics(&metrics)?;
     done::save(out, config, (trainer.fingerprint(), stamp), &ended)?;
-    let trained = Trained { trainer, ended, scored, losses, spent };
+    let trained = RunSummary { trainer, ended, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
 }
 
 /// Warns where the driver has less memory for us than the run may come to need.
-fn say_what_is_short(gpu: &Gpu, memory: &MemoryEstimate) {
+fn warn_of_memory(gpu: &Gpu, memory: &MemoryEstimate) {
     let Some(budget) = gpu.memory_budget() else { return };
     let left = budget.budget.saturating_sub(budget.usage) + gpu.memory_in_use();
-    if memory.most_device > left {
+    if memory.peak_device > left {
         let mebibytes = |bytes: u64| bytes >> 20;
         tracing::warn!(
             "{} Gaussians may take {} MiB of the device, {} MiB are free: max_vram or max_gaussians stops growth in time",
-            memory.most_gaussians,
-            mebibytes(memory.most_device),
+            memory.peak_gaussians,
+            mebibytes(memory.peak_device),
             mebibytes(left)
         );
     }
@@ -155,16 +156,16 @@ fn begin(
     out: &Path,
     session: &Session<'_>,
 ) -> Result<(RunDirectory, Trainer)> {
-    let held = session.held;
+    let if_exists = session.if_exists;
     // A tile that does not suit the device is said before there is a directory.
     config.render_settings().tile_on(gpu)?;
-    match held {
-        HeldRun::Refuse => RunDirectory::check(out, false)?,
-        HeldRun::Replace => RunDirectory::check(out, true)?,
-        HeldRun::Resume => RunDirectory::check_resumed(out)?,
+    match if_exists {
+        IfExists::Refuse => RunDirectory::check(out, false)?,
+        IfExists::Replace => RunDirectory::check(out, true)?,
+        IfExists::Resume => RunDirectory::check_resumed(out)?,
     }
     let lock = RunDirectory::lock(out)?;
-    let resumes = held == HeldRun::Resume;
+    let resumes = if_exists == IfExists::Resume;
     let checkpoint = if resumes { generations::newest(out) } else { None };
     let mut config = with_what_is_found(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
     // A disk that has room for the run has it for photographs.
@@ -189,10 +190,10 @@ fn begin(
         return Ok((directory, trainer));
     }
     // Without a checkpoint, an unfinished run is nothing to lose.
-    let replaces = match held {
-        HeldRun::Refuse => false,
-        HeldRun::Replace => true,
-        HeldRun::Resume => !load::is_finished(out),
+    let replaces = match if_exists {
+        IfExists::Refuse => false,
+        IfExists::Replace => true,
+        IfExists::Resume => !load::is_finished(out),
     };
     let directory = RunDirectory::create_locked(out, lock, config, replaces)?;
     explain(&directory)?;
@@ -225,18 +226,18 @@ fn with_what_is_found(
 }
 
 /// How far a run has come, and what that took.
-struct Course<'a> {
+struct TrainLoop<'a> {
     gpu: &'a Gpu,
     config: &'a TrainConfig,
     dataset: &'a Dataset,
-    meter: Meter,
+    meter: ResourceMeter,
     /// Steps that were done before.
     begin: u64,
     /// Steps that are in a checkpoint.
     saved: u64,
     progress: Vec<Progress>,
     /// Once something was scored.
-    yardstick: Option<Yardstick>,
+    score_reference: Option<ScoreReference>,
     /// For `TensorBoard`, once there is something to tell.
     events: Option<EventFile>,
     /// Scores of the held-out views that are told.
@@ -245,7 +246,7 @@ struct Course<'a> {
     may_end_early: bool,
 }
 
-impl<'a> Course<'a> {
+impl<'a> TrainLoop<'a> {
     fn new(
         gpu: &'a Gpu,
         config: &'a TrainConfig,
@@ -253,7 +254,7 @@ impl<'a> Course<'a> {
         directory: &RunDirectory,
         trainer: &Trainer,
     ) -> Self {
-        let (meter, begin) = (Meter::new(directory.seconds_before()), trainer.steps_done());
+        let (meter, begin) = (ResourceMeter::new(directory.seconds_before()), trainer.steps_done());
         let progress = directory.progress(begin);
         Self {
             gpu,
@@ -263,7 +264,7 @@ impl<'a> Course<'a> {
             begin,
             saved: begin,
             progress,
-            yardstick: None,
+            score_reference: None,
             events: None,
             told: trainer.held_out_scores().count(),
             may_end_early: trainer.may_end_early(),
@@ -271,7 +272,7 @@ impl<'a> Course<'a> {
     }
 
     /// Logs every step, writes checkpoints and ends early where that is asked for; gives the losses.
-    fn train_to_the_end(
+    fn train_to_end(
         &mut self,
         trainer: &mut Trainer,
         directory: &mut RunDirectory,
@@ -298,9 +299,9 @@ impl<'a> Course<'a> {
                 directory.settle()?;
             }
             if config.tensorboard {
-                self.tell_events(trainer, directory, &reports)?;
+                self.write_events(trainer, directory, &reports)?;
             }
-            self.tell_scores(trainer, directory, observe)?;
+            self.log_scores(trainer, directory, observe)?;
             let Some(step) = reports.last().map(|report| report.step) else { continue };
             let falls_on = |every: u64| every > 0 && step.is_multiple_of(every);
             if falls_on(config.hash_every) {
@@ -332,13 +333,13 @@ impl<'a> Course<'a> {
         trainer: &mut Trainer,
         directory: &mut RunDirectory,
         observe: &mut impl FnMut(Event<'_>),
-    ) -> Result<(Ended, Vec<ViewScore>, Spent)> {
+    ) -> Result<(Ended, Vec<ViewScore>, ResourceUsage)> {
         let ended = trainer.end()?;
         if let Some(events) = &mut self.events {
             events.text(ended.step, "run/ended", &ended.to_string())?;
         }
         observe(Event::Ended(&ended));
-        trainer.leave_out_what_gains_nothing()?;
+        trainer.drop_unused_degree()?;
         let spent = self.meter.spent(self.gpu.peak_memory());
         let scored = self.evaluate(trainer, directory, observe)?;
         let render = |view: &View| trainer.render(&view.camera);
@@ -348,7 +349,7 @@ impl<'a> Course<'a> {
     }
 
     /// Saves what was trained before an error that leaves it as it was: nothing but memory, a file or the like was missing.
-    fn rescue(&self, error: &Error, trainer: &mut Trainer, directory: &mut RunDirectory) {
+    fn save_on_error(&self, error: &Error, trainer: &mut Trainer, directory: &mut RunDirectory) {
         let is_lost = matches!(
             error,
             Error::Stopped { .. }
@@ -376,26 +377,30 @@ impl<'a> Course<'a> {
         directory: &RunDirectory,
         observe: &mut impl FnMut(Event<'_>),
     ) -> Result<Vec<ViewScore>> {
-        let mut yardstick = match self.yardstick.take() {
+        let mut score_reference = match self.score_reference.take() {
             Some(known) => known,
-            None => {
-                Yardstick::in_scene(self.gpu, &self.config.tone, self.dataset, trainer.scene())?
-            }
+            None => ScoreReference::in_scene(
+                self.gpu,
+                &self.config.tone,
+                self.dataset,
+                trainer.scene(),
+            )?,
         };
         let (step, mut is_first) = (trainer.steps_done(), true);
         let render = |view: &View| trainer.render(&view.camera);
-        let scored = eval::score_by(&mut yardstick, self.dataset, render, |score, compared| {
-            if self.config.exposure.learn == Learning::On {
-                score.aligned = Some(compared.aligned()?);
-            }
-            if std::mem::take(&mut is_first) {
-                self.tell_events_pictures(step, score, compared)?;
-            }
-            Ok(())
-        })?;
-        self.yardstick = Some(yardstick);
+        let scored =
+            eval::score_by(&mut score_reference, self.dataset, render, |score, compared| {
+                if self.config.exposure.learn == OnOff::On {
+                    score.aligned = Some(compared.aligned()?);
+                }
+                if std::mem::take(&mut is_first) {
+                    self.write_event_images(step, score, compared)?;
+                }
+                Ok(())
+            })?;
+        self.score_reference = Some(score_reference);
         observe(Event::Evaluated { step, scored: &scored });
-        self.tell_events_scores(step, &scored)?;
+        self.write_event_scores(step, &scored)?;
         if let Some(scores) = eval::means(&scored).0.filter(|_| self.config.eval_every > 0) {
             let (gaussians, spent) = (trainer.gaussian_count(), self.meter.spent(0));
             // A finished run that goes on begins where it was scored last.
@@ -407,9 +412,9 @@ impl<'a> Course<'a> {
     }
 }
 
-impl Course<'_> {
+impl TrainLoop<'_> {
     /// Writes what `TensorBoard` draws over the steps, of every tenth.
-    fn tell_events(
+    fn write_events(
         &mut self,
         trainer: &Trainer,
         directory: &RunDirectory,
@@ -438,7 +443,7 @@ impl Course<'_> {
     }
 
     /// Writes and tells every score of the held-out views since the last call, and the last step once that is certain.
-    fn tell_scores(
+    fn log_scores(
         &mut self,
         trainer: &Trainer,
         directory: &RunDirectory,
@@ -463,11 +468,11 @@ impl Course<'_> {
     }
 
     /// Writes how a test view looks, and what it should be.
-    fn tell_events_pictures(
+    fn write_event_images(
         &mut self,
         step: u64,
         ViewScore { name, against, .. }: &ViewScore,
-        Compared { render, target, .. }: &Compared<'_>,
+        ScoredImages { render, target, .. }: &ScoredImages<'_>,
     ) -> Result<()> {
         let Some(events) = &mut self.events else { return Ok(()) };
         for (what, image) in [("render", render), (against.name(), target)] {
@@ -478,7 +483,7 @@ impl Course<'_> {
     }
 
     /// Writes the mean scores.
-    fn tell_events_scores(&mut self, step: u64, scored: &[ViewScore]) -> Result<()> {
+    fn write_event_scores(&mut self, step: u64, scored: &[ViewScore]) -> Result<()> {
         let (Some(events), Some(first)) = (&mut self.events, scored.first()) else { return Ok(()) };
         let group = format!("test views against {}", first.against.name());
         if let Some(mean) = eval::means(scored).0 {
@@ -495,7 +500,7 @@ impl Course<'_> {
 }
 
 /// How the held-out views' scores came to their end, for `metrics.json`: the last, and how far the last ten lie apart.
-fn held_out_course(trainer: &Trainer) -> Option<serde_json::Value> {
+fn held_out_curve(trainer: &Trainer) -> Option<serde_json::Value> {
     const LAST: usize = 10;
     let scores: Vec<f64> =
         trainer.held_out_scores().rev().take(LAST).map(|(_, psnr)| psnr).collect();

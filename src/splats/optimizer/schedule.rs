@@ -75,13 +75,13 @@ settings! {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Schedule {
     /// The rate of the means at the end of its decay, for a scene of extent 1.
-    final_means_rate: f64 = 1.6e-6 => Rule::above(0.0, MOST_RATE);
+    final_means_rate: f64 = 1.6e-6 => Rule::above(0.0, MAX_RATE);
     /// The steps over which the rate of the means decays exponentially.
     means_rate_steps: u64 = 30_000 => Rule::COUNT, in "steps";
     /// All rates but the opacity's begin at this many times themselves, and fall to themselves exponentially.
-    boost: f64 = 4.0 => Rule::from_to(1e-3, 1e3);
+    initial_rate_factor: f64 = 4.0 => Rule::from_to(1e-3, 1e3);
     /// The steps over which the boost fades.
-    boost_steps: u64 = 600 => Rule::COUNT, in "steps";
+    initial_rate_steps: u64 = 600 => Rule::COUNT, in "steps";
     /// The SH degree in use grows by one each time this many steps are done, from 0.
     sh_degree_interval: u64 = 1_000 => Rule::COUNT, in "steps";
     /// Density control acts after this step.
@@ -92,9 +92,9 @@ pub struct Schedule {
     densify_interval: u64 = 100 => Rule::COUNT, in "steps";
     /// The last steps of a run, a third of it at most, in which the model settles: there is no density control, and all
     /// learning rates decay exponentially.
-    settle_steps: u64 = 250 => Rule::COUNT, in "steps";
+    cooldown_steps: u64 = 250 => Rule::COUNT, in "steps";
     /// The part of themselves to which the rates decay as the model settles.
-    settle_rate: f64 = 0.05 => Rule::above(0.0, 1.0);
+    cooldown_rate: f64 = 0.05 => Rule::above(0.0, 1.0);
     /// Views are a quarter of their width and height before the first of these steps, half before the second.
     resolution_steps: [u64; 2] = [0, 200] => Rule::List(2, 2, &Rule::COUNT), in "steps";
     /// The weight of the near-camera damping is 1 before the first of these steps, 1/2 before the second, then 0.
@@ -107,7 +107,7 @@ sections {
 }
 
 /// No rate of use is near it, and a step of it overflows nothing.
-const MOST_RATE: f64 = 100.0;
+const MAX_RATE: f64 = 100.0;
 
 impl LearningRates {
     /// A row for each rate.
@@ -116,8 +116,8 @@ impl LearningRates {
             key: format!("schedule.initial_rates.{}", spec.name).into(),
             rule: match spec.attribute {
                 // The decay of the means' rate divides by it.
-                Attribute::Means => Rule::above(0.0, MOST_RATE),
-                _ => Rule::from_to(0.0, MOST_RATE),
+                Attribute::Means => Rule::above(0.0, MAX_RATE),
+                _ => Rule::from_to(0.0, MAX_RATE),
             },
             unit: "",
             help: &["Adam's rate at the start; that of the means is for a scene of extent 1."],
@@ -143,13 +143,13 @@ impl Schedule {
     #[cfg(test)]
     pub(crate) fn paper() -> Self {
         Self {
-            boost: 1.0,
-            boost_steps: 0,
+            initial_rate_factor: 1.0,
+            initial_rate_steps: 0,
             densify_after: 500,
             densify_before: 5_000,
             densify_interval: 200,
             resolution_steps: [0, 0],
-            settle_steps: 0,
+            cooldown_steps: 0,
             ..Self::default()
         }
     }
@@ -161,11 +161,11 @@ impl Schedule {
         let mut rates = self.initial_rates;
         let decay = (self.final_means_rate / rates[Attribute::Means]).powf(done);
         rates[Attribute::Means] = rates[Attribute::Means] * decay * extent;
-        let left = 1.0 - (step as f64 / self.boost_steps.max(1) as f64).min(1.0);
+        let left = 1.0 - (step as f64 / self.initial_rate_steps.max(1) as f64).min(1.0);
         if left > 0.0 {
-            let boost = self.boost.powf(left);
+            let initial_rate_factor = self.initial_rate_factor.powf(left);
             let opacity = rates[Attribute::RawOpacities];
-            rates.0.iter_mut().for_each(|rate| *rate *= boost);
+            rates.0.iter_mut().for_each(|rate| *rate *= initial_rate_factor);
             rates[Attribute::RawOpacities] = opacity;
         }
         rates
@@ -192,8 +192,8 @@ impl Schedule {
     }
 
     /// What learning rates are multiplied by after this share of the settling phase.
-    pub(crate) fn settling_rate(&self, done: f64) -> f64 {
-        self.settle_rate.powf(done.clamp(0.0, 1.0))
+    pub(crate) fn cooldown_factor(&self, done: f64) -> f64 {
+        self.cooldown_rate.powf(done.clamp(0.0, 1.0))
     }
 
     /// How often the views of `step` are halved.
@@ -278,7 +278,8 @@ mod tests {
 
     #[test]
     fn a_boost_fades_and_leaves_the_rates_as_they_are() {
-        let schedule = Schedule { boost: 4.0, boost_steps: 100, ..Schedule::paper() };
+        let schedule =
+            Schedule { initial_rate_factor: 4.0, initial_rate_steps: 100, ..Schedule::paper() };
         let rate = |step| schedule.learning_rates(step, 1.0)[Attribute::Quats];
         assert_eq!(schedule.learning_rates(0, 1.0)[Attribute::RawOpacities], 0.05);
         assert!((rate(0) - 0.004).abs() < 1e-12 && (rate(50) - 0.002).abs() < 1e-12);

@@ -3,7 +3,7 @@
 use glam::{UVec2, Vec3};
 
 use super::RenderSettings;
-use super::frame::color_vectors;
+use super::buffers::color_vectors;
 use crate::gpu::{Gpu, Properties, Tile};
 use crate::kernels::ProjectedSplat;
 use crate::{Error, Result};
@@ -24,7 +24,7 @@ impl RenderSettings {
     /// The most Gaussians that this device can render and train: some passes read the splat and the colour of any of them,
     /// which one binding has to hold. What else there is of them is bound in [`Batches`](crate::splats::batches::Batches).
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn most_gaussians(&self, gpu: &Gpu) -> usize {
+    pub(crate) fn peak_gaussians(&self, gpu: &Gpu) -> usize {
         let color = color_vectors(self.channels()) * size_of::<Vec3>();
         let bytes = size_of::<ProjectedSplat>().max(color) as u64;
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
@@ -45,7 +45,7 @@ impl RenderSettings {
         let count = |[width, height]: [u32; 2], tile: Tile| {
             width.div_ceil(tile.size[0]) as usize * height.div_ceil(tile.size[1]) as usize
         };
-        let most = most_tiles(gpu);
+        let most = max_tiles(gpu);
         while self.tile.is_none() && sizes.clone().any(|size| count(size, tile) > most) {
             let higher = Tile { size: [tile.size[0], 2 * tile.size[1]], ..tile };
             if !gpu.properties().suits_tile(higher) {
@@ -77,7 +77,7 @@ impl RenderSettings {
         let bytes_per_pixel = (self.channels() * size_of::<f32>()) as u64;
         let bytes = u64::from(width) * u64::from(height) * bytes_per_pixel;
         let tiles = u64::from(width.div_ceil(tile_width)) * u64::from(height.div_ceil(tile_height));
-        let most = most_tiles(gpu) as u64;
+        let most = max_tiles(gpu) as u64;
         let (excess, what) = if bytes > *bindable {
             let what = format!("its render takes {bytes} bytes, {device} binds {bindable} at most");
             (bytes as f64 / *bindable as f64, what)
@@ -102,7 +102,7 @@ const SOME_TURNS: u32 = 64;
 
 /// How many tiles a view may have: where every Gaussian of a subgroup covers all of them, `project_backward` makes as
 /// many turns as there are tiles, its lanes taking turns at each; `emit` makes fewer.
-pub(super) fn most_tiles(gpu: &Gpu) -> usize {
+pub(super) fn max_tiles(gpu: &Gpu) -> usize {
     let Properties { max_loop_iterations, subgroup_size, .. } = *gpu.properties();
     let turns_of_owners = 2 * subgroup_size;
     (max_loop_iterations - SOME_TURNS - turns_of_owners) as usize

@@ -1,7 +1,7 @@
 //! What a renderer is made for, and the tile that suits a device.
 
 use crate::gpu::{Gpu, Tile};
-use crate::splats::halves::StorageFormat;
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{Features, Shape};
 use crate::{Error, Result};
 
@@ -21,7 +21,7 @@ pub struct RenderSettings {
     pub rest: StorageFormat,
     /// The gradient of noise and illumination moves and shapes no Gaussian; that of depth and structure, which are there for
     /// it, does.
-    pub observes: bool,
+    pub detach_geometry: bool,
     /// The tile that a workgroup owns; none: what is fastest on the device.
     pub tile: Option<Tile>,
     /// The most pixels that are rendered at once; none: as many as the device can bind.
@@ -36,7 +36,7 @@ impl Default for RenderSettings {
             shape: 3.into(),
             raw_colors: false,
             rest: StorageFormat::Single,
-            observes: false,
+            detach_geometry: false,
             tile: None,
             patch_pixels: None,
         }
@@ -87,7 +87,7 @@ impl RenderSettings {
     pub(super) fn shaping_channels(&self) -> u32 {
         let Features { noise, illumination, .. } = self.shape.features;
         let observing =
-            if self.observes { 3 * (u32::from(noise) + u32::from(illumination)) } else { 0 };
+            if self.detach_geometry { 3 * (u32::from(noise) + u32::from(illumination)) } else { 0 };
         self.channels() as u32 - observing
     }
 }

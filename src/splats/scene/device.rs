@@ -7,7 +7,7 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu, Slice};
 use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::Batches;
-use crate::splats::halves::{Halves, StorageFormat};
+use crate::splats::packed_sh::{PackedSh, StorageFormat};
 
 /// How Gaussians lie on the device: as planes (include/gaussian.glsl), in batches where one binding does not hold them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -107,7 +107,7 @@ impl DeviceGaussians {
         match self.layout.sh_rest {
             StorageFormat::Single => batches.write(gpu, &mut self.parameters, floats),
             StorageFormat::Half => {
-                let words = Halves::new(self.layout.floats()).pack(floats);
+                let words = PackedSh::new(self.layout.floats()).pack(floats);
                 batches.write(gpu, &mut self.parameters, &words)
             }
         }
@@ -122,7 +122,7 @@ impl DeviceGaussians {
         let words = self.layout.parameter_batches(gpu).read(gpu, &self.parameters)?;
         Ok(match self.layout.sh_rest {
             StorageFormat::Single => words,
-            StorageFormat::Half => Halves::new(self.layout.floats()).unpack(&words),
+            StorageFormat::Half => PackedSh::new(self.layout.floats()).unpack(&words),
         })
     }
 

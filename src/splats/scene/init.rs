@@ -24,21 +24,21 @@ settings! {
 /// opaque hides what lies behind it (docs/benchmarks.md). Still denser ones score higher yet, but lose more when they are split.
 /// Discs score as round ones do, with more Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Start {
+pub struct Initialization {
     /// The opacity of each first Gaussian.
     opacity: f64 = 0.2 => Rule::Number(Excluded(0.0), Excluded(1.0));
     /// Standard deviation in units of the root mean squared distance to the three nearest points.
     scale: f64 = 0.8 => Rule::from_to(1e-3, 1e3);
     /// The thinnest axis of a disc in units of its longest: neighbours that lie on a surface make discs along it. 1: all are
     /// round.
-    thinnest: f64 = 1.0 => Rule::from_to(1e-3, 1.0);
+    min_axis_ratio: f64 = 1.0 => Rule::from_to(1e-3, 1.0);
 }
 }
 
-impl Start {
+impl Initialization {
     /// 3DGS's, and the paper's.
     #[cfg(feature = "testing")]
-    pub const PAPER: Self = Self { opacity: 0.1, scale: 1.0, thinnest: 1.0 };
+    pub const PAPER: Self = Self { opacity: 0.1, scale: 1.0, min_axis_ratio: 1.0 };
 
     /// Refuses values that make no Gaussian, naming the field.
     ///
@@ -50,10 +50,10 @@ impl Start {
 }
 
 /// The least mean squared distance to the neighbours, world units squared (3DGS).
-const LEAST_SQUARED_DISTANCE: f64 = 1e-7;
+const MIN_SQUARED_DISTANCE: f64 = 1e-7;
 
 /// A point that no track says the views of is looked for in no more.
-pub const MOST_VIEWS: usize = 64;
+pub const MAX_VIEWS: usize = 64;
 
 /// The standard deviation of a Gaussian that has no neighbour at all, world units.
 const LONE_SCALE: f64 = 0.01;
@@ -67,12 +67,12 @@ impl Gaussians {
     /// single position has the standard deviation 0.01. Features are uniform in [0, 1), drawn from `seed` (LITA-GS).
     ///
     /// # Errors
-    /// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or `Start::check` refuses.
+    /// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or `Initialization::check` refuses.
     pub fn from_points(
         positions: &[DVec3],
         colors: &[Vec3],
         shape: impl Into<Shape>,
-        start: &Start,
+        start: &Initialization,
         seed: u64,
     ) -> Result<Self> {
         start.check()?;
@@ -122,7 +122,7 @@ struct Ellipsoid {
 }
 
 /// What each point's Gaussian covers.
-fn ellipsoids(positions: &[DVec3], start: &Start) -> Vec<Ellipsoid> {
+fn ellipsoids(positions: &[DVec3], start: &Initialization) -> Vec<Ellipsoid> {
     // The nearest position is the point itself.
     const NEAREST: usize = 1 + 3;
     /// So many tell the direction of a surface.
@@ -146,12 +146,12 @@ fn ellipsoids(positions: &[DVec3], start: &Start) -> Vec<Ellipsoid> {
         let others = &around[1..found];
         let nearest = &others[..others.len().min(NEAREST - 1)];
         let mean = nearest.iter().map(|(squared, _)| squared).sum::<f64>() / nearest.len() as f64;
-        let scale = start.scale * mean.max(LEAST_SQUARED_DISTANCE).sqrt();
-        if start.thinnest == 1.0 {
+        let scale = start.scale * mean.max(MIN_SQUARED_DISTANCE).sqrt();
+        if start.min_axis_ratio == 1.0 {
             return round(scale);
         }
         let (rotation, spread) = spread(others.iter().map(|(_, other)| *other - *position));
-        let axes = spread.map(|axis| axis.max(start.thinnest));
+        let axes = spread.map(|axis| axis.max(start.min_axis_ratio));
         // The area of the disc, the product of its two longer axes, stays that of the round one.
         let area = axes.element_product() / axes.min_element();
         Ellipsoid { rotation, scales: axes * (scale / area.sqrt()) }
@@ -180,7 +180,7 @@ fn spread(directions: impl Iterator<Item = DVec3>) -> (DQuat, DVec3) {
 /// Each lies at a uniform place of a random camera's image, at a depth that is log-uniform between half the
 /// capture's radius and five times it (radius: the greatest distance of a camera from the cameras' mean; 1 where all
 /// cameras are in one place). A position that a second camera sees is preferred: its depth can be learned. No more than
-/// [`MOST_VIEWS`] cameras are asked, so that the time is proportional to `count`.
+/// [`MAX_VIEWS`] cameras are asked, so that the time is proportional to `count`.
 pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
     const TRIES: u64 = 16;
     const DRAWS_PER_TRY: u64 = 4;
@@ -207,7 +207,7 @@ pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
         // Views that follow each other show the same: the second camera is found among the first ones most often.
         let seen_twice = |(place, position): &(usize, DVec3)| {
             let (before, from) = cameras.split_at(*place);
-            let seen = from.iter().chain(before.iter().rev()).take(MOST_VIEWS);
+            let seen = from.iter().chain(before.iter().rev()).take(MAX_VIEWS);
             seen.filter(|camera| camera.sees(*position).is_some()).nth(1).is_some()
         };
         let (_, position) =
@@ -230,11 +230,11 @@ fn radius(cameras: &[Camera]) -> f64 {
 /// The colour of each point: the mean of what the training views that see it show in their targets, RGB.
 ///
 /// A point is seen by the training views of its track; without any, by the training views that it lies inside of, of
-/// [`MOST_VIEWS`] that cover the scene (`Camera::covering`). A point that none of them sees gets the mean grey of the targets. `target` gives the target of a view (an index
+/// [`MAX_VIEWS`] that cover the scene (`Camera::covering`). A point that none of them sees gets the mean grey of the targets. `target` gives the target of a view (an index
 /// into `views`), or nothing where there is none; it is asked once per training view, in order, so it may compute.
 ///
 /// The time is proportional to the pixels of the views and the length of all tracks; a point without a track counts as one of
-/// [`MOST_VIEWS`] views.
+/// [`MAX_VIEWS`] views.
 ///
 /// # Errors
 /// Those of `target`.
@@ -301,7 +301,7 @@ impl Candidates {
             untracked: vec![],
             covers: vec![false; views.len()],
         };
-        for place in Camera::covering(&cameras, MOST_VIEWS) {
+        for place in Camera::covering(&cameras, MAX_VIEWS) {
             own.covers[training[place]] = true;
         }
         for (number, (point, is_tracked)) in (0..).zip(points.iter().zip(is_tracked)) {
@@ -400,7 +400,7 @@ mod tests {
         };
         assert_eq!(pairs(20), 10 * 2 + 20 * 20, "all views of a small set");
         for count in [100, 300] {
-            assert_eq!(pairs(count), 10 * 2 + 20 * MOST_VIEWS, "{count} views");
+            assert_eq!(pairs(count), 10 * 2 + 20 * MAX_VIEWS, "{count} views");
         }
         let colors = colors_from_views(&points, &views(300), |index| {
             Ok(Some(Image::from_fn(10, 10, |_, _| [index as f32; 3])))

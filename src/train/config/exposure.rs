@@ -12,7 +12,7 @@ use crate::{Error, Result};
 /// Whether something is learned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Learning {
+pub enum OnOff {
     /// It is not there: no buffer, no kernel.
     #[default]
     Off,
@@ -20,7 +20,7 @@ pub enum Learning {
     On,
 }
 
-impl FromStr for Learning {
+impl FromStr for OnOff {
     type Err = Error;
 
     fn from_str(name: &str) -> Result<Self> {
@@ -38,7 +38,7 @@ settings! {
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExposureConfig {
     /// on: learn gain and bias of each channel of each training view, where photographs are not equally bright; off.
-    learn: Learning = Learning::Off => Rule::OneOf(&["on", "off"]), "--exposure on|off";
+    learn: OnOff = OnOff::Off => Rule::OneOf(&["on", "off"]), "--exposure on|off";
     /// Learn exposures from where this table has them: `name,ev` or `name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b`.
     start: Option<PathBuf> = None, "exposures.csv of the dataset" => Rule::PATH, "--exposures FILE";
 }

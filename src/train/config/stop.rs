@@ -66,7 +66,7 @@ impl StopConfig {
 
 impl TrainConfig {
     /// The length of the settling phase: that of the schedule, or a third of a run that is short for it.
-    pub(crate) fn settling_steps(&self) -> u64 {
-        self.schedule.settle_steps.min(self.steps / 3)
+    pub(crate) fn effective_cooldown_steps(&self) -> u64 {
+        self.schedule.cooldown_steps.min(self.steps / 3)
     }
 }

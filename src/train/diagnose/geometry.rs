@@ -13,11 +13,11 @@ use crate::splats::scene::init;
 /// Random points in front of the cameras where the dataset has none.
 const RANDOM_POINTS: usize = 2000;
 /// More points tell no more of exposures.
-const MOST_POINTS: usize = 20_000;
+const MAX_POINTS: usize = 20_000;
 /// A point's brightness is the mean over a square of pixels that reaches so far from its middle.
 const REACH: i64 = 2;
 /// A view with fewer shared points has no known exposure.
-const LEAST_SHARED: usize = 12;
+const MIN_SHARED: usize = 12;
 
 /// What the cameras of the training views share.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -47,7 +47,7 @@ impl Shared {
         } else {
             &dataset.points
         };
-        let stride = points.len().div_ceil(MOST_POINTS).max(1);
+        let stride = points.len().div_ceil(MAX_POINTS).max(1);
         let points: Vec<&Point> = points.iter().step_by(stride).collect();
         let inside = |point: &&Point| -> Vec<usize> {
             let sees = |view: &View| pixel(&view.camera, point).is_some();
@@ -165,7 +165,7 @@ fn exposures(points: &[Vec<(usize, f64)>], view_count: usize) -> Vec<Option<f64>
                 of_view[view].push(light - level);
             }
         }
-        let known = |of: Vec<f64>| if of.len() < LEAST_SHARED { None } else { median(of) };
+        let known = |of: Vec<f64>| if of.len() < MIN_SHARED { None } else { median(of) };
         exposures = of_view.into_iter().map(known).collect();
         let known: Vec<f64> = exposures.iter().copied().flatten().collect();
         let mean = known.iter().sum::<f64>() / known.len().max(1) as f64;

@@ -20,12 +20,12 @@ const FLAT: f64 = 0.25;
 /// Bins of brightness that the line goes through.
 const BINS: usize = 24;
 /// A bin with fewer flat patches says nothing.
-const LEAST_PATCHES: usize = 12;
+const MIN_PATCHES: usize = 12;
 /// Patches with less than this fraction of the variance that whole codes add are flat to the code:
 /// compression, or too few codes, took their noise.
 const DEAD: f64 = 0.25;
 /// Where more values than this are black, noise is cut off at zero and looks smaller than it is.
-const MOST_ZEROS: f64 = 0.002;
+const MAX_ZEROS: f64 = 0.002;
 
 /// The noise of a channel in linear light, white at 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
@@ -111,11 +111,11 @@ pub(super) fn fit(mut patches: Vec<Patch>) -> Option<Noise> {
     // A plane that is not in codes has no dead patches.
     patches.retain(|patch| patch.variance >= DEAD * patch.quantization);
     patches.sort_unstable_by(|a, b| a.signal.total_cmp(&b.signal));
-    let per_bin = patches.len().div_ceil(BINS).max((LEAST_PATCHES as f64 / FLAT) as usize);
+    let per_bin = patches.len().div_ceil(BINS).max((MIN_PATCHES as f64 / FLAT) as usize);
     let mut bins: Vec<Bin> = patches.chunks_mut(per_bin).filter_map(Bin::of).collect();
     // Where noise is cut off everywhere, what is left of it is the best that there is.
-    if bins.iter().any(|bin| bin.zeros <= MOST_ZEROS) {
-        bins.retain(|bin| bin.zeros <= MOST_ZEROS);
+    if bins.iter().any(|bin| bin.zeros <= MAX_ZEROS) {
+        bins.retain(|bin| bin.zeros <= MAX_ZEROS);
     }
     (!bins.is_empty()).then(|| line(&bins))
 }
@@ -132,7 +132,7 @@ impl Bin {
     fn of(patches: &mut [Patch]) -> Option<Self> {
         let zeros = patches.iter().map(|patch| patch.zeros).sum::<f64>() / patches.len() as f64;
         let flat = (patches.len() as f64 * FLAT) as usize;
-        if flat < LEAST_PATCHES {
+        if flat < MIN_PATCHES {
             return None;
         }
         patches.sort_unstable_by(|a, b| a.texture.total_cmp(&b.texture));

@@ -12,7 +12,7 @@ const REGIONS: [usize; 2] = [8, 6];
 
 /// What is measured of one photograph; fractions are over the values of all channels.
 #[derive(Clone, Debug)]
-pub(super) struct Measured {
+pub(super) struct PhotographStatistics {
     pub(super) statistics: Statistics,
     /// The mean luminance in linear light.
     pub(super) light: f64,
@@ -29,7 +29,7 @@ pub(super) struct Measured {
     pub(super) checksum: u64,
 }
 
-impl Measured {
+impl PhotographStatistics {
     /// `counted` are the values of the pixels that count.
     pub(super) fn of(image: &Image, counted: &[f32]) -> Self {
         let values = counted.len().max(1) as f64;

@@ -11,19 +11,19 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::tone::ToneCurve;
 use crate::splats::scene::{Features, Shape, width};
 use crate::train::TrainConfig;
-use crate::train::layers::{Layer, Origin};
+use crate::train::layers::{Origin, SettingsLayer};
 use crate::{Error, Result};
 
 /// Targets less than this many times brighter than their photographs are the photographs: the rule of `--curve auto`.
-const LEAST_LIFT: f64 = 1.5;
+const MIN_BRIGHTENING: f64 = 1.5;
 /// Targets whose exposures are spread by more stops are worth learning them. A chair of which the views differ by 1.2 stops,
 /// all but .02 of which the curve takes away, lost .4 dB by it.
-const LEAST_SPREAD: f64 = 0.3;
+const MIN_SPREAD: f64 = 0.3;
 /// From this much noise in the average over the views, of encoded values, a denoiser pays (docs/benchmarks.md).
-const LEAST_NOISE: f64 = 0.01;
+const MIN_NOISE: f64 = 0.01;
 /// Light that varies by more stops between large regions is worth an illumination of its own. A hall with one bright window
 /// has 2.6; up to 1 the network bought .2 dB at most for two to four times the time.
-const LEAST_UNEVENNESS: f64 = 3.0;
+const MIN_UNEVENNESS: f64 = 3.0;
 /// Each SH coefficient of a channel is to be seen by so many views.
 const VIEWS_PER_COEFFICIENT: f64 = 2.0;
 /// A degree that the schedule reaches later in the run does not settle.
@@ -39,7 +39,7 @@ const COPIES: f64 = 4.0 * 1.5;
 /// A part of the model: whether it is on, and why.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Switch {
+pub struct PlannedPart {
     /// Whether the model has it.
     pub on: bool,
     /// The reason with its figure, a sentence.
@@ -50,7 +50,7 @@ pub struct Switch {
 /// A number of the model, and why it is that.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Number {
+pub struct PlannedNumber {
     /// The number.
     pub value: u64,
     /// The reason with its figure, a sentence.
@@ -98,21 +98,21 @@ pub struct Plan {
     /// Which dataset it is for.
     pub dataset: PlannedViews,
     /// A tone curve makes the targets; else the photographs are.
-    pub curve: Switch,
+    pub curve: PlannedPart,
     /// Each view's exposure is learned.
-    pub exposure: Switch,
+    pub exposure: PlannedPart,
     /// [`Part::Denoiser`](crate::train::Part::Denoiser).
-    pub denoiser: Switch,
+    pub denoiser: PlannedPart,
     /// [`Part::Tonemapper`](crate::train::Part::Tonemapper).
-    pub tonemapper: Switch,
+    pub tonemapper: PlannedPart,
     /// [`Part::Structure`](crate::train::Part::Structure).
-    pub structure: Switch,
+    pub structure: PlannedPart,
     /// [`Part::Depth`](crate::train::Part::Depth).
-    pub depth: Switch,
+    pub depth: PlannedPart,
     /// Highest degree of the spherical harmonics.
-    pub sh_degree: Number,
+    pub sh_degree: PlannedNumber,
     /// Density control stops growing here.
-    pub max_gaussians: Number,
+    pub max_gaussians: PlannedNumber,
 }
 
 impl Plan {
@@ -143,8 +143,8 @@ impl Plan {
     ///
     /// # Errors
     /// A number is out of its range, in a plan that was written by hand.
-    pub(in crate::train) fn layer(&self) -> Result<Layer> {
-        let mut layer = Layer::default();
+    pub(in crate::train) fn layer(&self) -> Result<SettingsLayer> {
+        let mut layer = SettingsLayer::default();
         let mut say = |key: &str, value: Value| layer.push(key, value, Origin::Plan);
         if !self.curve.on {
             say("tone.curve", ToneCurve::None.name().into())?;
@@ -165,11 +165,11 @@ impl Plan {
     /// Every decision: its name, what was decided, and why.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn decisions(&self) -> Vec<(&'static str, String, &str)> {
-        let switch = |name, switch: &'_ Switch| {
+        let switch = |name, switch: &'_ PlannedPart| {
             let on = if switch.on { "on" } else { "off" };
             (name, on.to_owned())
         };
-        let number = |name, number: &'_ Number| (name, number.value.to_string());
+        let number = |name, number: &'_ PlannedNumber| (name, number.value.to_string());
         let named = [
             (switch("curve", &self.curve), &self.curve.why),
             (switch("exposure", &self.exposure), &self.exposure.why),
@@ -232,14 +232,14 @@ impl Plan {
     }
 }
 
-fn curve(scene: &SceneDiagnosis) -> Switch {
-    let SceneDiagnosis { lift, mean_luminance, .. } = scene;
-    let on = *lift >= LEAST_LIFT;
+fn curve(scene: &SceneDiagnosis) -> PlannedPart {
+    let SceneDiagnosis { brightening, mean_luminance, .. } = scene;
+    let on = *brightening >= MIN_BRIGHTENING;
     let verdict = if on { "dark" } else { "well lit" };
     let why = format!(
-        "{verdict}: a target is {lift:.1} times as bright as its photograph (mean luminance {mean_luminance:.3}, a curve from {LEAST_LIFT})"
+        "{verdict}: a target is {brightening:.1} times as bright as its photograph (mean luminance {mean_luminance:.3}, a curve from {MIN_BRIGHTENING})"
     );
-    Switch { on, why }
+    PlannedPart { on, why }
 }
 
 /// How far the exposures of the targets lie apart.
@@ -260,49 +260,50 @@ impl Spread {
             "of the gain each view asks for"
         };
         Self {
-            is_wide: left >= LEAST_SPREAD && views > 2,
+            is_wide: left >= MIN_SPREAD && views > 2,
             found: format!(
                 "exposures are spread by {spread:.2} stops {by}, of which the targets keep {left:.2}"
             ),
         }
     }
 
-    fn exposure(&self) -> Switch {
-        Switch { on: self.is_wide, why: format!("{} (learned from {LEAST_SPREAD})", self.found) }
+    fn exposure(&self) -> PlannedPart {
+        PlannedPart { on: self.is_wide, why: format!("{} (learned from {MIN_SPREAD})", self.found) }
     }
 
-    fn structure(&self, scene: &SceneDiagnosis) -> Switch {
-        let on = self.is_wide && scene.target_noise < LEAST_NOISE;
-        Switch { on, why: format!("{}: edges are the same in all of them", self.found) }
+    fn structure(&self, scene: &SceneDiagnosis) -> PlannedPart {
+        let on = self.is_wide && scene.target_noise < MIN_NOISE;
+        PlannedPart { on, why: format!("{}: edges are the same in all of them", self.found) }
     }
 }
 
-fn denoiser(scene: &SceneDiagnosis) -> Switch {
+fn denoiser(scene: &SceneDiagnosis) -> PlannedPart {
     let SceneDiagnosis { target_noise, views_per_point, .. } = scene;
-    let on = *target_noise >= LEAST_NOISE;
+    let on = *target_noise >= MIN_NOISE;
     let why = format!(
-        "the average of {views_per_point:.0} views leaves noise of {target_noise:.3} in the target (a network from {LEAST_NOISE})"
+        "the average of {views_per_point:.0} views leaves noise of {target_noise:.3} in the target (a network from {MIN_NOISE})"
     );
-    Switch { on, why }
+    PlannedPart { on, why }
 }
 
-fn tonemapper(scene: &SceneDiagnosis, learns_exposures: bool) -> Switch {
+fn tonemapper(scene: &SceneDiagnosis, learns_exposures: bool) -> PlannedPart {
     let unevenness = scene.unevenness;
     // A learned exposure does not describe the dark photographs, to which the tonemapper holds the model.
-    let on = unevenness >= LEAST_UNEVENNESS && scene.lift >= LEAST_LIFT && !learns_exposures;
+    let on =
+        unevenness >= MIN_UNEVENNESS && scene.brightening >= MIN_BRIGHTENING && !learns_exposures;
     let why = format!(
-        "light varies by {unevenness:.1} stops between large regions (an illumination of its own from {LEAST_UNEVENNESS}, in dark sets)"
+        "light varies by {unevenness:.1} stops between large regions (an illumination of its own from {MIN_UNEVENNESS}, in dark sets)"
     );
-    Switch { on, why }
+    PlannedPart { on, why }
 }
 
-fn depth(diagnosis: &Diagnosis) -> Switch {
+fn depth(diagnosis: &Diagnosis) -> PlannedPart {
     let (maps, views) = (diagnosis.depth_maps, diagnosis.views.len());
-    Switch { on: maps > 0, why: format!("{maps} of {views} training views have a depth map") }
+    PlannedPart { on: maps > 0, why: format!("{maps} of {views} training views have a depth map") }
 }
 
 /// The highest degree whose coefficients are seen often enough and trained long enough.
-fn sh_degree(scene: &SceneDiagnosis, config: &TrainConfig) -> Number {
+fn sh_degree(scene: &SceneDiagnosis, config: &TrainConfig) -> PlannedNumber {
     let seen = (scene.views_per_point / VIEWS_PER_COEFFICIENT).sqrt() - 1.0;
     let seen = seen.max(0.0) as u32;
     let last = (config.steps as f64 * LATEST_DEGREE) as u64;
@@ -318,7 +319,7 @@ fn sh_degree(scene: &SceneDiagnosis, config: &TrainConfig) -> Number {
             "a point is seen by {views:.0} views, {VIEWS_PER_COEFFICIENT} are wanted for each of the (degree + 1)^2 coefficients"
         )
     };
-    Number { value: value.into(), why }
+    PlannedNumber { value: value.into(), why }
 }
 
 fn max_gaussians(
@@ -326,7 +327,7 @@ fn max_gaussians(
     config: &TrainConfig,
     sh_degree: u64,
     memory: u64,
-) -> Number {
+) -> PlannedNumber {
     // Features are 8 floats at most, which the headroom covers.
     let shape = Shape { sh_degree: sh_degree as u32, features: Features::NONE };
     let pixels = diagnosis.pixels as f64;
@@ -342,7 +343,7 @@ fn max_gaussians(
     } else {
         format!("one for {PIXELS_PER_GAUSSIAN} of the {pixels:.0} pixels to train on")
     };
-    Number { value: wanted.min(fitting).min(limit).round().max(1.0) as u64, why }
+    PlannedNumber { value: wanted.min(fitting).min(limit).round().max(1.0) as u64, why }
 }
 
 /// The hash FNV-1a, which plans hold: equal bytes have equal hashes, on every machine.

@@ -115,7 +115,7 @@ fn coincident(count: usize) -> Result<Hostile> {
 }
 
 /// So many faint ones on a pixel of an image of one tile, one behind the other.
-fn crowd(count: usize) -> Result<Hostile> {
+fn splats_per_tile(count: usize) -> Result<Hostile> {
     let mut own = Hostile::gaussians(count, [16, 8], |gaussians, i| {
         let depth = 1.0 + 4.0 * i as f32 / 100_000.0;
         gaussians.means_mut()[i] = Vec3::new(0.0, 0.0, depth);
@@ -266,13 +266,13 @@ pub(super) const CASES: &[Case] = &[
         "2000 on one pixel",
         "blended; those behind a full pixel have no gradient",
         Learns,
-        |_| crowd(2000),
+        |_| splats_per_tile(2000),
     ),
     large(case(
         "100 000 on one pixel",
         "blended; those behind a full pixel have no gradient",
         Learns,
-        |_| crowd(100_000),
+        |_| splats_per_tile(100_000),
     )),
     quick(case("no Gaussian", "black", Trains, |_| {
         size(32, 24).map(|mut own| {

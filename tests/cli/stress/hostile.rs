@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use glam::{DVec2, DVec3, Vec3};
 
 use nightsplat::base::random::Stream;
-use nightsplat::camera::{Camera, Frame};
+use nightsplat::camera::{Camera, TrainingFrame};
 use nightsplat::cli::bench::scene;
 use nightsplat::loss::exposure::{Affine, table};
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
@@ -14,7 +14,7 @@ use nightsplat::photographs::dataset::{Dataset, Point, Split, View};
 use nightsplat::photographs::image::{Image, linear_from_srgb};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::scene::Gaussians;
-use nightsplat::train::{Learning, TrainConfig};
+use nightsplat::train::{OnOff, TrainConfig};
 use nightsplat::{Error, Result};
 
 /// A dataset, the first Gaussians where it does not say them, and which of these the case is about.
@@ -35,10 +35,11 @@ const NEIGHBOURS: usize = 12;
 
 /// Steps that do the same work, in the world, without density control.
 fn config() -> TrainConfig {
-    let mut config = TrainConfig { steps: STEPS, frame: Some(Frame::WORLD), ..TrainConfig::bare() };
+    let mut config =
+        TrainConfig { steps: STEPS, frame: Some(TrainingFrame::WORLD), ..TrainConfig::bare() };
     config.tone = ToneSettings::new(ToneCurve::Ap3);
     config.schedule.sh_degree_interval = 1;
-    config.schedule.boost = 1.0;
+    config.schedule.initial_rate_factor = 1.0;
     config.schedule.densify_after = i64::MAX as u64;
     config.schedule.resolution_steps = [0, 0];
     config
@@ -152,7 +153,7 @@ impl Hostile {
         other.name = "view without gain".to_owned();
         table::save(&path, &[(self.dataset.views[0].name.clone(), affine)])?;
         self.dataset.views.push(other);
-        self.config.exposure.learn = Learning::On;
+        self.config.exposure.learn = OnOff::On;
         self.config.exposure.start = Some(path);
         self.files = Some(files);
         Ok(self)

@@ -13,7 +13,7 @@ use super::{load, names, view};
 use crate::common::command::run;
 
 /// What `tone apply` says on standard error of a dataset; one line for each remark.
-fn said_of(root: &Path) -> String {
+fn message_of(root: &Path) -> String {
     run(&format!("tone apply {} --json", root.display()), 0).1
 }
 
@@ -32,8 +32,11 @@ fn of_several_models_the_one_that_places_the_most_photographs_is_taken_and_said(
     assert_eq!(dataset.views.len(), 9);
     assert_eq!(dataset.points.len(), 20);
     assert!(dataset.points[0].views.len() > 2);
-    let said = said_of(root);
-    assert!(said.contains("3 models, of 2, 9, 0 photographs; sparse/1, the largest"), "{said}");
+    let message = message_of(root);
+    assert!(
+        message.contains("3 models, of 2, 9, 0 photographs; sparse/1, the largest"),
+        "{message}"
+    );
 }
 
 #[test]
@@ -45,7 +48,7 @@ fn photographs_without_a_pose_and_pictures_that_are_not_read_are_counted() {
     fs::write(root.join("images/IMG_1.HEIC"), "").unwrap();
     fs::write(root.join("images/clip.mp4"), "").unwrap();
     fs::write(root.join("images/notes.txt"), "").unwrap();
-    let said = said_of(root);
+    let message = message_of(root);
     let parts = [
         "6 of 9 photographs have no pose",
         "v03.png the first",
@@ -53,12 +56,15 @@ fn photographs_without_a_pose_and_pictures_that_are_not_read_are_counted() {
         "1 .heic, 1 .mp4",
         "heif-convert",
     ];
-    assert!(parts.iter().all(|part| said.contains(part)) && !said.contains("txt"), "{said}");
+    assert!(
+        parts.iter().all(|part| message.contains(part)) && !message.contains("txt"),
+        "{message}"
+    );
     // Where all have one, there is nothing to say.
     model(9).write_text(&root.join("sparse/0"));
     fs::remove_file(root.join("images/IMG_1.HEIC")).unwrap();
     fs::remove_file(root.join("images/clip.mp4")).unwrap();
-    assert_eq!(said_of(root), "");
+    assert_eq!(message_of(root), "");
 }
 
 #[test]
@@ -233,6 +239,6 @@ fn what_a_pinhole_cannot_show_of_a_fisheye_is_cropped_and_said() {
     assert!((corner.length().atan().to_degrees() - 60.0).abs() < 0.01, "{camera:?}");
     let (shown, out) = (root.display(), root.join("run"));
     let train = format!("train {shown} --steps 1 --undistort --out {}", out.display());
-    let said = run(&train, 0).1;
-    assert!(said.contains("fisheye") && said.contains("60 degrees"), "{said}");
+    let message = run(&train, 0).1;
+    assert!(message.contains("fisheye") && message.contains("60 degrees"), "{message}");
 }

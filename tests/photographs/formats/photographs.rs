@@ -122,8 +122,8 @@ fn heic_is_refused_with_what_converts_it_and_listed_where_it_is_not_read() {
         3,
         &["a.heic", "HEIC", "heif-convert", "sips"],
     );
-    let (_, said) = run(&format!("tone apply {}", root.display()), 0);
-    assert!(said.contains("not read: 1 .heic") && said.contains("heif-convert"), "{said}");
+    let (_, message) = run(&format!("tone apply {}", root.display()), 0);
+    assert!(message.contains("not read: 1 .heic") && message.contains("heif-convert"), "{message}");
 }
 
 /// A JPEG of one grey with an orientation in its Exif.
@@ -195,8 +195,8 @@ fn up_is_that_of_the_photographs_as_people_see_them() {
     // A phone held upright stores its pictures lying on a side: orientation 6, cameras of what is stored.
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
-    let aside = DAffine3::from_mat3(DMat3::from_cols(DVec3::NEG_Y, DVec3::X, DVec3::Z));
-    for (orientation, turn) in [(1, DAffine3::IDENTITY), (6, aside)] {
+    let backup = DAffine3::from_mat3(DMat3::from_cols(DVec3::NEG_Y, DVec3::X, DVec3::Z));
+    for (orientation, turn) in [(1, DAffine3::IDENTITY), (6, backup)] {
         let mut frames = vec![];
         for index in 0..9 {
             let file = format!("images/{}.jpg", name(index));

@@ -71,7 +71,7 @@ fn dng(width: u16, height: u16, pixel: impl Fn(u16, u16) -> [u16; 3]) -> Vec<u8>
     ];
     entries.sort_by_key(|(tag, _)| *tag);
     let directory = 8 + pixels.len();
-    let mut behind = directory + 2 + 12 * entries.len() + 4;
+    let mut after = directory + 2 + 12 * entries.len() + 4;
     let mut file = [b"II*\0".as_slice(), &(directory as u32).to_le_bytes(), &pixels].concat();
     file.extend((entries.len() as u16).to_le_bytes());
     let mut values = vec![];
@@ -83,9 +83,9 @@ fn dng(width: u16, height: u16, pixel: impl Fn(u16, u16) -> [u16; 3]) -> Vec<u8>
             value.resize(4, 0);
             file.extend(value);
         } else {
-            file.extend((behind as u32).to_le_bytes());
+            file.extend((after as u32).to_le_bytes());
             value.resize(value.len().next_multiple_of(2), 0);
-            behind += value.len();
+            after += value.len();
             values.extend(value);
         }
     }

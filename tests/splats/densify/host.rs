@@ -3,13 +3,13 @@
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use nightsplat::camera::{Camera, CameraModel, Patch};
 use nightsplat::gpu::{Gpu, Reference};
-use nightsplat::kernels::fate::{KEY_KEEP, KEY_PRUNE};
+use nightsplat::kernels::densify_action::{KEY_KEEP, KEY_PRUNE};
 use nightsplat::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
 use nightsplat::splats::densify::{
     Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, LARGEST_CHANGE, Round,
 };
-use nightsplat::splats::halves::StorageFormat;
 use nightsplat::splats::optimizer::Moments;
+use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::{DeviceGaussians, Features, GaussianSlice, Layout, Shape, width};
 
 /// Four features and SH of degree 1.
@@ -205,7 +205,7 @@ impl Host {
         let n = self.count;
         let (gaussian_count, column_count, feature_count) =
             (n as u32, COLUMNS as u32, FEATURES as u32);
-        let (mut keys, mut ids, mut tally) = (vec![0; n], vec![0; n], vec![0; 4]);
+        let (mut keys, mut ids, mut counters) = (vec![0; n], vec![0; n], vec![0; 4]);
         let params = densify_score::Params {
             gaussian_count,
             column_count,
@@ -223,15 +223,15 @@ impl Host {
             visit_counts: &self.visit_counts,
             keys: &mut keys,
             ids: &mut ids,
-            tally: &mut tally,
+            counters: &mut counters,
             cameras: &cameras,
         };
         densify_score::Kernel::run(&params, &densify_score::Constants::default(), slices);
-        assert_eq!(tally[0] as usize, keys.iter().filter(|&&key| key < KEY_KEEP).count());
-        assert_eq!(tally[1] as usize, keys.iter().filter(|&&key| key == KEY_PRUNE).count());
+        assert_eq!(counters[0] as usize, keys.iter().filter(|&&key| key < KEY_KEEP).count());
+        assert_eq!(counters[1] as usize, keys.iter().filter(|&&key| key == KEY_PRUNE).count());
         ids.sort_by_key(|&id| keys[id as usize]);
         keys.sort_unstable();
-        let (mut fates, mut offspring_counts) = (vec![0; n], vec![0; n]);
+        let (mut actions, mut child_counts) = (vec![0; n], vec![0; n]);
         let params = densify_decide::Params {
             gaussian_count,
             first_gaussian: 0,
@@ -239,23 +239,23 @@ impl Host {
             max_gaussians: settings.max_gaussians.min(u32::MAX as usize) as u32,
             rounds_left: round.rounds_left as u32,
             split_log_scale: settings.split_scale.ln() as f32,
-            most_added: u32::MAX,
+            max_added: u32::MAX,
         };
         let slices = densify_decide::Slices {
             parameters: &self.parameters,
             sorted_keys: &keys,
             sorted_ids: &ids,
-            tally: &mut tally,
-            fates: &mut fates,
-            offspring_counts: &mut offspring_counts,
+            counters: &mut counters,
+            actions: &mut actions,
+            child_counts: &mut child_counts,
         };
         densify_decide::Kernel::run(&params, &densify_decide::Constants { conserving }, slices);
         let mut count = 0;
-        let offsets: Vec<u32> = offspring_counts
+        let offsets: Vec<u32> = child_counts
             .iter()
-            .map(|offspring| {
-                count += offspring;
-                count - offspring
+            .map(|child_count| {
+                count += child_count;
+                count - child_count
             })
             .collect();
         let new_gaussian_count = count;
@@ -273,7 +273,7 @@ impl Host {
         };
         let slices = densify_scatter::Slices {
             parameters: &self.parameters,
-            fates: &fates,
+            actions: &actions,
             offsets: &offsets,
             new_parameters: &mut new_parameters,
         };
@@ -289,7 +289,7 @@ impl Host {
             };
             let slices = densify_moments::Slices {
                 moments: bytemuck::cast_slice(moments),
-                fates: &fates,
+                actions: &actions,
                 offsets: &offsets,
                 new_moments: bytemuck::cast_slice_mut(&mut new_moments),
             };

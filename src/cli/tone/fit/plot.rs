@@ -12,7 +12,7 @@ const POINTS: usize = 200;
 /// Columns of the pairs' own lines.
 const BINS: usize = 64;
 /// Below this share of the pixels, a column's mean says little.
-const LEAST_COLUMN: f64 = 1e-4;
+const MIN_COLUMN: f64 = 1e-4;
 /// What the page's style would say.
 const COLORS: [(&str, &str); 8] = [
     ("--text", "#23211e"),
@@ -46,8 +46,7 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
     let end = end.map_or(1.0, |column| column.x);
     let line = |name: &str, deviations: f64| {
         let columns = pooled.columns.iter();
-        let columns =
-            columns.filter(|column| column.count > LEAST_COLUMN * count && column.x <= end);
+        let columns = columns.filter(|column| column.count > MIN_COLUMN * count && column.x <= end);
         let point = |column: &crate::photographs::fit::Column| {
             let mean = column.sum_y / column.count;
             let deviation = (column.sum_y2 / column.count - mean * mean).max(0.0).sqrt();

@@ -11,10 +11,10 @@ struct Definitions {
     quantization: [bool; 4],
     /// Huffman codes: those of the DC coefficients, then of the others.
     codes: [[bool; 4]; 2],
-    frame: Option<Frame>,
+    frame: Option<FrameHeader>,
 }
 
-struct Frame {
+struct FrameHeader {
     is_progressive: bool,
     components: Vec<Component>,
 }
@@ -50,9 +50,9 @@ impl Definitions {
                 _ => {}
             }
             let length = u16::from_be_bytes(*rest.first_chunk()?);
-            let (segment, behind) = rest.split_at_checked(length.into())?;
+            let (segment, after) = rest.split_at_checked(length.into())?;
             let segment = segment.get(2..)?;
-            rest = behind;
+            rest = after;
             match marker {
                 0xC0..=0xC2 => self.start_frame(segment, marker == 0xC2, bytes.len())?,
                 0xC4 => self.define_codes(segment)?,
@@ -137,13 +137,13 @@ impl Definitions {
         {
             return None;
         }
-        self.frame = Some(Frame { is_progressive, components });
+        self.frame = Some(FrameHeader { is_progressive, components });
         Some(())
     }
 
     /// SOS: which components the coded data after it brings, and how far.
     fn start_scan(&mut self, segment: &[u8]) -> Option<()> {
-        let Frame { is_progressive, components } = self.frame.as_mut()?;
+        let FrameHeader { is_progressive, components } = self.frame.as_mut()?;
         let (&count, rest) = segment.split_first()?;
         let (selected, &[first, last, bits]) = rest.split_at_checked(2 * usize::from(count))?
         else {
@@ -159,10 +159,10 @@ impl Definitions {
         let reads =
             if *is_progressive { [first == 0 && before == 0, first > 0] } else { [true; 2] };
         let mut blocks = 0;
-        let mut behind = components.iter_mut();
+        let mut after = components.iter_mut();
         for &[id, codes] in selected.as_chunks().0 {
             // In the order of the frame.
-            let component = behind.find(|component| component.id == id)?;
+            let component = after.find(|component| component.id == id)?;
             let places = [codes >> 4, codes & 15].map(usize::from);
             let is_quantized = self.quantization.get(usize::from(component.quantization));
             if !*is_progressive && component.has_scan

@@ -6,7 +6,7 @@
 use std::f64::consts::FRAC_PI_2;
 
 use super::super::real::Real;
-use super::{Constant, Family, Law, White};
+use super::{Constant, Family, OffsetMode, White};
 use crate::kernels::curves::*;
 
 const CODE: &str =
@@ -25,7 +25,7 @@ const FITTED: Family = Family {
     monotone: true,
     bounded: false,
     identifiable: true,
-    law: Law::Added,
+    law: OffsetMode::Added,
     white: White::P90,
     alpha: 0.0,
     gain_c: 0.0,
@@ -126,7 +126,7 @@ families! {
             aliases: &["adaptive_softexp_v2"],
             source: "the paper's adaptive soft exponential",
             bounded: true,
-            law: Law::Rescaled,
+            law: OffsetMode::Rescaled,
             alpha: 0.12,
             gain_c: 3.0,
         },
@@ -424,7 +424,7 @@ families! {
             aliases: &["adaptive_sigmoid"],
             source: MODE,
             bounded: true,
-            law: Law::Rescaled,
+            law: OffsetMode::Rescaled,
             alpha: 0.12,
         },
         |t| t.tanh();
@@ -434,7 +434,7 @@ families! {
         [a = 0.1 in 0.0..1.0] {
             aliases: &["v4_floor", "adaptive_softexp_v4_floor"],
             source: "adaptive tone curves for 3DGS, a mode of its code; the share a of the straight line is our choice, 0 is ASE",
-            law: Law::Rescaled,
+            law: OffsetMode::Rescaled,
             alpha: 0.12,
             gain_c: 3.0,
         },

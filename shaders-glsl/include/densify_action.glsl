@@ -1,15 +1,15 @@
 // What density control does with a Gaussian, and how it gets there.
 
-const uint FATE_PRUNE = 0;  // it goes
-const uint FATE_KEEP  = 1;  // it stays as it is
-const uint FATE_CLONE = 2;  // it stays, and a copy appears at a position drawn from it
-const uint FATE_SPLIT = 3;  // two smaller ones take its place
+const uint ACTION_PRUNE = 0;  // it goes
+const uint ACTION_KEEP  = 1;  // it stays as it is
+const uint ACTION_CLONE = 2;  // it stays, and a copy appears at a position drawn from it
+const uint ACTION_SPLIT = 3;  // two smaller ones take its place
 
 // How many Gaussians come of one.
-uint offspring(uint fate) { return min(fate, 2u); }
+uint child_count(uint action) { return min(action, 2u); }
 
 // Whether a copy is another Gaussian than the one it comes of.
-bool is_new(uint fate, uint copy_index) { return fate == FATE_SPLIT || copy_index > 0; }
+bool is_new(uint action, uint copy_index) { return action == ACTION_SPLIT || copy_index > 0; }
 
 // Keys sort candidates by falling gradient, then those that stay, then those that go.
 const uint KEY_TOP   = 0x7f800000;  // the bits of an infinite gradient: a candidate's key is this less its own bits
@@ -17,11 +17,11 @@ const uint KEY_KEEP  = 0x80000000;
 const uint KEY_PRUNE = 0x80000001;
 
 // Places of the counts of a round.
-const uint TALLY_CANDIDATES = 0;
-const uint TALLY_PRUNED     = 1;
-const uint TALLY_CLONED     = 2;
-const uint TALLY_SPLIT      = 3;
-const uint TALLY_WORDS      = 4;
+const uint COUNTER_CANDIDATES = 0;
+const uint COUNTER_PRUNED     = 1;
+const uint COUNTER_CLONED     = 2;
+const uint COUNTER_SPLIT      = 3;
+const uint COUNTER_WORDS      = 4;
 
 // The paper's split: 1 / 1.6 of the scale (Kerbl et al. 2023).
 const float PAPER_LOG_SPLIT_FACTOR = 0.47000362924573558;  // ln 1.6

@@ -1,23 +1,23 @@
-// The gradients that arrive at a splat, of a kernel that declares `records`, and lanes of SUBGROUP_SIZE.
+// The gradients that arrive at a splat, of a kernel that declares `gradient_records`, and lanes of SUBGROUP_SIZE.
 
 // The record of the Gaussian whose slots are these, summed in slot order.
 //
 // The lanes share the slots of a Gaussian that has many: each sums every SUBGROUP_SIZE-th, then a tree the lanes. The same
 // order every time gives the same bits every time.
-void sum_records(uvec2 slots, out vec3 sum[RECORD_VECTORS]) {
+void sum_gradient_records(uvec2 intersection_ids, out vec3 sum[RECORD_VECTORS]) {
     uint lane = gl_SubgroupInvocationID;
-    bool is_shared = slots.y - slots.x > SHARED_SLOTS;
+    bool is_shared = intersection_ids.y - intersection_ids.x > SHARED_INTERSECTIONS;
     uvec4 sharing = subgroupBallot(is_shared);
 
     // First every lane its own slots, then all together those that are shared: in one loop, for a device that does not
     // jump over branches pays for a second one even where nothing is shared.
-    uvec2 walked = is_shared ? uvec2(0) : slots;
+    uvec2 walked = is_shared ? uvec2(0) : intersection_ids;
     uint owner = lane, stride = 1;
     while (true) {
         vec3 part[RECORD_VECTORS];
         [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) part[k] = vec3(0.0);
         for (uint slot = walked.x; slot < walked.y; slot += stride) {
-            [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) part[k] += records[RECORD_VECTORS * slot + k];
+            [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) part[k] += gradient_records[RECORD_VECTORS * slot + k];
         }
         bool is_alone = stride == 1;
         [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) {
@@ -28,6 +28,6 @@ void sum_records(uvec2 slots, out vec3 sum[RECORD_VECTORS]) {
         owner = subgroupBallotFindLSB(sharing);
         sharing[owner / 32] &= sharing[owner / 32] - 1;
         stride = SUBGROUP_SIZE;
-        walked = subgroupShuffle(slots, owner) + uvec2(lane, 0);
+        walked = subgroupShuffle(intersection_ids, owner) + uvec2(lane, 0);
     }
 }

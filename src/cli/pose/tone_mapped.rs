@@ -10,7 +10,7 @@ use crate::gpu::Gpu;
 use crate::photographs::image::files::{photographs_in, stem};
 use crate::photographs::image::{Image, exif_segment};
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{Measured, ToneSettings, all_black};
+use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 
 /// Lifts the photographs into `folder`, as stored, and returns the gain of the scene. A JPEG stays one and keeps its Exif,
 /// so that COLMAP finds the focal length; everything else becomes PNG.
@@ -25,13 +25,14 @@ pub(super) fn write(gpu: &Gpu, photographs: &[PathBuf], folder: &Path) -> Result
     let progress = progress_bar(2 * photographs.len());
     let mut measured = vec![];
     for path in photographs {
-        measured.push(Measured::of(&Image::load(path)?.data));
+        measured.push(MeasuredPhotograph::of(&Image::load(path)?.data));
         progress.inc(1);
     }
     let root = photographs.first().and_then(|path| path.parent()).unwrap_or(folder);
     let scene = settings.scene(&measured).ok_or_else(|| all_black(root))?;
     for (path, measured) in photographs.iter().zip(&measured) {
-        let image = pseudo_gt.lifted(&Image::load(path)?, &settings.lift(&scene, measured))?;
+        let image =
+            pseudo_gt.tone_mapped(&Image::load(path)?, &settings.tone_mapping(&scene, measured))?;
         let name = path.file_name().unwrap_or_default();
         if is_jpeg(path) {
             image.save_jpeg(folder.join(name), exif_of(path)?.as_deref())?;

@@ -16,9 +16,9 @@ use crate::camera::{Camera, Patch};
 use crate::loss::exposure::{Affine, Exposures};
 use crate::photographs::image::Image;
 use crate::splats::attributes::planes;
-use crate::splats::halves::StorageFormat;
+use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
-use crate::splats::scene::init::Start;
+use crate::splats::scene::init::Initialization;
 use crate::splats::scene::{Gaussians, SH_C0, width};
 
 /// Views that are looked at, at most.
@@ -27,44 +27,45 @@ const VIEWS: usize = 16;
 const PIXELS_EACH: usize = 4;
 /// Pixels of a view for each Gaussian that there is to be, at least: with more of them small views may score lower after
 /// thousands of steps (docs/benchmarks.md).
-const LEAST_PIXELS_EACH: usize = 8;
+const MIN_PIXELS_EACH: usize = 8;
 /// What covers less of a pixel than this says nothing of its depth.
-const LEAST_COVER: f32 = 0.5;
+const MIN_COVER: f32 = 0.5;
 
 /// What a pixel shows, in the frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Sight {
+struct DepthSample {
     position: DVec3,
     color: Vec3,
 }
 
 impl Trainer {
     /// The round behind this step fills, if it is the first and there are few Gaussians.
-    pub(super) fn fills_at(&self, step: u64) -> bool {
-        let (few, count) = (self.config.density.few(), self.model.count());
+    pub(super) fn seeds_at(&self, step: u64) -> bool {
+        let (sparse_threshold, count) =
+            (self.config.density.sparse_threshold(), self.model.count());
         let is_due = step == self.config.schedule.first_round();
-        is_due && count <= few && count < self.filled_count()
+        is_due && count <= sparse_threshold && count < self.seeded_count()
     }
 
     /// As many as there are to be behind that round.
-    pub(super) fn filled_count(&self) -> usize {
+    pub(super) fn seeded_count(&self) -> usize {
         let pixels = |view: &TrainView| Patch::from(&view.patch.camera).pixel_count();
         let most = self.supervision.views.photographs().map(pixels).max().unwrap_or_default();
-        self.config.density.fill.min(most / LEAST_PIXELS_EACH)
+        self.config.density.depth_seeding.min(most / MIN_PIXELS_EACH)
     }
 
     /// As many Gaussians as there are, or as there are to be once a later round has filled.
     pub(super) fn count_once_filled(&self) -> usize {
         let (count, first) = (self.model.count(), self.config.schedule.first_round());
-        let fills = self.step < first && self.fills_at(first) && self.densifies_at(first);
-        if fills { self.filled_count().max(count) } else { count }
+        let fills = self.step < first && self.seeds_at(first) && self.densifies_at(first);
+        if fills { self.seeded_count().max(count) } else { count }
     }
 
     /// Adds Gaussians until there are so many.
     ///
     /// # Errors
     /// A photograph can no longer be read, or the device is out of memory or lost: the model is as it was.
-    pub(super) fn fill(&mut self, wanted: usize) -> Result<()> {
+    pub(super) fn seed_depths(&mut self, wanted: usize) -> Result<()> {
         let more = wanted.saturating_sub(self.model.count());
         if more == 0 {
             return Ok(());
@@ -74,11 +75,12 @@ impl Trainer {
         if !old.means().iter().all(|mean| mean.is_finite()) {
             return Ok(());
         }
-        let sights = self.sights(&old, more)?;
+        let depth_samples = self.depth_samples(&old, more)?;
         let draws = Stream::new(self.config.seed, streams::FILL);
-        let mut order: Vec<usize> = (0..sights.len()).collect();
+        let mut order: Vec<usize> = (0..depth_samples.len()).collect();
         order.sort_by_key(|&i| draws.bits(i as u64));
-        let picked: Vec<Sight> = order.into_iter().take(more).map(|i| sights[i]).collect();
+        let picked: Vec<DepthSample> =
+            order.into_iter().take(more).map(|i| depth_samples[i]).collect();
         tracing::info!(
             "step {}: {} Gaussians at depths of the views beside {}",
             self.step,
@@ -92,7 +94,7 @@ impl Trainer {
     }
 
     /// What pixels of some views show, about [`PIXELS_EACH`] times so many.
-    fn sights(&self, gaussians: &Gaussians, more: usize) -> Result<Vec<Sight>> {
+    fn depth_samples(&self, gaussians: &Gaussians, more: usize) -> Result<Vec<DepthSample>> {
         let settings = RenderSettings {
             shape: 0.into(),
             raw_colors: true,
@@ -104,7 +106,7 @@ impl Trainer {
         let count = self.supervision.views.photographs().count();
         let views = self.supervision.views.photographs().step_by(count.div_ceil(VIEWS).max(1));
         let pixels = PIXELS_EACH * more / count.clamp(1, VIEWS);
-        let mut sights = vec![];
+        let mut depth_samples = vec![];
         for view in views {
             let camera = coarse(&view.patch.camera, pixels);
             let depths = self.depths(&mut renderer, gaussians, &camera)?;
@@ -117,9 +119,9 @@ impl Trainer {
             let neutral = exposure.map(Affine::inverse).map(|inverse| inverse.applied(&target));
             let target = neutral.unwrap_or(target).resized(camera.width, camera.height);
             let mask = self.mask_of(view)?.map(|mask| mask.resized(camera.width, camera.height));
-            sights.extend(seen(&camera, &depths, &target, mask.as_ref()));
+            depth_samples.extend(seen(&camera, &depths, &target, mask.as_ref()));
         }
-        Ok(sights)
+        Ok(depth_samples)
     }
 
     /// In place of colours, the sum of the depths of what covers a pixel by how much it does, and the sum of how much.
@@ -168,9 +170,9 @@ fn coarse(camera: &Camera, pixels: usize) -> Camera {
 }
 
 /// What the pixels show that something covers and no mask hides in part.
-fn seen(camera: &Camera, depths: &Image, target: &Image, mask: Option<&Image>) -> Vec<Sight> {
+fn seen(camera: &Camera, depths: &Image, target: &Image, mask: Option<&Image>) -> Vec<DepthSample> {
     let (pixels, world_from_view) = (depths.pixel_count(), camera.view_from_world.inverse());
-    let sight = |at: usize| {
+    let depth_sample = |at: usize| {
         let cover = depths.data[pixels + at];
         let depth = f64::from(depths.data[at] / cover);
         let (column, row) = (at % camera.width as usize, at / camera.width as usize);
@@ -178,18 +180,20 @@ fn seen(camera: &Camera, depths: &Image, target: &Image, mask: Option<&Image>) -
         let position = world_from_view.transform_point3(camera.in_view(pixel, depth)?);
         let color = Vec3::from_array([0, 1, 2].map(|c| target.data[c * pixels + at]));
         let counts = mask.is_none_or(|mask| mask.data[at] >= 1.0);
-        let is_sound = cover >= LEAST_COVER && position.is_finite() && color.is_finite();
-        (counts && is_sound).then_some(Sight { position, color })
+        let is_sound = cover >= MIN_COVER && position.is_finite() && color.is_finite();
+        (counts && is_sound).then_some(DepthSample { position, color })
     };
-    (0..pixels).filter_map(sight).collect()
+    (0..pixels).filter_map(depth_sample).collect()
 }
 
 /// Gaussians with those of what is seen behind them, which have the features of the nearest.
-fn joined(old: &Gaussians, new: &[Sight], start: &Start) -> Result<Gaussians> {
+fn joined(old: &Gaussians, new: &[DepthSample], start: &Initialization) -> Result<Gaussians> {
     let means = old.means().iter().map(|mean| mean.as_dvec3());
-    let positions: Vec<DVec3> = means.chain(new.iter().map(|sight| sight.position)).collect();
+    let positions: Vec<DVec3> =
+        means.chain(new.iter().map(|depth_sample| depth_sample.position)).collect();
     let colors = std::iter::repeat_n(Vec3::ZERO, old.count);
-    let colors: Vec<Vec3> = colors.chain(new.iter().map(|sight| sight.color)).collect();
+    let colors: Vec<Vec3> =
+        colors.chain(new.iter().map(|depth_sample| depth_sample.color)).collect();
     let mut all = Gaussians::from_points(&positions, &colors, old.shape, start, 0)?;
     let features = old.shape.features.width();
     for (column, width) in planes(features, width(old.shape)) {
@@ -198,8 +202,8 @@ fn joined(old: &Gaussians, new: &[Sight], start: &Start) -> Result<Gaussians> {
         all.parameters[to..to + own.len()].copy_from_slice(own);
     }
     if features > 0 {
-        let nearest = |sight: &Sight| {
-            let distance = |i: &usize| positions[*i].distance_squared(sight.position);
+        let nearest = |depth_sample: &DepthSample| {
+            let distance = |i: &usize| positions[*i].distance_squared(depth_sample.position);
             (0..old.count).min_by(|a, b| distance(a).total_cmp(&distance(b)))
         };
         let own = all.features_mut();
@@ -240,9 +244,10 @@ mod tests {
         let target = image(&[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]);
         let shown =
             |data: &[f32], mask: Option<&Image>| seen(&camera(2, 1), &image(data), &target, mask);
-        let left = Sight { position: DVec3::new(-1.0, 0.0, 3.0), color: Vec3::new(0.1, 0.3, 0.5) };
+        let left =
+            DepthSample { position: DVec3::new(-1.0, 0.0, 3.0), color: Vec3::new(0.1, 0.3, 0.5) };
         assert_eq!(shown(&[2.0, 0.4, 0.5, 0.4, 0.0, 0.0], None), [left]);
-        let nothing: [Sight; 0] = [];
+        let nothing: [DepthSample; 0] = [];
         for depth in [f32::NAN, f32::INFINITY] {
             assert_eq!(shown(&[depth, 0.0, 1.0, 0.0, 0.0, 0.0], None), nothing);
         }
@@ -267,15 +272,15 @@ mod tests {
         let numbers = old.parameters.len();
         old.parameters = (0..numbers).map(|i| i as f32).collect();
         let near = DVec3::new(3.0, 4.0, 5.5);
-        let new = [Sight { position: near, color: Vec3::ONE }];
-        let all = joined(&old, &new, &Start::default()).unwrap();
+        let new = [DepthSample { position: near, color: Vec3::ONE }];
+        let all = joined(&old, &new, &Initialization::default()).unwrap();
         assert_eq!((all.count, all.means()[2]), (3, near.as_vec3()));
         assert_eq!((&all.means()[..2], &all.rest()[..6]), (old.means(), old.rest()));
         assert_eq!(all.features()[..2], *old.features());
         assert_eq!(all.features()[2], old.features()[1]);
         assert!(all.raw_opacities()[2] < 0.0 && all.rest()[6..].iter().all(|c| *c == Vec3::ZERO));
-        assert_eq!(joined(&old, &[], &Start::default()).unwrap(), old);
+        assert_eq!(joined(&old, &[], &Initialization::default()).unwrap(), old);
         let none = Gaussians::zeros(0, shape);
-        assert_eq!(joined(&none, &new, &Start::default()).unwrap().count, 1);
+        assert_eq!(joined(&none, &new, &Initialization::default()).unwrap().count, 1);
     }
 }

@@ -2,16 +2,16 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! Window scatter: adds planes to a rectangle of some planes of an image, one thread per value; `window_gather` backward.
+//! Window scatter: adds planes to a rectangle of some planes of an image, one thread per value; `crop_gather` backward.
 //!
-//! Reference: `src/reference/window_scatter.rs`.
+//! Reference: `src/reference/crop_scatter.rs`.
 
 layout(local_size_x = 64) in;
 
 layout(push_constant) uniform Params {
     uvec2 size;         // pixels: the image
     uvec2 origin;       // pixels: the window's corner
-    uvec2 window;       // pixels: its size
+    uvec2 crop;       // pixels: its size
     uint  first_plane;  // of the image
     uint  plane_count;
 };
@@ -21,9 +21,9 @@ layout(binding = 1)          buffer Image   { float image[]; };    // (planes, H
 
 void main() {
     uint i = THREAD_INDEX;
-    uint pixels = window.x * window.y;
+    uint pixels = crop.x * crop.y;
     if (i >= plane_count * pixels) return;
     uint plane = first_plane + i / pixels;
-    uvec2 pixel = origin + uvec2(i % pixels % window.x, i % pixels / window.x);
+    uvec2 pixel = origin + uvec2(i % pixels % crop.x, i % pixels / crop.x);
     image[(plane * size.y + pixel.y) * size.x + pixel.x] += content[i];
 }

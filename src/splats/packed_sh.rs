@@ -23,14 +23,14 @@ impl StorageFormat {
     pub(crate) fn words(self, planes: PlaneCounts) -> usize {
         match self {
             Self::Single => planes.columns,
-            Self::Half => Halves::new(planes).columns(),
+            Self::Half => PackedSh::new(planes).columns(),
         }
     }
 }
 
 /// How Gaussians with halves differ from those of floats alone.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Halves {
+pub(crate) struct PackedSh {
     count: usize,
     /// Words of each before the halves.
     before: usize,
@@ -38,7 +38,7 @@ pub(crate) struct Halves {
     own: usize,
 }
 
-impl Halves {
+impl PackedSh {
     /// What takes the place of planes of floats.
     pub(crate) fn new(planes: PlaneCounts) -> Self {
         Self { count: planes.gaussians, before: planes.before_rest(), own: planes.rest() }
@@ -94,7 +94,7 @@ pub(crate) fn nearest(value: f32) -> u16 {
 
 #[cfg(test)]
 mod tests {
-    use super::{Halves, nearest, value};
+    use super::{PackedSh, nearest, value};
     use crate::splats::attributes::{PlaneCounts, column_count};
 
     #[test]
@@ -120,7 +120,7 @@ mod tests {
         for (degree, words) in (0..=3).zip([16, 21, 28, 39]) {
             for count in [0, 1, 5] {
                 let columns = column_count(2, degree);
-                let halves = Halves::new(PlaneCounts { gaussians: count, columns, features: 2 });
+                let halves = PackedSh::new(PlaneCounts { gaussians: count, columns, features: 2 });
                 assert_eq!(halves.columns(), words);
                 let planes: Vec<f32> =
                     (0..count * columns).map(|i| value(nearest(i as f32 * 0.25))).collect();

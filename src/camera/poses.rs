@@ -5,18 +5,18 @@ use glam::DVec3;
 use super::Camera;
 
 /// Position and direction. Positions count from the middle in units of their standard deviation, directions as unit vectors.
-type Place = [f64; 6];
+type CameraPose = [f64; 6];
 
 /// The places of a scene's cameras.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Places {
+pub(crate) struct CameraPoses {
     middle: DVec3,
     /// One over the standard deviation of the positions; 0 where all are one.
     scale: f64,
-    places: Vec<Place>,
+    poses: Vec<CameraPose>,
 }
 
-impl Places {
+impl CameraPoses {
     /// Those of cameras.
     pub(crate) fn new(cameras: &[Camera]) -> Self {
         let count = cameras.len().max(1) as f64;
@@ -24,30 +24,30 @@ impl Places {
         let squares = cameras.iter().map(|camera| camera.center().distance_squared(middle));
         let deviation = (squares.sum::<f64>() / count).sqrt();
         let scale = if deviation > 0.0 { 1.0 / deviation } else { 0.0 };
-        let mut own = Self { middle, scale, places: vec![] };
-        own.places = cameras.iter().map(|camera| own.place(camera)).collect();
+        let mut own = Self { middle, scale, poses: vec![] };
+        own.poses = cameras.iter().map(|camera| own.pose(camera)).collect();
         own
     }
 
     /// Every `step`th of the places, in the same units.
     pub(crate) fn every(self, step: usize) -> Self {
-        Self { places: self.places.into_iter().step_by(step).collect(), ..self }
+        Self { poses: self.poses.into_iter().step_by(step).collect(), ..self }
     }
 
     /// The squared distance of each place from that of a camera.
     pub(crate) fn squared_distances(&self, camera: &Camera) -> impl Iterator<Item = f64> {
-        let from = self.place(camera);
-        self.places.iter().map(move |place| squared_distance(place, &from))
+        let from = self.pose(camera);
+        self.poses.iter().map(move |pose| squared_distance(pose, &from))
     }
 
-    fn place(&self, camera: &Camera) -> Place {
+    fn pose(&self, camera: &Camera) -> CameraPose {
         let [x, y, z] = (self.scale * (camera.center() - self.middle)).to_array();
         let [u, v, w] = camera.view_from_world.matrix3.row(2).to_array();
         [x, y, z, u, v, w]
     }
 }
 
-fn squared_distance(a: &Place, b: &Place) -> f64 {
+fn squared_distance(a: &CameraPose, b: &CameraPose) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum()
 }
 
@@ -57,46 +57,46 @@ impl Camera {
     /// The cameras are divided into that many groups of about one size: again and again in two, across the direction in
     /// which a group differs most. Of each group the camera nearest to its mean is picked.
     pub(crate) fn covering(cameras: &[Self], count: usize) -> Vec<usize> {
-        let Places { places, .. } = Places::new(cameras);
+        let CameraPoses { poses, .. } = CameraPoses::new(cameras);
         let mut picked = vec![];
-        pick(&places, (0..cameras.len()).collect(), count.min(cameras.len()), &mut picked);
+        pick(&poses, (0..cameras.len()).collect(), count.min(cameras.len()), &mut picked);
         picked.sort_unstable();
         picked
     }
 }
 
 /// Picks `count` of a group.
-fn pick(places: &[Place], mut group: Vec<usize>, count: usize, picked: &mut Vec<usize>) {
+fn pick(poses: &[CameraPose], mut group: Vec<usize>, count: usize, picked: &mut Vec<usize>) {
     match count {
         0 => {}
-        1 => picked.extend(nearest_to_mean(places, &group)),
+        1 => picked.extend(nearest_to_mean(poses, &group)),
         _ => {
-            let axis = widest_axis(places, &group);
-            group.sort_by(|&a, &b| places[a][axis].total_cmp(&places[b][axis]).then(a.cmp(&b)));
+            let axis = widest_axis(poses, &group);
+            group.sort_by(|&a, &b| poses[a][axis].total_cmp(&poses[b][axis]).then(a.cmp(&b)));
             let first = count / 2;
             let rest = group.split_off(group.len() * first / count);
-            pick(places, group, first, picked);
-            pick(places, rest, count - first, picked);
+            pick(poses, group, first, picked);
+            pick(poses, rest, count - first, picked);
         }
     }
 }
 
-fn mean(places: &[Place], group: &[usize], axis: usize) -> f64 {
-    group.iter().map(|&i| places[i][axis]).sum::<f64>() / group.len().max(1) as f64
+fn mean(poses: &[CameraPose], group: &[usize], axis: usize) -> f64 {
+    group.iter().map(|&i| poses[i][axis]).sum::<f64>() / group.len().max(1) as f64
 }
 
-fn widest_axis(places: &[Place], group: &[usize]) -> usize {
+fn widest_axis(poses: &[CameraPose], group: &[usize]) -> usize {
     let variance = |axis: usize| {
-        let mean = mean(places, group, axis);
-        group.iter().map(|&i| (places[i][axis] - mean).powi(2)).sum::<f64>()
+        let mean = mean(poses, group, axis);
+        group.iter().map(|&i| (poses[i][axis] - mean).powi(2)).sum::<f64>()
     };
     let axes = (0..6).map(|axis| (axis, variance(axis)));
     axes.reduce(|best, next| if next.1 > best.1 { next } else { best }).map_or(0, |(axis, _)| axis)
 }
 
-fn nearest_to_mean(places: &[Place], group: &[usize]) -> Option<usize> {
-    let means: Place = std::array::from_fn(|axis| mean(places, group, axis));
-    let distance = |i: usize| squared_distance(&places[i], &means);
+fn nearest_to_mean(poses: &[CameraPose], group: &[usize]) -> Option<usize> {
+    let means: CameraPose = std::array::from_fn(|axis| mean(poses, group, axis));
+    let distance = |i: usize| squared_distance(&poses[i], &means);
     group.iter().copied().min_by(|&a, &b| distance(a).total_cmp(&distance(b)).then(a.cmp(&b)))
 }
 

@@ -6,7 +6,7 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::kernels::splat::RECORD_HEAD;
 use crate::kernels::status::{
-    STATUS_CROWDED, STATUS_GRADIENT, STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_WORDS,
+    STATUS_GRADIENT, STATUS_NOT_FINITE, STATUS_OVERFLOWED, STATUS_TILE_LIMIT, STATUS_WORDS,
 };
 use crate::kernels::{self, ProjectedSplat};
 
@@ -28,7 +28,7 @@ pub struct Status {
     /// The most intersections that a render had since the status was cleared.
     pub intersections: u32,
     /// The most splats of one tile, where the device cannot follow so many; else 0.
-    pub crowd: u32,
+    pub splats_per_tile: u32,
 }
 
 impl Status {
@@ -40,7 +40,7 @@ impl Status {
             not_finite: word(0) & STATUS_NOT_FINITE != 0,
             gradient_not_finite: word(0) & STATUS_GRADIENT != 0,
             intersections: word(1),
-            crowd: if word(0) & STATUS_CROWDED == 0 { 0 } else { word(2) },
+            splats_per_tile: if word(0) & STATUS_TILE_LIMIT == 0 { 0 } else { word(2) },
         }
     }
 }
@@ -48,7 +48,7 @@ impl Status {
 /// What the passes hand each other; buffers by what their length follows. Public for tests alone.
 #[derive(Debug)]
 #[allow(missing_docs, reason = "each is declared in the kernels that write and read it")]
-pub struct Frame {
+pub struct RenderBuffers {
     /// Values per pixel.
     channels: usize,
     // Gaussians
@@ -59,15 +59,15 @@ pub struct Frame {
     pub depth_keys: Buffer<u32>,
     pub ids: Buffer<u32>,
     pub tile_counts: Buffer<u32>,
-    pub slots_before: Buffer<u32>,
+    pub intersection_offsets: Buffer<u32>,
     /// One per partition of ranks.
     pub sums: Buffer<u32>,
-    pub emitted: Buffer<UVec2>,
+    pub intersection_ranges: Buffer<UVec2>,
     // intersections
     pub tiles: Buffer<u32>,
-    pub slots: Buffer<u32>,
-    pub owners: Buffer<u32>,
-    pub records: Buffer<Vec3>,
+    pub intersection_ids: Buffer<u32>,
+    pub gaussian_ids: Buffer<u32>,
+    pub gradient_records: Buffer<Vec3>,
     // pixels and tiles
     pub render: Buffer<f32>,
     pub transmittances: Buffer<f32>,
@@ -81,7 +81,7 @@ pub struct Frame {
     pub arrivals: Buffer<u32>,
 }
 
-impl Frame {
+impl RenderBuffers {
     /// Room for nothing but the single numbers.
     pub(super) fn new(gpu: &Gpu, channels: usize) -> Result<Self> {
         Ok(Self {
@@ -92,13 +92,13 @@ impl Frame {
             depth_keys: gpu.uninit("depth_keys", 0)?,
             ids: gpu.uninit("ids", 0)?,
             tile_counts: gpu.uninit("tile_counts", 0)?,
-            slots_before: gpu.uninit("slots_before", 0)?,
+            intersection_offsets: gpu.uninit("intersection_offsets", 0)?,
             sums: gpu.uninit("sums", 1)?,
-            emitted: gpu.uninit("emitted", 0)?,
+            intersection_ranges: gpu.uninit("intersection_ranges", 0)?,
             tiles: gpu.uninit("tiles", 0)?,
-            slots: gpu.uninit("slots", 0)?,
-            owners: gpu.uninit("owners", 0)?,
-            records: gpu.uninit("records", 0)?,
+            intersection_ids: gpu.uninit("intersection_ids", 0)?,
+            gaussian_ids: gpu.uninit("gaussian_ids", 0)?,
+            gradient_records: gpu.uninit("gradient_records", 0)?,
             render: gpu.uninit("render", 0)?,
             transmittances: gpu.uninit("transmittances", 0)?,
             tile_ranges: gpu.uninit("tile_ranges", 0)?,
@@ -125,10 +125,10 @@ impl Frame {
             self.depth_keys = gpu.uninit("depth_keys", count)?;
             self.ids = gpu.uninit("ids", count)?;
             self.tile_counts = gpu.uninit("tile_counts", count)?;
-            self.slots_before = gpu.uninit("slots_before", count)?;
+            self.intersection_offsets = gpu.uninit("intersection_offsets", count)?;
             let partitions = (count as u32).div_ceil(RANKS_PER_PARTITION).max(1);
             self.sums = gpu.uninit("sums", partitions as usize)?;
-            self.emitted = gpu.uninit("emitted", count)?;
+            self.intersection_ranges = gpu.uninit("intersection_ranges", count)?;
         }
         if self.render.len() < self.channels * pixels {
             self.render = gpu.uninit("render", self.channels * pixels)?;
@@ -139,7 +139,7 @@ impl Frame {
         }
         if self.tiles.is_empty() {
             let guess = (count.max(1024) as u32).saturating_mul(TILES_PER_GAUSSIAN);
-            self.set_intersection_capacity(gpu, guess.min(self.most_intersections(gpu)))?;
+            self.set_intersection_capacity(gpu, guess.min(self.max_intersections(gpu)))?;
         }
         Ok(())
     }
@@ -148,15 +148,16 @@ impl Frame {
         let capacity = capacity as usize;
         if capacity != self.tiles.len() {
             // What was there goes first: the two together may be more than there is.
-            for numbers in [&mut self.tiles, &mut self.slots, &mut self.owners] {
+            for numbers in [&mut self.tiles, &mut self.intersection_ids, &mut self.gaussian_ids] {
                 *numbers = gpu.uninit("intersections", 0)?;
             }
-            self.records = gpu.uninit("records", 0)?;
+            self.gradient_records = gpu.uninit("gradient_records", 0)?;
             gpu.free_unused();
             self.tiles = gpu.uninit("tiles", capacity)?;
-            self.slots = gpu.uninit("slots", capacity)?;
-            self.owners = gpu.uninit("owners", capacity)?;
-            self.records = gpu.uninit("records", self.record_vectors() * capacity)?;
+            self.intersection_ids = gpu.uninit("intersection_ids", capacity)?;
+            self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
+            self.gradient_records =
+                gpu.uninit("gradient_records", self.record_vectors() * capacity)?;
         }
         Ok(())
     }
@@ -179,7 +180,7 @@ impl Frame {
     }
 
     /// How many intersections' records one binding holds.
-    pub(super) fn most_intersections(&self, gpu: &Gpu) -> u32 {
+    pub(super) fn max_intersections(&self, gpu: &Gpu) -> u32 {
         let record = (self.record_vectors() * size_of::<Vec3>()) as u64;
         (gpu.properties().max_storage_buffer_range / record).min(u32::MAX.into()) as u32
     }
@@ -202,9 +203,14 @@ mod tests {
     fn every_flag_is_read_from_its_own_bit() {
         let read = |flags| Status::from_words(&[flags, 5, 7]);
         let flags = |status: Status| {
-            [status.overflowed, status.not_finite, status.gradient_not_finite, status.crowd == 7]
+            [
+                status.overflowed,
+                status.not_finite,
+                status.gradient_not_finite,
+                status.splats_per_tile == 7,
+            ]
         };
-        let all = [STATUS_OVERFLOWED, STATUS_NOT_FINITE, STATUS_GRADIENT, STATUS_CROWDED];
+        let all = [STATUS_OVERFLOWED, STATUS_NOT_FINITE, STATUS_GRADIENT, STATUS_TILE_LIMIT];
         for (own, flag) in all.into_iter().enumerate() {
             assert_eq!(flags(read(flag)), [0, 1, 2, 3].map(|at| at == own));
         }
@@ -217,7 +223,7 @@ mod tests {
     fn gaussians_and_intersections_take_the_bytes_that_are_foreseen() {
         let gpu = Gpu::new(&crate::gpu::DeviceChoice::Best).unwrap();
         for channels in [3, 11] {
-            let mut frame = Frame::new(&gpu, channels).unwrap();
+            let mut frame = RenderBuffers::new(&gpu, channels).unwrap();
             let before = gpu.memory_in_use();
             let (gaussians, intersections) = (100_000, 30_000);
             frame.reserve(&gpu, gaussians, gaussians, 0, 0).unwrap();

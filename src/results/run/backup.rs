@@ -6,28 +6,28 @@ use super::files::{FILES, unwritable};
 use crate::Result;
 
 /// Where the files of a run wait that is being replaced.
-const ASIDE: &str = ".replaced";
+const BACKUP: &str = ".replaced";
 
-/// The files of a run that was there before. Dropped, they are back where they were; [`Aside::give_up`] ends them.
+/// The files of a run that was there before. Dropped, they are back where they were; [`Backup::give_up`] ends them.
 #[derive(Debug, Default)]
-pub(super) struct Aside(Option<PathBuf>);
+pub(super) struct Backup(Option<PathBuf>);
 
-impl Aside {
+impl Backup {
     /// Moves the files of the run out of the way.
     ///
     /// # Errors
     /// The directory cannot be written.
     pub(super) fn set(run: &Path) -> Result<Self> {
-        let aside = run.join(ASIDE);
+        let backup = run.join(BACKUP);
         let held: Vec<&str> = FILES.into_iter().filter(|file| run.join(file).exists()).collect();
         if held.is_empty() {
             return Ok(Self(None));
         }
         let failed = |error| unwritable(run, &error);
-        std::fs::create_dir_all(&aside).map_err(failed)?;
+        std::fs::create_dir_all(&backup).map_err(failed)?;
         let guard = Self(Some(run.to_owned()));
         for file in held {
-            std::fs::rename(run.join(file), aside.join(file)).map_err(failed)?;
+            std::fs::rename(run.join(file), backup.join(file)).map_err(failed)?;
         }
         Ok(guard)
     }
@@ -38,11 +38,11 @@ impl Aside {
     /// The directory cannot be written.
     pub(super) fn give_up(&mut self) -> Result<()> {
         let Some(run) = self.0.take() else { return Ok(()) };
-        std::fs::remove_dir_all(run.join(ASIDE)).map_err(|error| unwritable(&run, &error))
+        std::fs::remove_dir_all(run.join(BACKUP)).map_err(|error| unwritable(&run, &error))
     }
 }
 
-impl Drop for Aside {
+impl Drop for Backup {
     fn drop(&mut self) {
         if let Some(run) = self.0.take() {
             // What failed before this is worth reporting; the next start tries again.
@@ -68,19 +68,19 @@ pub(super) fn recover(run: &Path) -> Result<()> {
 
 /// Moves what waits back, over what had begun in its place.
 fn restore(run: &Path) -> std::io::Result<()> {
-    let aside = run.join(ASIDE);
-    if !aside.is_dir() {
+    let backup = run.join(BACKUP);
+    if !backup.is_dir() {
         return Ok(());
     }
     for file in FILES {
-        let (kept, begun) = (aside.join(file), run.join(file));
+        let (kept, begun) = (backup.join(file), run.join(file));
         if kept.exists() {
             std::fs::rename(kept, begun)?;
-        } else if aside.join("config.toml").exists() && begun.exists() {
+        } else if backup.join("config.toml").exists() && begun.exists() {
             std::fs::remove_file(begun)?;
         }
     }
-    std::fs::remove_dir(aside)
+    std::fs::remove_dir(backup)
 }
 
 /// Whether a file of this name is what a killed process leaves: a run's own under another name, or that which safetensors
@@ -124,24 +124,24 @@ mod tests {
     fn a_replaced_run_is_back_unless_the_new_one_has_come_to_be() {
         let folder = run();
         let before = content(folder.path());
-        let aside = Aside::set(folder.path()).unwrap();
+        let backup = Backup::set(folder.path()).unwrap();
         assert!(!folder.path().join("model.ply").exists());
         // The new run begins files of both kinds.
         std::fs::write(folder.path().join("config.toml"), "new").unwrap();
         std::fs::write(folder.path().join("train.csv"), "new").unwrap();
-        drop(aside);
+        drop(backup);
         assert_eq!(content(folder.path()), before);
 
         // A process that is killed drops nothing; the next one finds the old run.
-        let aside = Aside::set(folder.path()).unwrap();
+        let backup = Backup::set(folder.path()).unwrap();
         std::fs::write(folder.path().join("config.toml"), "new").unwrap();
-        std::mem::forget(aside);
+        std::mem::forget(backup);
         recover(folder.path()).unwrap();
         assert_eq!(content(folder.path()), before);
 
-        let mut aside = Aside::set(folder.path()).unwrap();
-        aside.give_up().unwrap();
-        drop(aside);
+        let mut backup = Backup::set(folder.path()).unwrap();
+        backup.give_up().unwrap();
+        drop(backup);
         assert_eq!(content(folder.path()), [("notes.txt".to_owned(), "old notes.txt".to_owned())]);
     }
 

@@ -12,18 +12,18 @@ use crate::train::{Background, Rendered};
 
 /// More in the mean over a view is a hole. No view of a model of a real scene leaves more than .095, after 400 to 3 500 steps before
 /// black (docs/benchmarks.md).
-pub const MOST_LEFTOVER: f64 = 0.1;
+pub const MAX_RESIDUAL_TRANSMITTANCE: f64 = 0.1;
 
 /// The leftover transmittance of a view, 0 where the model is opaque, 1 where nothing is.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Leftover {
+pub struct ResidualTransmittance {
     /// Over the pixels that count.
     pub mean: f64,
     /// The 99 % quantile over these pixels.
     pub q99: f64,
 }
 
-impl Leftover {
+impl ResidualTransmittance {
     /// That of a view's render, over the pixels that its mask shows; none where there are none, or it is no render.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn of(rendered: &Rendered, view: &View) -> Option<Self> {
@@ -56,13 +56,15 @@ impl Leftover {
 }
 
 /// What to say of the views of a model that was trained before `background`: one line on the one with the largest hole, and
-/// a remedy; none where every view has at most [`MOST_LEFTOVER`].
+/// a remedy; none where every view has at most [`MAX_RESIDUAL_TRANSMITTANCE`].
 pub fn hole_warning<'a>(
-    views: impl IntoIterator<Item = (&'a str, Leftover)>,
+    views: impl IntoIterator<Item = (&'a str, ResidualTransmittance)>,
     background: Background,
 ) -> Option<String> {
-    let views: Vec<(&str, Leftover)> = views.into_iter().collect();
-    let open = views.iter().filter(|(_, leftover)| leftover.mean > MOST_LEFTOVER);
+    let views: Vec<(&str, ResidualTransmittance)> = views.into_iter().collect();
+    let open = views.iter().filter(|(_, residual_transmittance)| {
+        residual_transmittance.mean > MAX_RESIDUAL_TRANSMITTANCE
+    });
     let (name, worst) = open.clone().max_by(|(_, a), (_, b)| a.mean.total_cmp(&b.mean))?;
     let cause = match background {
         Background::Black => {
@@ -74,7 +76,7 @@ pub fn hole_warning<'a>(
         "view {name}: {:.0} % of the background shows through the model (above {:.0} % in {} of {} views): {cause}, or mask what \
          is to stay empty",
         100.0 * worst.mean,
-        100.0 * MOST_LEFTOVER,
+        100.0 * MAX_RESIDUAL_TRANSMITTANCE,
         open.count(),
         views.len()
     ))
@@ -93,16 +95,22 @@ pub fn warn_of_holes(
 ) -> Result<()> {
     /// The number of training views that are looked at, evenly spread.
     const MOST: usize = 8;
-    let own = |view: &ViewScore| Some((view.name.clone(), view.leftover?));
-    let mut leftovers: Vec<(String, Leftover)> = scored.iter().filter_map(own).collect();
-    if leftovers.is_empty() {
+    let own = |view: &ViewScore| Some((view.name.clone(), view.residual_transmittance?));
+    let mut residual_transmittances: Vec<(String, ResidualTransmittance)> =
+        scored.iter().filter_map(own).collect();
+    if residual_transmittances.is_empty() {
         let views: Vec<&View> = dataset.views.iter().filter(|v| v.is_for_training()).collect();
         for view in views.iter().step_by(views.len().div_ceil(MOST).max(1)) {
-            let leftover = Leftover::of(&render(view)?, view);
-            leftovers.extend(leftover.map(|leftover| (view.name.clone(), leftover)));
+            let residual_transmittance = ResidualTransmittance::of(&render(view)?, view);
+            residual_transmittances.extend(
+                residual_transmittance
+                    .map(|residual_transmittance| (view.name.clone(), residual_transmittance)),
+            );
         }
     }
-    let views = leftovers.iter().map(|(name, leftover)| (name.as_str(), *leftover));
+    let views = residual_transmittances
+        .iter()
+        .map(|(name, residual_transmittance)| (name.as_str(), *residual_transmittance));
     if let Some(warning) = hole_warning(views, background) {
         tracing::warn!("{warning}");
     }
@@ -116,29 +124,41 @@ mod tests {
     #[test]
     fn the_mean_and_the_99_percent_quantile_are_of_the_pixels() {
         let mut pixels: Vec<f32> = (0..200).rev().map(|k| k as f32 / 256.0).collect();
-        let leftover = Leftover::of_pixels(&mut pixels).unwrap();
+        let residual_transmittance = ResidualTransmittance::of_pixels(&mut pixels).unwrap();
         // 198 of 200 have at most 197 / 256.
-        assert_eq!(leftover, Leftover { mean: 99.5 / 256.0, q99: 197.0 / 256.0 });
-        assert_eq!(Leftover::of_pixels(&mut [0.25]), Some(Leftover { mean: 0.25, q99: 0.25 }));
-        assert_eq!(Leftover::of_pixels(&mut []), None);
-        let both =
-            Leftover::mean([leftover, Leftover { mean: 0.0, q99: 1.0 }].into_iter()).unwrap();
-        assert_eq!(both, Leftover { mean: 99.5 / 512.0, q99: 453.0 / 512.0 });
-        assert_eq!(Leftover::mean([].into_iter()), None);
+        assert_eq!(
+            residual_transmittance,
+            ResidualTransmittance { mean: 99.5 / 256.0, q99: 197.0 / 256.0 }
+        );
+        assert_eq!(
+            ResidualTransmittance::of_pixels(&mut [0.25]),
+            Some(ResidualTransmittance { mean: 0.25, q99: 0.25 })
+        );
+        assert_eq!(ResidualTransmittance::of_pixels(&mut []), None);
+        let both = ResidualTransmittance::mean(
+            [residual_transmittance, ResidualTransmittance { mean: 0.0, q99: 1.0 }].into_iter(),
+        )
+        .unwrap();
+        assert_eq!(both, ResidualTransmittance { mean: 99.5 / 512.0, q99: 453.0 / 512.0 });
+        assert_eq!(ResidualTransmittance::mean([].into_iter()), None);
     }
 
     #[test]
     fn the_worst_view_is_named_once_with_what_helps() {
-        let leftover = |mean| Leftover { mean, q99: 1.0 };
-        let views = [("a", leftover(0.3)), ("b", leftover(0.62)), ("c", leftover(0.1))];
-        let said = hole_warning(views, Background::Black).unwrap();
+        let residual_transmittance = |mean| ResidualTransmittance { mean, q99: 1.0 };
+        let views = [
+            ("a", residual_transmittance(0.3)),
+            ("b", residual_transmittance(0.62)),
+            ("c", residual_transmittance(0.1)),
+        ];
+        let message = hole_warning(views, Background::Black).unwrap();
         for part in ["view b: 62 %", "above 10 % in 2 of 3 views", "--background random", "mask"] {
-            assert!(said.contains(part), "{said}");
+            assert!(message.contains(part), "{message}");
         }
-        assert!(!said.contains('\n'), "{said}");
-        let said = hole_warning(views, Background::Random).unwrap();
-        assert!(said.contains("view b") && !said.contains("--background"), "{said}");
-        assert_eq!(hole_warning([("c", leftover(0.1))], Background::Black), None);
+        assert!(!message.contains('\n'), "{message}");
+        let message = hole_warning(views, Background::Random).unwrap();
+        assert!(message.contains("view b") && !message.contains("--background"), "{message}");
+        assert_eq!(hole_warning([("c", residual_transmittance(0.1))], Background::Black), None);
         assert_eq!(hole_warning([], Background::Black), None);
     }
 }

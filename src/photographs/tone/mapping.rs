@@ -11,7 +11,7 @@ const STRENGTHS: [f64; 2] = [1e-3, 1e4];
 
 /// What is measured of a photograph.
 #[derive(Clone, Debug)]
-pub struct Measured {
+pub struct MeasuredPhotograph {
     /// Percentiles and means.
     pub statistics: Statistics,
     /// The whole distribution of its luminance.
@@ -20,7 +20,7 @@ pub struct Measured {
     pub camera: Option<Camera>,
 }
 
-impl Measured {
+impl MeasuredPhotograph {
     /// Of the planes (3, pixels) of a photograph.
     pub fn of(planes: &[f32]) -> Self {
         let (statistics, luminance) = (Statistics::of(planes), LuminanceHistogram::of(planes));
@@ -36,7 +36,7 @@ impl Measured {
 
 /// What the curves of a scene's photographs have in common.
 #[derive(Clone, Debug, Default)]
-pub struct Scene {
+pub struct SceneTone {
     /// The means over the training photographs, where one curve serves all.
     statistics: Option<Statistics>,
     /// How bright the targets are to be, where that is found.
@@ -45,7 +45,7 @@ pub struct Scene {
 
 /// How a photograph becomes a target.
 #[derive(Clone, Copy, Debug)]
-pub struct Lift {
+pub struct ToneMapping {
     /// The curve.
     pub parameters: ToneParameters,
     /// k of soft(x; k), of whose mean luminance the target is; where it follows from the exposure.
@@ -56,7 +56,7 @@ impl ToneSettings {
     /// What the training photographs of a scene decide together; none where their exposure is asked for and all are as
     /// good as black, or there are none.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn scene(&self, training: &[Measured]) -> Option<Scene> {
+    pub(crate) fn scene(&self, training: &[MeasuredPhotograph]) -> Option<SceneTone> {
         let exposure = if self.takes_exposure() {
             let found = Exposure::of(training.iter().map(|one| &one.luminance), self.brightness)?;
             let seen = training.iter().map(|one| Some((&one.luminance, one.camera?)));
@@ -70,16 +70,20 @@ impl ToneSettings {
         };
         let statistics: Vec<_> = training.iter().map(|one| one.statistics).collect();
         let statistics = Statistics::mean_of(&statistics).filter(|_| self.scene_statistics);
-        Some(Scene { statistics, exposure })
+        Some(SceneTone { statistics, exposure })
     }
 
     /// How a photograph of the scene is lifted.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn lift(&self, scene: &Scene, photograph: &Measured) -> Lift {
+    pub(crate) fn tone_mapping(
+        &self,
+        scene: &SceneTone,
+        photograph: &MeasuredPhotograph,
+    ) -> ToneMapping {
         let statistics = scene.statistics.as_ref().unwrap_or(&photograph.statistics);
         let parameters = self.parameters(statistics);
         let Some(exposure) = &scene.exposure else {
-            return Lift { parameters, gain: None };
+            return ToneMapping { parameters, gain: None };
         };
         let gain = exposure.gain_of(&photograph.luminance, photograph.camera.as_ref());
         let strength = match self.curve {
@@ -90,7 +94,7 @@ impl ToneSettings {
         let weight = if self.profile.is_some() { 1.0 } else { exposure.weight() };
         let (white, weight) = ((1.0 / strength) as f32, weight as f32);
         let parameters = ToneParameters { white, gain: 1.0, weight, ..parameters };
-        Lift { parameters, gain: Some(gain) }
+        ToneMapping { parameters, gain: Some(gain) }
     }
 
     /// The factor on x at which the curve has the mean luminance of soft(x; gain).

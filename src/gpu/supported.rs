@@ -18,7 +18,7 @@ pub(super) const OPTIONAL_EXTENSIONS: &[&CStr] =
     &[khr::push_descriptor::NAME, khr::portability_subset::NAME];
 
 /// What a physical device offers, gathered once.
-pub(super) struct Offered {
+pub(super) struct Supported {
     pub(super) properties: vk::PhysicalDeviceProperties,
     pub(super) uuid: [u8; vk::UUID_SIZE],
     pub(super) pci: Option<PciAddress>,
@@ -35,7 +35,7 @@ pub(super) struct Offered {
     pub(super) timestamp_bits: u32,
 }
 
-impl Offered {
+impl Supported {
     pub(super) fn gather(
         instance: &ash::Instance,
         physical: vk::PhysicalDevice,
@@ -93,7 +93,7 @@ impl Offered {
                     .contains(vk::ShaderStageFlags::COMPUTE),
                 least: vulkan13_properties.min_subgroup_size,
                 most: vulkan13_properties.max_subgroup_size,
-                most_in_workgroup: vulkan13_properties.max_compute_workgroup_subgroups,
+                workgroup_limit: vulkan13_properties.max_compute_workgroup_subgroups,
             },
             subgroup_operations: vulkan11.subgroup_supported_operations,
             subgroup_stages: vulkan11.subgroup_supported_stages,
@@ -124,7 +124,7 @@ impl Offered {
     }
 
     /// Whether passes may push their descriptors, and the user does not forbid it.
-    pub(super) fn pushes_descriptors(&self) -> bool {
+    pub(super) fn has_push_descriptors(&self) -> bool {
         let is_forbidden = std::env::var_os(PUSH_VARIABLE).is_some_and(|value| value == "off");
         self.max_push_descriptors >= MAX_BUFFERS && !is_forbidden
     }

@@ -3,7 +3,7 @@
 use glam::UVec2;
 
 use super::Renderer;
-use super::limits::most_tiles;
+use super::limits::max_tiles;
 use crate::camera::Camera;
 use crate::{Error, Result};
 
@@ -40,7 +40,7 @@ impl Renderer {
             let UVec2 { x, y } = self.tiles(size);
             pixels = pixels.max(size.x as usize * size.y as usize);
             tiles = tiles.max(x as usize * y as usize);
-            if x as usize * y as usize > most_tiles(&self.gpu) {
+            if x as usize * y as usize > max_tiles(&self.gpu) {
                 return Err(self.too_many_tiles(size));
             }
         }
@@ -53,15 +53,15 @@ impl Renderer {
     /// The device is out of memory, or cannot bind so many.
     pub fn grow(&mut self, intersections: u32) -> Result<()> {
         let headroom =
-            intersections.saturating_add(intersections / 2).min(self.most_intersections());
+            intersections.saturating_add(intersections / 2).min(self.max_intersections());
         let capacity = headroom.max(intersections);
         self.set_intersection_capacity(capacity.max(self.frame.intersection_capacity()))
     }
 
     /// The most intersections of a view whose records the device can bind at once.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn most_intersections(&self) -> u32 {
-        self.frame.most_intersections(&self.gpu)
+    pub(crate) fn max_intersections(&self) -> u32 {
+        self.frame.max_intersections(&self.gpu)
     }
 
     /// What each Gaussian takes beside its own numbers, in bytes.
@@ -98,7 +98,7 @@ impl Renderer {
 
     fn too_many_tiles(&self, size: UVec2) -> Error {
         let (UVec2 { x: width, y: height }, [tile_width, tile_height]) = (size, self.tile.size);
-        let (count, most) = (self.tiles(size).element_product(), most_tiles(&self.gpu));
+        let (count, most) = (self.tiles(size).element_product(), max_tiles(&self.gpu));
         let device = &self.gpu.properties().name;
         Error::Usage(format!(
             "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}; \

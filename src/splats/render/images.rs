@@ -142,14 +142,17 @@ impl Renderer {
         let gaussians = gaussians.into();
         loop {
             let status = self.try_render(gaussians, patch, options)?;
-            if status.crowd > 0 {
+            if status.splats_per_tile > 0 {
                 let UVec2 { x: width, y: height } = patch.size;
-                return Err(self.too_crowded(format!("a {width}x{height} render"), status.crowd));
+                return Err(self.too_many_splats(
+                    format!("a {width}x{height} render"),
+                    status.splats_per_tile,
+                ));
             }
             if !status.overflowed {
                 break;
             }
-            let is_too_much = status.intersections > self.most_intersections();
+            let is_too_much = status.intersections > self.max_intersections();
             if let Some(halves) = patch.halves().filter(|_| is_too_much) {
                 return self.render_parts(gaussians, patch, &halves, options);
             }

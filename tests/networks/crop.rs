@@ -4,8 +4,8 @@ use glam::UVec2;
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::Reference;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::kernels::{window_gather, window_scatter};
-use nightsplat::networks::window::{Window, Windows};
+use nightsplat::kernels::{crop_gather, crop_scatter};
+use nightsplat::networks::crop::{CropKernels, PaddedCrop};
 
 #[test]
 fn a_crop_is_a_cell_of_the_view_and_its_margin_is_cut_off_there() {
@@ -13,11 +13,11 @@ fn a_crop_is_a_cell_of_the_view_and_its_margin_is_cut_off_there() {
     let view = UVec2::new(43, 25);
     let mut cells = std::collections::BTreeSet::new();
     for draw in 0..500 {
-        let window = Window::random(view, 20, 6, &stream, draw);
-        let corner = window.origin + window.crop_origin;
-        let end = corner + window.crop_size;
-        assert_eq!(window.origin, corner.saturating_sub(UVec2::splat(6)));
-        assert_eq!(window.origin + window.size, (end + 6).min(view));
+        let crop = PaddedCrop::random(view, 20, 6, &stream, draw);
+        let corner = crop.origin + crop.crop_origin;
+        let end = corner + crop.crop_size;
+        assert_eq!(crop.origin, corner.saturating_sub(UVec2::splat(6)));
+        assert_eq!(crop.origin + crop.size, (end + 6).min(view));
         cells.insert((corner.to_array(), end.to_array()));
     }
     // Three columns of 14 or 15 pixels, two rows of 12 or 13.
@@ -34,11 +34,11 @@ fn means_over_crops_estimate_the_mean_over_the_view() {
     for (view, side) in [(UVec2::new(17, 11), 5), (UVec2::new(8, 7), 7)] {
         let mut weights = vec![0.0; view.element_product() as usize];
         for draw in 0..DRAWS {
-            let window = Window::random(view, side, 1, &stream, draw);
-            let corner = window.origin + window.crop_origin;
-            let weight = 1.0 / f64::from(window.crop_size.element_product());
-            for y in corner.y..corner.y + window.crop_size.y {
-                for x in corner.x..corner.x + window.crop_size.x {
+            let crop = PaddedCrop::random(view, side, 1, &stream, draw);
+            let corner = crop.origin + crop.crop_origin;
+            let weight = 1.0 / f64::from(crop.crop_size.element_product());
+            for y in corner.y..corner.y + crop.crop_size.y {
+                for x in corner.x..corner.x + crop.crop_size.x {
                     weights[(y * view.x + x) as usize] += weight / DRAWS as f64;
                 }
             }
@@ -55,57 +55,54 @@ fn means_over_crops_estimate_the_mean_over_the_view() {
 fn a_crop_larger_than_the_view_is_the_view() {
     let view = UVec2::new(7, 300);
     for side in [300, 500, u32::MAX] {
-        let window = Window::random(view, side, 9, &Stream::new(1, 2), 3);
-        assert_eq!(window, Window::whole(view));
+        let crop = PaddedCrop::random(view, side, 9, &Stream::new(1, 2), 3);
+        assert_eq!(crop, PaddedCrop::whole(view));
     }
 }
 
 #[test]
 fn gathering_and_scattering_match_their_references() {
     let gpu = gpu();
-    let windows = Windows::new(&gpu).unwrap();
-    for (size, window, planes) in [
-        (UVec2::ONE, Window::whole(UVec2::ONE), 0..1),
-        (UVec2::new(33, 17), Window::random(UVec2::new(33, 17), 9, 2, &Stream::new(3, 0), 1), 2..5),
-        (UVec2::new(64, 5), Window::whole(UVec2::new(64, 5)), 1..4),
+    let crops = CropKernels::new(&gpu).unwrap();
+    for (size, crop, planes) in [
+        (UVec2::ONE, PaddedCrop::whole(UVec2::ONE), 0..1),
+        (
+            UVec2::new(33, 17),
+            PaddedCrop::random(UVec2::new(33, 17), 9, 2, &Stream::new(3, 0), 1),
+            2..5,
+        ),
+        (UVec2::new(64, 5), PaddedCrop::whole(UVec2::new(64, 5)), 1..4),
     ] {
         let pixels = size.element_product() as usize;
         let image: Vec<f32> = (0..5 * pixels).map(|i| (i as f32 * 0.7).sin()).collect();
-        let mut content = vec![f32::NAN; planes.len() * window.size.element_product() as usize];
-        let params = window_gather::Params {
+        let mut content = vec![f32::NAN; planes.len() * crop.size.element_product() as usize];
+        let params = crop_gather::Params {
             size,
-            origin: window.origin,
-            window: window.size,
+            origin: crop.origin,
+            crop: crop.size,
             first_plane: planes.start as u32,
             plane_count: planes.len() as u32,
         };
-        let slices = window_gather::Slices { image: &image, content: &mut content };
-        window_gather::Kernel::run(&params, &window_gather::Constants::default(), slices);
+        let slices = crop_gather::Slices { image: &image, content: &mut content };
+        crop_gather::Kernel::run(&params, &crop_gather::Constants::default(), slices);
         let mut sum = image.clone();
-        let scatter = window_scatter::Params {
+        let scatter = crop_scatter::Params {
             size,
-            origin: window.origin,
-            window: window.size,
+            origin: crop.origin,
+            crop: crop.size,
             first_plane: params.first_plane,
             plane_count: params.plane_count,
         };
-        let slices = window_scatter::Slices { content: &content, image: &mut sum };
-        window_scatter::Kernel::run(&scatter, &window_scatter::Constants::default(), slices);
+        let slices = crop_scatter::Slices { content: &content, image: &mut sum };
+        crop_scatter::Kernel::run(&scatter, &crop_scatter::Constants::default(), slices);
 
         let device_image = gpu.buffer("image", &image).unwrap();
         let mut device_sum = gpu.buffer("sum", &image).unwrap();
         let mut device_content = gpu.zeros("content", content.len()).unwrap();
         gpu.run("windows", |pass| {
             let planes = planes.clone();
-            windows.gather(
-                pass,
-                &device_image,
-                size,
-                planes.clone(),
-                &window,
-                &mut device_content,
-            )?;
-            windows.scatter(pass, &device_content, &window, planes, size, &mut device_sum)
+            crops.gather(pass, &device_image, size, planes.clone(), &crop, &mut device_content)?;
+            crops.scatter(pass, &device_content, &crop, planes, size, &mut device_sum)
         })
         .unwrap();
         assert_eq!(gpu.read(&device_content).unwrap(), content);
@@ -116,17 +113,16 @@ fn gathering_and_scattering_match_their_references() {
 #[test]
 fn a_window_beyond_the_view_or_its_buffers_is_refused() {
     let gpu = gpu();
-    let windows = Windows::new(&gpu).unwrap();
+    let crops = CropKernels::new(&gpu).unwrap();
     let view = UVec2::new(8, 8);
     let image = gpu.zeros("image", 3 * 64).unwrap();
     let mut content = gpu.zeros("content", 3 * 64).unwrap();
-    let mut problem = |window: Window, planes| {
-        let gathered = gpu.run("window", |pass| {
-            windows.gather(pass, &image, view, planes, &window, &mut content)
-        });
+    let mut problem = |crop: PaddedCrop, planes| {
+        let gathered =
+            gpu.run("window", |pass| crops.gather(pass, &image, view, planes, &crop, &mut content));
         gathered.unwrap_err().to_string()
     };
-    let beyond = Window { origin: UVec2::ONE, ..Window::whole(view) };
+    let beyond = PaddedCrop { origin: UVec2::ONE, ..PaddedCrop::whole(view) };
     assert!(problem(beyond, 0..3).contains("does not lie"));
-    assert!(problem(Window::whole(view), 1..4).contains("`image` holds 192"));
+    assert!(problem(PaddedCrop::whole(view), 1..4).contains("`image` holds 192"));
 }

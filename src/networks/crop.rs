@@ -10,12 +10,12 @@ use glam::UVec2;
 
 use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::{window_gather, window_scatter};
+use crate::kernels::{crop_gather, crop_scatter};
 use crate::{Error, Result};
 
 /// A rectangle of a view, and within it the crop that counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Window {
+pub struct PaddedCrop {
     /// The window's corner in the view, pixels.
     pub origin: UVec2,
     /// Its size, pixels.
@@ -26,7 +26,7 @@ pub struct Window {
     pub crop_size: UVec2,
 }
 
-impl Window {
+impl PaddedCrop {
     /// A whole view of this size.
     pub fn whole(view: UVec2) -> Self {
         Self { origin: UVec2::ZERO, size: view, crop_origin: UVec2::ZERO, crop_size: view }
@@ -58,24 +58,24 @@ impl Window {
 
 /// Copies windows out of images, and adds them back.
 #[derive(Debug)]
-pub struct Windows {
-    gather: Pipeline<window_gather::Kernel>,
-    scatter: Pipeline<window_scatter::Kernel>,
+pub struct CropKernels {
+    gather: Pipeline<crop_gather::Kernel>,
+    scatter: Pipeline<crop_scatter::Kernel>,
 }
 
-impl Windows {
+impl CropKernels {
     /// The kernels on this device.
     ///
     /// # Errors
     /// The device refuses a pipeline.
     pub fn new(gpu: &Gpu) -> Result<Self> {
         Ok(Self {
-            gather: gpu.pipeline(&window_gather::Constants::default())?,
-            scatter: gpu.pipeline(&window_scatter::Constants::default())?,
+            gather: gpu.pipeline(&crop_gather::Constants::default())?,
+            scatter: gpu.pipeline(&crop_scatter::Constants::default())?,
         })
     }
 
-    /// Records `content = image[planes, window]`; `image` is (planes, H, W) of a view of `size`.
+    /// Records `content = image[planes, crop]`; `image` is (planes, H, W) of a view of `size`.
     ///
     /// # Errors
     /// A buffer is too short for it.
@@ -85,22 +85,22 @@ impl Windows {
         image: &Buffer<f32>,
         size: UVec2,
         planes: Range<usize>,
-        window: &Window,
+        crop: &PaddedCrop,
         content: &mut Buffer<f32>,
     ) -> Result<()> {
-        check(image, size, &planes, window, content)?;
+        check(image, size, &planes, crop, content)?;
         let plane_count = planes.len() as u32;
-        let (origin, first_plane) = (window.origin, planes.start as u32);
-        let window = window.size;
+        let (origin, first_plane) = (crop.origin, planes.start as u32);
+        let crop = crop.size;
         pass.dispatch(
             &self.gather,
-            &window_gather::Params { size, origin, window, first_plane, plane_count },
-            window_gather::Buffers { image: image.slice(), content: content.slice_mut() },
-            Threads::Exactly([plane_count * window.element_product(), 1, 1]),
+            &crop_gather::Params { size, origin, crop, first_plane, plane_count },
+            crop_gather::Buffers { image: image.slice(), content: content.slice_mut() },
+            Threads::Exactly([plane_count * crop.element_product(), 1, 1]),
         )
     }
 
-    /// Records `image[planes, window] += content`.
+    /// Records `image[planes, crop] += content`.
     ///
     /// # Errors
     /// A buffer is too short for it.
@@ -108,20 +108,20 @@ impl Windows {
         &self,
         pass: &mut Recorder<'_>,
         content: &Buffer<f32>,
-        window: &Window,
+        crop: &PaddedCrop,
         planes: Range<usize>,
         size: UVec2,
         image: &mut Buffer<f32>,
     ) -> Result<()> {
-        check(image, size, &planes, window, content)?;
+        check(image, size, &planes, crop, content)?;
         let plane_count = planes.len() as u32;
-        let (origin, first_plane) = (window.origin, planes.start as u32);
-        let window = window.size;
+        let (origin, first_plane) = (crop.origin, planes.start as u32);
+        let crop = crop.size;
         pass.dispatch(
             &self.scatter,
-            &window_scatter::Params { size, origin, window, first_plane, plane_count },
-            window_scatter::Buffers { content: content.slice(), image: image.slice_mut() },
-            Threads::Exactly([plane_count * window.element_product(), 1, 1]),
+            &crop_scatter::Params { size, origin, crop, first_plane, plane_count },
+            crop_scatter::Buffers { content: content.slice(), image: image.slice_mut() },
+            Threads::Exactly([plane_count * crop.element_product(), 1, 1]),
         )
     }
 }
@@ -131,15 +131,15 @@ fn check(
     image: &Buffer<f32>,
     size: UVec2,
     planes: &Range<usize>,
-    window: &Window,
+    crop: &PaddedCrop,
     content: &Buffer<f32>,
 ) -> Result<()> {
     let pixels = |size: UVec2| size.x as usize * size.y as usize;
-    if (window.origin + window.size).cmpgt(size).any() {
-        return Err(Error::Usage(format!("{window:?} does not lie in a view of {size} pixels")));
+    if (crop.origin + crop.size).cmpgt(size).any() {
+        return Err(Error::Usage(format!("{crop:?} does not lie in a view of {size} pixels")));
     }
     for (buffer, needed) in
-        [(image, planes.end * pixels(size)), (content, planes.len() * pixels(window.size))]
+        [(image, planes.end * pixels(size)), (content, planes.len() * pixels(crop.size))]
     {
         if buffer.len() < needed {
             let (name, len) = (buffer.name(), buffer.len());
