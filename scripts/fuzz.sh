@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# Fuzzes every parser for so many seconds each (600), one after the other, and fails with what was found:
-#     scripts/fuzz.sh 120 ply jpeg
-# cargo-fuzz comes prebuilt into target/tools. It wants a nightly compiler; where there is none, the one at hand takes nightly's options.
+# Fuzzes every parser, or those that are named, for SECONDS each (600), and fails with the input that it found:
+#     scripts/fuzz.sh [SECONDS [PARSER...]]
+# Installs cargo-fuzz, prebuilt, into target/tools. cargo-fuzz needs a nightly compiler; without one, RUSTC_BOOTSTRAP lets
+# the installed compiler take nightly's options.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 seconds=${1:-600}

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Times the rasteriser of gsplat forward and backward on a scene like that of `nightsplat bench`, and prints JSON.
 
-Needs torch with CUDA, and gsplat with its kernels built. The scene is drawn from the same distributions, not from the same
-random numbers: as many Gaussians of the same sizes, opacities and depths before a camera of the same size.
+Needs torch with CUDA, and gsplat with its kernels built. The scene has the same distributions, not the same random
+numbers: number, sizes, opacities and depths of the Gaussians, and the size of the image.
 """
 
 import argparse
@@ -31,7 +31,7 @@ def scene(count, width, height):
 
 
 def measure(count, width, height, repeats):
-    """Medians of milliseconds of the forward and the backward pass, after two runs that do not count."""
+    """Median milliseconds of the forward and the backward pass, after two warm-up runs."""
     (means, quats, scales, opacities, colors), intrinsics = scene(count, width, height)
     view = torch.eye(4, device="cuda")[None]
     times = []

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Makes sure that nightsplat can be built and tested here: cargo, a C++ compiler, the Vulkan loader, a Vulkan device and
-# the validation layer. Installs what is missing of Vulkan on Debian and Ubuntu; elsewhere says what to install.
+# Checks for what building and testing need: cargo, a C++ compiler, the Vulkan loader, a Vulkan device and the
+# validation layer. Installs the missing parts of Vulkan on Debian and Ubuntu; elsewhere prints what to install.
 set -euo pipefail
 
 fail() {
@@ -41,7 +41,7 @@ command -v "${CXX:-c++}" > /dev/null ||
         'on Arch `pacman -S gcc`, on macOS `xcode-select --install`'
 
 if [ "$(uname -s)" != Linux ]; then
-    # Where the loader lies differs by system; `nightsplat doctor` is the judge.
+    # The path of the loader differs by system; `nightsplat doctor` finds it.
     [ -n "${VULKAN_SDK:-}" ] || cat >&2 <<'NOTE'
 note: Vulkan 1.3 and its validation layer come with the Vulkan SDK (https://vulkan.lunarg.com);
       on macOS also `brew install vulkan-loader vulkan-validationlayers molten-vk`

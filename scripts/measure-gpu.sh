@@ -4,22 +4,23 @@
 #     scripts/measure-gpu.sh pack DIR SCENE    where nightsplat is built; SCENE is the folder of a LOM scene
 #     DIR/run.sh OUT                           where the GPU is; DIR was carried there
 #
-# The pack is below 64 MB: the program and the tests without their symbols, the Vulkan loader and its validation layer, the
-# sources that tests read, the scene. The run takes at most ten minutes, each step a part of them; one that fails or runs
-# out of time does not end the others. OUT then holds
+# The pack is below 64 MB: the program and the tests without symbols, the Vulkan loader and its validation layer, the
+# sources that tests read, the scene. The run takes at most ten minutes, of which each step has a share; a step that
+# fails or runs out of time does not stop the others. OUT then holds
 #
 #     summary.txt   what ran, how it ended and how long it took
-#     log.txt       what every step said on standard error
-#     doctor.txt    the devices, and what the driver says of them
+#     log.txt       standard error of every step
+#     doctor.txt    the devices and their drivers
 #     bench.json    kernels, stages and a step, checked against the references
-#     tune.json     every tile at 500x375 and 1920x1080, with registers and spills; many.json: a million Gaussians at 1080p
-#     tune-N.json   the same with subgroups of N lanes, where the device leaves the choice
-#     lom.txt       training at the paper's protocol, plain and with every part: scores, or how far it came
-#     gsplat.json   the rasteriser of gsplat, where the variable GSPLAT names a folder to import it from
-#     tests.txt     every test binary, and the end of what those said that failed
+#     tune.json     every tile at 500x375 and 1920x1080, with registers and spills
+#     many.json     a million Gaussians at 1080p
+#     tune-N.json   the same with subgroups of N lanes, where the device has a choice
+#     lom.txt       training by the paper's protocol, plain and with every part: scores, or the last steps
+#     gsplat.json   the rasteriser of gsplat, if GSPLAT names a folder to import it from
+#     tests.txt     the result of every test binary, and the end of the output of those that failed
 #
-# Variables, with what they are where they are not set: of the pack PROFILE=release and TESTS, the test targets to take
-# (all); of the run TIME=570 in seconds, and the arguments BENCH, TUNE, MANY and LOM of the steps.
+# Variables and their defaults. pack: PROFILE=release, TESTS (the test targets; all). run: TIME=570 (seconds), and
+# BENCH, TUNE, MANY, LOM (arguments of the steps).
 set -euo pipefail
 
 MAX_BYTES=64000000
@@ -32,7 +33,7 @@ fail() {
 # ---------------------------------------------------------------------------
 # Where nightsplat is built
 
-# The executables that cargo names in its messages, of the targets whose line matches the pattern.
+# The executables in cargo's messages, of the targets whose line matches the pattern.
 executables() {
     sed -n "/$1/"'s|.*"executable":"\([^"]*\)".*|\1|p'
 }
@@ -40,8 +41,8 @@ executables() {
 pack() {
     local dir scene stage profile=${PROFILE:-release} messages=--message-format=json-render-diagnostics targets=()
     dir=$(realpath -m "$1") scene=$(realpath "$2")
-    [ -d "$scene/low" ] || fail "$scene: is no LOM scene: it has no folder \`low\`"
-    [ ! -e "$dir" ] || [ -z "$(ls -A "$dir")" ] || fail "$dir: is not empty; name another folder"
+    [ -d "$scene/low" ] || fail "$scene: is not a LOM scene: it has no folder \`low\`"
+    [ ! -e "$dir" ] || [ -z "$(ls -A "$dir")" ] || fail "$dir: is not empty; choose another folder"
     cd "$(dirname "$0")/.."
     for test in ${TESTS:-}; do targets+=(--test "$test"); done
     stage=$(mktemp -d)
@@ -53,7 +54,7 @@ pack() {
     tests=$(cargo test --no-run --profile "$profile" "${targets[@]}" "$messages" | executables '"profile":{[^}]*"test":true}')
     strip -o "$stage/nightsplat" "$program"
     for test in $tests; do strip -o "$stage/tests/$(basename "$test")" "$test"; done
-    # Tests know by these paths where they were built.
+    # The paths that are compiled into the tests.
     printf '%s\n' "$PWD" "$program" > "$stage/paths"
 
     local loader layer=VkLayer_khronos_validation
@@ -63,7 +64,7 @@ pack() {
     sed "s|\"lib$layer.so\"|\"./lib$layer.so\"|" "/usr/share/vulkan/explicit_layer.d/$layer.json" > "$stage/layers/$layer.json"
 
     git ls-files -z | tar --null -T - -c | tar -x -C "$stage/source"
-    # A preset knows a scene by the name of its folder.
+    # The benchmark's preset recognises a scene by the name of its folder.
     cp -RL "$scene" "$stage/scene/"
     local filters=(--lzma2=preset=6,dict=128MiB)
     [ "$(uname -m)" != x86_64 ] || filters=(--x86 "${filters[@]}")
@@ -74,7 +75,7 @@ pack() {
     bytes=$(cat "$dir"/* | wc -c)
     if [ "$bytes" -gt "$MAX_BYTES" ]; then
         (cd "$stage" && du -sk -- * tests/* scene/*/*) | sort -rn >&2
-        fail "$dir has $bytes bytes, more than $MAX_BYTES; above in kB before compression: take fewer TESTS"
+        fail "$dir has $bytes bytes, more than $MAX_BYTES; sizes above in kB before compression; choose fewer TESTS"
     fi
     echo "$dir: $bytes bytes, $(wc -w <<< "$tests") test binaries"
 }
@@ -86,7 +87,7 @@ say() {
     printf '%-10s %-14s %4d s\n' "$@" | tee -a "$out/summary.txt"
 }
 
-# step NAME FILE LIMIT COMMAND..: appends what the command prints to FILE; it has LIMIT seconds of those that are left.
+# step NAME FILE LIMIT COMMAND..: appends the command's output to FILE; it has at most LIMIT of the remaining seconds.
 step() {
     local name=$1 file=$2 limit=$3 begin=$SECONDS code=0 left=$((end - SECONDS))
     shift 3
@@ -103,7 +104,7 @@ step() {
     esac
 }
 
-# The machine's own loader and driver where they are found; else the loader of the pack, and a manifest for the driver.
+# The machine's loader and driver if found; else the loader of the pack, and a manifest for the driver.
 find_vulkan() {
     PATH="$PATH:/usr/sbin:/sbin" ldconfig -p | grep -q 'libvulkan\.so\.1' ||
         export LD_LIBRARY_PATH="$work/lib${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}"
@@ -119,14 +120,14 @@ find_vulkan() {
     export VK_DRIVER_FILES
 }
 
-# place FROM TO: makes FROM found under TO, unless something is there.
+# place FROM TO: links TO to FROM, unless TO exists.
 place() {
     [ ! -e "$2" ] || return 0
     mkdir -p "$(dirname "$2")" && ln -sfn "$1" "$2" || return
     placed+=("$2")
 }
 
-# train NAME LIMIT ARGUMENTS..: a run on the scene; its scores, or the last steps that it logged.
+# train NAME LIMIT ARGUMENTS..: trains on the scene; prints its scores, or the last logged steps.
 train() {
     local name=$1 limit=$2 run=$work/runs/$1
     shift 2
@@ -179,13 +180,13 @@ run() {
         NIGHTSPLAT_SUBGROUP=$size NIGHTSPLAT_TUNE=$work/tiles-$size.json \
             step "tune-$size" "tune-$size.json" 60 "$nightsplat" bench --tune --json ${TUNE:---gaussians 100000}
     done
-    # From here on with the tiles that were the fastest.
+    # From here on with the fastest tiles.
     export NIGHTSPLAT_TUNE=$work/tiles.json
     step many many.json 60 "$nightsplat" bench --json --unchecked ${MANY:---gaussians 1000000 --width 1920 --height 1080}
     train plain 60 --curve ap3 ${LOM:-}
     [ -z "${GSPLAT:-}" ] ||
         PYTHONPATH=$GSPLAT step gsplat gsplat.json 60 python3 "$work/source/scripts/gsplat-rasteriser.py"
-    # All that is left is for the tests and the networks.
+    # The rest of the time is for the networks and the tests.
     train lita $(((end - SECONDS) / 2)) --curve ap3 --model lita ${LOM:-}
     NIGHTSPLAT_TUNE=off run_tests
 }

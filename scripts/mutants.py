@@ -1,18 +1,18 @@
 #!/usr/bin/env python3
-"""Plants every mutant that cargo-mutants lists for some modules, builds them all at once, and shows which no test catches.
+"""Builds every mutant that cargo-mutants lists for some modules into one program, and names those that no test catches.
 
     scripts/mutants.py [--minutes N] [--jobs N] [--seed N] [--tests LIST] [MODULE ...]
 
-A mutated function becomes a choice between its bodies by the environment variable NIGHTSPLAT_MUTANT, so that a mutant costs
-the tests that reach it and no build. It happens in a copy of the tree, target/mutants; what is known so far is kept there in
-JSON, and another run goes on with it as long as no file of the tree changes. Mutants come in an order drawn by chance: a run
-that is cut off is a fair sample.
+A mutated function selects one of its bodies by the environment variable NIGHTSPLAT_MUTANT, so that a mutant costs the
+tests that reach it but no build. This happens in a copy of the tree, target/mutants, where results are kept in JSON;
+another run resumes from them as long as no file of the tree changes. Mutants come in random order: an interrupted run
+is a fair sample.
 
-  caught       a test that reaches it failed, or ran four times as long as it should
-  missed       all tests that reach it passed, or as many of them as fit in two minutes
-  unreached    no test of those that are run calls the function
+  caught       a test that reaches it failed, or took four times its usual time
+  missed       all tests that reach it passed, or all that fit in two minutes
+  unreached    none of the tests calls the function
   unviable     it does not compile
-  unplanted    not a choice of bodies: in a constant function, of an unnamed type, or a field left to its default
+  unplanted    not a whole body: in a const function, of an unnamed type, or a field left at its default
 
 Needs `cargo install cargo-mutants --locked`. Exit code 1 if a mutant was missed.
 """
@@ -37,13 +37,13 @@ WORK = ROOT / "target" / "mutants"
 TREE = WORK / "tree"
 MODULES = ["splats/optimizer", "splats/densify", "loss", "splats/render", "photographs/tone"]
 TESTS = "cli gpu loss networks photographs splats train"
-# Of the tests that reach a mutant, those that take together so many seconds are run, the quickest first.
+# Tests of a mutant, the quickest first, run until they have taken this many seconds.
 MOST_SECONDS = 120
-# Tests of a program run together as long as that takes no more than this beside what was spent before: a mutant that quick
-# tests catch costs little, and the slow ones are started seldom.
+# Tests of a program run together if that adds no more than this to the time spent so far: quick tests catch most
+# mutants, and slow ones are rarely started.
 START_SECONDS = 2
 
-CHOICE = """//! Which mutant is in place of the code, and what was reached.
+CHOICE = """//! Which mutant is active, and which functions were reached.
 
 use std::io::Write;
 use std::sync::OnceLock;
@@ -51,7 +51,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 static REACHED: [AtomicBool; SITES] = [const { AtomicBool::new(false) }; SITES];
 
-/// The mutant in place; notes that its function was reached.
+/// The active mutant; records that its function was reached.
 pub fn mutant(site: usize) -> u32 {
     static MUTANT: OnceLock<u32> = OnceLock::new();
     if !REACHED[site].swap(true, Ordering::Relaxed) {
@@ -69,11 +69,13 @@ pub fn mutant(site: usize) -> u32 {
 
 def listed(modules):
     """The mutants of some modules, numbered from 1."""
-    files = subprocess.run(["git", "ls-files", "src"], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split()
+    git = subprocess.run(["git", "ls-files", "src"], cwd=ROOT, check=True, capture_output=True, text=True)
+    files = git.stdout.split()
     own = [file for file in files if re.match(rf"src/({'|'.join(modules)})(\.rs$|/.*\.rs$)", file)]
     files = [argument for file in own for argument in ("-f", file)]
     try:
-        run = subprocess.run(["cargo-mutants", "mutants", "--list", "--json", *files], cwd=ROOT, capture_output=True, text=True)
+        listing = ["cargo-mutants", "mutants", "--list", "--json", *files]
+        run = subprocess.run(listing, cwd=ROOT, capture_output=True, text=True)
     except FileNotFoundError:
         sys.exit("cargo-mutants is not installed: `cargo install cargo-mutants --locked`")
     if run.returncode != 0:
@@ -82,12 +84,12 @@ def listed(modules):
 
 
 def offset(lines, place):
-    """Where a place lies in the text of a file."""
+    """The offset of a line and column in the text of a file."""
     return sum(len(line) for line in lines[:place["line"] - 1]) + place["column"] - 1
 
 
 def body_at(text):
-    """Where the body of a function begins in its text: at the first brace outside of parentheses."""
+    """The offset of a function's body in its text: its first brace outside of parentheses."""
     depth = 0
     for at, char in enumerate(text):
         depth += (char in "([") - (char in ")]")
@@ -97,7 +99,7 @@ def body_at(text):
 
 
 def planted(source, mutants, site):
-    """The text of a file with all its mutants, and the number of its first site; notes where each lies and its site."""
+    """The text of a file with all its mutants, and the next free site; records site and lines of each mutant."""
     lines = source.splitlines(keepends=True)
     functions = defaultdict(list)
     for mutant in mutants:
@@ -154,14 +156,14 @@ def plant(mutants):
 
 
 def messages(*arguments):
-    """What cargo says of the copy."""
+    """The run of cargo in the copy, and its messages."""
     run = subprocess.run(["cargo", *arguments, "--message-format=json"], cwd=TREE, capture_output=True, text=True)
     said = [json.loads(line) for line in run.stdout.splitlines() if line.startswith("{")]
     return run, said
 
 
 def viable(mutants):
-    """Those that compile, planted."""
+    """The mutants that compile, planted."""
     while True:
         plant(mutants)
         run, said = messages("check", "--lib")
@@ -170,7 +172,7 @@ def viable(mutants):
         broken = set()
         for error in (message["message"] for message in said if message.get("message")):
             spans = list(error["spans"]) if error["level"] == "error" else []
-            # What a macro made is where it was called.
+            # Code from a macro lies where the macro is called.
             for span in spans:
                 spans += [span["expansion"]["span"]] if span["expansion"] else []
                 line = span["line_start"]
@@ -193,11 +195,12 @@ def built(tests):
 
 
 def run_tests(program, names, seconds, **variables):
-    """Whether tests pass in time; and how long they took."""
+    """Whether the tests pass in time, and the seconds that they took."""
     begin = time.monotonic()
     try:
-        run = subprocess.run([program, "--exact", "--test-threads", "1", *names], cwd=TREE, timeout=seconds, env=dict(os.environ, **variables),
-                             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+        run = subprocess.run([program, "--exact", "--test-threads", "1", *names], cwd=TREE, timeout=seconds,
+                             env=dict(os.environ, **variables), **quiet)
         passes = run.returncode == 0
     except subprocess.TimeoutExpired:
         passes = False
@@ -205,7 +208,7 @@ def run_tests(program, names, seconds, **variables):
 
 
 def reach(programs, jobs, kept):
-    """Of every test: its program, how long it takes, and the sites that it reaches; kept in a file."""
+    """Program, seconds and reached sites of every test; cached in a file."""
     known = json.loads(kept.read_text()) if kept.exists() else {}
 
     def one(program, name):
@@ -229,8 +232,9 @@ def reach(programs, jobs, kept):
 
 
 def verdict(mutant, tests, programs):
-    """What becomes of a mutant, and of which test."""
-    own = sorted((test for test in tests if mutant["site"] in test["sites"] and test["passes"]), key=lambda test: test["seconds"])
+    """The verdict on a mutant, and the test that gave it."""
+    own = [test for test in tests if mutant["site"] in test["sites"] and test["passes"]]
+    own.sort(key=lambda test: test["seconds"])
     if not own:
         return "unreached", None
     spent = 0.0
@@ -251,24 +255,26 @@ def verdict(mutant, tests, programs):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("modules", nargs="*", default=MODULES, metavar="MODULE", help="of src/, " + ", ".join(MODULES) + " where none is named")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="ends after so many")
-    parser.add_argument("--jobs", type=int, default=2, help="tests that run side by side")
-    parser.add_argument("--seed", type=int, default=1, help="of the order that they come in")
+    parser.add_argument("modules", nargs="*", default=MODULES, metavar="MODULE",
+                        help=f"of src/ [default: {', '.join(MODULES)}]")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after this time")
+    parser.add_argument("--jobs", type=int, default=2, help="tests that run in parallel")
+    parser.add_argument("--seed", type=int, default=1, help="of the order of the mutants")
     parser.add_argument("--tests", default=TESTS, help="test programs beside the library's own tests")
     options = parser.parse_args()
     end = time.monotonic() + 60 * options.minutes
     known = kept_in()
 
     everything = listed(options.modules)
-    unplanted = [mutant for mutant in everything if not mutant["function"] or "impl " in (mutant["function"]["return_type"] or "")
+    unplanted = [mutant for mutant in everything
+                 if not mutant["function"] or "impl " in (mutant["function"]["return_type"] or "")
                  or "StructField" == mutant["genre"] or is_constant(mutant)]
     candidates = [mutant for mutant in everything if mutant not in unplanted]
     mutants = viable(candidates)
     programs = built(options.tests.split())
     tests = reach(programs, options.jobs, known / "reach.json")
     failing = [test["name"] for test in tests if not test["passes"]]
-    print(f"not counted on, as they fail without a mutant: {', '.join(failing) or 'none'}")
+    print(f"ignored, since they fail without a mutant: {', '.join(failing) or 'none'}")
 
     kept, lock = known / "verdicts.json", threading.Lock()
     verdicts = json.loads(kept.read_text()) if kept.exists() else {}
@@ -302,7 +308,7 @@ def main():
 
 
 def is_constant(mutant):
-    """Whether its function is one that the compiler runs."""
+    """Whether its function is a const function."""
     start = mutant["function"]["span"]["start"]
     line = (ROOT / mutant["file"]).read_text().splitlines()[start["line"] - 1]
     return "const " in line[start["column"] - 1:].split("(")[0]

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Packs a built program for those who do not build it: scripts/package.sh TARGET BINARY
-# leaves dist/nightsplat-VERSION-TARGET.tar.gz (.zip for Windows) with completions, man pages and licences, and its checksum.
-# GLIBC names the newest glibc that it may need; without it that is said, and all.
+# Packs a built program for a release: scripts/package.sh TARGET BINARY writes dist/nightsplat-VERSION-TARGET.tar.gz
+# (.zip for Windows) with completions, man pages and licences, and its checksum. GLIBC is the newest glibc that the
+# program may need (default: any); the version that it needs is printed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 target=${1:?name the target, such as x86_64-unknown-linux-gnu}
-binary=${2:?name the program that was built}
+binary=${2:?name the built program}
 
 version=$("$binary" --version | cut -d ' ' -f 2)
 name=nightsplat-$version-$target
@@ -17,7 +17,7 @@ for shell in bash elvish fish powershell zsh; do
     "$binary" completions "$shell" > "dist/$name/completions/nightsplat.$shell"
 done
 
-# What an old distribution has to bring: 2.17 is of 2012.
+# The glibc that a distribution must have; 2.17 is from 2012.
 case $target in
 *-linux-gnu)
     newest=$(objdump -T "$binary" | grep -o 'GLIBC_[0-9.]*' | sort -Vu | tail -1)

@@ -3,8 +3,8 @@
 
     scripts/plant-defects.py [PART OF A NAME]
 
-Each defect is one replacement in one file, which is put back whatever happens. The tests named beside it are built and
-run; one of them has to fail. Exit code 1 if a defect survives, or if its place is no longer there to plant it in.
+Each defect is one replacement in one file, which is always restored. The tests named beside it are built and run; one
+of them has to fail. Exit code 1 if a defect survives, or if the text to replace is no longer there.
 """
 
 import re
@@ -15,7 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# name, file, what is there, what is planted, arguments of `cargo test`
+# name, file, text, its replacement, arguments of `cargo test`
 DEFECTS = [
     ("the sign of a conic's off-diagonal", "shaders-glsl/splats/render/project.comp",
      "vec3(cov2d.z, -cov2d.y, cov2d.x)", "vec3(cov2d.z, cov2d.y, cov2d.x)", "--test splats golden"),
@@ -81,7 +81,7 @@ DEFECTS = [
      "SPLIT_OFFSET * abs(camera_depth_change(mean_in_view, view_axes[axis], camera));", "0.0;", "--test splats densify::"),
     ("a round that is tried again makes as many splits", "shaders-glsl/splats/densify/densify_decide.comp",
      "return min(most_added, ", "return min(most_added | ~0u, ", "--test splats densify::"),
-    # The guards of the kernels, each taken out: docs/extremes.md is their table.
+    # The guards of the kernels, each removed: docs/extremes.md is their table.
     ("guard: what is not before the near plane is culled", "shaders-glsl/splats/render/project.comp",
      "if (!(depth > near && opacity > ALPHA_MIN)) return;", "if (!(opacity > ALPHA_MIN)) return;",
      "--test splats gaussians"),
@@ -132,11 +132,11 @@ DEFECTS = [
 
 
 def plant(file, before, after, arguments):
-    """What became of the defect, in words, and whether it was caught."""
+    """The result in words, and whether the defect was caught."""
     path = ROOT / file
     original = path.read_text()
     if original.count(before) != 1:
-        return f"its place is there {original.count(before)} times", False
+        return f"the text to replace occurs {original.count(before)} times", False
     try:
         path.write_text(original.replace(before, after))
         run = subprocess.run(["cargo", "test", "-q", *arguments.split()], cwd=ROOT, text=True, capture_output=True)
@@ -152,7 +152,7 @@ def plant(file, before, after, arguments):
 
 
 def main():
-    # Interrupted, Python unwinds as for any other exception, and the file is put back.
+    # As an exception, an interruption restores the file.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(130))
     wanted = " ".join(sys.argv[1:])
     survivors = 0

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""The public API of the library, one line an item: what hosts and trainers may rely on.
+"""Lists the public API of the library, one item a line.
 
-    scripts/public-api.py            compares it with docs/public-api.txt, and says how much is embedded
-    scripts/public-api.py --write    writes that file anew
+    scripts/public-api.py            compares it with docs/public-api.txt, and counts the items
+    scripts/public-api.py --write    rewrites that file
 
-Reads the JSON that rustdoc makes of a build without features for tests. Fields, variants and the implementations of traits
-stand with their type and are no items of their own.
+Reads rustdoc's JSON of a build without the feature `testing`. Fields, variants and trait implementations belong to
+their type and do not count as items.
 """
 
 import difflib
@@ -17,16 +17,16 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 SNAPSHOT = ROOT / "docs/public-api.txt"
-# The version of rustdoc's JSON that this reads; another one moves names.
+# The version of rustdoc's JSON that this script reads.
 FORMAT = 57
 BUILDS = {"embedded": [], "with files": ["--features", "io"]}
 
 
 def documented(features: list[str]) -> dict:
-    """What rustdoc knows of the library."""
+    """Rustdoc's JSON of the library."""
     command = ["cargo", "rustdoc", "--quiet", "--lib", "--no-default-features", *features]
     options = ["-Z", "unstable-options", "--output-format", "json", "--cap-lints", "allow"]
-    # The output is unstable; the compiler that makes it is the project's own.
+    # The JSON is unstable; this lets the project's own compiler write it.
     environment = os.environ | {"RUSTC_BOOTSTRAP": "1"}
     subprocess.run([*command, "--", *options], cwd=ROOT, env=environment, check=True)
     metadata = subprocess.run(
@@ -81,7 +81,7 @@ NAMED: set[int] = set()
 
 
 def named(path: dict) -> str:
-    """By its last name, as code that imports it does."""
+    """Its last segment, as in code that imports it."""
     NAMED.add(path["id"])
     return path["path"].split("::")[-1] + arguments(path["args"])
 
@@ -145,7 +145,7 @@ def signature(sig: dict) -> str:
 
 
 class Api:
-    """The lines of a crate, and how much it has of what."""
+    """The lines of a crate, and its numbers of items and parts."""
 
     def __init__(self, crate: dict):
         self.index = crate["index"]
@@ -265,7 +265,7 @@ def main() -> None:
         api = Api(documented(features))
         print(f"{name}: {api.items} public items, {api.parts} fields and variants")
         if api.hidden:
-            sys.exit(f"the API names types that are no part of it: {', '.join(api.hidden)}")
+            sys.exit(f"the API uses types that are not part of it: {', '.join(api.hidden)}")
     text = "\n".join(api.lines) + "\n"
     if is_written:
         SNAPSHOT.write_text(text)
@@ -273,8 +273,8 @@ def main() -> None:
         sys.stdout.writelines(
             difflib.unified_diff(before.splitlines(True), text.splitlines(True), "docs/public-api.txt", "now", n=0)
         )
-        remedy = "where that is meant: scripts/public-api.py --write, and a line in CHANGELOG.md"
-        sys.exit(f"the public API is another one; {remedy}")
+        remedy = "if that is meant: scripts/public-api.py --write, and a line in CHANGELOG.md"
+        sys.exit(f"the public API has changed; {remedy}")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Reads a run's model.glb with a glTF library of others, and compares every number with model.ply, read by plyfile.
+"""Reads a run's model.glb with pygltflib and compares every number with model.ply, read by plyfile.
 
     python3 -m venv env && env/bin/pip install numpy plyfile pygltflib
     nightsplat export RUN --to glb && env/bin/python scripts/read-glb.py RUN
 
-glTF has y up, so positions and rotations are turned by half about x, and so is what the coefficients say of a direction.
+glTF has y up: positions, rotations and the directions of SH are turned by half a turn about x.
 """
 
 import pathlib
@@ -18,7 +18,7 @@ EXTENSION = "KHR_gaussian_splatting"
 
 
 def read_glb(path):
-    """Every attribute of the one primitive, as the accessors describe it."""
+    """The attributes of the one primitive, as the accessors describe them."""
     gltf = GLTF2.load(str(path))
     assert EXTENSION in gltf.extensionsUsed
     (mesh,) = gltf.meshes
@@ -57,7 +57,7 @@ def read_ply(path):
 
 
 def covariances(quats, scales):
-    """R S S^T R^T of unit (w, x, y, z)."""
+    """R S S^T R^T of unit quaternions (w, x, y, z)."""
     w, x, y, z = quats.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -89,7 +89,7 @@ def main():
     run = pathlib.Path(sys.argv[1])
     glb, ply = read_glb(run / "model.glb"), read_ply(run / "model.ply")
     turn = np.array([1.0, -1.0, -1.0])
-    # Of rotation and scale only the covariance is seen: axes may point either way.
+    # Axes may point either way, so rotations and scales are compared as covariances.
     ply_covariances = covariances(ply["rotations"], ply["scales"]) * np.outer(turn, turn)
     glb_covariances = covariances(glb["ROTATION"][:, [3, 0, 1, 2]], glb["SCALE"])
     sizes = np.max(ply["scales"], axis=1)[:, None, None] ** 2
@@ -112,7 +112,7 @@ def main():
     for name, (read, wanted) in pairs.items():
         assert read.shape == wanted.shape, name
         error = np.max(np.abs(read - wanted) / (1e-2 + np.abs(wanted)))
-        print(f"{'ok' if error < 1e-4 else 'BAD':3} {name}: {error:.1e} of themselves at most")
+        print(f"{'ok' if error < 1e-4 else 'BAD':3} {name}: relative error {error:.1e} at most")
         failed += not error < 1e-4
     print(f"{len(glb['POSITION'])} Gaussians")
     return int(failed > 0)

@@ -1,11 +1,14 @@
 #!/usr/bin/env python3
-"""The campaigns that take longer than tests may: each prints what it found, and the first that fails ends the script.
+"""Campaigns that take longer than tests may. Each prints its result; the first that fails ends the script.
 
     scripts/stress.py [table] [conditioning] [cameras] [long] [kills] [fuzz] [guards] [growth]
 
-Without a name all of them run. NIGHTSPLAT names the command (default: target/release/nightsplat, built first), STEPS and
-KILLS how many steps and kills (100000 and 200), FUZZ_SECONDS what each fuzz target gets (600), NIGHTSPLAT_SCENES the scenes
-of growth, parted by commas (NIGHTSPLAT_DOWNSCALES 4,2,1 and NIGHTSPLAT_SEEDS 1,2,3).
+Without a name, all of them run.
+
+NIGHTSPLAT           the command (default: target/release/nightsplat, built first)
+STEPS, KILLS         of long and kills (100000, 200)
+FUZZ_SECONDS         for each fuzz target (600)
+NIGHTSPLAT_SCENES    the scenes of growth, comma-separated; NIGHTSPLAT_DOWNSCALES (4,2,1), NIGHTSPLAT_SEEDS (1,2,3)
 """
 
 import os
@@ -23,7 +26,7 @@ STEPS = int(os.environ.get("STEPS", "100000"))
 KILLS = int(os.environ.get("KILLS", "200"))
 FUZZ_SECONDS = int(os.environ.get("FUZZ_SECONDS", "600"))
 PLAIN = ["--model", "plain", "--plan", "none", "--curve", "ap3"]
-# What a run may grow by between its first tenth and its last: the allocator's doings, no more.
+# The largest factor by which memory may grow from the second tenth of a run to its last: the allocator's share.
 MOST_GROWTH = 1.05
 
 
@@ -56,8 +59,9 @@ def conditioning(_):
 
 
 def cameras(_):
-    """COLMAP on real dark photographs, and a training with what it finds."""
-    run("cargo", "test", "--release", "--test", "photographs", "--", "--ignored", "--nocapture", "real_dark_photographs")
+    """COLMAP on real dark photographs, and training with its poses."""
+    test = ["--test", "photographs", "--", "--ignored", "--nocapture", "real_dark_photographs"]
+    run("cargo", "test", "--release", *test)
 
 
 def resident(pid):
@@ -68,8 +72,11 @@ def resident(pid):
 
 
 def long(folder):
-    """Memory over many steps: on a software device that of the device is the process's own. A debug build grows here:
-    it loads the validation layer, which keeps part of what it allocates for each command buffer."""
+    """Memory over many steps.
+
+    A software device's memory is the process's own. A debug build grows: its validation layer keeps part of the allocations
+    of each command buffer.
+    """
     data, out = synth(folder / "set", 32, 8), folder / "long"
     arguments = [command(), "train", data, "--out", out, "--steps", STEPS, "--max-gaussians", 1000, *PLAIN]
     child = subprocess.Popen([str(a) for a in arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -81,13 +88,13 @@ def long(folder):
     tenth = max(1, len(samples) // 10)
     means = [sum(part) / len(part) for part in (samples[i:i + tenth] for i in range(0, len(samples), tenth))]
     print(f"{STEPS} steps: resident MB by tenths of the run: " + ", ".join(f"{mean / 1024:.0f}" for mean in means))
-    # The first tenth holds the start, the second is the yardstick.
+    # The first tenth includes the start, so the second is the base.
     if child.returncode != 0 or (len(means) > 2 and means[-1] > MOST_GROWTH * means[1]):
         sys.exit("memory grows, or the run failed")
 
 
 def kills(folder):
-    """Kills a run at any moment, again and again; it ends with the bytes of one that was left alone."""
+    """Kills runs at random moments; resumed, they end with the bytes of an uninterrupted one."""
     data = synth(folder / "set", 32, 8)
     rounds = random.Random(14)
 
@@ -105,7 +112,7 @@ def kills(folder):
         while True:
             child = subprocess.Popen(arguments(out), **quiet)
             try:
-                # Enough kills: the last run may end.
+                # After enough kills the last run may finish.
                 code = child.wait(timeout=rounds.uniform(0.05, 4) if killed < KILLS else None)
             except subprocess.TimeoutExpired:
                 child.send_signal(signal.SIGKILL)
@@ -117,16 +124,16 @@ def kills(folder):
             break
         if (out / "model.ply").read_bytes() != expected:
             sys.exit(f"after {killed} kills a run ended with other bytes")
-    print(f"{killed} kills over {runs} runs: every one ended with the bytes of a run that was left alone")
+    print(f"{killed} kills over {runs} runs: every one ended with the bytes of an uninterrupted run")
 
 
 def fuzz(_):
-    """Every parser, so long each."""
+    """Every parser, FUZZ_SECONDS each."""
     run(ROOT / "scripts" / "fuzz.sh", FUZZ_SECONDS)
 
 
 def guards(_):
-    """Takes every guard out of the kernels, one at a time: a test has to fail."""
+    """Removes every guard of the kernels, one at a time: a test has to fail."""
     run(sys.executable, ROOT / "scripts" / "plant-defects.py", "guard:")
 
 
@@ -138,7 +145,8 @@ def growth(_):
     run("cargo", "test", "--release", "--lib", "--", "--ignored", "--nocapture", "no_round_of_a_real_scene")
 
 
-CAMPAIGNS = {campaign.__name__: campaign for campaign in (table, conditioning, cameras, long, kills, fuzz, guards, growth)}
+ALL = (table, conditioning, cameras, long, kills, fuzz, guards, growth)
+CAMPAIGNS = {campaign.__name__: campaign for campaign in ALL}
 
 
 def main():

@@ -1,8 +1,7 @@
 #!/usr/bin/env bash
-# Builds the image of Containerfile and trains the demo's scene in it, on the software device that it brings:
-#     scripts/test-container.sh
-# Wants root and buildah, no daemon and no rights beyond a chroot. A base image that cannot be pulled is made by debootstrap, of
-# the same packages.
+# Builds the image of Containerfile and trains the demo's scene in it, on the image's software device. Needs root and
+# buildah, no daemon and no rights beyond a chroot. A base image that cannot be pulled is made by debootstrap from the
+# same packages.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 export BUILDAH_ISOLATION=chroot STORAGE_DRIVER=${STORAGE_DRIVER:-vfs}
@@ -12,12 +11,12 @@ if ! buildah inspect --type image "$base" > /dev/null 2>&1 && ! buildah pull "$b
     suite=${base#*:}
     root=$(mktemp -d)
     trap 'rm -rf "$root"' EXIT
-    # By the rules of sid: debootstrap may be older than the suite.
+    # The script of sid, since debootstrap may be older than the suite.
     debootstrap --variant=minbase "${suite%-slim}" "$root" "" /usr/share/debootstrap/scripts/sid
-    # What this machine trusts beside the usual, such as a proxy, its packages have to be fetched through.
+    # Certificates of this machine, such as a proxy's, through which packages are fetched.
     mkdir -p "$root/usr/local/share/ca-certificates"
     find /usr/local/share/ca-certificates -name '*.crt' -exec cp {} "$root/usr/local/share/ca-certificates/" \;
-    # A mirror may stand still for longer than its index is said to hold.
+    # A mirror's index may be older than its expiry date.
     echo 'Acquire::Check-Valid-Until "false";' > "$root/etc/apt/apt.conf.d/99-mirror"
     made=$(buildah from scratch)
     buildah add --quiet "$made" "$root" /

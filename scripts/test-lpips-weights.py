@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Tests scripts/lpips-weights.py on weights that are planted here, without a network and without numpy.
+"""Tests scripts/lpips-weights.py on planted weights, without network access and without numpy.
 
-    scripts/test-lpips-weights.py [--keep FOLDER]      (leaves what was converted, lpips-alex.safetensors and lpips-vgg.safetensors)
+    scripts/test-lpips-weights.py [--keep FOLDER]      (keeps lpips-alex.safetensors and lpips-vgg.safetensors)
 """
 
 import argparse
@@ -128,7 +128,7 @@ class Conversion(unittest.TestCase):
     def test_a_pickle_that_names_anything_but_arrays_is_refused_and_runs_nothing(self):
         with tempfile.TemporaryDirectory() as folder:
             trap = os.path.join(folder, "made")
-            self.refused({**planted("alex"), "beside": Malicious(trap)}, "mkdir", "no array")
+            self.refused({**planted("alex"), "beside": Malicious(trap)}, "mkdir", "not an array")
             self.assertFalse(os.path.exists(trap))
 
     def test_weights_of_another_shape_or_kind_are_named(self):
@@ -145,7 +145,8 @@ class Conversion(unittest.TestCase):
 
     def test_values_that_no_distance_has_are_refused(self):
         tree = planted("alex")
-        for value, part in [(-0.5, "layer 0 is negative"), (float("nan"), "lin0.model.1.weight holds values that are not finite")]:
+        not_finite = "lin0.model.1.weight holds values that are not finite"
+        for value, part in [(-0.5, "layer 0 is negative"), (float("nan"), not_finite)]:
             tree["NetLinLayer_0"]["Conv_0"]["kernel"] = Planted(1, 1, 64, 1, period=[0.5, value])
             self.refused(tree, part)
 
@@ -162,7 +163,7 @@ class Conversion(unittest.TestCase):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="where what was converted is left")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the converted files here")
     Conversion.KEEP = parser.parse_args().keep
     stand_in_for_numpy()
     unittest.main(argv=sys.argv[:1])

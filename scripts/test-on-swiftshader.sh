@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# Runs the tests on SwiftShader, the software device that comes with Debian's chromium: subgroups of four, and no push
-# descriptors. Arguments go to `cargo test`:
+# Runs the tests on SwiftShader, the software device of Debian's chromium: subgroups of four, and no push descriptors.
+# Arguments go to `cargo test`:
 #     scripts/test-on-swiftshader.sh --test splats
-# What fails there is named in scripts/known-failures/swiftshader.txt.
+# scripts/known-failures/swiftshader.txt lists the tests that fail there.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 driver=${SWIFTSHADER_ICD:-/usr/lib/chromium/vk_swiftshader_icd.json}
 if [ ! -e "$driver" ]; then
-    echo "not run: the tests on SwiftShader, as there is no $driver (on Debian \`apt install chromium\`)"
+    echo "not run: the tests on SwiftShader: there is no $driver (on Debian \`apt install chromium\`)"
     exit 0
 fi
-# Older loaders know the second name alone.
+# Older loaders know only the second name.
 export VK_DRIVER_FILES=$driver VK_ICD_FILENAMES=$driver
 exec scripts/test-with-known-failures.sh scripts/known-failures/swiftshader.txt "$@"

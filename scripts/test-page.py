@@ -3,10 +3,10 @@
 
     scripts/test-page.py [NIGHTSPLAT]      (default: target/release/nightsplat, or debug)
 
-Trains a small synthetic set, opens the page from disk at the size of its views and at twice that, and wants 30 dB or more
-of every view. Turns the background grey by its key and black again by its control: grey must show where nothing is, and
-leave what is opaque. Then opens it in a browser without WebGL, which must say so. Needs nothing but Python and Chromium, to
-which it speaks the DevTools protocol through a pipe; where there is no Chromium it says `not run`.
+Trains a small synthetic set, opens the page from disk at the size of its views and at twice that, and requires 30 dB or
+more for every view. Turns the background grey by its key and black again by its control: grey must show where nothing
+is, and not where the model is opaque. Then opens the page in a browser without WebGL, where it must say so. Needs
+Python and Chromium, which it controls by the DevTools protocol through a pipe; without Chromium it prints `not run`.
 """
 
 import base64
@@ -42,7 +42,8 @@ COMPARE = """(async (png) => {
   return 10 * Math.log10(255 ** 2 / Math.max(square, 1e-9));
 })('PNG')"""
 
-# The key G from far away: before, behind, and once the control has been clicked. Red of every pixel; the alpha is left out.
+# The key G from far away: before, behind, and once the control has been clicked. Red of every pixel; the alpha is left
+# out.
 GREY = """(async () => {
   const canvas = document.getElementById('canvas'), gl = canvas.getContext('webgl2');
   const press = (key) => canvas.dispatchEvent(new KeyboardEvent('keydown', { key, bubbles: true }));

@@ -19,6 +19,7 @@ mod measuring;
 mod memory;
 mod model;
 mod networks;
+mod old_keys;
 mod parts;
 mod passes;
 mod patches;

@@ -40,6 +40,26 @@ pub fn write_whole_with(
     })
 }
 
+/// Checks, before any work, that a file or a folder can be created.
+///
+/// # Errors
+/// [`Error::Output`] if not.
+pub fn check_writable(path: &Path) -> Result<()> {
+    let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    let parent = absolute.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
+    // A file is replaced in its folder; a device or a pipe is written to.
+    let folder =
+        if parent.is_file() && parent == absolute { parent.parent() } else { Some(parent) };
+    let written = match folder {
+        Some(folder) if parent == absolute && !folder.is_dir() => Ok(()),
+        Some(folder) => tempfile::tempfile_in(folder).map(drop),
+        None => Ok(()),
+    };
+    written.map_err(|error| {
+        Error::output(path, format!("cannot be written ({error}); choose another place"))
+    })
+}
+
 /// Text for a terminal or a line of a log: control characters, which names from elsewhere may hold, are spelled out. Line
 /// breaks stay.
 pub fn printable(text: &str) -> Cow<'_, str> {

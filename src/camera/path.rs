@@ -1,4 +1,4 @@
-//! Flights of a camera through the poses of photographs: what a video of a model shows.
+//! Camera paths through the poses of photographs, for videos.
 
 use std::f64::consts::{PI, TAU};
 
@@ -8,36 +8,36 @@ use super::Camera;
 use super::axes::{forward, mean, nearest_to_axes, upwards};
 use crate::{Error, Result};
 
-/// How a camera flies.
+/// The shape of a path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CameraPath {
-    /// A circle around the point nearest to all optical axes, as high and as far as the cameras are on the mean.
+    /// A circle around the point nearest to all optical axes, at the mean height and distance of the cameras.
     Orbit,
     /// The part of that circle which the cameras cover, there and back.
     Arc,
-    /// Two turns about the mean pose, as wide as the cameras lie apart, looking at what they look at (LLFF).
+    /// Two turns around the mean pose, as wide as the spread of the cameras, looking at their common point (LLFF).
     Spiral,
-    /// A smooth curve through every pose, in order.
+    /// A smooth curve through all poses, in order.
     Interpolate,
 }
 
-/// Turns of a spiral; it comes and goes once along the optical axis meanwhile.
+/// Turns of a spiral, with one oscillation along the optical axis.
 const TURNS: f64 = 2.0;
 
-/// The largest gap between neighbouring cameras of those that surround a scene, radians: more shows what no photograph does.
+/// Cameras surround a scene if no gap between neighbours is larger, radians.
 const SURROUNDED: f64 = 100.0 * PI / 180.0;
 
-/// Cameras that cover less of a circle look as good as in parallel, radians.
-const LEAST_ARC: f64 = 20.0 * PI / 180.0;
+/// Cameras that cover less of a circle count as parallel, radians.
+const MIN_ARC: f64 = 20.0 * PI / 180.0;
 
 impl CameraPath {
-    /// The path that stays where the cameras of `poses` show the scene: an orbit where they surround it, an arc where they cover
-    /// a part of the circle, a spiral where they look in parallel, and a curve through all of them where they look outwards.
+    /// The path that stays where the cameras of `poses` show the scene: an orbit if they surround it, an arc if they cover
+    /// a part of the circle, a spiral if they are parallel, and a curve through all of them if they look outwards.
     pub fn suited(poses: &[Camera]) -> Self {
         Self::suited_about(poses, upwards(poses))
     }
 
-    /// The same about a direction that is up.
+    /// The same about a given up direction, a unit vector.
     pub(crate) fn suited_about(poses: &[Camera], up: DVec3) -> Self {
         let Some(circle) = Circle::new(poses, up) else { return Self::Spiral };
         let faces = |pose: &&Camera| forward(pose).dot(circle.target - pose.center()) > 0.0;
@@ -47,18 +47,17 @@ impl CameraPath {
             Self::Interpolate
         } else if TAU - (end - begin) < SURROUNDED {
             Self::Orbit
-        } else if end - begin < LEAST_ARC {
+        } else if end - begin < MIN_ARC {
             Self::Spiral
         } else {
             Self::Arc
         }
     }
 
-    /// The cameras of so many frames, with the image and focal lengths of the first of `poses`.
+    /// `frames` cameras with the image size and focal lengths of the first of `poses`.
     ///
     /// # Errors
-    /// [`Error::Usage`]: there is no pose, or the cameras look in parallel, so that there is nothing to look at from all
-    /// sides.
+    /// [`Error::Usage`]: there is no pose, or the cameras are parallel, so that there is no point to orbit.
     pub fn cameras(self, poses: &[Camera], frames: usize) -> Result<Vec<Camera>> {
         self.cameras_about(poses, upwards(poses), frames)
     }
@@ -84,14 +83,14 @@ impl CameraPath {
     }
 }
 
-/// Uniform Catmull-Rom splines of the centres and, on one side of the sphere, of the rotations.
+/// Uniform Catmull-Rom splines of the centres and, within one hemisphere, of the quaternions.
 fn interpolated(poses: &[Camera], frames: usize) -> Vec<DAffine3> {
     let world_from_view = poses.iter().map(|pose| pose.view_from_world.inverse());
     let centers: Vec<DVec3> = world_from_view.clone().map(|pose| pose.translation).collect();
     let mut turns: Vec<DVec4> = vec![];
     for pose in world_from_view {
         let turn = DVec4::from(DQuat::from_mat3(&pose.matrix3).normalize());
-        // Both signs are the same rotation; the nearer one is the shorter way.
+        // Both signs are the same rotation; the nearer one gives the shorter path.
         let is_far = turns.last().is_some_and(|last| last.dot(turn) < 0.0);
         turns.push(if is_far { -turn } else { turn });
     }
@@ -109,7 +108,7 @@ fn interpolated(poses: &[Camera], frames: usize) -> Vec<DAffine3> {
     (0..frames).map(frame).collect()
 }
 
-/// Of four knots, between the middle ones.
+/// Interpolates between the middle two of four knots.
 fn weights(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [
@@ -200,7 +199,7 @@ fn spiral(poses: &[Camera], up: DVec3, frames: usize) -> Vec<DAffine3> {
     });
     let reach = DVec3::from(radii).length().max(f64::MIN_POSITIVE);
     let ahead = nearest_to_axes(poses).map(|target| (target - center).dot(forward));
-    // What parallel cameras look at is anywhere; far, the frames look in parallel too.
+    // Parallel cameras have no common point; with one far away the frames are parallel too.
     let focus = ahead.filter(|&ahead| ahead > 0.0).unwrap_or(10.0 * reach);
     let world_from_middle = middle.inverse();
     let frame = |index: usize| {
@@ -231,7 +230,7 @@ mod tests {
 
     const TARGET: DVec3 = DVec3::new(0.5, -0.25, 2.0);
 
-    /// So many cameras on a part of a circle, a bit above what they look at.
+    /// Cameras on an arc, slightly above the point that they look at.
     fn ring(count: usize, turn: f64) -> Vec<Camera> {
         let pose = |index: usize| {
             let (sin, cos) = (turn * index as f64 / count as f64).sin_cos();
@@ -335,7 +334,7 @@ mod tests {
             assert!(frame.center().distance(center) < 1.5);
             assert!(forward(frame).dot((TARGET - frame.center()).normalize()) > 0.99);
         }
-        // Cameras in parallel have no point in common, and still a spiral.
+        // Parallel cameras have no common point, and yet a spiral.
         let mut parallel = poses[0];
         parallel.view_from_world.translation += DVec3::X;
         let frames = CameraPath::Spiral.cameras(&[poses[0], parallel], 5).unwrap();

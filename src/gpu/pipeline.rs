@@ -151,7 +151,7 @@ pub(super) unsafe fn raw_pipeline(
         .specialization_info(&specialization);
     if interface.subgroup_size_id.is_some() {
         stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
-        // Where a device cannot be told the size, its only size is the one it reports.
+        // Where a device cannot be told the subgroup size, its only size is the one it reports.
         if shared.properties.subgroup_size_is_selectable {
             stage = stage.push_next(&mut required);
         }

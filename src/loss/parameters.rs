@@ -50,7 +50,7 @@ pub struct ParameterWeights {
     opacity_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
     /// Weight of the mean standard deviation, in units of the frame; 3DGS-MCMC has 0.01.
     scale_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
-    /// Weight of the mean excess of ln(longest / shortest standard deviation) over ln(loss.anisotropy_limit).
+    /// Weight of the mean excess of ln(longest / shortest standard deviation) over ln(`loss.anisotropy_limit`).
     anisotropy_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
     /// The ratio of longest to shortest standard deviation that costs nothing.
     anisotropy_limit: f64 = 3.0 => Rule::from_to(1.0, 1e6);

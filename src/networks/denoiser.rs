@@ -39,13 +39,13 @@ settings! {
 /// (docs/benchmarks.md).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DenoiserSettings {
-    /// Stages of the denoiser: estimates of the noise, each with its own weights.
+    /// Stages of the denoiser, each with its own weights.
     stages: u32 = 1 => Rule::Whole(1, 16), "--denoiser-stages N";
-    /// Repeats of the inner convolution and norm in a stage of the denoiser.
+    /// Inner convolutions per stage of the denoiser.
     repeats: u32 = 2 => Rule::Whole(1, 64), "--denoiser-repeats N";
-    /// Feature maps of the denoiser.
+    /// Channels of the denoiser.
     channels: u32 = 8 => Rule::Whole(1, 512), "--denoiser-channels N";
-    /// single, or half: 16-bit factors in the inner convolution where the device has matrices of them.
+    /// Precision of the denoiser: single, or half, which takes 16-bit cooperative matrices.
     precision: Precision = Precision::Single => Rule::OneOf(&["single", "half"]), "--denoiser-precision P";
     /// How the networks begin and end, the tonemapper too: identity, which lets through what goes in until something better
     /// is learned, or paper.

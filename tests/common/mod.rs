@@ -6,6 +6,8 @@
 pub(crate) mod chain;
 #[cfg(feature = "cli")]
 pub(crate) mod command;
+#[cfg(feature = "cli")]
+pub(crate) mod log;
 pub(crate) mod lpips;
 pub(crate) mod place;
 pub(crate) mod safetensors;

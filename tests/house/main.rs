@@ -7,5 +7,7 @@ mod common;
 
 mod architecture;
 mod circles;
+mod documents;
 mod install;
 mod settings;
+mod words;

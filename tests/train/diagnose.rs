@@ -276,12 +276,15 @@ fn the_command_prints_json_writes_a_page_and_a_plan_that_train_keeps() {
     let printed =
         succeed(&format!("diagnose {root} --json --report {page} --plan {plan} --steps 9"));
     let json: serde_json::Value = serde_json::from_str(&printed).unwrap();
-    assert!(json["scene"]["lift"].as_f64() > Some(2.0) && json["plan"]["curve"]["on"] == true);
+    assert!(
+        json["scene"]["brightening"].as_f64() > Some(2.0) && json["plan"]["curve"]["on"] == true
+    );
     assert!(!json["device"].as_str().unwrap().is_empty());
     assert_eq!(json["views"].as_array().unwrap().len(), 10);
     let html = fs::read_to_string(&page).unwrap();
-    let picture = html.find("<img").unwrap();
-    assert!(picture < html.find("<table").unwrap(), "pictures come first");
+    let plan_at = html.find("The plan").unwrap();
+    assert!(plan_at < html.find("<img").unwrap(), "the plan comes first");
+    assert!(html.contains("Bad: below 0.02"), "a column says its unit and what a bad value is");
     assert!(!html.contains("http://") && !html.contains("https://"));
     let text = succeed(&format!("diagnose {root}"));
     for part in ["10 photographs to train on (96x72), 2 held out", "denoiser", "views"] {

@@ -14,6 +14,7 @@ use crate::base::hash::Hasher;
 use crate::camera::Lens;
 use crate::photographs::image::{Image, Orientation, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
+use crate::photographs::white_balance::WhiteBalanceGains;
 
 /// A photograph that was shrunk on loading, or is not kept.
 #[derive(Clone, Debug)]
@@ -25,6 +26,8 @@ pub struct Original {
     undistort: bool,
     /// From what is stored to what the camera took.
     orientation: Orientation,
+    /// White balance of a photograph.
+    pub(super) gains: Option<WhiteBalanceGains>,
     /// The statistics of the photograph, and of which size.
     pub(super) measured: Option<(MeasuredSize, MeasuredPhotograph)>,
     /// Of the pixels as they are loaded, where they are not kept.
@@ -35,8 +38,16 @@ pub struct Original {
 
 impl Original {
     pub(super) fn new(path: PathBuf, lens: Lens, undistort: bool, turns: Turns) -> Self {
-        let (orientation, stored) = (turns.loading, Arc::default());
-        Self { path, lens, undistort, orientation, measured: None, checksum: None, stored }
+        Self {
+            path,
+            lens,
+            undistort,
+            orientation: turns.loading,
+            gains: None,
+            measured: None,
+            checksum: None,
+            stored: Arc::default(),
+        }
     }
 
     /// Width and height, undistorted.
@@ -62,7 +73,10 @@ impl Original {
     pub(super) fn load_at(&self, size: (u32, u32)) -> Result<Image> {
         let Self { path, lens, undistort, .. } = self;
         let preparation = Preparation::new(lens, *undistort, size, &path.to_string_lossy())?;
-        let (image, _) = PictureFile::open(path)?.decode()?;
+        let (mut image, _) = PictureFile::open(path)?.decode()?;
+        if let Some(gains) = self.gains {
+            gains.apply(&mut image);
+        }
         preparation.loaded(image.turned(self.orientation), path)
     }
 

@@ -8,8 +8,9 @@ use glam::DAffine3;
 use super::Split;
 use super::allowance::Allowance;
 use super::turns::{Header, Turns};
+use crate::base::tree;
 use crate::camera::Lens;
-use crate::photographs::image::{Image, Orientation, PictureFile};
+use crate::photographs::image::{Image, MaskFile, Orientation, PictureFile};
 
 /// What a view is made of.
 #[derive(Clone, Debug)]
@@ -21,7 +22,7 @@ pub(super) struct Source {
     pub(super) view_from_world: DAffine3,
     pub(super) input: Option<PathBuf>,
     pub(super) reference: Option<PathBuf>,
-    pub(super) mask: Option<PathBuf>,
+    pub(super) mask: Option<MaskFile>,
     pub(super) depth: Option<PathBuf>,
     /// Photograph and reference image, where they are read already.
     pub(super) read: [Option<Arc<PictureFile>>; 2],
@@ -34,7 +35,8 @@ impl Source {
     pub(super) fn new(
         (name, split): (String, Split),
         (lens, view_from_world): (Lens, DAffine3),
-        [input, reference, mask, depth]: [Option<PathBuf>; 4],
+        [input, reference, depth]: [Option<PathBuf>; 3],
+        mask: Option<MaskFile>,
     ) -> Self {
         let (read, turns) = ([None, None], [Turns::default(); 2]);
         Self { name, split, lens, view_from_world, input, reference, mask, depth, read, turns }
@@ -47,7 +49,7 @@ impl Source {
         let mut headers = [None; 2];
         for ((path, read), header) in paths.into_iter().zip(&mut self.read).zip(&mut headers) {
             let Some(path) = path else { continue };
-            let bytes = path.metadata().map_or(u64::MAX, |file| file.len());
+            let bytes = tree::metadata(path).map_or(u64::MAX, |(length, _)| length);
             if !memory.take(bytes) {
                 let of_size = |size| Header { size, orientation: Orientation::of(path) };
                 *header = Image::size_of(path).ok().map(of_size);

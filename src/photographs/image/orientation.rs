@@ -1,6 +1,5 @@
 //! How a photograph is turned: cameras store what the sensor saw, and say in Exif which way is up.
 
-use std::fs::File;
 use std::io::{BufRead, BufReader, Seek};
 use std::path::Path;
 
@@ -8,7 +7,7 @@ use ::exif::{In, Reader, Tag};
 use rayon::prelude::*;
 
 use super::Image;
-use crate::Result;
+use crate::base::tree;
 
 /// The orientation of Exif, 1 to 8: how an image is turned, and whether it is mirrored, to be what people see.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,7 +25,7 @@ impl Orientation {
 
     /// What a file says; upright where it says nothing.
     pub fn of(path: &Path) -> Self {
-        File::open(path).map_or(Self::UPRIGHT, |file| Self::read(&mut BufReader::new(file)))
+        tree::open(path).map_or(Self::UPRIGHT, |file| Self::read(&mut BufReader::new(file)))
     }
 
     /// What the bytes of a file say; upright where they say nothing.
@@ -80,17 +79,8 @@ impl Orientation {
 }
 
 impl Image {
-    /// As [`Image::load`], turned upright as the file's Exif says.
-    ///
-    /// # Errors
-    /// As there.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn load_upright(path: impl AsRef<Path>) -> Result<Self> {
-        let path = path.as_ref();
-        Ok(Self::load(path)?.turned(Orientation::of(path)))
-    }
-
     /// The image as it is seen.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn turned(self, orientation: Orientation) -> Self {
         if orientation == Orientation::UPRIGHT {
             return self;

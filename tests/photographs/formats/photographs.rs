@@ -179,7 +179,7 @@ fn a_photograph_is_turned_where_its_camera_saw_it_upright_and_stays_where_it_did
             let stated = Orientation::of(&lone);
             let left = if is_turned { Orientation::UPRIGHT } else { stated };
             assert_eq!(view(&dataset, "v03").orientation, left);
-            let upright = Image::load_upright(&lone).unwrap();
+            let upright = Image::load(&lone).unwrap().turned(Orientation::of(&lone));
             assert_eq!((upright.width, upright.height), Orientation::of(&lone).size(stored));
         }
         jpeg(&root.join("images/v03.jpg"), (36, 40), orientation);

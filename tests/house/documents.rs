@@ -1,0 +1,162 @@
+//! The documents: their lengths, their links, and the options and settings that they name.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::architecture::files;
+
+const ROOT: &str = env!("CARGO_MANIFEST_DIR");
+
+/// The longest that a document may be, in bytes.
+const MAX_BYTES: [(&str, usize); 3] =
+    [("README.md", 8 << 10), ("docs/guide.md", 30 << 10), ("docs/benchmarks.md", 20 << 10)];
+
+/// Every page for people, with its text.
+fn documents() -> Vec<(PathBuf, String)> {
+    let root =
+        ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"].map(|name| Path::new(ROOT).join(name));
+    let docs =
+        fs::read_dir(Path::new(ROOT).join("docs")).unwrap().map(|entry| entry.unwrap().path());
+    let docs = docs.filter(|path| path.extension().is_some_and(|it| it == "md"));
+    root.into_iter()
+        .chain(docs)
+        .map(|path| (path.clone(), fs::read_to_string(path).unwrap()))
+        .collect()
+}
+
+/// The anchors of a page's headings, as GitHub makes them.
+fn anchors(page: &str) -> BTreeSet<String> {
+    let slug = |heading: &str| {
+        let kept = heading.trim().chars().filter(|it| it.is_alphanumeric() || "-_ ".contains(*it));
+        kept.collect::<String>().to_lowercase().replace(' ', "-")
+    };
+    prose(page)
+        .filter(|line| line.starts_with('#'))
+        .map(|line| slug(line.trim_start_matches('#')))
+        .collect()
+}
+
+/// The lines outside of code blocks.
+fn prose(page: &str) -> impl Iterator<Item = &str> {
+    page.split("```").step_by(2).flat_map(str::lines)
+}
+
+#[test]
+fn documents_keep_to_their_lengths() {
+    for (name, limit) in MAX_BYTES {
+        let bytes = fs::metadata(Path::new(ROOT).join(name)).unwrap().len();
+        assert!(bytes <= limit as u64, "{name} has {bytes} bytes, and may have {limit}");
+    }
+}
+
+#[test]
+fn links_lead_to_files_and_headings_that_exist() {
+    for (path, page) in documents() {
+        let links = page.split("](").skip(1).filter_map(|rest| rest.split(')').next());
+        for link in links.filter(|link| !link.contains("://") && !link.contains(' ')) {
+            let (file, anchor) =
+                link.split_once('#').map_or((link, None), |(file, it)| (file, Some(it)));
+            let target =
+                if file.is_empty() { path.clone() } else { path.parent().unwrap().join(file) };
+            assert!(target.exists(), "{}: {link} leads nowhere", path.display());
+            if let Some(anchor) = anchor {
+                let found = anchors(&fs::read_to_string(target).unwrap()).contains(anchor);
+                assert!(found, "{}: there is no heading for {link}", path.display());
+            }
+        }
+    }
+}
+
+/// Code as a reader would type it: lines of code blocks, and code within text.
+fn code(page: &str) -> impl Iterator<Item = &str> {
+    let blocks = page.split("```").skip(1).step_by(2).flat_map(str::lines);
+    blocks.chain(prose(page).flat_map(|line| line.split('`').skip(1).step_by(2)))
+}
+
+#[cfg(feature = "cli")]
+#[test]
+fn options_that_documents_name_are_options_of_the_command() {
+    use clap::CommandFactory;
+
+    fn options(command: &clap::Command) -> BTreeSet<String> {
+        let own = command
+            .get_arguments()
+            .flat_map(|it| it.get_long_and_visible_aliases().unwrap_or_default());
+        let own: BTreeSet<_> = own.map(str::to_owned).collect();
+        command.get_subcommands().map(options).fold(own, |all, more| &all | &more)
+    }
+    let mut command = nightsplat::cli::Cli::command();
+    command.build();
+    let known = options(&command);
+    let commands: BTreeSet<_> =
+        command.get_subcommands().map(|it| it.get_name().to_owned()).collect();
+
+    for (path, page) in documents().into_iter().filter(|(path, _)| !path.ends_with("CHANGELOG.md"))
+    {
+        for line in code(&page) {
+            let first = line.split(' ').next().unwrap();
+            let is_ours =
+                first == "nightsplat" || first.starts_with("--") || commands.contains(first);
+            let line = line.split(" #").next().unwrap();
+            let words = line.split([' ', '=']).filter_map(|word| word.strip_prefix("--"));
+            for option in words.filter(|_| is_ours) {
+                assert!(
+                    known.contains(option),
+                    "{}: `{line}`: there is no --{option}",
+                    path.display()
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn settings_that_the_guide_and_the_internals_name_exist() {
+    use nightsplat::train::settings::setting;
+
+    let is_key =
+        |word: &&str| word.chars().all(|it| it.is_ascii_lowercase() || it == '_' || it == '.');
+    let sections =
+        ["tone", "start", "schedule", "density", "model", "loss", "stop", "exposure", "precision"];
+    for (path, page) in documents() {
+        let words = code(&page).flat_map(|line| line.split([' ', '=']));
+        let keys =
+            words.filter(|word| sections.iter().any(|it| word.starts_with(&format!("{it}."))));
+        for key in keys.filter(is_key).filter(|key| !key.ends_with(['.', '_'])) {
+            let is_file =
+                [".rs", ".ply", ".csv", ".toml", ".md"].iter().any(|it| key.ends_with(it));
+            assert!(
+                is_file || setting(key).is_some(),
+                "{}: there is no setting {key}",
+                path.display()
+            );
+        }
+    }
+}
+
+#[test]
+fn files_and_tests_that_documents_name_exist() {
+    let folders = ["src/", "tests/", "scripts/", "examples/", "docs/", "shaders-glsl/", "build/"];
+    let sources = [files("src", "rs"), files("tests", "rs")].concat();
+    for (path, page) in documents() {
+        let words = prose(&page)
+            .flat_map(|line| line.split('`').skip(1).step_by(2))
+            .flat_map(str::split_whitespace);
+        for word in words.filter(|word| !word.contains(char::is_uppercase)) {
+            if folders.iter().any(|folder| word.starts_with(folder)) {
+                assert!(
+                    Path::new(ROOT).join(word).exists(),
+                    "{}: there is no {word}",
+                    path.display()
+                );
+            }
+            // The name of a test is a sentence; shorter ones are modules.
+            let test = word.rsplit("::").next().unwrap();
+            if word.contains("::") && test.matches('_').count() > 4 {
+                let is_test = |(_, text): &(PathBuf, String)| text.contains(&format!("fn {test}("));
+                assert!(sources.iter().any(is_test), "{}: there is no test {test}", path.display());
+            }
+        }
+    }
+}
