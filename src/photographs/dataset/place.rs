@@ -2,6 +2,7 @@
 
 use glam::DVec3;
 
+use super::layout::Layout;
 use super::{Dataset, View};
 use crate::camera::{Camera, TrainingFrame, frame, upwards};
 
@@ -20,10 +21,14 @@ impl Dataset {
         TrainingFrame::new(center, extent)
     }
 
-    /// What is up in the world, a unit vector: across what the training cameras hold level.
+    /// The world's up direction, a unit vector: perpendicular to the horizontal axes of the training cameras. A NeRF-style
+    /// listing has z up by convention, which is exact where cameras are not held level; it is taken unless they lie on a side.
     pub fn up(&self) -> DVec3 {
+        const MIN_COSINE: f64 = 0.7;
         let cameras: Vec<Camera> = self.train_views().map(View::upright_camera).collect();
-        upwards(&cameras)
+        let up = upwards(&cameras);
+        let has_convention = Layout::of(&self.root).is_ok_and(|own| !own.listings().is_empty());
+        if has_convention && up.z > MIN_COSINE { DVec3::Z } else { up }
     }
 
     /// The middle of the training cameras, and the extent.
