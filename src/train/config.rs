@@ -6,6 +6,7 @@ mod stop;
 use std::ops::Bound;
 use std::path::{Path, PathBuf};
 
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use super::cache::CacheSize;
@@ -131,6 +132,9 @@ pub struct TrainConfig {
         => Rule::List(2, 3, &Rule::Whole(0, u32::MAX as u64));
     /// Near plane, in units of the scene extent: the distance of the cameras from their centre, rounded to a power of two.
     near: f64 = 0.1 => Rule::from_to(1e-6, 1.0), "--near N";
+    /// What is up in the dataset's world: paths fly about it, and exported files are turned by it.
+    up: Option<[f64; 3]> = None, "found from the cameras, and recorded"
+        => Rule::List(3, 3, &Rule::Number(Bound::Unbounded, Bound::Unbounded));
     /// Random points to begin with where the dataset has none.
     random_points: usize = 20_000 => Rule::at_least(1), in "points";
 }
@@ -361,6 +365,14 @@ impl TrainConfig {
         self.precision.check_rows()?;
         if let Some(frame) = self.frame {
             frame.check_rows()?;
+        }
+        if self.up.is_some_and(|up| DVec3::from_array(up).try_normalize().is_none()) {
+            let rule = "a direction: three numbers that are not all 0".to_owned();
+            return Err(Error::Setting {
+                key: "up".to_owned(),
+                value: "no direction".to_owned(),
+                rule,
+            });
         }
         if self.exposure.learn == OnOff::On && self.model.tonemapper {
             let rule = "off with a tonemapper, which fits the dark photographs: a gain of the targets does not describe \

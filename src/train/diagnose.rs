@@ -416,7 +416,8 @@ fn without_pose(
     let mut names = vec![];
     for folder in folders {
         let photographs = files::photographs_in(folder)?;
-        let is_other = |path: &&PathBuf| !of_views.contains(path.as_path()) && !dataset::is_mask(path);
+        let is_other =
+            |path: &&PathBuf| !of_views.contains(path.as_path()) && !dataset::is_mask(path);
         let others = photographs.iter().filter(is_other);
         let stems = others.filter_map(|path| path.file_stem()?.to_str());
         names.extend(stems.filter(|name| !posed.contains(name)).map(str::to_owned));

@@ -11,12 +11,13 @@ use crate::base::hash::{self, Hasher};
 
 /// The settings that no result depends on beyond its rounding: where the dataset lies, what is kept and logged and when,
 /// how long the run may take, and what it finds for itself.
-const FREE: [&str; 16] = [
+const FREE: [&str; 17] = [
     "dataset",
     "device",
     "tile",
     "frame.center",
     "frame.scale",
+    "up",
     "cache",
     "max_vram",
     "max_ram",

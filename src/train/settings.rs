@@ -164,6 +164,7 @@ mod tests {
             "test_every=8",
             "tile=[16,8]",
             "frame.scale=2",
+            "up=[0,0,1]",
             "tone.brightness=0.5",
         ];
         set.extend(rest.map(str::to_owned));
