@@ -88,7 +88,7 @@ fn filters(ffmpeg: &Tool<'_>, clip: &Path, transfer: &str) -> Result<String> {
     if !has(" zscale ") || !has(" tonemap ") {
         let path = clip.display();
         let problem = format!(
-            "is HDR ({range}), and this ffmpeg has no filters zscale and tonemap; with one that has: ffmpeg -i {path} -vf \
+            "is HDR ({range}), and this ffmpeg lacks zscale and tonemap; with one that has them: ffmpeg -i {path} -vf \
              {STANDARD_RANGE},format=yuv444p -color_primaries bt709 -color_trc iec61966-2-1 -crf 10 sdr.mp4"
         );
         return Err(Error::input(clip, problem));
