@@ -401,7 +401,10 @@ mod tests {
         let mut config = TrainConfig::default();
         (config.exposure.learn, config.model.tonemapper) = (OnOff::On, true);
         let message = config.check().unwrap_err().to_string();
-        assert!(message.starts_with("exposure.learn is on; it must be off where"), "{message}");
+        assert!(
+            message.starts_with("exposure.learn is on; it must be off with a tonemapper"),
+            "{message}"
+        );
     }
 
     #[test]

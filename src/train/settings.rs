@@ -155,7 +155,7 @@ mod tests {
 
     /// A configuration with every setting that may be left out.
     fn whole() -> TrainConfig {
-        let set = ["reference", "init", "exposure.start", "model.depth_folder"]
+        let set = ["images", "reference", "init", "exposure.start", "model.depth_folder"]
             .map(|key| format!("{key}=a"));
         let mut set = set.to_vec();
         set.extend(["cache", "max_vram", "max_ram"].map(|key| format!("{key}=1G")));
@@ -165,6 +165,7 @@ mod tests {
             "tile=[16,8]",
             "frame.scale=2",
             "up=[0,0,1]",
+            "white_balance=5000",
             "tone.brightness=0.5",
         ];
         set.extend(rest.map(str::to_owned));
@@ -249,7 +250,7 @@ mod tests {
             ("stepz", "steps"),
             ("density.gradient", "density.gradient_threshold"),
             ("density.foo", "density."),
-            ("densty.fill", "density.depth_seeding"),
+            ("densty.depth_seeding", "density.depth_seeding"),
             ("stop.not-finite", "stop.not_finite"),
             ("frame.scal", "frame.scale"),
         ] {
