@@ -120,6 +120,16 @@ fn file_name(device: &str, driver: &str) -> String {
     name.split('-').filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-") + ".csv"
 }
 
+/// Leaves the first points of a COLMAP model: of more points than Gaussians, training takes an even sample.
+fn keep_first_points(path: &Path, count: usize) {
+    let text = fs::read_to_string(path).unwrap();
+    let (comments, points): (Vec<&str>, Vec<&str>) =
+        text.lines().partition(|line| line.starts_with('#'));
+    assert!(points.len() >= count);
+    let kept = comments.into_iter().chain(points.into_iter().take(count));
+    fs::write(path, kept.map(|line| format!("{line}\n")).collect::<String>()).unwrap();
+}
+
 /// A tiny scene, trained with density control, in a folder with `hashes.csv`, `train.csv` and `metrics.json`.
 fn tiny_run() -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
@@ -132,6 +142,7 @@ fn tiny_run() -> (tempfile::TempDir, PathBuf) {
         ..SyntheticOptions::default()
     };
     synthetic::write(&set, &options).unwrap();
+    keep_first_points(&set.join("colmap_sparse/0/points3D.txt"), 2000);
     succeed(&format!(
         "train {} --out {} --plan none --model plain --curve ap3 --steps 60 --hash-every 20 --set tile=[16,8] \
          --set schedule.densify_after=10 --set schedule.densify_interval=10 --max-gaussians 2000 --background black \

@@ -161,7 +161,7 @@ impl<'a> Reconstruction<'a> {
         match self.compare(all, &say).and_then(|()| self.place(tone_mapped, &say)) {
             // What the first comparison came to is there.
             Err(error) if placed > 0 => {
-                tracing::warn!("{error}; the cameras are those of the first comparison");
+                tracing::warn!("{error}; using the cameras of the first attempt");
                 return Ok(best);
             }
             outcome => outcome?,
