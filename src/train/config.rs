@@ -64,96 +64,95 @@ settings! {
 pub struct TrainConfig {
     /// The dataset's folder.
     dataset: PathBuf = PathBuf::new() => Rule::PATH;
-    /// A folder of reference images by name, for scores only.
+    /// A folder of reference images with the photographs' names, for scores only.
     reference: Option<PathBuf> = None, "what lies beside the photographs" => Rule::PATH, "--reference DIR";
-    /// Begin with the Gaussians of a PLY, of a run or of another program, in the dataset's world, in place of the dataset's
-    /// points; every SH degree is in use from the first step.
+    /// Start from the Gaussians of a PLY, of a run or of another program, in the dataset's world, instead of the
+    /// dataset's points; every SH degree is in use from the first step.
     init: Option<PathBuf> = None, "the dataset's points" => Rule::PATH, "--init MODEL.ply";
     /// Masks (masks/NAME.png or masks/NAME.jpg.png of the dataset) hide what is white, not what is black.
     invert_masks: bool = false => Rule::Flag, "--invert-masks";
-    /// Undistort the photographs of a fisheye to a pinhole's, cropped to 60 degrees off its axis, in place of training on
-    /// the fisheye as it is; those of other distorted lenses are always undistorted.
+    /// Undistort fisheye photographs to a pinhole of 60 degrees off the axis instead of training on them as they are;
+    /// other distorted lenses are always undistorted.
     undistort: bool = false => Rule::Flag, "--undistort";
     /// Training steps, one view each.
     steps: u64 = 5000 => Rule::at_least(1), in "steps", "--steps N";
-    /// Shrink the photographs by this factor.
+    /// Resize the photographs by 1/F.
     downscale: f64 = 1.0 => DOWNSCALE, "--downscale F";
-    /// Shrink photographs whose longest side is still larger to this; 0 or none: take them as they are. Brightness is
-    /// measured, and the curve applied, at their own size.
+    /// Resize photographs whose longest side is then still larger to this; 0 or none: no limit. Brightness is measured,
+    /// and the curve applied, at their own size.
     max_resolution: u32 = 1600 => Rule::Whole(0, u32::MAX as u64), in "pixels", "--max-resolution N|none";
-    /// Train on photographs of more pixels than this patch by patch; steps then take less memory, and more of them see each
-    /// photograph once.
-    patch_pixels: Option<u64> = None, "as many as the device can bind"
+    /// Train in patches on photographs of more pixels than this: less memory a step, more steps a photograph.
+    patch_pixels: Option<u64> = None, "as many as the device binds"
         => Rule::at_least(MIN_PATCH), in "pixels", "--patch-pixels N";
-    /// Hold out every Nth view by name, whatever split the dataset has; 0: none, train on all.
-    test_every: Option<usize> = None, "the dataset's split, else every 8th" => Rule::COUNT, in "views", "--test-every N";
-    /// Memory for photographs, such as 4G, on the device and decoded on the host; the rest waits on disk, which takes time and
-    /// changes no bit.
+    /// Use every Nth view by name as a test view, whatever split the dataset has; 0: none, train on all.
+    test_every: Option<usize> = None, "the dataset's split, else every 8th"
+        => Rule::COUNT, in "views", "--test-every N";
+    /// Memory for photographs, such as 4G, on the device and decoded on the host; the rest waits on disk, which takes
+    /// time but changes no bit.
     cache: Option<CacheSize> = None, "a quarter of the memory of each" => MEMORY, in "bytes", "--cache SIZE";
-    /// The most that buffers may take on the device, such as 4G: growth stops in time, and what exceeds it all the same ends
-    /// the run, saved, with exit code 4.
-    max_vram: Option<CacheSize> = None, "all that there is" => MEMORY, in "bytes", "--max-vram SIZE";
-    /// The most that the process is to take on the host, as far as that can be foreseen: growth stops in time.
-    max_ram: Option<CacheSize> = None, "all that there is" => MEMORY, in "bytes", "--max-ram SIZE";
-    /// Everything random follows from it; the same seed gives the same bits.
+    /// Device-memory limit, such as 4G: densification stops below it; exceeding it all the same saves a checkpoint and
+    /// exits with 4.
+    max_vram: Option<CacheSize> = None, "no limit" => MEMORY, in "bytes", "--max-vram SIZE";
+    /// Host-memory limit, as far as it can be foreseen: densification stops below it.
+    max_ram: Option<CacheSize> = None, "no limit" => MEMORY, in "bytes", "--max-ram SIZE";
+    /// Seed of all random numbers; the same seed gives the same bits.
     seed: u64 = 10 => Rule::COUNT, "--seed S";
     /// Highest degree of the spherical harmonics.
     sh_degree: u32 = MAX_SH_DEGREE => Rule::Whole(0, MAX_SH_DEGREE as u64), "--sh-degree D";
-    /// Weight of 1 - SSIM beside L1, which has the rest of 1.
+    /// Weight of 1 - SSIM; L1 has the rest of 1.
     ssim_weight: f64 = 0.2 => Rule::SHARE, "--ssim-weight W";
-    /// Never grow beyond this many Gaussians.
+    /// The largest number of Gaussians.
     max_gaussians: usize = 1_000_000 => Rule::at_least(1), in "Gaussians", "--max-gaussians N";
-    /// What is seen where no splat is, during training: black, or random, another colour every step. Scores and renders use
-    /// black.
+    /// Background during training: black, or random, a new colour every step. Scores and renders use black.
     background: Background = Background::Random => Rule::OneOf(&["black", "random"]), "--background BACKGROUND";
-    /// Score the test views every N steps as well as at the end: a line, and a row of evals.csv; 0: at the end only.
+    /// Score the test views every N steps too: a line, and a row of evals.csv; 0: at the end only.
     eval_every: u64 = 0 => Rule::COUNT, in "steps", "--eval-every N";
-    /// Write what --resume goes on from, and the model, every N steps; 0: never.
+    /// Write a checkpoint and the model every N steps; 0: never.
     checkpoint_every: u64 = 1000 => Rule::COUNT, in "steps", "--checkpoint-every N";
-    /// Write it whenever the last is this old, too; 0: never.
+    /// Write a checkpoint whenever the last is this old, too; 0: never.
     checkpoint_minutes: f64 = 10.0 => MINUTES, in "minutes", "--checkpoint-minutes MINUTES";
     /// Save and stop after this time, with exit code 75; --resume goes on; 0: train to the end.
     max_minutes: f64 = 0.0 => MINUTES, in "minutes", "--max-minutes MINUTES";
     /// Log a checksum of every plane of the parameters to hashes.csv every N steps; 0: never.
     hash_every: u64 = 0 => Rule::COUNT, in "steps", "--hash-every N";
-    /// Leave RUN/tensorboard: losses, rates, Gaussians, scores, and a test view, for `tensorboard --logdir RUN`.
+    /// Write losses, rates, Gaussians, scores and a test view for `tensorboard --logdir RUN`.
     tensorboard: bool = false => Rule::Flag, "--tensorboard";
     /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu.
     device: String = String::new(), "the best" => Rule::Text("a device", |_| true), "--device DEVICE";
-    /// The tile that a workgroup renders: width and height in pixels and, where more than one subgroup share it, their number.
-    tile: Option<Tile> = None, "the fastest known on the device, and recorded"
+    /// The tile that a workgroup renders: width and height in pixels and, if several subgroups share it, their number.
+    tile: Option<Tile> = None, "the fastest known on the device; recorded"
         => Rule::List(2, 3, &Rule::Whole(0, u32::MAX as u64));
-    /// Nothing nearer to a camera is seen, in units of the scene's extent: of how far the cameras stand from their middle. The
-    /// extent is taken as the power of two of which it is 0.75 to 1.5 times.
+    /// Near plane, in units of the scene's extent: the distance of the cameras from their centre, rounded to a power of
+    /// two.
     near: f64 = 0.1 => Rule::from_to(1e-6, 1.0), "--near N";
-    /// Random points to begin with where the dataset has none.
+    /// Random points to start from if the dataset has none.
     random_points: usize = 20_000 => Rule::at_least(1), in "points";
 }
 sections {
-    /// The folder for what exceeds the cache; none: that of the system's temporary files.
+    /// The folder of the cache's spool file; `None`: the system's temporary folder.
     #[serde(skip)]
     spool: Option<PathBuf>;
-    /// Where the model is trained; left out, it is found from the cameras, and recorded.
+    /// The training frame; by default from the cameras, and recorded.
     frame: Option<TrainingFrame>;
-    /// The curve that lifts each photograph.
+    /// The tone curve.
     tone: ToneSettings;
-    /// Steps whose every pass is compared with its CPU reference.
+    /// Comparison of passes with their CPU references.
     check: CheckConfig;
-    /// What the first Gaussians look like.
+    /// The first Gaussians.
     start: Initialization;
-    /// Learning rates, and what else changes with the step.
+    /// Learning rates and schedule.
     schedule: Schedule;
     /// Density control.
     density: DensityConfig;
-    /// What the model has beside colour.
+    /// Parts of the model beside colour.
     model: ModelConfig;
-    /// What the parameters of the Gaussians weigh in the loss.
+    /// Loss terms on the parameters of the Gaussians.
     loss: ParameterWeights;
-    /// When a run ends before its last step.
+    /// Early stopping.
     stop: StopConfig;
     /// Gain and bias of each training view.
     exposure: ExposureConfig;
-    /// In how many bits things are kept.
+    /// Storage precision.
     precision: PrecisionConfig;
 }
 }
@@ -170,34 +169,34 @@ settings! {
 /// Steps whose every pass is compared with its CPU reference.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CheckConfig {
-    /// Compare every pass of every Nth step with its CPU reference, and warn of what differs; 0: never.
+    /// Compare every pass of every Nth step with its CPU reference, and warn of differences; 0: never.
     every: u64 = 0 => Rule::COUNT, in "steps", "--check-every N";
-    /// Stop where a checked step differs.
+    /// Stop at a difference.
     stops: bool = false => Rule::Flag, "--check-stops";
 }
 }
 
 settings! {
 "density."
-/// Which Gaussians multiply and which go; [`Schedule`] says when.
+/// Density control; [`Schedule`] has its steps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DensityConfig {
-    /// What comes of a Gaussian that multiplies: conserving, two halves that cover what it covered, or paper, LITA-GS's.
+    /// Densification: conserving, a split that preserves coverage, or paper, the clone and split of LITA-GS.
     control: DensityControl = DensityControl::Conserving => Rule::OneOf(&["conserving", "paper"]), "--density NAME";
-    /// The mean norm of the screen-space gradient, in normalised device units, from which a Gaussian multiplies.
+    /// Densify Gaussians whose mean screen-space gradient, in normalised device coordinates, has at least this norm.
     gradient_threshold: f64 = 4e-4 => Rule::POSITIVE;
-    /// Larger than this fraction of the extent: split; smaller: cloned. Of the paper's control alone.
+    /// Paper's control only: split Gaussians larger than this fraction of the extent, clone smaller ones.
     split_scale: f64 = 0.01 => Rule::POSITIVE_OR_0;
-    /// Fainter Gaussians are removed.
+    /// Prune Gaussians of lower opacity.
     min_opacity: f64 = 0.005 => Rule::Number(Bound::Included(0.0), Bound::Excluded(1.0));
-    /// This many Gaussians come of few, a tenth of them or fewer: random points up to that tenth, and in the first round
-    /// Gaussians at the depths of what the views show. Of the conserving control alone; 0: none are added.
+    /// Depth seeding, conserving control only: if the dataset has at most a tenth of this many points, add random
+    /// points up to that tenth, and in the first round Gaussians at rendered depths up to this number; 0: off.
     depth_seeding: usize = 5_000 => Rule::COUNT, in "Gaussians";
 }
 }
 
 impl DensityConfig {
-    /// The most first Gaussians that are few.
+    /// At most this many first Gaussians count as sparse.
     pub(super) fn sparse_threshold(&self) -> usize {
         match self.control {
             DensityControl::Conserving => self.depth_seeding / 10,
@@ -205,7 +204,7 @@ impl DensityConfig {
         }
     }
 
-    /// Those of LITA-GS.
+    /// The values of LITA-GS.
     #[cfg(feature = "testing")]
     pub fn paper() -> Self {
         Self {
@@ -218,8 +217,8 @@ impl DensityConfig {
 }
 
 impl TrainConfig {
-    /// The bare method, in nothing but what is compared with it: black background, all in 32 bits, no view held out, no
-    /// Gaussians beside those that multiply, no end that settles. Measurements and tests begin with it.
+    /// The plain method, for measurements and tests: black background, 32-bit storage, no held-out views, no depth
+    /// seeding, no cooldown.
     pub fn bare() -> Self {
         Self {
             background: Background::Black,
@@ -238,12 +237,12 @@ impl TrainConfig {
     /// The configuration as TOML.
     ///
     /// # Errors
-    /// None for values that [`TrainConfig::check`] accepts.
+    /// Never for values that [`TrainConfig::check`] accepts.
     pub fn to_toml(&self) -> Result<String> {
         toml::to_string(self).map_err(|error| Error::Usage(error.to_string()))
     }
 
-    /// How the dataset is to be loaded.
+    /// The options to load the dataset with.
     pub fn load_options(&self) -> LoadOptions {
         LoadOptions {
             downscale: self.downscale,
@@ -268,7 +267,7 @@ impl TrainConfig {
         }
     }
 
-    /// Switches off the depth part where no training view has a depth map, and says so.
+    /// Disables the depth part, with a warning, if no training view has a depth map.
     pub(crate) fn disable_missing_parts(&mut self, dataset: &Dataset) {
         if !self.model.depth {
             return;
@@ -287,7 +286,7 @@ impl TrainConfig {
         }
     }
 
-    /// The same run of another copy of its dataset; what lay in its folder lies there, too.
+    /// Moves the run to another copy of its dataset, with the paths inside its folder.
     pub(crate) fn move_dataset(&mut self, dataset: &Path) {
         let from = std::mem::replace(&mut self.dataset, dataset.to_owned());
         let inside = [&mut self.reference, &mut self.model.depth_folder, &mut self.exposure.start];
@@ -298,7 +297,7 @@ impl TrainConfig {
         }
     }
 
-    /// What the rasteriser is specialised for.
+    /// The settings of the rasteriser.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn render_settings(&self) -> RenderSettings {
         RenderSettings {
@@ -312,7 +311,7 @@ impl TrainConfig {
         }
     }
 
-    /// What the loss terms of the model are built from.
+    /// The configuration of the loss.
     pub(crate) fn loss(&self) -> LossConfig {
         LossConfig {
             ssim_weight: self.ssim_weight,
@@ -325,10 +324,10 @@ impl TrainConfig {
         }
     }
 
-    /// Refuses values that make no sense, naming the field.
+    /// Refuses invalid values, by name.
     ///
     /// # Errors
-    /// [`Error::Setting`], and [`Error::Usage`] for what does not go together.
+    /// [`Error::Setting`], or [`Error::Usage`] for settings that exclude each other.
     pub fn check(&self) -> Result<()> {
         self.check_rows()?;
         self.tone.check()?;
@@ -346,8 +345,8 @@ impl TrainConfig {
             frame.check_rows()?;
         }
         if self.exposure.learn == OnOff::On && self.model.tonemapper {
-            let rule = "off where the model has a tonemapper, which holds it to the dark photographs: their exposures a gain \
-                        on lifted targets does not describe";
+            let rule = "off where the model has a tonemapper: a gain on targets does not describe the exposure of the \
+                        dark photographs";
             let (key, value) = ("exposure.learn".to_owned(), "on".to_owned());
             return Err(Error::Setting { key, value, rule: rule.to_owned() });
         }

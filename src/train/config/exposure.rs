@@ -1,4 +1,4 @@
-//! What is learned of the training views' exposures.
+//! Settings of learned exposures.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -9,14 +9,14 @@ use crate::base::settings::{Rule, settings};
 use crate::loss::exposure::ExposureRates;
 use crate::{Error, Result};
 
-/// Whether something is learned.
+/// A switch.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum OnOff {
-    /// It is not there: no buffer, no kernel.
+    /// Off: no buffer, no kernel.
     #[default]
     Off,
-    /// It is.
+    /// On.
     On,
 }
 
@@ -27,7 +27,7 @@ impl FromStr for OnOff {
         match name {
             "off" => Ok(Self::Off),
             "on" => Ok(Self::On),
-            _ => Err(Error::Usage(format!("`{name}` is neither off nor on"))),
+            _ => Err(Error::Usage(format!("`{name}` is neither on nor off"))),
         }
     }
 }
@@ -37,9 +37,9 @@ settings! {
 /// Gain and bias of each channel of each training view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExposureConfig {
-    /// on: learn gain and bias of each channel of each training view, where photographs are not equally bright; off.
+    /// Learn gain and bias of each channel of each training view, for photographs of differing brightness.
     learn: OnOff = OnOff::Off => Rule::OneOf(&["on", "off"]), "--exposure on|off";
-    /// Learn exposures from where this table has them: `name,ev` or `name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b`.
+    /// Initial exposures, as a table of `name,ev` or `name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b`.
     start: Option<PathBuf> = None, "exposures.csv of the dataset" => Rule::PATH, "--exposures FILE";
 }
 sections {
