@@ -26,7 +26,7 @@ pub(crate) struct Text {
 }
 
 impl Text {
-    /// The comment behind a declaration, or in the lines above it.
+    /// The comment after a declaration, or in the lines above it.
     pub(crate) fn comment(&self, block: &str, member: &str) -> &str {
         self.comments.get(&(block.to_owned(), member.to_owned())).map_or("", String::as_str)
     }
@@ -105,7 +105,8 @@ impl Text {
         }
     }
 
-    /// `type name = value, name = value;` or `type name[n] = type[](value, value);`, where all that values name is known.
+    /// `type name = value, name = value;` or `type name[n] = type[](value, value);`, where all that values name is
+    /// known.
     fn add_constants(&mut self, declared: &str, comment: &str) {
         const TYPES: [(&str, &str); 3] = [("uint ", "u32"), ("int ", "i32"), ("float ", "f64")];
         let declared = declared.trim_end_matches(';');

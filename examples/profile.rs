@@ -1,6 +1,6 @@
 //! Where the time of a training step goes: `cargo run --release --example profile -- DATASET DOWNSCALE STEPS`.
 //!
-//! Trains for so many steps, then prints each kernel's milliseconds, the median of nine steps.
+//! Trains for STEPS steps, then prints each kernel's milliseconds, the median of nine steps.
 
 use std::io::Write;
 

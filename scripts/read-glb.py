@@ -2,7 +2,7 @@
 """Reads a run's model.glb with pygltflib and compares every number with model.ply, read by plyfile.
 
     python3 -m venv env && env/bin/pip install numpy plyfile pygltflib
-    nightsplat export RUN --to glb && env/bin/python scripts/read-glb.py RUN
+    nightsplat export RUN --format glb && env/bin/python scripts/read-glb.py RUN
 
 glTF has y up: positions, rotations and the directions of SH are turned by half a turn about x.
 """

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Opens the page of `export --to html` in a headless Chromium and compares its canvas with `render`.
+"""Opens the page of `export --format html` in a headless Chromium and compares its canvas with `render`.
 
     scripts/test-page.py [NIGHTSPLAT]      (default: target/release/nightsplat, or debug)
 

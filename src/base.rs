@@ -1,10 +1,11 @@
-//! What every other module stands on and none of it knows splatting: files read and written whole, hashes, random numbers.
+//! The base of all other modules, independent of splatting: files read and written whole, hashes, random numbers.
 //!
 //! - [`input`]: files that users name, read whole
 //! - [`output`]: files that are never seen half-written
 //! - [`hash`]: checksums of numbers and bytes
 //! - [`random`]: counter-based random numbers
 //! - [`settings`]: a row for each setting: key, default, rule, unit, help, option
+//! - [`tree`]: files and folders by path, on the disk or in a ZIP archive
 
 #[cfg(feature = "io")]
 pub mod hash;
@@ -14,3 +15,5 @@ pub mod output;
 pub mod random;
 #[cfg(feature = "io")]
 pub mod settings;
+#[cfg(feature = "io")]
+pub mod tree;

@@ -1,6 +1,7 @@
-//! Cameras: the pinhole or fisheye that everything renders with, and the calibrated lens that a dataset lists.
+//! Cameras: the pinhole or fisheye that is rendered, and the calibrated lens of a dataset.
 //!
-//! Axes are those of `OpenCV` (x right, y down, z forward); pixel units, the image's corner at (0, 0), pixel centres at +0.5.
+//! Axes are those of `OpenCV` (x right, y down, z forward). Pixel coordinates: the image's corner is (0, 0), pixel
+//! centres are at +0.5.
 
 #[cfg(feature = "io")]
 pub mod frame;
@@ -20,7 +21,7 @@ pub use path::CameraPath;
 #[cfg(feature = "io")]
 pub(crate) use poses::CameraPoses;
 
-/// A camera with its pose: a pinhole, or a fisheye as it is.
+/// A camera with its pose: a pinhole or a fisheye.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
     /// Pixels per row.
@@ -29,20 +30,20 @@ pub struct Camera {
     pub height: u32,
     /// Focal lengths, pixels.
     pub focal: DVec2,
-    /// Where the optical axis meets the image, pixels; rarely the centre.
+    /// The principal point, pixels.
     pub principal_point: DVec2,
-    /// Which place of the picture shows which direction.
+    /// The projection model.
     pub model: CameraModel,
     /// Rigid: world space to view space (`OpenCV` axes).
     pub view_from_world: DAffine3,
 }
 
 impl Camera {
-    /// A pinhole with square pixels that looks through the middle of its image, of `size` (width, height), pixels; `fov_y` is the
-    /// angle from the image's top to its bottom, radians.
+    /// A pinhole with square pixels and a centred principal point, for an image of `size` (width, height) in pixels;
+    /// `fov_y` is the vertical field of view in radians.
     ///
-    /// An engine whose views look along -z with y up has `view_from_world` = `DAffine3::from_scale(DVec3::new(1.0, -1.0, -1.0)) *
-    /// view`.
+    /// For an engine whose views look along -z with y up: `view_from_world` = `DAffine3::from_scale(DVec3::new(1.0,
+    /// -1.0, -1.0)) * view`.
     pub fn perspective(view_from_world: DAffine3, fov_y: f64, [width, height]: [u32; 2]) -> Self {
         let size = DVec2::new(width.into(), height.into());
         Self {
@@ -60,15 +61,15 @@ impl Camera {
         self.view_from_world.inverse().translation
     }
 
-    /// Where a world-space point appears, pixels (possibly outside the image); `None` behind the camera, or beyond what a
-    /// fisheye sees.
+    /// Projects a world-space point to pixels (possibly outside the image); `None` behind the camera, or beyond the
+    /// field of view of a fisheye.
     pub fn project(&self, point: DVec3) -> Option<DVec2> {
         let place = self.model.place(self.view_from_world.transform_point3(point))?;
         Some(self.focal * place + self.principal_point)
     }
 
-    /// The point of the view (x right, y down, z forward) that is seen at a pixel and a depth, as
-    /// `CameraModel::depth` counts it; `None` where a fisheye sees nothing.
+    /// Unprojects a pixel at a depth, as `CameraModel::depth` counts it, to view space; `None` outside the field of
+    /// view of a fisheye.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn in_view(&self, pixel: DVec2, depth: f64) -> Option<DVec3> {
         self.model.point((pixel - self.principal_point) / self.focal, depth)
@@ -79,7 +80,7 @@ impl Camera {
         self.model.depth(self.view_from_world.transform_point3(point))
     }
 
-    /// As [`Camera::project`], inside the image alone.
+    /// As [`Camera::project`], `None` outside the image.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn sees(&self, point: DVec3) -> Option<DVec2> {
         let size = DVec2::new(self.width.into(), self.height.into());
@@ -87,13 +88,13 @@ impl Camera {
             .filter(|pixel| pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all())
     }
 
-    /// The pixels of which a part shows nothing, as indices into a plane, ascending: outside the circle of a fisheye.
+    /// The pixels that are at least partly outside the image circle of a fisheye, as indices into a plane, ascending.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn unseen(&self) -> Vec<usize> {
         let CameraModel::Fisheye(lens) = self.model else { return vec![] };
         let reach = lens.radius(lens.largest_angle());
         let size = DVec2::new(self.width.into(), self.height.into());
-        // A rectangle lies within an ellipse where its corners do.
+        // A rectangle is within an ellipse if its corners are.
         let is_within = |corner: DVec2, size: DVec2| {
             let corners = [DVec2::ZERO, DVec2::X, DVec2::Y, DVec2::ONE];
             let mut corners = corners.into_iter().map(|at| corner + at * size);
@@ -112,7 +113,7 @@ impl Camera {
             .collect()
     }
 
-    /// The same camera over an image of another size.
+    /// The same camera with another image size.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let scale = DVec2::new(f64::from(width), f64::from(height))
             / DVec2::new(f64::from(self.width), f64::from(self.height));
@@ -126,12 +127,12 @@ impl Camera {
     }
 }
 
-/// Where a lens puts what a pinhole would see elsewhere, as COLMAP's camera models define it; the default is no distortion.
+/// Lens distortion as COLMAP's camera models define it; the default is none.
 ///
 /// With `(x, y)` at unit depth and r its length, a perspective lens (COLMAP's `SIMPLE_RADIAL`, `RADIAL`, `OPENCV` and
-/// `FULL_OPENCV`, which differ in what is zero) scales by `(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)`
-/// and shifts by p1 and p2. A fisheye (`SIMPLE_RADIAL_FISHEYE`, `RADIAL_FISHEYE`, `OPENCV_FISHEYE`) puts what it sees
-/// at the angle t off its axis, t = atan r, at `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`.
+/// `FULL_OPENCV`, which differ in what is zero) scales by `(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6
+/// r^6)` and shifts by p1 and p2. A fisheye (`SIMPLE_RADIAL_FISHEYE`, `RADIAL_FISHEYE`, `OPENCV_FISHEYE`) projects the
+/// angle t off its axis, t = atan r, to `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Distortion {
     /// Radial coefficient of r^2, or of a fisheye's t^2.
@@ -150,12 +151,12 @@ pub struct Distortion {
     pub p1: f64,
     /// Tangential coefficient; a fisheye has none.
     pub p2: f64,
-    /// Whether angles, not their tangents, make the picture.
+    /// Whether the polynomial is of angles, not of their tangents.
     pub is_fisheye: bool,
 }
 
 impl Distortion {
-    /// The distorted position of an undistorted one; both at unit depth, relative to the optical axis.
+    /// Distorts a position at unit depth, relative to the optical axis.
     pub fn distort(&self, at: DVec2) -> DVec2 {
         let DVec2 { x, y } = at;
         let r2 = x * x + y * y;
@@ -169,7 +170,7 @@ impl Distortion {
         )
     }
 
-    /// The determinant of [`Distortion::distort`]'s derivative: not positive where the model folds over itself.
+    /// The determinant of the Jacobian of [`Distortion::distort`]: not positive where the model folds over.
     pub fn determinant(&self, DVec2 { x, y }: DVec2) -> f64 {
         let r2 = x * x + y * y;
         if self.is_fisheye {
@@ -184,37 +185,37 @@ impl Distortion {
         xx * yy - xy * xy
     }
 
-    /// The factor of a perspective lens, and its derivative with respect to r^2.
+    /// The radial factor of a perspective lens, and its derivative with respect to r^2.
     fn radial(&self, r2: f64) -> [f64; 2] {
         let Self { k1, k2, k3, k4, k5, k6, .. } = *self;
         let polynomial = |a: f64, b: f64, c: f64| 1.0 + a * r2 + b * r2 * r2 + c * r2 * r2 * r2;
         let slope = |a: f64, b: f64, c: f64| a + 2.0 * b * r2 + 3.0 * c * r2 * r2;
         let (above, below) = (polynomial(k1, k2, k3), polynomial(k4, k5, k6));
         let slope = (slope(k1, k2, k3) * below - above * slope(k4, k5, k6)) / (below * below);
-        // Behind a pole the lens would see itself through.
+        // Beyond a pole the factor changes its sign.
         [if below > 0.0 { above / below } else { f64::NAN }, slope]
     }
 
-    /// The factor of a fisheye, and the derivative of the distorted distance with respect to r.
+    /// The radial factor of a fisheye, and the derivative of the distorted radius with respect to r.
     fn fisheye(&self, r: f64) -> [f64; 2] {
         let (lens, angle) = (self.kannala_brandt(), r.atan());
         let factor = if r > 1e-8 { lens.radius(angle) / r } else { 1.0 };
         [factor, lens.slope(angle) / (1.0 + r * r)]
     }
 
-    /// What a fisheye makes of angles.
+    /// The fisheye polynomial of an angle.
     fn kannala_brandt(&self) -> KannalaBrandt {
         KannalaBrandt { coefficients: [self.k1, self.k2, self.k3, self.k4] }
     }
 
-    /// Every coefficient.
+    /// All coefficients.
     fn coefficients(&self) -> [f64; 8] {
         let Self { k1, k2, k3, k4, k5, k6, p1, p2, .. } = *self;
         [k1, k2, k3, k4, k5, k6, p1, p2]
     }
 }
 
-/// The intrinsics that a dataset lists for a photograph, before undistortion.
+/// The intrinsics of a photograph in a dataset, before undistortion.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Lens {
     /// Pixels per row.
@@ -230,10 +231,10 @@ pub struct Lens {
 }
 
 impl Lens {
-    /// The longest side that is taken for an image's; anything beyond comes from a corrupt file.
+    /// The longest side that counts as plausible; anything beyond comes from a corrupt file.
     pub const MAX_SIDE: u32 = 65_535;
 
-    /// The model that renders what the lens shows; `None` where there is none, and photographs are undistorted.
+    /// The camera model that renders this lens; `None` where there is none, and photographs are undistorted.
     pub fn model(&self) -> Option<CameraModel> {
         match self.distortion {
             distortion if distortion == Distortion::default() => Some(CameraModel::Pinhole),
@@ -244,7 +245,7 @@ impl Lens {
         }
     }
 
-    /// What makes the numbers unusable, if anything.
+    /// Why the intrinsics are unusable; `None` if they are fine.
     pub fn problem(&self) -> Option<String> {
         let sides = 1..=Self::MAX_SIDE;
         if !sides.contains(&self.width) || !sides.contains(&self.height) {
@@ -260,8 +261,8 @@ impl Lens {
         }
     }
 
-    /// The same lens over a photograph of `width` x `height`; `None` unless that is the same picture at another
-    /// scale, to the rounding of a pixel.
+    /// The lens of a photograph of `width` x `height`, which must have the same aspect ratio to the rounding of a
+    /// pixel; else `None`.
     pub fn fitted(&self, width: u32, height: u32) -> Option<Self> {
         let listed = DVec2::new(f64::from(self.width), f64::from(self.height));
         let actual = DVec2::new(f64::from(width), f64::from(height));
@@ -368,7 +369,7 @@ mod tests {
         ),
     ];
 
-    /// Where COLMAP's documentation and header (sensor/models.h) put a direction, formula by formula.
+    /// The distortion formulas of COLMAP's documentation and header (sensor/models.h).
     fn published(model: &str, d: Distortion, u: f64, v: f64) -> DVec2 {
         let (u2, v2, uv) = (u.powi(2), v.powi(2), u * v);
         let r = (u2 + v2).sqrt();
@@ -401,10 +402,10 @@ mod tests {
         }
     }
 
-    /// The undistorted position by Newton's method, from the steps of central differences: shares nothing with what is tested.
+    /// The undistorted position by Newton's method with central differences: independent of the code under test.
     fn unprojected(model: &str, distortion: Distortion, target: DVec2) -> DVec2 {
         let forward = |at: DVec2| published(model, distortion, at.x, at.y);
-        // Along the ray first: a fisheye's tangents grow without bound.
+        // Along the ray first: a fisheye's tangents are unbounded.
         let mut at = target * 1.0001;
         let (mut low, mut high) = (0.0_f64, 400.0_f64);
         for _ in 0..100 {
@@ -427,7 +428,7 @@ mod tests {
     #[test]
     fn every_model_projects_as_colmap_publishes_it_and_comes_back() {
         for (model, distortion) in MODELS {
-            // A fisheye to 85 degrees off the axis, the others as far as their polynomials rise.
+            // A fisheye up to 85 degrees off the axis, the others as far as their polynomials increase.
             let angles: &[f64] = if distortion.is_fisheye {
                 &[0.5, 10.0, 30.0, 45.0, 60.0, 75.0, 85.0]
             } else {

@@ -1,10 +1,11 @@
 //! The command line: one file per subcommand.
 
+use std::ffi::OsString;
+use std::io::Write;
 use std::path::Path;
 
 use anyhow::Result;
-use clap::error::{ContextKind, ContextValue};
-use clap::{Parser, Subcommand};
+use clap::{FromArgMatches, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::base::output::printable;
@@ -15,13 +16,13 @@ use crate::train::settings::setting;
 pub mod bench;
 pub mod check;
 pub mod completions;
-mod defaults;
 pub mod demo;
 pub mod diagnose;
 pub mod doctor;
 pub mod eval;
 pub mod export;
-mod finished_run;
+mod help;
+mod hints;
 pub mod man;
 pub mod pose;
 pub mod progress;
@@ -32,16 +33,18 @@ pub mod synth;
 mod table;
 pub mod tone;
 pub mod train;
+mod words;
+
+pub use hints::hint;
 
 /// 3D Gaussian Splatting from dark photographs, on any Vulkan device.
 #[derive(Debug, Parser)]
 #[command(name = "nightsplat", version, max_term_width = 98, after_help = EXAMPLES)]
-#[command(mut_subcommands = defaults::shown)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
-    /// Say more on stderr: -v what is done, -vv how
-    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    /// Log more to stderr; -vv for debugging
+    #[arg(short, long, global = true, action = clap::ArgAction::Count, display_order = 998)]
     verbose: u8,
 }
 
@@ -53,7 +56,7 @@ const EXAMPLES: &str = "Start with:
   nightsplat train photos --out run                 train from a folder of dark photographs
   nightsplat eval run --save-images                 score it where there are references
   nightsplat render run --split all --out pictures  see the model from every camera
-  nightsplat export run --to html                   a page with the splat to fly through
+  nightsplat export run --format html                   a page with the splat to fly through
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
   nightsplat sweep photos --out s --table presets   what time and memory buy
 
@@ -90,33 +93,25 @@ enum Command {
     Man(man::ManArgs),
 }
 
-/// Commands that have another name now, and that name.
-const RENAMED: [(&str, &str); 4] = [
-    ("ablate", "sweep DATASET --out DIR --table parts"),
-    ("tradeoff", "sweep DATASET --out DIR --table presets"),
-    ("curves", "tone list"),
-    ("fit", "tone fit"),
-];
-
-/// The new name of the command that a command line gives by its old one.
-pub fn renamed(error: &clap::Error) -> Option<String> {
-    let Some(ContextValue::String(name)) = error.get(ContextKind::InvalidSubcommand) else {
-        return None;
-    };
-    let (old, new) = RENAMED.iter().find(|(old, _)| old == name)?;
-    Some(format!("`nightsplat {old}` is now `nightsplat {new}`"))
-}
-
 impl Cli {
-    /// The level of the log: 0 for warnings, 1 and 2 for more.
+    /// Reads a command line, the program's name first.
+    ///
+    /// # Errors
+    /// Help where it is asked for, or what is wrong with the command line.
+    pub fn read(arguments: Vec<OsString>) -> Result<Self, clap::Error> {
+        let everything = arguments.iter().any(|argument| argument == "--help-all");
+        Self::from_arg_matches(&help::command(everything).try_get_matches_from(arguments)?)
+    }
+
+    /// The number of -v flags.
     pub fn verbosity(&self) -> u8 {
         self.verbose
     }
 
-    /// Runs the subcommand.
+    /// Runs the command.
     ///
     /// # Errors
-    /// What stopped it, in one line.
+    /// Those of the command.
     pub fn run(self) -> Result<()> {
         match self.command {
             Command::Train(args) => train::run(&args),
@@ -127,18 +122,18 @@ impl Cli {
             Command::Export(args) => export::run(&args),
             Command::Tone(args) => tone::run(&args),
             Command::Sweep(args) => sweep::run(&args),
-            Command::Synth(args) => Ok(synth::run(args)?),
+            Command::Synth(args) => synth::run(args),
             Command::Demo(args) => demo::run(&args),
             Command::Doctor(args) => doctor::run(&args),
             Command::Bench(args) => bench::run(&args),
             Command::Check(args) => check::run(&args),
             Command::Completions(args) => completions::run(args),
-            Command::Man(args) => Ok(man::run(&args)?),
+            Command::Man(args) => man::run(&args),
         }
     }
 }
 
-/// What is said of an error, in one line: a setting by its key and by its option, where it has one.
+/// The message of an error; settings are named by key and option.
 pub fn message(error: &anyhow::Error) -> String {
     let message = format!("{error:#}");
     let Some(crate::Error::Setting { key, .. }) = error.downcast_ref() else { return message };
@@ -148,25 +143,45 @@ pub fn message(error: &anyhow::Error) -> String {
     }
 }
 
-/// A message as it is printed, whatever the names in it hold.
+/// Prints the end of a command: the files that it wrote, if any, and the command to run next.
+fn finish(wrote: &str, next: &str) -> Result<()> {
+    let wrote = if wrote.is_empty() { String::new() } else { format!("wrote {wrote}\n") };
+    Ok(writeln!(std::io::stdout(), "{}next: {}", printable(&wrote), printable(next))?)
+}
+
+/// A path as a word of a command.
+fn word(path: &Path) -> String {
+    quoted(&path.display().to_string())
+}
+
+/// A word quoted for a POSIX shell.
+fn quoted(word: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./=,+:@%".contains(c);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', "'\\''"))
+}
+
+/// A message on one line, with control characters in names escaped.
 pub fn in_one_line(message: &str) -> String {
     printable(&message.replace('\n', "\\n")).into_owned()
 }
 
-/// The picture files that a command writes.
+/// Image formats for output.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum ImageFormat {
-    /// 8 bits a channel, sRGB-encoded, clamped.
+    /// 8 bits per channel, sRGB
     #[default]
     Png,
-    /// 16 bits a channel, sRGB-encoded, clamped.
+    /// 16 bits per channel, sRGB
     Png16,
-    /// 32-bit float, linear light.
+    /// 32-bit float, linear
     Exr,
 }
 
 impl ImageFormat {
-    /// The extension of its files.
+    /// File extension.
     pub fn extension(self) -> &'static str {
         match self {
             Self::Png | Self::Png16 => "png",
@@ -183,7 +198,7 @@ impl ImageFormat {
     }
 }
 
-/// A bar on standard error, shown only where that is a terminal.
+/// A progress bar on standard error, hidden unless that is a terminal.
 fn progress_bar(len: usize) -> ProgressBar {
     let style = ProgressStyle::with_template("{bar:32} {pos}/{len}  {msg}  {eta} left");
     ProgressBar::new(len as u64).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
@@ -206,6 +221,15 @@ mod tests {
         );
         assert_eq!(refused("stop.every"), "stop.every is 0; it must be at least 1");
     }
+
+    #[test]
+    fn words_are_quoted_where_a_shell_needs_it() {
+        assert_eq!(quoted("--set"), "--set");
+        assert_eq!(quoted("curve=ap3,seed=1"), "curve=ap3,seed=1");
+        assert_eq!(quoted("a b"), "'a b'");
+        assert_eq!(quoted("it's"), "'it'\\''s'");
+        assert_eq!(quoted(""), "''");
+    }
 }
 
 #[cfg(all(test, not(feature = "fit")))]
@@ -215,7 +239,7 @@ mod without_fit {
     #[test]
     fn fit_says_which_feature_has_it() {
         let cli =
-            Cli::try_parse_from(["nightsplat", "tone", "fit", "pairs", "--family", "ase"]).unwrap();
+            Cli::read(["nightsplat", "tone", "fit", "pairs"].map(Into::into).to_vec()).unwrap();
         let message = cli.run().unwrap_err().to_string();
         assert!(message.contains("feature `fit`"), "{message}");
     }

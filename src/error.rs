@@ -1,4 +1,4 @@
-//! What can go wrong, sorted by what the user can do about it.
+//! Errors, sorted by what the user can do about them.
 //!
 //! A message names a setting by its key in config.toml: `max_gaussians`, `density.depth_seeding`.
 
@@ -11,7 +11,7 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A file or folder that was read is missing, cut short or not what it should be.
+    /// An input file or folder is missing, truncated or invalid.
     #[error("{}: {problem}", path.display())]
     Input {
         /// The file or folder.
@@ -27,7 +27,7 @@ pub enum Error {
         /// The fact and the remedy.
         problem: String,
     },
-    /// A setting has a value that it does not take; the exit code is 2.
+    /// A setting has an invalid value; the exit code is 2.
     #[error("{key} is {value}; it must be {rule}")]
     Setting {
         /// Its dotted path in config.toml.
@@ -37,13 +37,13 @@ pub enum Error {
         /// The values that it takes.
         rule: String,
     },
-    /// A setting, an argument or a combination of them that makes no sense; the exit code is 2.
+    /// A setting, an argument or a combination of them is invalid; the exit code is 2.
     #[error("{0}")]
     Usage(String),
-    /// There is no Vulkan loader, or no device that the choice names.
+    /// There is no Vulkan loader, or no device that matches the choice.
     #[error("{0}")]
     NoDevice(String),
-    /// The device lacks something every kernel needs.
+    /// The device lacks a requirement of the kernels.
     #[error(
         "{device} lacks {feature}; `nightsplat doctor` lists every device and what it offers, --device picks another"
     )]
@@ -53,7 +53,7 @@ pub enum Error {
         /// The feature, extension or limit, by its Vulkan name.
         feature: String,
     },
-    /// A buffer did not fit into device memory.
+    /// A buffer does not fit into device memory.
     #[error(
         "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower max_gaussians, patch_pixels \
          or cache"
@@ -63,7 +63,7 @@ pub enum Error {
         buffer: String,
         /// Its size in bytes.
         bytes: u64,
-        /// What the driver or the allocator said.
+        /// The message of the driver or the allocator.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// A buffer exceeds what one binding may hold on this device.
@@ -88,7 +88,7 @@ pub enum Error {
         /// The label of the submission.
         submission: String,
     },
-    /// A Vulkan call failed for a reason not named above.
+    /// A Vulkan call failed for another reason.
     #[error("{call} failed on {device}: {result}")]
     Vulkan {
         /// The Vulkan call.
@@ -110,7 +110,7 @@ pub enum Error {
         /// The loss term or buffer that is not finite.
         what: String,
     },
-    /// More splats lie on one tile than a kernel gets through on this device.
+    /// More splats are on one tile than a kernel can process on this device.
     #[error(
         "{view}: {splats} splats on one tile of {tile} pixels, {device} follows {limit}; lower \
          max_gaussians or take another device"
@@ -120,11 +120,11 @@ pub enum Error {
         view: String,
         /// The most splats of one tile.
         splats: u32,
-        /// Its width and height in pixels.
+        /// Width and height of the tile in pixels.
         tile: String,
         /// The device's name.
         device: String,
-        /// How many it follows.
+        /// The most that it can process.
         limit: u32,
     },
     /// A parameter became NaN or infinite.
@@ -137,32 +137,32 @@ pub enum Error {
         step: u64,
         /// The attribute, by its name in the table.
         plane: String,
-        /// The Gaussian's index, or that of a number of what else is learned.
+        /// The index of the Gaussian, or of another parameter.
         gaussian: usize,
     },
-    /// A run that was asked to stop did so, and saved what it goes on from.
+    /// A run stopped on request, with its state saved.
     #[error("{}: {cause} after step {step}, and saved; go on with --resume", run.display())]
     Stopped {
         /// The run directory.
         run: PathBuf,
         /// Steps done.
         step: u64,
-        /// Who asked.
+        /// What requested it.
         cause: Stop,
     },
-    /// Several runs that were asked to stop did so; those under way are saved.
+    /// A batch of runs stopped on request; those under way are saved.
     #[error("{}: {cause} with {done} of {all} runs done; the same command goes on", folder.display())]
     BatchStopped {
         /// The folder of their run directories.
         folder: PathBuf,
         /// Runs that are finished.
         done: usize,
-        /// Runs that there are to be.
+        /// Runs in all.
         all: usize,
-        /// Who asked.
+        /// What requested it.
         cause: Stop,
     },
-    /// A checked pass left other numbers than its CPU reference.
+    /// The result of a checked pass differs from its CPU reference.
     #[error(
         "the device disagrees with the CPU references: {what}; update the driver, or report this with the output of \
          `nightsplat doctor`"
@@ -174,7 +174,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// An [`Error::Input`]. What the file holds may be a part of the problem: it becomes one line of a length that can be read.
+    /// An [`Error::Input`]. The problem may quote the file: it becomes one line of limited length.
     pub(crate) fn input(path: impl AsRef<Path>, problem: impl Into<String>) -> Self {
         Self::Input { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
     }
@@ -185,7 +185,7 @@ impl Error {
         Self::Output { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
     }
 
-    /// The process's exit code, by what a scheduler can do about it: 2 for misuse, 3 for data that cannot be used, 4 for the
+    /// The process's exit code, by what a scheduler can do about it: 2 for misuse, 3 for unusable data, 4 for the
     /// device and its memory, those of [`Stop`] for a run that can go on, 1 for everything else.
     pub fn exit_code(&self) -> u8 {
         match self {
@@ -207,7 +207,7 @@ impl Error {
     }
 }
 
-/// Line breaks spelled out, and what is beyond a thousand characters left out.
+/// Escapes line breaks, and truncates to a thousand characters.
 fn in_a_line(text: String) -> String {
     const MOST: usize = 1000;
     if text.len() <= MOST && !text.contains('\n') {
@@ -220,19 +220,19 @@ fn in_a_line(text: String) -> String {
     }
 }
 
-/// Why a run stops before its end, with what it goes on from saved.
+/// Why a run stopped before its end, with its state saved.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stop {
-    /// Somebody at the terminal: SIGINT; the exit code is 130.
+    /// SIGINT, from a terminal; the exit code is 130.
     Interrupted,
-    /// The system or a scheduler: SIGTERM; the exit code is 143.
+    /// SIGTERM, from the system or a scheduler; the exit code is 143.
     Terminated,
-    /// It has taken as long as it may; the exit code is 75, by which schedulers know to run it again.
+    /// `max_minutes` are over; the exit code is 75, on which schedulers run it again.
     TimeUp,
 }
 
 impl Stop {
-    /// What a shell sees of it.
+    /// Its exit code.
     pub fn exit_code(self) -> u8 {
         match self {
             Self::Interrupted => 130,

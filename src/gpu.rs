@@ -90,30 +90,30 @@ pub struct Properties {
     pub driver: String,
     /// Bytes of device-local memory.
     pub memory: u64,
-    /// Lanes of a subgroup in our kernels.
+    /// Lanes of a subgroup in the kernels.
     pub subgroup_size: u32,
-    /// Kernels can ask for that subgroup size.
+    /// Kernels can require that subgroup size.
     pub subgroup_size_is_selectable: bool,
     /// Bytes that one storage buffer binding can span.
     pub max_storage_buffer_range: u64,
     /// Workgroups of a dispatch along one dimension.
     pub max_workgroups: u32,
-    /// After how many turns, of all its loops together, a kernel's invocation leaves them, silently.
+    /// Loop iterations, summed over all loops, after which an invocation silently leaves its loops.
     pub max_loop_iterations: u32,
-    /// Bits of a timestamp on our queue that count; 0 where the queue has none, and passes cannot be timed.
+    /// Valid bits of a timestamp on the queue; 0 where the queue has none, and passes cannot be timed.
     pub timestamp_bits: u32,
     /// Nanoseconds of one timestamp tick.
     pub timestamp_period: f32,
-    /// The device is a processor (lavapipe and the like).
+    /// The device is a CPU (lavapipe and the like).
     pub is_cpu: bool,
-    /// Products of 16-bit matrices; none where the device does not offer them or a host lends it.
+    /// Products of 16-bit matrices; `None` where the device does not support them or a host lends it.
     pub cooperative_matrix: Option<CooperativeMatrix>,
-    /// A subgroup whose lanes agree stays together, whatever the others of its workgroup do: promised, not only so; never of a
-    /// device that a host lends.
-    pub has_maximal_reconvergence: bool,
-    /// Passes may push their descriptors; where not, they bind sets.
+    /// Subgroup-uniform control flow is guaranteed (`VK_KHR_shader_subgroup_uniform_control_flow`); never of a device
+    /// that a host lends.
+    pub has_uniform_subgroup_control_flow: bool,
+    /// Passes push their descriptors; else they bind descriptor sets.
     pub has_push_descriptors: bool,
-    /// Kernels can be asked for their registers and spills; never of a device that a host lends.
+    /// The driver reports registers and spills of kernels; never of a device that a host lends.
     pub has_pipeline_statistics: bool,
 }
 
@@ -124,9 +124,9 @@ struct Shared {
     descriptors: descriptors::Descriptors,
     /// Names objects; absent without the validation layer.
     debug: Option<ext::debug_utils::Device>,
-    /// Labels passes; absent without a validation layer that can take labels from several threads.
+    /// Labels passes; absent without a validation layer that takes labels from several threads.
     labels: Option<ext::debug_utils::Device>,
-    /// Statistics of compiled kernels; absent where the device does not tell them.
+    /// Statistics of compiled kernels; absent where the device has none.
     executables: Option<khr::pipeline_executable_properties::Device>,
     allocator: Mutex<Option<gpu_allocator::vulkan::Allocator>>,
     queue: Mutex<Queue>,
@@ -135,7 +135,7 @@ struct Shared {
     /// The timeline value after which a resource that is dropped now is unused.
     last_use: AtomicU64,
     usage: memory::MemoryUsage,
-    /// What else takes memory of the device; absent where the driver does not tell.
+    /// Memory that other processes take of the device; absent where the driver does not report it.
     budget: Option<memory::BudgetQuery>,
     #[cfg(feature = "testing")]
     faults: faults::Faults,
@@ -145,9 +145,9 @@ struct Shared {
     #[cfg(feature = "check")]
     checks: checked::Checks,
     pipeline_cache: vk::PipelineCache,
-    /// What the file of the fastest tiles says; read when it is first asked.
+    /// The file of the fastest tiles, read on first use.
     tuned_tiles: OnceLock<Vec<TunedTile>>,
-    /// What we created around the device and destroy with it; nothing for a borrowed device.
+    /// What we created around the device and destroy with it; `None` for a borrowed device.
     owned: Option<instance::OwnedInstance>,
 }
 
@@ -165,14 +165,14 @@ struct Queue {
     family: u32,
 }
 
-/// Where recording and submission are. Unlike the queue, nobody holds it for long.
+/// Progress of recording and submission. Unlike the queue, it is held for moments only.
 #[derive(Default)]
 struct Progress {
-    /// Who records, and under which label.
+    /// The thread that records, and under which label.
     recording: Option<(ThreadId, String)>,
     /// The timeline value of the last submission.
     submitted: u64,
-    /// The labels of the submissions that were not waited for, and the last that was.
+    /// The labels of the submissions in flight, and of the last that is done.
     labels: BTreeMap<u64, String>,
 }
 
@@ -224,13 +224,13 @@ impl Shared {
         }
     }
 
-    /// What the timeline has reached.
+    /// The value that the timeline has reached.
     fn reached(&self) -> u64 {
         // SAFETY: the semaphore lives as long as `self`. A lost device may not know.
         unsafe { self.device.get_semaphore_counter_value(self.timeline) }.unwrap_or(0)
     }
 
-    /// The label of the submission that the device is at; where it is done with all, of the last.
+    /// The label of the submission that the device executes, or of the last one if all are done.
     fn unfinished(&self) -> Option<String> {
         let done = self.reached();
         let progress = lock(&self.progress);
@@ -239,7 +239,7 @@ impl Shared {
         later.map(|(_, label)| label).next().or_else(|| all.next_back()).cloned()
     }
 
-    /// Blocks until the timeline reaches `value`, then frees what nobody uses any more.
+    /// Blocks until the timeline reaches `value`, then frees what is no longer used.
     fn wait(&self, value: u64) -> Result<()> {
         let is_coming = {
             let progress = lock(&self.progress);
@@ -271,8 +271,9 @@ impl Shared {
         lock(&self.retired).push((self.last_use.load(Ordering::Acquire), retired));
     }
 
-    /// Frees every retired object whose last submission is `reached` or earlier; commands first, then what they name. One
-    /// thread at a time: validation layers have been seen to crash where two free what belongs together.
+    /// Frees every retired object whose last submission is `reached` or earlier; command buffers before the objects
+    /// that they name. One thread at a time: validation layers have crashed where two threads free objects that belong
+    /// together.
     fn collect(&self, reached: u64) {
         let mut retired = lock(&self.retired);
         let mut done: Vec<_> =

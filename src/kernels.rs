@@ -1,5 +1,5 @@
 //! Every kernel of `shaders-glsl/`, as `build.rs` reflected it: `Params`, `Constants`, `Buffers`, `Slices`; and the
-//! constants of every include, a module each. Floats are as they are written: a shader rounds them to `f32`.
+//! constants of every include, a module each. Floats have the digits of the source: a shader rounds them to `f32`.
 
 #![allow(
     clippy::doc_markdown,

@@ -1,8 +1,8 @@
 //! The loss terms, their gradients, and their log.
 //!
-//! A term is one file: what it logs and weighs, its kernels, its scratch memory, what it compares a view with. [`TERMS`]
-//! lists them, and the columns of train.csv, the reported loss, the checks of the weights and what a step records follow
-//! from the list. Nothing is read back: each step leaves its terms in a slot of a log.
+//! A term is one file: its columns and weights, its kernels, its scratch memory, what it compares a view with.
+//! [`TERMS`] lists them; the columns of train.csv, the reported loss, the checks of the weights and the recording of a
+//! step follow from the list. Nothing is read back: each step writes its terms to a slot of a log.
 
 mod denoising;
 mod depth;
@@ -29,14 +29,14 @@ pub use log::{LogSlot, LossLog, LossLogDownload, StepLosses};
 pub use parameters::{ParameterInputs, ParameterTerms, ParameterWeights};
 pub use structure::{StructureInputs, StructureLoss};
 
-/// Every term, in the order of the columns.
+/// All terms, in the order of the columns.
 pub const TERMS: [LossSpec; 6] =
     [image::TARGET, image::DARK, structure::SPEC, depth::SPEC, denoising::SPEC, parameters::SPEC];
 
 settings! {
 "model.weights."
-/// What the terms weigh beside (1 - w) L1 + w (1 - SSIM). The defaults are those of LITA-GS's code but for the total variation,
-/// which blurs what holds no noise.
+/// What the terms weigh beside (1 - w) L1 + w (1 - SSIM). The defaults are those of LITA-GS's code but for the total
+/// variation, which blurs what holds no noise.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
     /// Of mean `(R_K - target)^2`, in the paper's form `(R_K - R_0)^2`.
@@ -59,58 +59,58 @@ impl Weights {
     }
 }
 
-/// All that is to know about a term; it is on where something that it logs has a weight above 0.
+/// The description of a term; it is on if any of its columns has a weight above 0.
 #[derive(Debug)]
 pub struct LossSpec {
-    /// What it logs.
+    /// Its columns.
     pub terms: &'static [Term],
-    /// What it looks at, and what builds it.
+    /// What it reads, and its constructor.
     pub on: TermOn,
 }
 
-/// What a term looks at, with what builds it.
+/// What a term reads, with its constructor.
 #[derive(Clone, Copy, Debug)]
 pub enum TermOn {
-    /// The colours of the render. The first such term writes their gradient, every other adds to it.
+    /// The colours of the render. The first such term writes their gradient, the others add to it.
     Colors(fn(&Gpu, &LossConfig, Gradient) -> Result<Box<dyn LossTerm>>),
-    /// The channels of the render that show a feature, whose gradient it writes.
+    /// The channels of a feature, whose gradient it writes.
     Feature(Feature, fn(&Gpu, &LossConfig) -> Result<Box<dyn LossTerm>>),
-    /// Outputs of the networks, with which it is built and recorded.
+    /// Outputs of the networks.
     Networks,
     /// The parameters of the Gaussians, to whose gradient it adds; recorded by [`ParameterTerms`].
     Parameters,
 }
 
-/// What a term of the colours does with the gradient that is there.
+/// How a term on colours updates the gradient.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Gradient {
-    /// It overwrites it.
+    /// Overwrite.
     Written,
-    /// It adds to it.
+    /// Add.
     Added,
 }
 
-/// A value that a loss term logs, and how it enters the loss.
+/// A column of the log, and how it enters the loss.
 #[derive(Clone, Copy)]
 #[non_exhaustive]
 pub struct Term {
     /// Its column in train.csv.
     pub column: &'static str,
-    /// What it is called in messages and tables.
+    /// Its name in messages and tables.
     pub name: &'static str,
-    /// A likeness enters the loss as 1 - value, a distance as it is.
+    /// A similarity enters the loss as 1 - value, a distance as it is.
     pub is_likeness: bool,
-    /// What it weighs.
+    /// Its weight.
     pub(crate) weight: fn(&LossConfig) -> f64,
 }
 
 impl Term {
-    /// Every term, in the order of the columns.
+    /// All terms, in the order of the columns.
     pub fn all() -> impl Iterator<Item = Self> {
         TERMS.iter().flat_map(|spec| spec.terms).copied()
     }
 
-    /// Its place among the columns.
+    /// Its index among the columns.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn index(self) -> usize {
         Self::all().position(|term| term == self).unwrap_or_default()
@@ -129,27 +129,27 @@ impl std::fmt::Debug for Term {
     }
 }
 
-/// What the terms of a model are built from.
+/// The settings of the terms of a model.
 #[derive(Clone, Copy, Debug)]
 pub struct LossConfig {
     /// w of (1 - w) L1 + w (1 - SSIM), in [0, 1].
     pub ssim_weight: f64,
-    /// What the other terms weigh; 0 of a part that the model lacks.
+    /// The weights of the other terms; 0 for parts that the model lacks.
     pub weights: Weights,
-    /// What the reconstruction of the dark photograph weighs: 1, or 0 where the model has no tonemapper.
+    /// The weight of the reconstruction of the dark photograph: 1, or 0 where the model has no tonemapper.
     pub low: f64,
-    /// What the parameters of the Gaussians weigh.
+    /// The weights of the terms on parameters.
     pub parameters: ParameterWeights,
     /// The side of the boxes of the local depth term, in pixels.
     pub depth_box: u32,
-    /// The random numbers that place these boxes.
+    /// The random numbers that place the boxes.
     pub boxes: Stream,
-    /// What the Gaussians carry beside colour.
+    /// The features of the Gaussians.
     pub features: Features,
 }
 
 impl LossConfig {
-    /// The terms that the model has.
+    /// The terms of the model.
     pub fn terms(&self) -> Vec<Term> {
         self.specs().flat_map(|spec| spec.terms.iter().copied()).collect()
     }
@@ -174,34 +174,34 @@ impl LossConfig {
 pub struct ViewSource<'a> {
     /// Width and height in pixels.
     pub size: UVec2,
-    /// Depth from elsewhere, (H, W), larger is farther.
+    /// Estimated depth, (H, W), larger is farther.
     pub depth: Option<&'a [f32]>,
-    /// Makes the pseudo-GT, (3, H, W).
+    /// Returns the target, (3, H, W).
     pub target: Box<dyn Fn() -> Result<Arc<Buffer<f32>>> + 'a>,
 }
 
-/// What the terms read of one step.
+/// The inputs of the terms in one step.
 #[derive(Clone, Copy, Debug)]
 pub struct TermInputs<'a> {
     /// Counted from 1.
     pub step: u64,
-    /// The place of the view among those that the terms were prepared for.
+    /// The index of the view among those that the terms were prepared for.
     pub view: usize,
     /// Width and height in pixels.
     pub size: UVec2,
-    /// What the render shows beside colour.
+    /// The features of the render.
     pub features: Features,
     /// (channels, H, W), not clamped.
     pub render: &'a Buffer<f32>,
-    /// What is held to the target, (3, H, W) or longer, not clamped: the colours of the render, or what the view's exposure
-    /// makes of them.
+    /// The image that is compared with the target, (3, H, W) or longer, not clamped: the colours of the render, with
+    /// the view's exposure if that is learned.
     pub colors: &'a Buffer<f32>,
-    /// The pseudo-GT, (3, H, W).
+    /// The target, (3, H, W).
     pub target: &'a Buffer<f32>,
 }
 
 impl TermInputs<'_> {
-    /// The first channel of the render that shows a feature, which it has.
+    /// The first channel of a feature, which the render must have.
     fn plane(&self, feature: Feature) -> u32 {
         self.features.channels_of(feature).unwrap_or_default().start as u32
     }
@@ -209,7 +209,7 @@ impl TermInputs<'_> {
 
 /// A term of the render.
 pub trait LossTerm: std::fmt::Debug + Send {
-    /// Takes scratch memory for these views, and what it compares each of them with.
+    /// Allocates scratch memory for these views, and prepares what each of them is compared with.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -228,12 +228,12 @@ pub trait LossTerm: std::fmt::Debug + Send {
     ) -> Result<()>;
 }
 
-/// The terms of the render that a model has.
+/// The terms on the render of a model.
 #[derive(Debug)]
 pub struct Losses(Vec<Box<dyn LossTerm>>);
 
 impl Losses {
-    /// The terms; [`Losses::prepare`] makes them ready for views.
+    /// Builds the terms; [`Losses::prepare`] prepares them for views.
     ///
     /// # Errors
     /// A weight makes no sense, or the device refuses a pipeline.
@@ -254,7 +254,7 @@ impl Losses {
         Ok(Self(terms))
     }
 
-    /// Computes what stays the same of these views, and makes room for them.
+    /// Prepares what is constant for these views, and allocates for them.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -274,7 +274,7 @@ impl Losses {
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
         if inputs.features != Features::NONE {
-            // Not every term reaches every pixel of its planes.
+            // Not every term writes every pixel of its planes.
             pass.fill(d_render, 0);
         }
         self.0.iter_mut().try_for_each(|term| term.record_step(pass, inputs, d_render, log))
@@ -291,7 +291,7 @@ pub struct LossRegion {
 }
 
 impl LossRegion {
-    /// All of a view.
+    /// The whole view.
     pub const fn whole(size: UVec2) -> Self {
         Self { origin: UVec2::ZERO, size }
     }
@@ -301,12 +301,12 @@ impl LossRegion {
         self.origin + self.size
     }
 
-    /// The values of its three channels.
+    /// The number of values in its three channels.
     fn value_count(self) -> u32 {
         value_count(self.size)
     }
 
-    /// Refuses an interior that is empty or reaches out of a view of `size`.
+    /// Refuses a region that is empty or not inside a view of `size`.
     fn check(self, size: UVec2) -> Result<()> {
         let Self { origin, size: own } = self;
         let fits = own.min_element() > 0
@@ -322,7 +322,7 @@ impl LossRegion {
     }
 }
 
-/// The values of the three channels of a view.
+/// The number of values in the three channels of a view.
 fn value_count(size: UVec2) -> u32 {
     pixel_count(size).saturating_mul(3)
 }
@@ -358,7 +358,7 @@ mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
 
-    /// Another plane would still train, on the wrong thing.
+    /// Another plane would train as well, on the wrong feature.
     #[test]
     fn a_term_reads_the_first_channel_of_its_feature() {
         let gpu = gpu();

@@ -1,15 +1,14 @@
-//! The `nightsplat` command: parse, run, print the error once, exit code.
+//! The `nightsplat` command: parses, runs, prints an error once and sets the exit code.
 
 use std::io::{IsTerminal, Write};
 use std::process::ExitCode;
 
-use clap::Parser;
 use nightsplat::Error;
-use nightsplat::cli::{Cli, in_one_line, message, renamed};
+use nightsplat::cli::{Cli, hint, in_one_line, message};
 use tracing_subscriber::filter::LevelFilter;
 
 fn main() -> ExitCode {
-    let cli = match Cli::try_parse() {
+    let cli = match Cli::read(std::env::args_os().collect()) {
         Ok(cli) => cli,
         Err(error) => return misuse(&error),
     };
@@ -29,13 +28,13 @@ fn main() -> ExitCode {
     if is_broken_pipe(&error) {
         return ExitCode::SUCCESS;
     }
-    // A closed stderr leaves nobody to tell.
+    // Standard error may be closed.
     let message = message(&error);
     let _ = writeln!(std::io::stderr(), "error: {}", in_one_line(&message));
     ExitCode::from(error.downcast_ref::<Error>().map_or(1, Error::exit_code))
 }
 
-/// Help is printed as it is; what is wrong with a command line is said in one line, as every other error.
+/// Prints help as it is, and a misuse in one line like every other error.
 fn misuse(error: &clap::Error) -> ExitCode {
     use clap::error::ErrorKind;
     let help = [
@@ -51,13 +50,13 @@ fn misuse(error: &clap::Error) -> ExitCode {
     let told =
         lines.take_while(|line| !line.starts_with("Usage:") && !line.starts_with("For more"));
     let line = told.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
-    let line = renamed(error).map_or(line, |line| format!("error: {line}"));
-    // A closed stderr leaves nobody to tell.
-    let _ = writeln!(std::io::stderr(), "{}; --help says more", in_one_line(&line));
+    let line = hint(error).map_or(line, |line| format!("error: {line}"));
+    // Standard error may be closed.
+    let _ = writeln!(std::io::stderr(), "{}; see --help", in_one_line(&line));
     ExitCode::from(2)
 }
 
-/// Whoever reads our output has seen enough, as in `nightsplat doctor | head`.
+/// Whether the reader closed the pipe, as in `nightsplat doctor | head`.
 fn is_broken_pipe(error: &anyhow::Error) -> bool {
     let is_broken = |io: &std::io::Error| io.kind() == std::io::ErrorKind::BrokenPipe;
     error.chain().any(|cause| cause.downcast_ref().is_some_and(is_broken))

@@ -1,11 +1,10 @@
-//! The networks: the denoiser that takes the noise from a render, and the tonemapper that darkens it again; and those that
-//! LPIPS looks through.
+//! The networks: the denoiser of a render, the tonemapper that darkens it again, and the trunks of LPIPS.
 //!
-//! Images are planes, (C, H, W), row by row. A network owns its parameters, with their gradients beside them, and the
-//! memory of one view: [`Denoiser::reserve`] takes it, `forward` fills it, `backward` uses it up. Sums over pixels are
-//! partial sums in a fixed order, so the same step gives the same bits.
+//! Images are planes, (C, H, W), row-major. A network owns its parameters with their gradients, and the memory of one
+//! view: [`Denoiser::reserve`] allocates it, `forward` fills it, `backward` consumes it. Sums over pixels are partial
+//! sums in a fixed order, so that results are bit-identical.
 //!
-//! Norms use the statistics of the image itself, in training and afterwards: there are no running averages.
+//! Norms use the statistics of the image itself, in training and in inference: there are no running averages.
 
 mod conv;
 pub mod crop;
@@ -35,26 +34,25 @@ pub use tonemapper::Tonemapper;
 pub use trunk::Network;
 pub(crate) use trunk::{Trunk, published};
 
-/// How a network begins and ends.
+/// How the networks are initialised and what they output.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum NetworkVariant {
-    /// What goes in comes out until something better is learned: the network's last layer begins at zero, has nothing behind
-    /// it, and what it says is a difference.
+    /// A residual whose last layer begins at zero and has no activation: the output is the input at first.
     #[default]
     Identity,
-    /// LITA-GS's: the denoiser's last layer begins at random behind a sigmoid, about one half; the tonemapper says its whole
-    /// image.
+    /// As in LITA-GS: the denoiser's last layer has a random initialisation and a sigmoid, about one half; the
+    /// tonemapper outputs the whole image.
     Paper,
 }
 
 /// Red, green, blue.
 const RGB: u32 = 3;
 
-/// The columns and rows of pixels that one lane of `conv3x3` owns.
+/// The columns and rows of pixels per lane of `conv3x3`.
 ///
-/// On a processor a load costs the most, and a lane's neighbouring columns share theirs; on a GPU neighbouring lanes
-/// read neighbouring pixels, and registers are what a block may fill.
+/// On a CPU loads cost most, and neighbouring columns of a lane share theirs; on a GPU neighbouring lanes read
+/// neighbouring pixels, and registers limit the block.
 const CPU_SHAPE: [u32; 2] = [4, 4];
 const GPU_SHAPE: [u32; 2] = [1, 8];
 
@@ -63,7 +61,7 @@ pub(crate) fn conv_shape(gpu: &Gpu) -> [u32; 2] {
     if gpu.properties().is_cpu { CPU_SHAPE } else { GPU_SHAPE }
 }
 
-/// Pixels of a view.
+/// The number of pixels of a view.
 ///
 /// # Errors
 /// The view is empty.
@@ -91,7 +89,7 @@ fn check_images<const N: usize>(pixels: usize, images: [&Buffer<f32>; N]) -> Res
 }
 
 /// # Errors
-/// One binding cannot span `len` floats of `what`.
+/// Refuses `len` floats of `what` that exceed one binding.
 fn check_binding(gpu: &Gpu, what: &str, size: UVec2, len: usize) -> Result<()> {
     let properties = gpu.properties();
     let (bytes, limit) = (float_bytes(len), properties.max_storage_buffer_range);
@@ -105,7 +103,7 @@ fn check_binding(gpu: &Gpu, what: &str, size: UVec2, len: usize) -> Result<()> {
     )))
 }
 
-/// The forward or backward pass does not match what came before it.
+/// The error for a pass that does not match the one before.
 fn out_of_turn(network: &str, size: UVec2, remedy: &str) -> Error {
     let UVec2 { x: width, y: height } = size;
     Error::Usage(format!("the {network} is not ready for a view of {width} x {height}; {remedy}"))

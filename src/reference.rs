@@ -1,8 +1,8 @@
 //! CPU references: one file per kernel, same name, same buffers, plain loops.
 //!
 //! They are written to be read beside the shader, line by line, and to be obviously right rather than fast; the tests
-//! hold each kernel to its reference. What decides where a splat lies is f32, as in the shader; what makes light and
-//! gradients is f64.
+//! compare each kernel with its reference. Coverage of pixels by splats is computed in f32, as in the shader; alphas,
+//! colours and gradients are computed in f64.
 
 #![expect(clippy::needless_range_loop, reason = "keeps each line comparable to the shader")]
 
@@ -85,7 +85,7 @@ mod structure_l1;
 
 use glam::UVec2;
 
-/// Value `i` of planes of `width` x `height` lies in the columns and rows from `begin` to before `end`.
+/// Whether index `i` of planes of `width` x `height` is in the columns and rows from `begin` to before `end`.
 fn inside(i: usize, [width, height]: [u32; 2], [begin, end]: [UVec2; 2]) -> bool {
     let row = i as u32 / width;
     let pixel = UVec2::new(i as u32 % width, row % height);

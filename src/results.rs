@@ -4,10 +4,22 @@
 //!
 //! - [`eval`]: scores of the test views
 //! - [`run`]: a training run, its events and its directory
+//! - [`run_facts`]: the summary of a run before its first step
 //! - [`report`]: tables and plots in one self-contained page
+//! - [`diagnosis`]: a diagnosis of photographs as a table and a page
+//! - [`evaluation`]: scores as a table, and the page of a run
+//! - [`finished_run`]: a finished run or a model file, opened for rendering
+//! - [`view_exposures`]: renders at the exposure of their targets
+//! - [`video`]: frames as a video
 //! - [`export`]: a model in the formats of others
 
+pub mod diagnosis;
 pub mod eval;
+pub mod evaluation;
 pub mod export;
+pub mod finished_run;
 pub mod report;
 pub mod run;
+pub mod run_facts;
+pub mod video;
+pub mod view_exposures;

@@ -1,16 +1,16 @@
-//! Gaussians: how they lie in memory, how they are drawn, and how they learn.
+//! Gaussians: their memory layout, their rendering and their optimisation.
 //!
-//! In: points or a model file, cameras, the gradient of the loss with respect to a render. Out: renders, and better
+//! In: points or a model file, cameras, the gradient of the loss with respect to a render. Out: renders, and updated
 //! Gaussians.
 //!
-//! - [`attributes`]: the one table of what every Gaussian has
-//! - [`packed_sh`]: how numbers are stored, and those of 16 bits
-//! - [`batches`]: Gaussians of more planes than one binding holds
+//! - [`attributes`]: the table of the attributes of a Gaussian
+//! - [`packed_sh`]: storage formats, and 16-bit SH coefficients
+//! - [`batches`]: buffers of Gaussians that exceed one binding
 //! - [`scene`]: Gaussians on the host and on the device, PLY
 //! - [`sort`]: scan and radix sort on the device
-//! - [`optimizer`]: Adam, what it learns beside the Gaussians, and the schedules of its rates
+//! - [`optimizer`]: Adam, what is learned beside the Gaussians, and learning-rate schedules
 //! - [`render`]: the differentiable rasteriser
-//! - [`densify`]: clone, split, prune
+//! - [`densify`]: density control: clone, split, prune
 
 pub mod attributes;
 pub mod batches;

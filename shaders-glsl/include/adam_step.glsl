@@ -32,16 +32,16 @@ vec4 adam_step(Moments moments, vec4 rate, float second_correction) {
     return rate * moments.first / (sqrt(moments.second) * second_correction + EPSILON);
 }
 
-// Chance for four parameters, as a hash of them, of their second moments and of the step: it follows a Gaussian wherever
-// it is moved, and no two that differ share it.
+// Chance for four parameters, as a hash of them, of their second moments and of the step: it follows a Gaussian
+// wherever it is moved, and no two that differ share it.
 uvec4 chance_of(vec4 parameter, Moments moments, uint step) {
     uvec4 key = (floatBitsToUint(parameter) ^ floatBitsToUint(moments.second)) + random_bits(step);
     return uvec4(random_bits(key.x), random_bits(key.y), random_bits(key.z), random_bits(key.w));
 }
 
 // Both moments in a word each: the upper halves of their bits (bfloat16), the first above. What is cut off decides how
-// probably the rest is rounded up, so that their mean stays: to the nearest of 8 bits, a mean that moves by a thousandth of
-// itself a step would not move at all.
+// probably the rest is rounded up, so that their mean stays: to the nearest of 8 bits, a mean that moves by a
+// thousandth of itself a step would not move at all.
 uvec4 in_halves(Moments moments, uvec4 chance) {
     uvec4 first = floatBitsToUint(moments.first) + (chance & 0xffffu);
     uvec4 second = floatBitsToUint(moments.second) + (chance >> 16);

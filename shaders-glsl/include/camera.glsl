@@ -1,8 +1,8 @@
 // A camera: where a point of its view is seen, and how that changes with the point.
 //
-// Every model has the same functions in a file of its own; those at the end of this file choose. A kernel is specialised for
-// one model, or defines CAMERA_MODEL as the `camera.model` that it meets at run time. A point in the view has x to the right,
-// y down and z forward, in world units.
+// Every model has the same functions in a file of its own; those at the end of this file choose. A kernel is
+// specialised for one model, or defines CAMERA_MODEL as the `camera.model` that it meets at run time. A point in the
+// view has x to the right, y down and z forward, in world units.
 
 const uint CAMERA_PINHOLE = 0;
 const uint CAMERA_FISHEYE = 1;
@@ -30,8 +30,8 @@ struct Jacobian {
     vec3 row1;
 };
 
-// Numbers of a camera's gradient: of a shift of all points in the view and of a turn about the camera, as (x, y, z) each, of
-// focal lengths, principal point and distortion.
+// Numbers of a camera's gradient: of a shift of all points in the view and of a turn about the camera, as (x, y, z)
+// each, of focal lengths, principal point and distortion.
 const uint CAMERA_WIDTH = 14;
 
 // A renderer without a near plane counts from here, in world units.
@@ -40,7 +40,8 @@ const float NEAREST = 1e-4;
 #include "camera_pinhole.glsl"
 #include "camera_fisheye.glsl"
 
-// The depth of a point, by which splats are sorted and the near plane cuts; not positive where the model does not see it.
+// The depth of a point, by which splats are sorted and the near plane cuts; not positive where the model does not see
+// it.
 float camera_depth(vec3 point, Camera camera) {
     if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_depth(point, camera);
     return pinhole_depth(point);

@@ -1,12 +1,13 @@
-// The fisheye of Kannala and Brandt (2006) with four coefficients, which OpenCV and COLMAP call OPENCV_FISHEYE: what is seen
-// at the angle t off the axis lies t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) focal lengths from the principal point.
-// Included by camera.glsl.
+// The fisheye of Kannala and Brandt (2006) with four coefficients, which OpenCV and COLMAP call OPENCV_FISHEYE: what is
+// seen at the angle t off the axis lies t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) focal lengths from the principal
+// point. Included by camera.glsl.
 //
-// A point is seen where it lies before the camera and its angle is below the camera's largest one, up to which the polynomial
-// rises: what is farther off the axis would be seen twice. Depth is the distance, as z says little of what lies at 80 degrees.
+// A point is seen where it lies before the camera and its angle is below the camera's largest one, up to which the
+// polynomial rises: what is farther off the axis would be seen twice. Depth is the distance, as z says little of what
+// lies at 80 degrees.
 //
-// With n the unit vector from the axis to the point across it, r the polynomial, r' its derivative by the angle, and d the
-// distance, the derivative of the pixel is focal / d times
+// With n the unit vector from the axis to the point across it, r the polynomial, r' its derivative by the angle, and d
+// the distance, the derivative of the pixel is focal / d times
 //     (r / sin t) (I - n n^T) + r' cos t n n^T   by x and y, and   -r' sin t n   by z.
 
 struct FisheyeRay {
@@ -22,8 +23,8 @@ struct FisheyeRay {
     float d_stretch;  // its derivative by the angle
 };
 
-// The angle off the axis of a point that lies r from it and z forward of the camera, both not negative: within three units of
-// the last place (polynomial of Cephes' atanf), where Vulkan demands no more of atan than 4096.
+// The angle off the axis of a point that lies r from it and z forward of the camera, both not negative: within three
+// units of the last place (polynomial of Cephes' atanf), where Vulkan demands no more of atan than 4096.
 float angle_off_axis(float r, float z) {
     float base = 0.0, x = r / z;
     if (r > 2.414213562373095 * z) {
@@ -84,7 +85,8 @@ Jacobian fisheye_jacobian(vec3 point, Camera camera) {
 }
 
 // By distance, angle and turn about the axis: what is differentiated is d_pixel . pixel and (S / d) with
-// S = r / sin t ss + r' cos t nn - r' sin t zn, where nn, ss and zn are components of the rows' gradient along and across n.
+// S = r / sin t ss + r' cos t nn - r' sin t zn, where nn, ss and zn are components of the rows' gradient along and
+// across n.
 vec3 fisheye_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
     FisheyeRay ray = fisheye_ray(point, camera);
     vec2 n = ray.across, side = vec2(-n.y, n.x);

@@ -27,7 +27,8 @@ vec3 pinhole_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3
     vec2 d_slope = -camera.focal / z * vec2(d_row0.z, d_row1.z);
     bvec2 is_free = equal(free_slope, slope);
     vec2 d_xy = camera.focal * d_pixel / z + mix(vec2(0.0), d_slope / z, is_free);
-    float d_z = -(camera.focal.x * (d_row0.x - slope.x * d_row0.z) + camera.focal.y * (d_row1.y - slope.y * d_row1.z)) / (z * z)
+    float d_z = -(camera.focal.x * (d_row0.x - slope.x * d_row0.z)
+        + camera.focal.y * (d_row1.y - slope.y * d_row1.z)) / (z * z)
         - dot(d_xy, free_slope);
     return vec3(d_xy, d_z);
 }

@@ -1,5 +1,5 @@
-// The shapes of the tone curves, f(t) for t >= 0: a number, a function and a case each. `src/photographs/tone/catalogue.rs` is the
-// host's side: a row each, with the same formula.
+// The shapes of the tone curves, f(t) for t >= 0: a number, a function and a case each.
+// `src/photographs/tone/catalogue.rs` is the host's side: a row each, with the same formula.
 
 const uint CURVE_NONE                = 0;
 const uint CURVE_LINEAR              = 1;

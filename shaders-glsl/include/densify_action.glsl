@@ -1,22 +1,22 @@
-// What density control does with a Gaussian, and how it gets there.
+// The action of density control on a Gaussian, and how it is decided.
 
-const uint ACTION_PRUNE = 0;  // it goes
-const uint ACTION_KEEP  = 1;  // it stays as it is
-const uint ACTION_CLONE = 2;  // it stays, and a copy appears at a position drawn from it
-const uint ACTION_SPLIT = 3;  // two smaller ones take its place
+const uint ACTION_PRUNE = 0;  // the Gaussian is removed
+const uint ACTION_KEEP  = 1;  // unchanged
+const uint ACTION_CLONE = 2;  // kept, with a copy at a position drawn from it
+const uint ACTION_SPLIT = 3;  // replaced by two smaller ones
 
-// How many Gaussians come of one.
+// The number of Gaussians that an action leaves.
 uint child_count(uint action) { return min(action, 2u); }
 
-// Whether a copy is another Gaussian than the one it comes of.
+// Whether a copy is another Gaussian than its parent.
 bool is_new(uint action, uint copy_index) { return action == ACTION_SPLIT || copy_index > 0; }
 
-// Keys sort candidates by falling gradient, then those that stay, then those that go.
+// Keys sort candidates by falling gradient, then those that are kept, then those that are pruned.
 const uint KEY_TOP   = 0x7f800000;  // the bits of an infinite gradient: a candidate's key is this less its own bits
 const uint KEY_KEEP  = 0x80000000;
 const uint KEY_PRUNE = 0x80000001;
 
-// Places of the counts of a round.
+// Indices of the counters of a round.
 const uint COUNTER_CANDIDATES = 0;
 const uint COUNTER_PRUNED     = 1;
 const uint COUNTER_CLONED     = 2;
@@ -27,8 +27,8 @@ const uint COUNTER_WORDS      = 4;
 const float PAPER_LOG_SPLIT_FACTOR = 0.47000362924573558;  // ln 1.6
 
 // The conserving split along the longest axis, for opacity o and in standard deviations of the parent: centres at
-// +-OFFSET; scales and opacity are constants + slopes times o, the opacity as a fraction of o. Fitted to the least squared
-// difference of the composited alpha over all directions of view (docs/benchmarks.md).
+// +-OFFSET; scales and opacity are constants + slopes times o, the opacity as a fraction of o. Fitted to the least
+// squared difference of the composited alpha over all directions of view (docs/benchmarks.md).
 const float SPLIT_OFFSET        = 0.5;
 const float SPLIT_ALONG         = 0.866;  // sqrt(1 - OFFSET^2): the pair keeps the parent's variance where o is small
 const float SPLIT_ALONG_SLOPE   = -0.105;

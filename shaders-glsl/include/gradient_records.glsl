@@ -2,8 +2,8 @@
 
 // The record of the Gaussian whose slots are these, summed in slot order.
 //
-// The lanes share the slots of a Gaussian that has many: each sums every SUBGROUP_SIZE-th, then a tree the lanes. The same
-// order every time gives the same bits every time.
+// The lanes share the slots of a Gaussian that has many: each sums every SUBGROUP_SIZE-th, then a tree the lanes. The
+// same order every time gives the same bits every time.
 void sum_gradient_records(uvec2 intersection_ids, out vec3 sum[RECORD_VECTORS]) {
     uint lane = gl_SubgroupInvocationID;
     bool is_shared = intersection_ids.y - intersection_ids.x > SHARED_INTERSECTIONS;

@@ -7,7 +7,7 @@ layout(constant_id = 0) const uint CHUNK = 1024;
 layout(push_constant) uniform Params {
     uint pixel_count;  // of a channel
     uint channel_count;
-    uint offset;       // of the layer in `values` or `gradients`: the scales gamma of all channels, then the shifts beta
+    uint offset;  // of the layer in `values` or `gradients`: the scales gamma of all channels, then the shifts beta
     uint slot;         // use of the layer, times `channel_count`: where its statistics are
 };
 

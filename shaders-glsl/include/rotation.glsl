@@ -10,8 +10,8 @@ mat3 rotation(vec4 q) {
     );
 }
 
-// What a vector is multiplied by before its length counts, where that is too large or not finite: beyond 1e19 the squares
-// of its numbers are infinite.
+// What a vector is multiplied by before its length counts, where that is too large or not finite: beyond 1e19 the
+// squares of its numbers are infinite.
 float finite_scale(float length) { return length < 1e18 ? 1.0 : 1e-25; }
 
 // A quaternion of unit length; the identity where the length is not a positive number.

@@ -12,14 +12,14 @@ bool tile_is_shared() {
     return subgroups > 1;
 }
 
-// Whether the groups that a splat misses are jumped over. A GPU jumps where its whole subgroup agrees; a software device
-// may only mask its lanes, does the work all the same, and is faster without the test.
+// Whether the groups that a splat misses are skipped. A GPU skips them where its whole subgroup agrees; a software
+// device may only mask its lanes, does the work all the same, and is faster without the test.
 layout(constant_id = 6) const bool SKIPS_GROUPS = true;
 
 const uint PART_HEIGHT = TILE_HEIGHT / SUBGROUPS_PER_TILE;
 const uint GROUPS = TILE_WIDTH * PART_HEIGHT / SUBGROUP_SIZE;
 
-// How many splats of a batch one turn of the loop over it blends: some devices give an invocation but so many turns.
+// The splats of a batch that one iteration of the loop blends: some devices limit the iterations of an invocation.
 layout(constant_id = 7) const uint SPLATS_PER_TURN = 1;
 
 // The first pixel of a tile.

@@ -2,8 +2,8 @@
 //
 // The includer declares `counts[]`, [0]: intersections, `sorted_tiles[]` and `status[]`.
 
-// How many intersections lie in tiles before `tile`: every lane probes, and the run of those before it goes on between two
-// probes.
+// How many intersections lie in tiles before `tile`: every lane probes, and the run of those before it goes on between
+// two probes.
 uint intersections_before(uint tile) {
     uint begin = 0;
     uint end = counts[0];

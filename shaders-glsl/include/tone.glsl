@@ -1,5 +1,5 @@
 // The tone curves: sRGB-encoded dark value in, pseudo-GT value in [0, 1] out.
-// The statistics behind the parameters are taken once per view; `tone::ToneCurve` is the host side.
+// The statistics of the parameters are taken once per view; `tone::ToneCurve` is the host side.
 
 #include "curves.glsl"
 

@@ -4,9 +4,9 @@
 
 //! The gradients of u mean(a - b)^2 + v TV(a) with respect to the denoised image a and the render b, and partial sums.
 //!
-//! TV(a) = 2 (mean of squared differences of neighbours along y + the same along x). Means are over the interior, and over
-//! pairs inside it; outside, both gradients are 0. A thread marches down `ROWS` pixels of one column of one channel.
-//! Reference: `src/reference/denoising.rs`.
+//! TV(a) = 2 (mean of squared differences of neighbours along y + the same along x). Means are over the interior, and
+//! over pairs inside it; outside, both gradients are 0. A thread marches down `ROWS` pixels of one column of one
+//! channel. Reference: `src/reference/denoising.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

@@ -17,7 +17,8 @@ layout(push_constant) uniform Params {
     uint  key;        // of the step
 };
 
-layout(binding = 0) writeonly buffer Regions { uvec4 regions[]; };  // (1 + box_count,), first column and row, width, height
+// (1 + box_count,), first column and row, width, height
+layout(binding = 0) writeonly buffer Regions { uvec4 regions[]; };
 
 // Uniform in [0, range), 0 for an empty range.
 uint draw(uint at, uint range) {
@@ -29,5 +30,6 @@ uint draw(uint at, uint range) {
 void main() {
     uint i = THREAD_INDEX;
     if (i > box_count) return;
-    regions[i] = i == 0 ? uvec4(0, 0, size) : uvec4(draw(2 * i, size.x - side), draw(2 * i + 1, size.y - side), side, side);
+    regions[i] = i == 0 ? uvec4(0, 0, size) : uvec4(draw(2 * i, size.x - side), draw(2 * i + 1, size.y - side),
+        side, side);
 }

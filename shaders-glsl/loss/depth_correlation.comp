@@ -5,9 +5,9 @@
 
 //! The Pearson loss P of every region and its gradient, from the moments of its chunks.
 //!
-//! P = 1 - mean(a^ b^) with a^ = (a - mean a) / (s_a + 1e-6), s_a^2 the unbiased variance of the rendered depth a, b the
-//! estimated depth. One subgroup per region, in a fixed order: the mean of the means, then the sums of products about it.
-//! Where a or b is constant, P is 1 and its gradient 0. Reference: `src/reference/depth_correlation.rs`.
+//! P = 1 - mean(a^ b^) with a^ = (a - mean a) / (s_a + 1e-6), s_a^2 the unbiased variance of the rendered depth a, b
+//! the estimated depth. One subgroup per region, in a fixed order: the mean of the means, then the sums of products
+//! about it. Where a or b is constant, P is 1 and its gradient 0. Reference: `src/reference/depth_correlation.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

@@ -3,7 +3,8 @@
 #include "kernel.glsl"
 #include "depth_region.glsl"
 
-//! The gradient of the depth loss with respect to one plane of the render: the sum of those of the regions around a pixel.
+//! The gradient of the depth loss with respect to one plane of the render: the sum of those of the regions around a
+//! pixel.
 //!
 //! One thread per pixel. Reference: `src/reference/depth_gradient.rs`.
 

@@ -4,9 +4,9 @@
 
 //! The gradient of mean|a - b| with respect to the render a, b the pseudo-GT, and partial sums of |a - b|.
 //!
-//! A thread takes `VALUES_PER_THREAD` values, one subgroup apart, so that a subgroup reads one run. At a = b the gradient
-//! is 0. With `WITH_LOSS_REGION` the mean is over a rectangle of the view, and outside it the gradient is 0. The first term of
-//! a step writes the gradient, the others add to it. Reference: `src/reference/l1.rs`.
+//! A thread takes `VALUES_PER_THREAD` values, one subgroup apart, so that a subgroup reads one run. At a = b the
+//! gradient is 0. With `WITH_LOSS_REGION` the mean is over a rectangle of the view, and outside it the gradient is 0.
+//! The first term of a step writes the gradient, the others add to it. Reference: `src/reference/l1.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

@@ -6,7 +6,7 @@
 //! The means of two loss terms from their partial sums, into the step's slot of the log.
 //!
 //! One subgroup, in a fixed order. A term that is NaN or infinite raises a flag in the sticky status word,
-//! so that the steps recorded behind this one change nothing. Reference: `src/reference/loss_log.rs`.
+//! so that later steps in the recording change nothing. Reference: `src/reference/loss_log.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -22,7 +22,7 @@ layout(push_constant) uniform Params {
 layout(binding = 0) readonly  buffer FirstPartials  { float first_partials[]; };
 layout(binding = 1) readonly  buffer SecondPartials { float second_partials[]; };
 layout(binding = 2) writeonly buffer Log            { float log[]; };       // (slots, term_count)
-layout(binding = 3) writeonly buffer Statuses       { uint statuses[]; };   // (slots,), status[0] behind the step's last term
+layout(binding = 3) writeonly buffer Statuses       { uint statuses[]; };   // (slots,), status[0] after the step
 layout(binding = 4)           buffer Status         { uint status[]; };
 
 bool is_finite(float x) { return (floatBitsToUint(x) & 0x7f800000u) != 0x7f800000u; }

@@ -2,8 +2,8 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! Mask: what the loss sees of a render, w a + (1 - w) b with the weights w of the pixels, a the render and b the pseudo-GT,
-//! one thread per value.
+//! Mask: what the loss sees of a render, w a + (1 - w) b with the weights w of the pixels, a the render and b the
+//! pseudo-GT, one thread per value.
 //!
 //! A pixel that is hidden equals its target. `mask_gradient` goes back. Reference: `src/reference/mask_render.rs`.
 

@@ -3,8 +3,9 @@
 #include "kernel.glsl"
 #include "gaussian.glsl"
 
-//! The gradients of w_o mean sigmoid(o) + w_s mean exp(s) + w_a mean max(max s - min s - ln r, 0) with respect to the raw
-//! opacities o and the logarithms s of the standard deviations, added to those that are there, and partial sums of the three.
+//! The gradients of w_o mean sigmoid(o) + w_s mean exp(s) + w_a mean max(max s - min s - ln r, 0) with respect to the
+//! raw opacities o and the logarithms s of the standard deviations, added to those that are there, and partial sums of
+//! the three.
 //!
 //! A thread takes `GAUSSIANS_PER_THREAD` Gaussians, one subgroup apart. A weight of 0 leaves the gradients as they are.
 //! Reference: `src/reference/parameter_terms.rs`.

@@ -2,25 +2,24 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! L1 and SSIM of a render a against the pseudo-GT b: the gradient of (1 - w) mean|a - b| + w (1 - mean SSIM) with respect to
-//! a, and partial sums of |a - b| and of SSIM.
+//! L1 and SSIM of a render a against the pseudo-GT b: the gradient of (1 - w) mean|a - b| + w (1 - mean SSIM) with
+//! respect to a, and partial sums of |a - b| and of SSIM.
 //!
-//! Wang et al. 2004 with the window of 3DGS: 11 x 11 Gaussian, sigma 1.5, zero padding, per channel. With E[.] the windowed
-//! mean, per pixel and channel:
-//! S = (2 E[a] E[b] + C1) (2 (E[ab] - E[a] E[b]) + C2)
+//! Wang et al. 2004 with the window of 3DGS: 11 x 11 Gaussian, sigma 1.5, zero padding, per channel. With E[.] the
+//! windowed mean, per pixel and channel: S = (2 E[a] E[b] + C1) (2 (E[ab] - E[a] E[b]) + C2)
 //!   / ((E[a]^2 + E[b]^2 + C1) (E[aa] - E[a]^2 + E[bb] - E[b]^2 + C2)),
-//! and the gradient of sum S is E[dS/dE[a]] + 2 a E[dS/dE[aa]] + b E[dS/dE[ab]]: the window is symmetric and zero outside the
-//! image, so the transposed blur is the blur. At a = b the gradient of the L1 term is 0. Means are over the interior: pixels
-//! outside are seen by the windows, but their S counts neither in the sum nor in the derivatives. The L1 term stays inside
-//! it, the SSIM term reaches a window's radius beyond. The first term of a step writes the gradient, the others add to it.
-//! Reference: `src/reference/ssim.rs`.
+//! and the gradient of sum S is E[dS/dE[a]] + 2 a E[dS/dE[aa]] + b E[dS/dE[ab]]: the window is symmetric and zero
+//! outside the image, so the transposed blur is the blur. At a = b the gradient of the L1 term is 0. Means are over the
+//! interior: pixels outside are seen by the windows, but their S counts neither in the sum nor in the derivatives. The
+//! L1 term stays inside it, the SSIM term reaches a window's radius beyond. The first term of a step writes the
+//! gradient, the others add to it. Reference: `src/reference/ssim.rs`.
 //!
-//! A subgroup owns a run of columns of one channel and marches down ROWS rows. Every lane loads COLUMNS of a row and takes
-//! what its windows reach beyond from the lanes beside it, so that a value is loaded once, but for the ends of the run, where
-//! windows lack a side and have no outputs. A row that is loaded is blurred along x in registers and added, weighted by the
-//! taps along y, to the moments still in reach; those RADIUS rows above are then complete, their derivatives go the same way,
-//! and the gradient 2 RADIUS rows above is complete. No barrier is needed, and nothing between the images and the gradient is
-//! written.
+//! A subgroup owns a run of columns of one channel and marches down ROWS rows. Every lane loads COLUMNS of a row and
+//! takes what its windows reach beyond from the lanes beside it, so that a value is loaded once, but for the ends of
+//! the run, where windows lack a side and have no outputs. A row that is loaded is blurred along x in registers and
+//! added, weighted by the taps along y, to the moments still in reach; those RADIUS rows above are then complete, their
+//! derivatives go the same way, and the gradient 2 RADIUS rows above is complete. No barrier is needed, and nothing
+//! between the images and the gradient is written.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -57,7 +56,8 @@ const uint QUADS = (COLUMNS + 7 - ALIGNMENT) / 4;  // vectors of four that hold 
 
 // exp(-d^2 / (2 sigma^2)) / sum for d = 0..RADIUS.
 const float TAPS[RADIUS + 1] =
-    float[](0.2660117248617943, 0.21300553771125366, 0.1093606895097, 0.03600077212843082, 0.007598758135239184, 0.0010283800844791099);
+    float[](0.2660117248617943, 0.21300553771125366, 0.1093606895097, 0.03600077212843082, 0.007598758135239184,
+        0.0010283800844791099);
 
 // The blurred moments, in the order of the arrays below: of the squares, SSIM knows the sum alone.
 const uint A = 0, B = 1, SQUARES = 2, PRODUCT = 3, MOMENTS = 4;

@@ -5,10 +5,10 @@
 //! A 3x3 convolution with stride 1 and zero padding 1, and the gradient of its input, which is one too.
 //!
 //! output[o](p) = activation(bias[o] + sum over i and t of weight[o, i, t] input[i](p + t)), t in {-1, 0, 1}^2.
-//! TRANSPOSED: weight[i, o, -t] and no bias, which turns dL/d output into dL/d input; `in_channels` counts what is read.
-//! A lane owns COLUMNS x ROWS pixels of OUT_BLOCK output channels in registers: an implicit matrix product whose inner
-//! dimension is (i, t). The lanes of a subgroup lie side by side; they load the weights of an input channel together
-//! and broadcast them, so no shared memory and no barrier is needed. Reference: `src/reference/conv3x3.rs`.
+//! TRANSPOSED: weight[i, o, -t] and no bias, which turns dL/d output into dL/d input; `in_channels` counts what is
+//! read. A lane owns COLUMNS x ROWS pixels of OUT_BLOCK output channels in registers: an implicit matrix product whose
+//! inner dimension is (i, t). The lanes of a subgroup lie side by side; they load the weights of an input channel
+//! together and broadcast them, so no shared memory and no barrier is needed. Reference: `src/reference/conv3x3.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -23,7 +23,7 @@ layout(push_constant, scalar) uniform Params {
     uvec2 size;          // pixels
     uint  in_channels;
     uint  out_channels;
-    uint  offset;        // of the layer in `values`: weights (out, in, 3, 3), or (in, out, 3, 3) if TRANSPOSED, then biases
+    uint offset;  // of the layer in `values`: weights (out, in, 3, 3), or (in, out, 3, 3) if TRANSPOSED, then biases
 };
 
 // Workgroups: (out blocks, columns / (SUBGROUP_SIZE COLUMNS), rows / ROWS), so that neighbours read the same pixels.
@@ -69,7 +69,8 @@ void main() {
     float sum[OUT_BLOCK][ROWS][COLUMNS];
     [[unroll]] for (uint o = 0; o < OUT_BLOCK; ++o) {
         float bias = 0.0;
-        if (TRANSPOSED) {} else bias = values[offset + TAPS * in_channels * out_channels + min(first_channel + o, out_channels - 1)];
+        if (TRANSPOSED) {} else bias = values[offset + TAPS * in_channels * out_channels + min(first_channel + o,
+            out_channels - 1)];
         [[unroll]] for (uint r = 0; r < ROWS; ++r)
             [[unroll]] for (uint c = 0; c < COLUMNS; ++c) sum[o][r][c] = bias;
     }

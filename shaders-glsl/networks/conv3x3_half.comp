@@ -14,10 +14,11 @@
 
 //! The 3x3 convolution of `conv3x3` as a product of cooperative matrices: factors of 16 bits, sums in single precision.
 //!
-//! output(M channels, N pixels) += weight_t(M, K) input_t(K, N) for each tap t and every K input channels, the weights as
-//! `pack_weights` has them, the input as `pack_map`. A subgroup owns BLOCKS matrices of channels by PACKED_ROWS rows of pixels;
-//! a row that it loads serves the three taps above each other. The gradient of the input is the same of transposed weights.
-//! Rounding the factors costs 2^-9 of the terms' magnitudes, beside what the sums cost. Reference:
+//! output(M channels, N pixels) += weight_t(M, K) input_t(K, N) for each tap t and every K input channels, the weights
+//! as
+//! `pack_weights` has them, the input as `pack_map`. A subgroup owns BLOCKS matrices of channels by PACKED_ROWS rows of
+//! pixels; a row that it loads serves the three taps above each other. The gradient of the input is the same of
+//! transposed weights. Rounding the factors costs 2^-9 of the terms' magnitudes, beside what the sums cost. Reference:
 //! `src/reference/conv3x3_half.rs`.
 
 layout(local_size_x_id = 100) in;
@@ -66,14 +67,17 @@ void main() {
         for (uint column = 0; column < 3; ++column) {
             coopmat<float16_t, gl_ScopeSubgroup, K, N, gl_MatrixUseB> neighbours[PACKED_ROWS + 2];
             [[unroll]] for (uint r = 0; r < PACKED_ROWS + 2; ++r)
-                coopMatLoad(neighbours[r], source, corner + r * row_length + column * from + first, from, gl_CooperativeMatrixLayoutColumnMajor);
+                coopMatLoad(neighbours[r], source, corner + r * row_length + column * from + first, from,
+                    gl_CooperativeMatrixLayoutColumnMajor);
             [[unroll]] for (uint row = 0; row < 3; ++row) {
                 [[unroll]] for (uint b = 0; b < BLOCKS; ++b) {
                     // Beyond the last channels their sums are made once more, and not kept.
                     uint channel = min(first_channel + b * M, to - M);
                     coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> factor;
-                    coopMatLoad(factor, weights, ((3 * row + column) * to + channel) * from + first, from, gl_CooperativeMatrixLayoutRowMajor);
-                    [[unroll]] for (uint r = 0; r < PACKED_ROWS; ++r) sum[b][r] = coopMatMulAdd(factor, neighbours[r + row], sum[b][r]);
+                    coopMatLoad(factor, weights, ((3 * row + column) * to + channel) * from + first, from,
+                        gl_CooperativeMatrixLayoutRowMajor);
+                    [[unroll]] for (uint r = 0; r < PACKED_ROWS; ++r)
+                        sum[b][r] = coopMatMulAdd(factor, neighbours[r + row], sum[b][r]);
                 }
             }
         }

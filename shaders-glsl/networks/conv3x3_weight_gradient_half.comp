@@ -12,13 +12,13 @@
 #include "kernel.glsl"
 #include "packed.glsl"
 
-//! The partial sums of `conv3x3_weight_gradient` as products of cooperative matrices: factors of 16 bits, sums in single
-//! precision.
+//! The partial sums of `conv3x3_weight_gradient` as products of cooperative matrices: factors of 16 bits, sums in
+//! single precision.
 //!
-//! d_weight(M out, N in) of tap t += d_target(M out, K pixels) input_t(K pixels, N in) for every K pixels of every row of a
-//! strip, both as `pack_map` has them. A subgroup owns BLOCKS matrices of output channels by one of input channels, for all
-//! nine taps, and slides a window of three rows down K columns after K columns: a matrix of input is loaded once.
-//! What rounding a factor costs is said in `pack_map`. Biases are summed in single precision. Reference:
+//! d_weight(M out, N in) of tap t += d_target(M out, K pixels) input_t(K pixels, N in) for every K pixels of every row
+//! of a strip, both as `pack_map` has them. A subgroup owns BLOCKS matrices of output channels by one of input
+//! channels, for all nine taps, and slides a window of three rows down K columns after K columns: a matrix of input is
+//! loaded once. What rounding a factor costs is said in `pack_map`. Biases are summed in single precision. Reference:
 //! `src/reference/conv3x3_weight_gradient_half.rs`.
 
 layout(local_size_x_id = 100) in;
@@ -41,7 +41,7 @@ layout(binding = 1) readonly  buffer LargestDTarget { uint largest_d_target[]; }
 layout(binding = 2) readonly  buffer Source         { HALVES source[]; };           // (rows, columns, in)
 layout(binding = 3) readonly  buffer DTarget        { HALVES d_target[]; };         // (rows, columns, out)
 layout(binding = 4) readonly  buffer DTargetSingle  { float d_target_single[]; };   // (out, H, W)
-layout(binding = 5) writeonly buffer Partials       { float partials[]; };  // (strips, out in 9 + out): weights, then biases
+layout(binding = 5) writeonly buffer Partials { float partials[]; };  // (strips, out in 9 + out): weights, then biases
 
 #ifdef REFLECTION
 void main() {}
@@ -69,16 +69,20 @@ void main() {
         coopmat<float16_t, gl_ScopeSubgroup, K, N, gl_MatrixUseB> window[3][3];
         [[unroll]] for (uint r = 0; r < 2; ++r)
             [[unroll]] for (uint c = 0; c < 3; ++c)
-                coopMatLoad(window[r][c], source, ((top + r) * columns + first + c) * from + first_in, from, gl_CooperativeMatrixLayoutRowMajor);
+                coopMatLoad(window[r][c], source, ((top + r) * columns + first + c) * from + first_in, from,
+                    gl_CooperativeMatrixLayoutRowMajor);
         for (uint y = top; y < end; ++y) {
             [[unroll]] for (uint c = 0; c < 3; ++c)
-                coopMatLoad(window[2][c], source, ((y + 2) * columns + first + c) * from + first_in, from, gl_CooperativeMatrixLayoutRowMajor);
+                coopMatLoad(window[2][c], source, ((y + 2) * columns + first + c) * from + first_in, from,
+                    gl_CooperativeMatrixLayoutRowMajor);
             [[unroll]] for (uint b = 0; b < BLOCKS; ++b) {
                 // Beyond the last channels their sums are made once more, and not kept.
                 uint channel = min(first_out + b * M, to - M);
                 coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> factor;
-                coopMatLoad(factor, d_target, ((y + 1) * columns + first + 1) * to + channel, to, gl_CooperativeMatrixLayoutColumnMajor);
-                [[unroll]] for (uint t = 0; t < TAPS; ++t) sum[b][t] = coopMatMulAdd(factor, window[t / 3][t % 3], sum[b][t]);
+                coopMatLoad(factor, d_target, ((y + 1) * columns + first + 1) * to + channel, to,
+                    gl_CooperativeMatrixLayoutColumnMajor);
+                [[unroll]] for (uint t = 0; t < TAPS; ++t)
+                    sum[b][t] = coopMatMulAdd(factor, window[t / 3][t % 3], sum[b][t]);
             }
             [[unroll]] for (uint c = 0; c < 3; ++c) {
                 window[0][c] = window[1][c];
@@ -97,7 +101,8 @@ void main() {
             for (uint i = gl_SubgroupInvocationID; i < M * N; i += SUBGROUP_SIZE) {
                 uint own = first_out + b * M + i / N, other = first_in + i % N;
                 if (own < out_channels && other < in_channels)
-                    partials[set + (own * in_channels + other) * TAPS + t] = unpacked(sums[i], largest_d_target[0], largest_source[0]);
+                    partials[set + (own * in_channels + other) * TAPS + t] = unpacked(sums[i], largest_d_target[0],
+                        largest_source[0]);
             }
         }
     }
@@ -106,7 +111,8 @@ void main() {
     for (uint own = first_out; own < min(first_out + BLOCKS * M, out_channels); ++own) {
         float bias = 0.0;
         uint begin = (own * size.y + top) * size.x;
-        for (uint i = gl_SubgroupInvocationID; i < (end - top) * size.x; i += SUBGROUP_SIZE) bias += d_target_single[begin + i];
+        for (uint i = gl_SubgroupInvocationID; i < (end - top) * size.x; i += SUBGROUP_SIZE)
+            bias += d_target_single[begin + i];
         bias = subgroupAdd(bias);
         if (gl_SubgroupInvocationID == 0) partials[set + weight_count + own] = bias;
     }

@@ -2,10 +2,11 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! A convolution with a square window of any size, a stride and zero padding, behind it a ReLU.
+//! A convolution with a square window of any size, a stride and zero padding, followed by a ReLU.
 //!
-//! output[o](p) = max(0, bias[o] + sum over i and t of weight[o, i, t] input[i](stride p + t - padding)), t in [0, window)^2.
-//! A thread owns a pixel of OUT_BLOCK output channels, so that it loads what it reads once for all of them. Reference:
+//! output[o](p) = max(0, bias[o] + sum over i and t of weight[o, i, t] input[i](stride p + t - padding)), t in [0,
+//! window)^2. A thread owns a pixel of OUT_BLOCK output channels, so that it loads what it reads once for all of them.
+//! Reference:
 //! `src/reference/conv_strided.rs`.
 
 layout(local_size_x = 64) in;
@@ -55,6 +56,7 @@ void main() {
     }
     [[unroll]] for (uint o = 0; o < OUT_BLOCK; ++o) {
         // Phrased so that a NaN stays one.
-        if (first_channel + o < out_channels) target[first_channel * pixels + o * pixels + i % pixels] = sum[o] < 0.0 ? 0.0 : sum[o];
+        if (first_channel + o < out_channels)
+            target[first_channel * pixels + o * pixels + i % pixels] = sum[o] < 0.0 ? 0.0 : sum[o];
     }
 }

@@ -3,7 +3,8 @@
 #include "kernel.glsl"
 #include "norm.glsl"
 
-//! Per chunk: the sums of d_y and of d_y n, with n = (z - mean) / deviation, y = gamma n + beta, d_y = d_f' where y > 0.
+//! Per chunk: the sums of d_y and of d_y n, with n = (z - mean) / deviation, y = gamma n + beta, d_y = d_f' where y >
+//! 0.
 //!
 //! They are the gradients of beta and gamma, and what the gradient of z is made of.
 //! Reference: `src/reference/norm_backward_sums.rs`.

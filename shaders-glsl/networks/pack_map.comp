@@ -3,11 +3,12 @@
 #include "kernel.glsl"
 #include "packed.glsl"
 
-//! A map of features as the second factor of 16-bit matrices: packed(p + 1)[c] = scale source[c](p), zeros around and beyond.
+//! A map of features as the second factor of 16-bit matrices: packed(p + 1)[c] = scale source[c](p), zeros around and
+//! beyond.
 //!
-//! A thread writes PACKED_CHANNELS channels of a packed pixel; its neighbours read the pixels beside its own. Rounding costs
-//! 2^-10 at most, and what is below 2^-28 of the map's largest magnitude may vanish: below it halves are subnormal, which some
-//! devices flush; below 2^-39 it does. Reference: `src/reference/pack_map.rs`.
+//! A thread writes PACKED_CHANNELS channels of a packed pixel; its neighbours read the pixels beside its own. Rounding
+//! costs 2^-10 at most, and what is below 2^-28 of the map's largest magnitude may vanish: below it halves are
+//! subnormal, which some devices flush; below 2^-39 it does. Reference: `src/reference/pack_map.rs`.
 
 layout(local_size_x = 256) in;
 

@@ -3,10 +3,11 @@
 #include "kernel.glsl"
 #include "packed.glsl"
 
-//! The weights of a layer as the first factor of 16-bit matrices: packed[t, o, i] = scale weight[o, i, t], zeros beyond.
+//! The weights of a layer as the first factor of 16-bit matrices: packed[t, o, i] = scale weight[o, i, t], zeros
+//! beyond.
 //!
-//! TRANSPOSED: packed[t, i, o] = scale weight[o, i, -t], which turns dL/d output into dL/d input. A thread writes eight side
-//! by side. What rounding costs is said in `pack_map`. Reference: `src/reference/pack_weights.rs`.
+//! TRANSPOSED: packed[t, i, o] = scale weight[o, i, -t], which turns dL/d output into dL/d input. A thread writes eight
+//! side by side. What rounding costs is said in `pack_map`. Reference: `src/reference/pack_weights.rs`.
 
 layout(local_size_x = 256) in;
 layout(constant_id = 0) const bool TRANSPOSED = false;

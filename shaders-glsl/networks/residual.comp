@@ -7,7 +7,7 @@
 //! Reference: `src/reference/residual.rs`.
 
 layout(local_size_x = 256) in;
-layout(constant_id = 0) const bool IDENTITY = false;  // no gradient dies behind a clamp
+layout(constant_id = 0) const bool IDENTITY = false;  // no gradient vanishes in a clamp
 
 layout(push_constant) uniform Params {
     uint value_count;  // 3HW

@@ -6,9 +6,9 @@
 //! The colour invariant W of an image, its logarithm, and the partial moments that normalise it.
 //!
 //! Smoothing and differentiating what `ciconv_rows` left along the columns gives E and the derivatives along x and y of
-//! E, E_l and E_ll; W = sum (d / (E + 1e-5))^2 over the six. One thread per pixel. A workgroup is one subgroup and leaves
-//! the mean of its ln(W + 1e-5) and their sum of squares about that mean: nothing cancels, however far from 0 they lie.
-//! Lengyel et al. 2021. Reference: `src/reference/ciconv_columns.rs`.
+//! E, E_l and E_ll; W = sum (d / (E + 1e-5))^2 over the six. One thread per pixel. A workgroup is one subgroup and
+//! leaves the mean of its ln(W + 1e-5) and their sum of squares about that mean: nothing cancels, however far from 0
+//! they lie. Lengyel et al. 2021. Reference: `src/reference/ciconv_columns.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -22,7 +22,7 @@ layout(push_constant) uniform Params {
 layout(binding = 0) readonly  buffer Smooth  { vec3 smooth_rows[]; };  // (H, W, 3), E, E_l, E_ll
 layout(binding = 1) readonly  buffer Slope   { vec3 slope_rows[]; };   // (H, W, 3)
 layout(binding = 2) writeonly buffer Logs    { float logs[]; };        // (H, W), ln(W + 1e-5)
-layout(binding = 3) writeonly buffer Moments { vec2 moments[]; };      // mean and sum of squares about it, per workgroup
+layout(binding = 3) writeonly buffer Moments { vec2 moments[]; };  // mean and sum of squares about it, per workgroup
 
 const float EPSILON = 1e-5;
 

@@ -5,16 +5,17 @@
 
 //! Pseudo-GT: decodes a stored photograph and applies its curve; one thread per pixel.
 //!
-//! A code is looked up and not divided, which a device may round as it likes: what is decoded has the bits that were encoded.
-//! Most curves map each value alone. `lum_preserve` scales a pixel by what its luminance gains, `per_channel` each channel
-//! by its own white; `auto` mixes the curve of each channel with the curve of the luminance, which keeps the ratios of the
-//! channels; `table` and `profile` are what `tone::Table` and `tone::Profile` are. Of a photograph that is hardly too dark
-//! the curve has a part of the weight: the target is x + weight (curve(x) - x), x clamped to [0, 1]. Reference:
+//! A code is looked up and not divided, which a device may round as it likes: what is decoded has the bits that were
+//! encoded. Most curves map each value alone. `lum_preserve` scales a pixel by what its luminance gains, `per_channel`
+//! each channel by its own white; `auto` mixes the curve of each channel with the curve of the luminance, which keeps
+//! the ratios of the channels; `table` and `profile` are what `tone::Table` and `tone::Profile` are. Of a photograph
+//! that is hardly too dark the curve has a part of the weight: the target is x + weight (curve(x) - x), x clamped to
+//! [0, 1]. Reference:
 //! `src/reference/pseudo_gt.rs`.
 
 layout(local_size_x = 256) in;
 
-layout(constant_id = 0) const uint CODE_BITS = 32;       // 8 or 16; 32: `values` are the photograph, and there are no codes
+layout(constant_id = 0) const uint CODE_BITS = 32;  // 8 or 16; 32: `values` are the photograph, and there are no codes
 layout(constant_id = 1) const bool WITH_CURVE = true;    // else the photograph is decoded alone, to the bit
 
 // Of a profile: ramps of equal width of each channel,
@@ -31,7 +32,7 @@ layout(push_constant) uniform Params {
 layout(binding = 0) readonly  buffer Codes      { uint codes[]; };     // (3, H, W), the lowest bits of a word first
 layout(binding = 1) readonly  buffer Values     { float values[]; };   // one per code, or (3, H, W); sRGB-encoded
 layout(binding = 2) readonly  buffer Parameters { ToneParameters parameters[]; };
-layout(binding = 3) readonly  buffer CurveInputs    { float numbers[]; };  // (3, K, 3) knots x, y, slope; or (3, PROFILE_WIDTH)
+layout(binding = 3) readonly buffer Knots { float numbers[]; };  // (3, K, 3) knots x, y, slope; or (3, PROFILE_WIDTH)
 layout(binding = 4) writeonly buffer Target     { float target[]; };   // (3, H, W)
 
 float stored(uint i) {
@@ -101,8 +102,8 @@ float tabled(uint channel, float x) {
     return clamp(y, 0.0, 1.0);
 }
 
-// v = 1 - exp(-x / white); u = a v + b, clamped to [0, 1]; y = s_0 + sum of s_i clamp(16 u - i + 1, 0, 1) over 16 rises s_i
-// of equal width. The sum of ramps is continuous, so no rounding of u can jump.
+// v = 1 - exp(-x / white); u = a v + b, clamped to [0, 1]; y = s_0 + sum of s_i clamp(16 u - i + 1, 0, 1) over 16 rises
+// s_i of equal width. The sum of ramps is continuous, so no rounding of u can jump.
 float profiled(uint channel, vec3 v) {
     uint own = PROFILE_WIDTH * channel;
     float u = numbers[own] * v.r + numbers[own + 1] * v.g + numbers[own + 2] * v.b + numbers[own + 3];

@@ -1,9 +1,9 @@
-//! Checksums of 64 bits: whether numbers and bytes are what they were. Against chance and decay, not against anybody.
+//! 64-bit checksums of numbers and bytes. They detect accidental changes, not attacks.
 //!
-//! A word at a time is folded into the state by the two halves of a product, as wyhash does; the same bytes give the same
-//! number on every machine.
+//! Each word is folded into the state by the two halves of a product, as in wyhash; the same bytes give the same number
+//! on every machine.
 
-/// A checksum that grows with what is written to it.
+/// An incremental checksum.
 #[derive(Clone, Copy, Debug)]
 pub struct Hasher(u64);
 
@@ -18,7 +18,7 @@ impl Default for Hasher {
 }
 
 impl Hasher {
-    /// Takes bytes; where one slice ends and the next begins counts.
+    /// Hashes bytes; the boundaries between slices count.
     pub fn write(&mut self, bytes: &[u8]) {
         let (words, rest) = bytes.as_chunks::<8>();
         let mut last = [0; 8];
@@ -29,12 +29,12 @@ impl Hasher {
         self.0 = folded(self.0 ^ bytes.len() as u64, LENGTH);
     }
 
-    /// Takes numbers by their bits.
+    /// Hashes the bits of numbers.
     pub fn write_numbers(&mut self, numbers: &[f64]) {
         numbers.iter().for_each(|number| self.write(&number.to_bits().to_le_bytes()));
     }
 
-    /// The checksum of what was written so far.
+    /// The checksum of everything so far.
     pub fn finish(self) -> u64 {
         folded(self.0, WORD)
     }
@@ -47,14 +47,14 @@ pub fn of(bytes: &[u8]) -> u64 {
     hasher.finish()
 }
 
-/// As files have it: sixteen hexadecimal digits.
+/// In files: sixteen hexadecimal digits.
 pub fn text(hash: u64) -> String {
     format!("{hash:016x}")
 }
 
 fn folded(a: u64, b: u64) -> u64 {
     let product = u128::from(a) * u128::from(b);
-    // A factor of zero would forget all that was before.
+    // A factor of zero would forget everything before.
     (product as u64) ^ (product >> 64) as u64 ^ a.rotate_left(32)
 }
 

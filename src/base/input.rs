@@ -15,6 +15,10 @@ const MOST: u64 = 1 << 28;
 /// [`Error::Input`] where it cannot be read, or does not end.
 pub fn bytes(path: &Path) -> Result<Vec<u8>> {
     let cannot = |error: std::io::Error| Error::input(path, format!("cannot be read: {error}"));
+    #[cfg(feature = "io")]
+    if let Some(bytes) = crate::base::tree::archived_bytes(path) {
+        return bytes.map_err(cannot);
+    }
     if path.metadata().is_ok_and(|there| there.is_file()) {
         return std::fs::read(path).map_err(cannot);
     }
@@ -27,7 +31,7 @@ pub fn bytes(path: &Path) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// The text of a file, UTF-8, or UTF-16 behind its mark: a byte-order mark is no text.
+/// The text of a file, UTF-8, or UTF-16 after its mark: a byte-order mark is no text.
 ///
 /// # Errors
 /// As [`bytes`]; it is no text.

@@ -13,8 +13,8 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     write_whole_with(path, |path| std::fs::write(path, bytes))
 }
 
-/// As [`write_whole`], for what writes the file itself, under the name that it is given. What a link leads to is written, and
-/// the link stays; a device or a pipe is written to, and not replaced.
+/// As [`write_whole`], for what writes the file itself, under the name that it is given. What a link leads to is
+/// written, and the link stays; a device or a pipe is written to, and not replaced.
 ///
 /// # Errors
 /// As there.
@@ -34,14 +34,48 @@ pub fn write_whole_with(
     let partial = Path::new(&partial);
     let written = write(partial).and_then(|()| std::fs::rename(partial, &target));
     written.map_err(|error| {
-        // The first failure is the one worth reporting; a leftover of it is not.
+        // The first failure is the one worth reporting; a temporary file that remains is not.
         let _ = std::fs::remove_file(partial);
         failed(error)
     })
 }
 
-/// Text for a terminal or a line of a log: control characters, which names from elsewhere may hold, are spelled out. Line
-/// breaks stay.
+/// Creates a folder unless it exists.
+///
+/// # Errors
+/// [`Error::Output`].
+pub fn create_folder(folder: &Path) -> Result<()> {
+    std::fs::create_dir_all(folder)
+        .map_err(|error| Error::output(folder, format!("cannot be created: {error}")))
+}
+
+/// Whether two paths name the same file.
+pub fn is_same_file(a: &Path, b: &Path) -> bool {
+    a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
+}
+
+/// Checks, before any work, that a file or a folder can be created.
+///
+/// # Errors
+/// [`Error::Output`] if not.
+pub fn check_writable(path: &Path) -> Result<()> {
+    let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    let parent = absolute.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
+    // A file is replaced in its folder; a device or a pipe is written to.
+    let folder =
+        if parent.is_file() && parent == absolute { parent.parent() } else { Some(parent) };
+    let written = match folder {
+        Some(folder) if parent == absolute && !folder.is_dir() => Ok(()),
+        Some(folder) => tempfile::tempfile_in(folder).map(drop),
+        None => Ok(()),
+    };
+    written.map_err(|error| {
+        Error::output(path, format!("cannot be written ({error}); choose another place"))
+    })
+}
+
+/// Text for a terminal or a line of a log: control characters, which names from elsewhere may hold, are spelled out.
+/// Line breaks stay.
 pub fn printable(text: &str) -> Cow<'_, str> {
     let acts = |c: char| c.is_control() && c != '\n';
     if !text.contains(acts) {

@@ -1,7 +1,8 @@
-//! Settings, a row each: its key in config.toml, its default, the values it takes, its unit, its help, its option.
+//! Settings, one row each: key in config.toml, default, valid values, unit, help, option.
 //!
-//! `settings!` declares a struct of settings and their rows in one. What reads, writes, checks and explains a setting goes by
-//! the row: config.toml and `--set`, the options of `train` and their help, the guide's reference of settings.
+//! `settings!` declares a struct of settings together with its rows. Reading, writing, checking and explaining a
+//! setting follow from the row: config.toml and `--set`, the options of `train` and their help, the reference page of
+//! settings.
 
 use std::any::Any;
 use std::borrow::Cow;
@@ -10,20 +11,20 @@ use std::ops::{Bound, RangeBounds};
 
 use crate::{Error, Result};
 
-/// All that is to know about one setting but its default, which is that of the struct.
+/// The description of a setting. Its default is that of the struct.
 #[derive(Clone, Debug)]
 pub struct Setting {
     /// Its dotted path in config.toml.
     pub key: Cow<'static, str>,
-    /// The values it takes.
+    /// The values that it takes.
     pub rule: Rule,
-    /// What a number counts or measures; empty where it has no unit.
+    /// The unit of a number; empty if it has none.
     pub unit: &'static str,
     /// What it does, in lines.
     pub help: &'static [&'static str],
-    /// What holds where it is left out, if it can be.
+    /// What applies where it is left out, if it can be.
     pub absent: Option<&'static str>,
-    /// The option of `train` and what its value is called: `--steps N`; a flag has no value.
+    /// The option of `train` with the name of its value: `--steps N`; a flag has no value.
     pub option: Option<&'static str>,
 }
 
@@ -36,13 +37,13 @@ pub enum Rule {
     Whole(u64, u64),
     /// A finite number within bounds.
     Number(Bound<f64>, Bound<f64>),
-    /// From the first to the second count of values that follow a rule.
+    /// A list whose length is from the first to the second number, of values that follow a rule.
     List(usize, usize, &'static Self),
     /// One of these words.
     OneOf(&'static [&'static str]),
-    /// A text of which this is the form, and what tells whether it is one.
+    /// A text: its description, and its check.
     Text(&'static str, fn(&str) -> bool),
-    /// Several values in a form of their own, which their type checks.
+    /// Several values in a form that their type checks.
     Table(&'static str),
 }
 
@@ -143,14 +144,14 @@ impl fmt::Display for Rule {
     }
 }
 
-/// A number without a row of zeros.
+/// A number without a long row of zeros.
 fn short(number: f64) -> String {
     let is_plain = number == 0.0 || (1e-6..1e7).contains(&number.abs());
     if is_plain { number.to_string() } else { format!("{number:e}") }
 }
 
 impl Setting {
-    /// What it does, in one line.
+    /// Its help, in one line.
     pub fn help(&self) -> String {
         let lines: Vec<&str> = self.help.iter().map(|line| line.trim()).collect();
         lines.join(" ").trim_end_matches('.').to_owned()
@@ -162,20 +163,20 @@ impl Setting {
         if unit.is_empty() { rule.to_string() } else { format!("{rule}, in {unit}") }
     }
 
-    /// The option's name without its dashes, and what its value is called; none is a flag's.
+    /// The option's name without its dashes, and the name of its value; `None` for a flag.
     pub fn option(&self) -> Option<(&'static str, Option<&'static str>)> {
         let text = self.option?.trim_start_matches('-');
         Some(text.split_once(' ').map_or((text, None), |(name, value)| (name, Some(value))))
     }
 
-    /// What is to be said of a value that it does not take.
+    /// The error for a value that it does not take.
     pub fn refused(&self, value: impl fmt::Display) -> Error {
         let (key, rule) = (self.key.to_string(), self.takes());
         Error::Setting { key, value: value.to_string(), rule }
     }
 
-    /// Refuses a value that the rule does not take; what has a type of its own, such as one of several words, is right by
-    /// its type.
+    /// Refuses a value that the rule does not take; values with a type of their own, such as an enum, are valid by
+    /// their type.
     ///
     /// # Errors
     /// [`Error::Setting`].
@@ -218,9 +219,9 @@ pub(crate) fn row<'a>(rows: &'a [Setting], key: &str) -> Option<&'a Setting> {
 
 /// Declares a struct of settings with its defaults, its rows and the check of its values.
 ///
-/// A field is `name: type = default => rule;`, where `default, "what holds"` says so of one that is left out, and `rule, in
-/// "unit", "--option VALUE"` has what there is of these. Its documentation is its help. Fields of `sections` have rows of
-/// their own, or none.
+/// A field is `name: type = default => rule;`. `default, "what applies"` is for a setting that can be left out, and
+/// `rule, in "unit", "--option VALUE"` adds unit and option. Its documentation is its help. Fields of `sections` have
+/// rows of their own, or none.
 macro_rules! settings {
     (
         $section:literal
@@ -268,7 +269,7 @@ macro_rules! settings {
             }
         }
     };
-    // The rows alone, of settings that have a form of their own in memory.
+    // The rows alone, of settings with another form in memory.
     (
         rows $section:literal
         $(

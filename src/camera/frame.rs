@@ -1,13 +1,13 @@
-//! Where a model is trained: near the origin, and of an extent near 2, wherever and however large its world is.
+//! The training frame: near the origin and of an extent near 2, whatever the world's scale and offset.
 //!
 //! ```text
 //! position in the frame = (position in the world - center) * scale
 //! ```
 //!
-//! The device computes in f32, whose numbers are dense near zero; near plane, squared distances and first sizes are
-//! absolute. So cameras and points go into the frame on the host, in f64, and what is trained comes back. The scale is a power
-//! of two and a world that lies near its origin is not moved, so that a world of an extent of 1.5 to 3 is its own frame, to
-//! the bit.
+//! The device computes in f32, which is most precise near zero; near plane, squared distances and initial sizes are
+//! absolute. So cameras and points are transformed into the frame on the host, in f64, and the trained model is
+//! transformed back. The scale is a power of two, and a world near its origin is not moved, so that a world of an
+//! extent of 1.5 to 3 is its own training frame, to the bit.
 
 use std::ops::Bound;
 
@@ -18,28 +18,29 @@ use crate::base::settings::{Rule, settings};
 
 settings! {
 "frame."
-/// A translation and a scaling of the world.
+/// A translation and a uniform scale of the world.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrainingFrame {
-    /// The origin of the frame in which the model is trained, in the world.
+    /// The origin of the training frame, in world coordinates.
     center: [f64; 3] = [0.0; 3], "found from the cameras, and recorded"
         => Rule::List(3, 3, &Rule::Number(Bound::Unbounded, Bound::Unbounded)), in "world units";
-    /// Units of the frame in a unit of the world.
+    /// Units of the training frame per world unit.
     scale: f64 = 1.0, "found from the cameras, and recorded"
         => Rule::Number(Bound::Included(f64::MIN_POSITIVE), Bound::Unbounded);
 }
 }
 
-/// The extent that a frame is made for.
+/// The extent of the scene in the training frame.
 pub const FRAME_EXTENT: f64 = 2.0;
 
-/// A frame is not moved from an origin that is so many extents away at most: f32 loses three bits.
+/// The frame is not translated if the world's origin is at most this many extents away: f32 loses three bits.
 const NEAR_ORIGIN: f64 = 8.0;
 
-/// Positions so many extents away from the origin are 1e-5 of the extent apart in f32: files have them from another one.
+/// From this many extents away from the origin, positions in f32 are 1e-5 of the extent apart: files store them
+/// relative to another origin.
 const FAR_FROM_ORIGIN: f64 = 64.0;
 
-/// A camera so many times as far from the middle as half of them are stands elsewhere.
+/// A camera this many times as far from the centre as the median is an outlier.
 const OUTLIER: f64 = 32.0;
 
 impl TrainingFrame {
@@ -47,10 +48,11 @@ impl TrainingFrame {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) const WORLD: Self = Self { center: [0.0; 3], scale: 1.0 };
 
-    /// The frame of cameras around `center` that are `extent` world units wide.
+    /// The training frame of cameras around `center` with an extent of `extent` world units.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn new(center: DVec3, extent: f64) -> Self {
-        // The power of two that brings the extent to 0.75 to 1.5 times the frame's; within what has an inverse.
+        // The power of two that scales the extent to 0.75 to 1.5 times the frame's, within the range of invertible
+        // scales.
         let octave = (0.75 * FRAME_EXTENT / extent).log2().ceil().clamp(-900.0, 900.0);
         let scale = octave.exp2();
         let is_near = center.abs().max_element() * scale <= NEAR_ORIGIN * FRAME_EXTENT;
@@ -62,19 +64,19 @@ impl TrainingFrame {
         DVec3::from_array(self.center)
     }
 
-    /// A position in the world, in the frame.
+    /// From the world to the training frame.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn framed(&self, position: DVec3) -> DVec3 {
         (position - self.center()) * self.scale
     }
 
-    /// A position in the frame, in the world.
+    /// From the training frame to the world.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn unframed(&self, position: DVec3) -> DVec3 {
         position / self.scale + self.center()
     }
 
-    /// The same camera before the frame; its view space is scaled alike.
+    /// The same camera in the training frame; its view space is scaled alike.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn camera(&self, camera: &Camera) -> Camera {
         if *self == Self::WORLD {
@@ -85,7 +87,7 @@ impl TrainingFrame {
         Camera { view_from_world: DAffine3 { matrix3, translation }, ..*camera }
     }
 
-    /// What files hold positions relative to: the world's origin, or the frame's where f32 is too coarse for that.
+    /// The origin of positions in files: the world's, or the training frame's where f32 is too coarse for that.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn file_origin(&self) -> DVec3 {
         let center = self.center();
@@ -94,10 +96,10 @@ impl TrainingFrame {
     }
 }
 
-/// Where cameras stand: their mean, and 1.1 times the largest distance of one to it (3DGS). Those that stand more than 32
-/// times as far out as half of them are left out, which is the case of broken poses.
+/// Mean and extent of the camera positions: the extent is 1.1 times the largest distance to the mean (3DGS). Cameras
+/// more than 32 times as far out as the median are left out, since their poses are most likely wrong.
 ///
-/// Where all stand in one spot, or there is one, the distance is zero.
+/// Where all positions coincide, the extent is zero.
 pub fn spread(centers: &[DVec3]) -> (DVec3, f64) {
     let mut around = centers.to_vec();
     let middle = DVec3::from_array([0, 1, 2].map(|axis| median(centers.iter().map(|c| c[axis]))));
@@ -107,18 +109,18 @@ pub fn spread(centers: &[DVec3]) -> (DVec3, f64) {
     }
     let mean = around.iter().sum::<DVec3>() / around.len().max(1) as f64;
     let radius = around.iter().map(|center| center.distance(mean)).fold(0.0, f64::max);
-    // Below this the spread is the rounding of one place's coordinates.
+    // Below this the spread is rounding error of one position's coordinates.
     let is_spread = radius > 1e-12 * mean.length();
     (mean, if is_spread { 1.1 * radius } else { 0.0 })
 }
 
-/// Whether a camera stands where [`spread`] leaves it out.
+/// Whether [`spread`] leaves a camera out.
 pub fn stands_elsewhere(center: DVec3, (mean, extent): (DVec3, f64)) -> bool {
-    // Within the spread every camera is nearer than its extent.
+    // All inliers are closer than the extent.
     extent > 0.0 && center.distance(mean) > extent
 }
 
-/// The median; 0 of nothing.
+/// The median; 0 if empty.
 fn median(values: impl Iterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.collect();
     let middle = values.len() / 2;

@@ -1,21 +1,21 @@
-//! Camera models: which place of the picture shows which direction.
+//! Camera models: the projection of directions onto the image.
 
 use std::f64::consts::FRAC_PI_2;
 
 use glam::{DVec2, DVec3};
 
-/// How directions become places of the picture.
+/// The projection of a camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum CameraModel {
-    /// Light goes straight through a hole: x / z and y / z.
+    /// Perspective: x / z and y / z.
     #[default]
     Pinhole,
-    /// `OPENCV_FISHEYE`: angles off the axis make the picture.
+    /// `OPENCV_FISHEYE`: a polynomial of the angle off the axis.
     Fisheye(KannalaBrandt),
 }
 
-/// The polynomial of a fisheye (Kannala and Brandt 2006, as `OpenCV` and COLMAP have it): what is seen at the angle t off the
-/// axis lies `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)` focal lengths from the principal point.
+/// The polynomial of a fisheye (Kannala and Brandt 2006, as in `OpenCV` and COLMAP): the angle t off the axis is
+/// projected to `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)` focal lengths from the principal point.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct KannalaBrandt {
     /// k1 to k4.
@@ -23,7 +23,7 @@ pub struct KannalaBrandt {
 }
 
 impl KannalaBrandt {
-    /// The distance from the principal point, in focal lengths, of what is seen at an angle off the axis, in radians.
+    /// The radius, in focal lengths, at an angle off the axis, in radians.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn radius(&self, angle: f64) -> f64 {
         let [k1, k2, k3, k4] = self.coefficients;
@@ -38,12 +38,12 @@ impl KannalaBrandt {
         1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
     }
 
-    /// The angle below which the camera sees, in radians: 90 degrees, or less where the radius stops to rise.
+    /// The largest angle of the field of view, in radians: 90 degrees, or less where the radius stops increasing.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn largest_angle(&self) -> f64 {
         const STEPS: u32 = 4096;
         let at = |step: u32| FRAC_PI_2 * f64::from(step) / f64::from(STEPS);
-        // Positive phrasing: a NaN rises no more.
+        // Positive phrasing: a NaN does not increase.
         let rises = |angle: f64| self.slope(angle) > 0.0;
         let Some(step) = (1..=STEPS).find(|&step| !rises(at(step))) else { return FRAC_PI_2 };
         let (mut low, mut high) = (at(step - 1), at(step));
@@ -54,14 +54,14 @@ impl KannalaBrandt {
         low
     }
 
-    /// The angle of what is seen at a distance from the principal point, in focal lengths; `None` beyond the largest.
+    /// The angle at a radius, in focal lengths; `None` beyond the largest radius.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn angle(&self, radius: f64) -> Option<f64> {
         let (mut low, mut high) = (0.0, self.largest_angle());
         if !(0.0..self.radius(high)).contains(&radius) {
             return None;
         }
-        // As far as halving goes: the interval's ends are neighbours.
+        // Bisection down to neighbouring floats.
         for _ in 0..60 {
             let middle = 0.5 * (low + high);
             *(if self.radius(middle) <= radius { &mut low } else { &mut high }) = middle;
@@ -71,8 +71,8 @@ impl KannalaBrandt {
 }
 
 impl CameraModel {
-    /// The depth of a point of the view (x right, y down, z forward), by which it is sorted and which the near plane cuts: z
-    /// of a pinhole, the distance of a fisheye. `None` where the model does not see it.
+    /// The depth of a view-space point (x right, y down, z forward), by which it is sorted and which the near plane
+    /// cuts: z for a pinhole, the distance for a fisheye. `None` outside the field of view.
     pub(crate) fn depth(&self, point: DVec3) -> Option<f64> {
         match self {
             Self::Pinhole => Some(point.z).filter(|&z| z > 0.0),
@@ -83,7 +83,7 @@ impl CameraModel {
         }
     }
 
-    /// Where a point of the view is seen, focal lengths from the principal point; `None` where the model does not see it.
+    /// Projects a view-space point, in focal lengths from the principal point; `None` outside the field of view.
     pub(crate) fn place(&self, point: DVec3) -> Option<DVec2> {
         self.depth(point)?;
         Some(match self {
@@ -96,8 +96,8 @@ impl CameraModel {
         })
     }
 
-    /// The point of the view that is seen at a place, focal lengths from the principal point, at a depth; `None` where the
-    /// model sees nothing.
+    /// Unprojects a position, in focal lengths from the principal point, at a depth, to view space; `None` outside the
+    /// field of view.
     pub(crate) fn point(&self, place: DVec2, depth: f64) -> Option<DVec3> {
         match self {
             Self::Pinhole => Some(place.extend(1.0) * depth),
@@ -116,7 +116,7 @@ mod tests {
     const LENSES: [[f64; 4]; 4] = [
         [0.0; 4],
         [0.05, -0.02, 0.006, -0.001],
-        // Rises to 70 degrees and falls from there on.
+        // Increases up to 70 degrees and decreases beyond.
         [-0.2231, 0.0, 0.0, 0.0],
         [-0.0124, 0.0044, -0.0031, 0.0005],
     ];

@@ -10,15 +10,15 @@ use crate::kernels;
 use crate::kernels::camera::{CAMERA_FISHEYE, CAMERA_PINHOLE};
 use crate::kernels::camera_pinhole::JACOBIAN_MARGIN;
 
-/// Patches of which both sides would be shorter are no patches, pixels: what compares them looks at 11 x 11.
+/// Patches are not cut to less than this on both sides, pixels: SSIM looks at 11 x 11.
 const SMALLEST: u32 = 16;
 
-/// A rectangle of what a camera sees. It shows what the whole view shows there.
+/// A rectangle of a camera's image. It shows what the whole view shows there.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Patch {
     /// The camera of the whole view.
     pub camera: Camera,
-    /// The corner, pixels of the view.
+    /// Its first column and row in the view, pixels.
     pub origin: UVec2,
     /// Width and height, pixels.
     pub size: UVec2,
@@ -33,8 +33,8 @@ impl From<&Camera> for Patch {
 }
 
 impl Camera {
-    /// The view in rows of patches of about one size: as few as there can be of a size that fits. Where not even small ones
-    /// do, there is no remedy in cutting, and the view stays whole.
+    /// Cuts the view into rows of patches of about equal size, as few as satisfy `fits`. If even small ones do not,
+    /// cutting does not help, and the view stays whole.
     pub(crate) fn patches(&self, fits: impl Fn(UVec2) -> bool) -> Vec<Patch> {
         let whole = UVec2::new(self.width, self.height);
         let mut counts = UVec2::ONE;
@@ -61,17 +61,17 @@ impl Camera {
 }
 
 impl Patch {
-    /// Whether it is the first of its view, or all of it.
+    /// Whether it is the first of its view, or the whole view.
     pub fn is_first(&self) -> bool {
         self.origin == UVec2::ZERO
     }
 
-    /// Whether it is all of its view.
+    /// Whether it is the whole view.
     pub fn is_whole(&self) -> bool {
         *self == Self::from(&self.camera)
     }
 
-    /// With so many pixels of the view around it, as far as the view reaches.
+    /// With a margin of this many pixels, clipped to the view.
     pub fn with_margin(&self, pixels: u32) -> Self {
         let whole = Self::from(&self.camera).size;
         let origin = self.origin.saturating_sub(UVec2::splat(pixels));
@@ -79,7 +79,7 @@ impl Patch {
         Self { origin, size: end - origin, ..*self }
     }
 
-    /// What planes of the view, (planes, H, W), show of it.
+    /// Crops planes of the view, (planes, H, W).
     pub fn cut<'a, T: Copy>(&self, planes: &'a [T]) -> Cow<'a, [T]> {
         if self.is_whole() {
             return Cow::Borrowed(planes);
@@ -90,7 +90,7 @@ impl Patch {
         rows.flatten().copied().collect()
     }
 
-    /// Writes it from the planes of one patch that it lies in into those of another, (planes, h, w) each.
+    /// Copies it from the planes of one enclosing patch to those of another, (planes, h, w) each.
     pub fn paste(&self, (from, source): (&Self, &[f32]), (into, target): (&Self, &mut [f32])) {
         let targets = target.chunks_exact_mut(into.pixel_count());
         for (target, source) in targets.zip(source.chunks_exact(from.pixel_count())) {
@@ -100,7 +100,7 @@ impl Patch {
         }
     }
 
-    /// Its halves along its longer side; none of a single pixel.
+    /// Its halves along its longer side; `None` for a single pixel.
     pub fn halves(&self) -> Option<[Self; 2]> {
         let UVec2 { x, y } = self.size;
         let first = if x >= y { UVec2::new(x / 2, y) } else { UVec2::new(x, y / 2) };
@@ -114,7 +114,7 @@ impl Patch {
         self.size.x as usize * self.size.y as usize
     }
 
-    /// Where its rows lie in a plane of a patch that it lies in.
+    /// The ranges of its rows in a plane of an enclosing patch.
     fn rows_in(&self, around: &Self) -> impl Iterator<Item = Range<usize>> + use<> {
         let ([column, row], [width, height]) =
             ((self.origin - around.origin).to_array(), self.size.to_array());
@@ -125,7 +125,7 @@ impl Patch {
         })
     }
 
-    /// A camera whose whole view it is; splats far beyond its edges may have another shape there.
+    /// A camera whose whole view it is; splats far beyond its edges may differ there.
     pub fn own_camera(&self) -> Camera {
         let Self { camera, origin, size } = *self;
         Camera {
@@ -136,8 +136,8 @@ impl Patch {
         }
     }
 
-    /// Half the view, pixels, by the share that the patch is of its pixels: what makes of the gradient of a loss per pixel of
-    /// the patch one in normalised device units, of a loss per pixel of the view.
+    /// Half the view, in pixels, times the fraction of its pixels in the patch: converts the gradient of a loss per
+    /// pixel of the patch to normalised device units and a loss per pixel of the view.
     pub(crate) fn half_view(&self) -> Vec2 {
         let whole = Self::from(&self.camera).size.as_vec2();
         let share = (self.size.as_vec2() / whole).element_product();
@@ -145,7 +145,7 @@ impl Patch {
     }
 }
 
-/// The patch as the kernels take it: a camera that looks past its principal point.
+/// The patch as the kernels take it: a camera with a shifted principal point.
 impl From<&Patch> for kernels::Camera {
     fn from(patch: &Patch) -> Self {
         let DAffine3 { matrix3: rotation, translation } = patch.camera.view_from_world;
@@ -175,7 +175,7 @@ impl From<&Patch> for kernels::Camera {
 }
 
 impl CameraModel {
-    /// What kernels call it, and are specialised for.
+    /// The number of the camera model in kernels.
     pub(crate) fn number(&self) -> u32 {
         match self {
             Self::Pinhole => CAMERA_PINHOLE,

@@ -1,4 +1,4 @@
-//! Flights of a camera through the poses of photographs: what a video of a model shows.
+//! Camera paths through the poses of photographs, for videos.
 
 use std::f64::consts::TAU;
 
@@ -7,26 +7,25 @@ use glam::{DAffine3, DMat3, DQuat, DVec3, DVec4};
 use super::Camera;
 use crate::{Error, Result};
 
-/// How a camera flies.
+/// The shape of a path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CameraPath {
-    /// A circle around the point nearest to all optical axes, as high and as far as the cameras are on the mean.
+    /// A circle around the point nearest to all optical axes, at the mean height and distance of the cameras.
     Orbit,
-    /// Two turns about the mean pose, as wide as the cameras lie apart, looking at what they look at (LLFF).
+    /// Two turns around the mean pose, as wide as the spread of the cameras, looking at their common point (LLFF).
     Spiral,
-    /// A smooth curve through every pose, in order.
+    /// A smooth curve through all poses, in order.
     Interpolate,
 }
 
-/// Turns of a spiral; it comes and goes once along the optical axis meanwhile.
+/// Turns of a spiral, with one oscillation along the optical axis.
 const TURNS: f64 = 2.0;
 
 impl CameraPath {
-    /// The cameras of so many frames, with the image and focal lengths of the first of `poses`.
+    /// `frames` cameras with the image size and focal lengths of the first of `poses`.
     ///
     /// # Errors
-    /// [`Error::Usage`]: there is no pose, or the cameras look in parallel, so that there is nothing to look at from all
-    /// sides.
+    /// [`Error::Usage`]: there is no pose, or the cameras are parallel, so that there is no point to orbit.
     pub fn cameras(self, poses: &[Camera], frames: usize) -> Result<Vec<Camera>> {
         let first = poses.first().ok_or_else(|| {
             Error::Usage("a path leads along cameras, and there are none".to_owned())
@@ -41,14 +40,14 @@ impl CameraPath {
     }
 }
 
-/// Uniform Catmull-Rom splines of the centres and, on one side of the sphere, of the rotations.
+/// Uniform Catmull-Rom splines of the centres and, within one hemisphere, of the quaternions.
 fn interpolated(poses: &[Camera], frames: usize) -> Vec<DAffine3> {
     let world_from_view = poses.iter().map(|pose| pose.view_from_world.inverse());
     let centers: Vec<DVec3> = world_from_view.clone().map(|pose| pose.translation).collect();
     let mut turns: Vec<DVec4> = vec![];
     for pose in world_from_view {
         let turn = DVec4::from(DQuat::from_mat3(&pose.matrix3).normalize());
-        // Both signs are the same rotation; the nearer one is the shorter way.
+        // Both signs are the same rotation; the nearer one gives the shorter path.
         let is_far = turns.last().is_some_and(|last| last.dot(turn) < 0.0);
         turns.push(if is_far { -turn } else { turn });
     }
@@ -66,7 +65,7 @@ fn interpolated(poses: &[Camera], frames: usize) -> Vec<DAffine3> {
     (0..frames).map(frame).collect()
 }
 
-/// Of four knots, between the middle ones.
+/// Interpolates between the middle two of four knots.
 fn weights(t: f64) -> [f64; 4] {
     let (t2, t3) = (t * t, t * t * t);
     [
@@ -112,7 +111,7 @@ fn spiral(poses: &[Camera], frames: usize) -> Vec<DAffine3> {
     });
     let reach = DVec3::from(radii).length().max(f64::MIN_POSITIVE);
     let ahead = nearest_to_axes(poses).map(|target| (target - center).dot(forward));
-    // What parallel cameras look at is anywhere; far, the frames look in parallel too.
+    // Parallel cameras have no common point; with one far away the frames are parallel too.
     let focus = ahead.filter(|&ahead| ahead > 0.0).unwrap_or(10.0 * reach);
     let world_from_middle = middle.inverse();
     let frame = |index: usize| {
@@ -133,9 +132,9 @@ fn looking(center: DVec3, target: DVec3, up: DVec3) -> DAffine3 {
     DAffine3::from_mat3_translation(world_from_view, center).inverse()
 }
 
-/// The point with the least squared distances to the optical axes; none where they are as good as parallel.
+/// The point with the least squared distances to the optical axes; `None` where they are almost parallel.
 fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
-    /// Less of the cameras' turns says nothing of a distance.
+    /// Smaller rotations do not determine a distance.
     const MIN_DETERMINANT: f64 = 1e-6;
     let (mut matrix, mut vector) = (DMat3::ZERO, DVec3::ZERO);
     for pose in poses {
@@ -155,8 +154,8 @@ fn forward(pose: &Camera) -> DVec3 {
     pose.view_from_world.matrix3.row(2)
 }
 
-/// What is up in the world, for cameras that are held level: across all their horizontal axes, on the side of their mean.
-/// Cameras on one side that look down have a mean that leans.
+/// The world's up direction, for cameras that are held level: perpendicular to all their horizontal axes, on the side
+/// of the mean up vector. The mean of cameras on one side that look down leans.
 fn upwards(poses: &[Camera]) -> DVec3 {
     let mut horizontal = DMat3::from_diagonal(DVec3::splat(1e-6));
     for pose in poses {
@@ -164,7 +163,7 @@ fn upwards(poses: &[Camera]) -> DVec3 {
         let axes = [right * right.x, right * right.y, right * right.z];
         horizontal += DMat3::from_cols(axes[0], axes[1], axes[2]) * (1.0 / poses.len() as f64);
     }
-    // Inverse iteration: what the axes have least of is left.
+    // Inverse iteration converges to the eigenvector of the smallest eigenvalue.
     let (inverse, mut up) = (horizontal.inverse(), mean(poses.iter().map(up)));
     for _ in 0..8 {
         up = (inverse * up).normalize_or(DVec3::NEG_Y);
@@ -172,7 +171,7 @@ fn upwards(poses: &[Camera]) -> DVec3 {
     up
 }
 
-/// In the world; an image's y points down.
+/// In world space; an image's y points down.
 fn up(pose: &Camera) -> DVec3 {
     -pose.view_from_world.matrix3.row(1)
 }
@@ -191,7 +190,7 @@ mod tests {
 
     const TARGET: DVec3 = DVec3::new(0.5, -0.25, 2.0);
 
-    /// So many cameras on a part of a circle, a bit above what they look at.
+    /// Cameras on an arc, slightly above the point that they look at.
     fn ring(count: usize, turn: f64) -> Vec<Camera> {
         let pose = |index: usize| {
             let (sin, cos) = (turn * index as f64 / count as f64).sin_cos();
@@ -258,7 +257,7 @@ mod tests {
             assert!(frame.center().distance(center) < 1.5);
             assert!(forward(frame).dot((TARGET - frame.center()).normalize()) > 0.99);
         }
-        // Cameras in parallel have no point in common, and still a spiral.
+        // Parallel cameras have no common point, and yet a spiral.
         let mut parallel = poses[0];
         parallel.view_from_world.translation += DVec3::X;
         let frames = CameraPath::Spiral.cameras(&[poses[0], parallel], 5).unwrap();

@@ -1,23 +1,24 @@
-//! Where the cameras of a scene stand and look: how near one is to another, and a choice that covers them all.
+//! Camera poses of a scene: distances between them, and a subset that covers them.
 
 use glam::DVec3;
 
 use super::Camera;
 
-/// Position and direction. Positions count from the middle in units of their standard deviation, directions as unit vectors.
+/// Position and direction: the position relative to the mean in units of the standard deviation, the direction as a
+/// unit vector.
 type CameraPose = [f64; 6];
 
-/// The places of a scene's cameras.
+/// The poses of a scene's cameras.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct CameraPoses {
     middle: DVec3,
-    /// One over the standard deviation of the positions; 0 where all are one.
+    /// One over the standard deviation of the positions; 0 if they coincide.
     scale: f64,
     poses: Vec<CameraPose>,
 }
 
 impl CameraPoses {
-    /// Those of cameras.
+    /// The poses of cameras.
     pub(crate) fn new(cameras: &[Camera]) -> Self {
         let count = cameras.len().max(1) as f64;
         let middle = cameras.iter().map(Camera::center).sum::<DVec3>() / count;
@@ -29,12 +30,12 @@ impl CameraPoses {
         own
     }
 
-    /// Every `step`th of the places, in the same units.
+    /// Every `step`th pose, in the same units.
     pub(crate) fn every(self, step: usize) -> Self {
         Self { poses: self.poses.into_iter().step_by(step).collect(), ..self }
     }
 
-    /// The squared distance of each place from that of a camera.
+    /// The squared distance of each pose from that of a camera.
     pub(crate) fn squared_distances(&self, camera: &Camera) -> impl Iterator<Item = f64> {
         let from = self.pose(camera);
         self.poses.iter().map(move |pose| squared_distance(pose, &from))
@@ -52,10 +53,10 @@ fn squared_distance(a: &CameraPose, b: &CameraPose) -> f64 {
 }
 
 impl Camera {
-    /// The indices of `count` cameras, or of all if there are fewer, in ascending order, that cover where they stand and look.
+    /// The indices of `count` cameras, or of all if there are fewer, in ascending order, that cover the poses.
     ///
-    /// The cameras are divided into that many groups of about one size: again and again in two, across the direction in
-    /// which a group differs most. Of each group the camera nearest to its mean is picked.
+    /// The cameras are divided into that many groups of about equal size, recursively in two, across the direction of
+    /// the largest variance. Of each group the camera nearest to its mean is selected.
     pub(crate) fn covering(cameras: &[Self], count: usize) -> Vec<usize> {
         let CameraPoses { poses, .. } = CameraPoses::new(cameras);
         let mut picked = vec![];
@@ -65,7 +66,7 @@ impl Camera {
     }
 }
 
-/// Picks `count` of a group.
+/// Selects `count` of a group.
 fn pick(poses: &[CameraPose], mut group: Vec<usize>, count: usize, picked: &mut Vec<usize>) {
     match count {
         0 => {}

@@ -1,5 +1,5 @@
-//! `nightsplat bench`: check a step against the CPU references pass by pass, then time its kernels and stages; or find the
-//! fastest tiles.
+//! `nightsplat bench`: checks a training step against the CPU references, then times its kernels and stages; or finds
+//! the fastest tiles.
 
 pub mod scene;
 mod stages;
@@ -11,41 +11,40 @@ use std::io::Write;
 use anyhow::Result;
 use serde_json::{Map, Value, json};
 
-use super::table;
+use super::{finish, table};
 use crate::Error;
 use crate::gpu::{CheckReport, DeviceChoice, Gpu, PassTime};
 use crate::kernels;
 use scene::BenchScene;
 
-/// Check a training step against the CPU references, pass by pass, then time its kernels and its stages.
+/// Check a training step against the CPU references, then time its kernels and stages.
 ///
-/// The scene is the same every time. Bounds are those of two processor cores at the default size. With --tune, it times
-/// the rasteriser with every tile that suits the device instead, and keeps the fastest in the user's cache folder;
-/// training takes them from there unless `NIGHTSPLAT_TUNE=off`.
+/// The scene is synthetic and always the same. With --tune, times the rasteriser with every tile size that the device
+/// supports, and stores the fastest in the user's cache folder, where training finds it unless `NIGHTSPLAT_TUNE=off`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct BenchArgs {
-    /// Print JSON instead of tables: device, driver, largest errors, kernels, groups and the step
+    /// Print JSON instead of tables
     #[arg(long)]
     pub json: bool,
-    /// Find the fastest tiles of the device, for 3 and 11 channels, and keep them
+    /// Find the fastest tile sizes of the device, and store them for training
     #[arg(long)]
     pub tune: bool,
-    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the best]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
-    /// Pixels per row of the view [default: 512; with --tune, 500 and 1920]
+    /// Width of the view, pixels [default: 512; with --tune, 500 and 1920]
     #[arg(long)]
     pub width: Option<u32>,
-    /// Rows of the view [default: 384; with --tune, 375 and 1080]
+    /// Height of the view, pixels [default: 384; with --tune, 375 and 1080]
     #[arg(long)]
     pub height: Option<u32>,
-    /// Gaussians in the scene
+    /// Number of Gaussians
     #[arg(long, default_value_t = GAUSSIANS)]
     pub gaussians: usize,
-    /// Time without checking first: the references take minutes for a million Gaussians
+    /// Skip the check, which takes minutes for a million Gaussians
     #[arg(long)]
     pub unchecked: bool,
-    /// Timed runs, after one that is not timed; the median counts
+    /// Timed repetitions, after one for warm-up; the median is reported
     #[arg(long, default_value_t = 5, value_name = "N")]
     pub repeats: usize,
 }
@@ -54,25 +53,19 @@ const SIZE: [u32; 2] = [512, 384];
 const TUNED_SIZES: [[u32; 2]; 2] = [[500, 375], [1920, 1080]];
 const GAUSSIANS: usize = 20_000;
 
-/// What something took.
-#[derive(Clone, Debug)]
-struct Timing {
-    name: &'static str,
-    milliseconds: f64,
-    /// Milliseconds that two processor cores may take at the default size.
-    bound: Option<f64>,
-}
+/// A stage and its milliseconds.
+type Timing = (&'static str, f64);
 
-/// What the bench runs on, and how often.
+/// Device and repetitions.
 struct Bench {
     gpu: Gpu,
     repeats: usize,
 }
 
-/// What it found.
+/// The results.
 struct Findings {
     checked: CheckReport,
-    /// Milliseconds of every kernel of a step.
+    /// Milliseconds per kernel of a step.
     kernels: BTreeMap<&'static str, f64>,
     stages: stages::Stages,
 }
@@ -80,7 +73,7 @@ struct Findings {
 /// Checks, times and prints.
 ///
 /// # Errors
-/// A kernel disagrees with its reference, or there is no such device.
+/// A kernel disagrees with its reference, or the device does not exist.
 pub fn run(args: &BenchArgs) -> Result<()> {
     let [width, height] = [args.width.unwrap_or(SIZE[0]), args.height.unwrap_or(SIZE[1])];
     let sizes_hold = (16..=8192).contains(&width)
@@ -113,14 +106,14 @@ pub fn run(args: &BenchArgs) -> Result<()> {
     if args.json {
         writeln!(out, "{:#}", findings.as_json(&bench))?;
     } else {
-        let has_bounds = ([width, height], args.gaussians) == (SIZE, GAUSSIANS);
-        write!(out, "{}", findings.as_text(&bench, &scene, has_bounds))?;
+        write!(out, "{}", findings.as_text(&bench, &scene))?;
+        finish("", "nightsplat bench --tune")?;
     }
     Ok(())
 }
 
 impl Findings {
-    /// The kernels that no checked pass was of.
+    /// The kernels that no checked pass ran.
     fn not_covered(&self) -> Vec<&'static str> {
         let covered = self.checked.kernels();
         let is_covered = |name: &str| covered.iter().any(|(covered, ..)| *covered == name);
@@ -128,7 +121,7 @@ impl Findings {
     }
 
     fn as_json(&self, bench: &Bench) -> Value {
-        let entry = |timing: &Timing| (timing.name.to_owned(), json!(timing.milliseconds));
+        let entry = |(name, milliseconds): &Timing| ((*name).to_owned(), json!(milliseconds));
         let properties = bench.gpu.properties();
         let Self { stages, .. } = self;
         let errors = self.checked.kernels();
@@ -140,11 +133,11 @@ impl Findings {
             "not_covered": self.not_covered(),
             "kernels": self.kernels,
             "groups": stages.groups.iter().map(entry).collect::<Map<String, Value>>(),
-            "step_ms": stages.step.milliseconds,
+            "step_ms": stages.step.1,
         })
     }
 
-    fn as_text(&self, bench: &Bench, scene: &BenchScene, has_bounds: bool) -> String {
+    fn as_text(&self, bench: &Bench, scene: &BenchScene) -> String {
         let (properties, stages) = (bench.gpu.properties(), &self.stages);
         let head = format!(
             "{}, {}\n{}x{} pixels, {} Gaussians, {} intersections; medians of {} runs",
@@ -171,15 +164,14 @@ impl Findings {
             vec![name.to_owned(), or_dash(error), or_dash(milliseconds)]
         }));
         let kernel_table = table::aligned(&rows);
-        let mut rows = vec![header(&["stage", "ms", "bound", "within"])];
-        rows.extend(stages.groups.iter().chain([&stages.step]).map(|stage| {
-            let mut row = vec![stage.name.to_owned(), format!("{:.2}", stage.milliseconds)];
-            if let Some(bound) = stage.bound.filter(|_| has_bounds) {
-                let within = if stage.milliseconds <= bound { "yes" } else { "no" };
-                row.extend([format!("{bound:.0}"), within.to_owned()]);
-            }
-            row
-        }));
+        let mut rows = vec![header(&["stage", "ms"])];
+        rows.extend(
+            stages
+                .groups
+                .iter()
+                .chain([&stages.step])
+                .map(|(name, milliseconds)| vec![(*name).to_owned(), format!("{milliseconds:.2}")]),
+        );
         let not_covered = self.not_covered().join(", ");
         let stage_table = table::aligned(&rows);
         format!("{head}\n\n{kernel_table}not covered: {not_covered}\n\n{stage_table}")
@@ -187,7 +179,7 @@ impl Findings {
 }
 
 impl Bench {
-    /// The median of the milliseconds that `once` reports, after a run that does not count.
+    /// The median of the milliseconds that `once` reports, after a warm-up.
     fn median(&self, mut once: impl FnMut() -> crate::Result<f64>) -> crate::Result<f64> {
         once()?;
         let times = (0..self.repeats).map(|_| once()).collect::<crate::Result<Vec<_>>>()?;

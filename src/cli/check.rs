@@ -1,4 +1,4 @@
-//! `nightsplat check`: training steps on one's own data and device, every pass against its CPU reference.
+//! `nightsplat check`: compares every pass of some training steps with its CPU reference.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -6,20 +6,20 @@ use std::path::PathBuf;
 use anyhow::Result;
 use serde_json::{Value, json};
 
-use super::table;
 use super::train::TrainOptions;
+use super::{finish, table, word};
 use crate::gpu::{CheckReport, CheckedPass, DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::train::Trainer;
 
 /// Compare every pass of some training steps with its CPU reference, and name the first number that differs.
 ///
-/// Slow, and nothing is written: for a device or driver that one does not trust. `--steps` says how many [default here: 1].
+/// For a device or driver that you do not trust. Slow; writes nothing. Checks one step unless --steps says more.
 #[derive(Clone, Debug, clap::Args)]
 pub struct CheckArgs {
-    /// The folder with the photographs
+    /// Dataset, as for `train`
     pub dataset: PathBuf,
-    /// Print JSON instead of a table: device, driver, passes, and the first difference
+    /// Print JSON instead of a table
     #[arg(long)]
     pub json: bool,
     #[command(flatten)]
@@ -29,13 +29,13 @@ pub struct CheckArgs {
 /// Checks and prints.
 ///
 /// # Errors
-/// [`crate::Error::Disagrees`] where something differs, or whatever keeps a run from training.
+/// [`crate::Error::Disagrees`] where something differs, and the errors of `train`.
 pub fn run(args: &CheckArgs) -> Result<()> {
-    // The schedule is that of a whole run; so many of its steps are checked.
+    // The schedule is that of a whole run, of which the first steps are checked.
     let steps = args.options.config(&args.dataset, None)?.steps;
     let steps = if args.options.gives("steps") { steps } else { 1 };
     let mut config = args.options.without("steps").config(&args.dataset, None)?;
-    // Sizes that training comes to, from the first step on.
+    // Full resolution from the first step on.
     config.schedule.resolution_steps = [0, 0];
     let steps = steps.min(config.steps);
     let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
@@ -53,7 +53,9 @@ pub fn run(args: &CheckArgs) -> Result<()> {
     } else {
         write!(out, "{}", as_text(&gpu, &report))?;
     }
-    Ok(report.agree()?)
+    report.agree()?;
+    let next = format!("nightsplat train {} --out run", word(&args.dataset));
+    if args.json { Ok(()) } else { finish("", &next) }
 }
 
 fn as_json(gpu: &Gpu, report: &CheckReport) -> Value {
@@ -88,9 +90,9 @@ fn as_text(gpu: &Gpu, report: &CheckReport) -> String {
         vec![pass.kernel.to_owned(), pass.recording.clone(), error]
     }));
     let (properties, passes) = (gpu.properties(), report.passes.len());
-    let end = match report.first_difference() {
+    let verdict = match report.first_difference() {
         None => format!("{passes} passes agree with their references"),
         Some(first) => format!("the first difference is in {first}"),
     };
-    format!("{}, {}\n\n{}\n{end}\n", properties.name, properties.driver, table::aligned(&rows))
+    format!("{}, {}\n\n{}\n{verdict}\n", properties.name, properties.driver, table::aligned(&rows))
 }

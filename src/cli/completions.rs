@@ -1,17 +1,18 @@
-//! `nightsplat completions`: what a shell completes after `nightsplat`.
+//! `nightsplat completions`: completion scripts for shells.
 
 use std::io::Write;
 
 use anyhow::Result;
-use clap::CommandFactory;
 use clap_complete::Shell;
 
-use super::Cli;
+use super::help;
 
-/// Print the completions for a shell: `nightsplat completions bash > ~/.local/share/bash-completion/completions/nightsplat`
+/// Print the completion script of a shell
+///
+/// For bash: `nightsplat completions bash > ~/.local/share/bash-completion/completions/nightsplat`
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub struct CompletionsArgs {
-    /// The shell
+    /// Shell
     pub shell: Shell,
 }
 
@@ -21,6 +22,6 @@ pub struct CompletionsArgs {
 /// Standard output is closed.
 pub fn run(args: CompletionsArgs) -> Result<()> {
     let mut script = vec![];
-    clap_complete::generate(args.shell, &mut Cli::command(), "nightsplat", &mut script);
+    clap_complete::generate(args.shell, &mut help::command(true), "nightsplat", &mut script);
     Ok(std::io::stdout().lock().write_all(&script)?)
 }

@@ -1,31 +1,36 @@
-//! `nightsplat demo`: make a dark multi-view set, and sweep three curves over it.
+//! `nightsplat demo`: a small dark dataset, trained with several tone curves.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 
+use super::export::{self, ExportArgs};
 use super::sweep::{self, SweepArgs, parsed};
 use crate::Error;
 use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
 
-/// Make a small dark multi-view set, train on it with three tone curves, and show the results side by side.
+/// Write a small dark dataset, train on it with several tone curves, and compare the results on a page.
 ///
-/// Takes less than three minutes on two processor cores. Leaves DIR/index.html, a page that needs no other file, and
-/// beside it the set (DIR/dataset) and what `nightsplat sweep` leaves. An interrupted demo goes on.
+/// Takes less than three minutes on two processor cores. DIR/index.html is a self-contained page; the dataset is in
+/// DIR/dataset, with a run directory per curve beside it. An interrupted demo continues.
 #[derive(Clone, Debug, clap::Args)]
 pub struct DemoArgs {
-    /// The folder to write to, empty or with an earlier demo
+    /// Folder to write to: new, empty or with an earlier demo
     #[arg(long, value_name = "DIR", default_value = "demo")]
     pub out: PathBuf,
-    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the best]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 
-/// The baseline first; enough steps for a clear picture, few enough for two processor cores.
-const SWEEP: [&str; 6] = ["--curves", "linear,ase,ap3", "--steps", "400", "--sh-degree", "1"];
+/// The default curve beside the paper's, with enough steps for a clear picture.
+const SWEEP: [&str; 6] = ["--curves", "auto,ase,ap3,linear", "--steps", "500", "--sh-degree", "1"];
+/// The size of the photographs.
+const SIZE: [u32; 2] = [384, 288];
+/// The run whose model is exported.
+const SHOWN: &str = "curve=auto";
 
 /// Runs the demo.
 ///
@@ -35,23 +40,35 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     claim(&args.out)?;
     let set = args.out.join("dataset");
     if !args.out.join("sweep.toml").exists() {
-        synthetic::write(&set, &SyntheticOptions::default())?;
+        let [width, height] = SIZE;
+        let options = SyntheticOptions { width, height, ..SyntheticOptions::default() };
+        synthetic::write(&set, &options)?;
     }
-    let paths = [&set, Path::new("--out"), &args.out].map(Path::as_os_str);
     let device = args.device.iter().flat_map(|it| ["--device".to_owned(), it.to_string()]);
-    let words = ["sweep"].map(OsString::from).into_iter();
-    let words = words.chain(paths.map(OsString::from)).chain(SWEEP.map(OsString::from));
-    let sweep: SweepArgs = parsed("demo", words.chain(device.map(OsString::from)))?;
+    let device: Vec<OsString> = device.map(OsString::from).collect();
+    let command = |name: &str, paths: &[&Path], options: &[&str]| {
+        let paths = paths.iter().map(|path| path.as_os_str().to_owned());
+        let options = options.iter().map(OsString::from).chain(device.clone());
+        std::iter::once(OsString::from(name)).chain(paths).chain(options).collect::<Vec<_>>()
+    };
+    let paths = [set.as_path(), Path::new("--out"), &args.out];
+    let sweep: SweepArgs = parsed("demo", command("sweep", &paths, &SWEEP))?;
     let intro = format!(
-        "Trained on photographs that were exposed {} times too short: shot and read noise, 8 bits. Each curve lifts every \
-         photograph into the target that supervises training. The normal-light reference images are used for nothing but \
-         the scores below.",
+        "Trained on photographs that were exposed {} times too short, with shot and read noise, at 8 bits. Each \
+         tone curve maps the photographs to the targets of training. The reference images in normal light are used \
+         for the scores only.",
         synthetic::DARKENING
     );
-    sweep::run_titled(&sweep, "3D Gaussian Splatting from dark photographs", &[intro])
+    let link =
+        [format!("{SHOWN}/model.html"), "Fly through the model of the curve auto".to_owned()];
+    let title = "3D Gaussian Splatting from dark photographs";
+    sweep::run_titled(&sweep, title, &[intro], &[link])?;
+    let shown = args.out.join(SHOWN);
+    let export = command("export", &[&shown], &["--format", "html"]);
+    export::write(&parsed::<ExportArgs>("demo", export)?).map(drop)
 }
 
-/// Takes a folder that is empty, or holds an earlier demo.
+/// Refuses a folder with anything but an earlier demo.
 fn claim(folder: &Path) -> crate::Result<()> {
     let is_empty = std::fs::read_dir(folder).map_or(true, |mut entries| entries.next().is_none());
     if !is_empty && !folder.join("dataset").exists() {

@@ -1,19 +1,23 @@
-//! `nightsplat doctor`: which devices there are, and whether they will do.
+//! `nightsplat doctor`: the Vulkan devices and whether they can train.
 
+use std::collections::BTreeMap;
 use std::io::Write;
+use std::path::PathBuf;
 
 use anyhow::Result;
 use serde::Serialize;
 
+use super::finish;
+use super::pose::sources;
 use crate::Error;
 use crate::gpu::{
     CooperativeMatrix, DeviceChoice, DeviceReport, SUBGROUP_VARIABLE, SchedulerVariables, devices,
 };
 
-/// List the Vulkan devices, what training requires, and whether each device offers it.
+/// List the Vulkan devices and check what training requires of them.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub struct DoctorArgs {
-    /// Print the list as JSON.
+    /// Print JSON instead of text
     #[arg(long)]
     pub json: bool,
 }
@@ -22,25 +26,28 @@ pub struct DoctorArgs {
 #[derive(Serialize)]
 struct Output<'a> {
     devices: Vec<Listed<'a>>,
-    /// Index of the device that is used unless `--device` picks another.
+    /// Index of the default device.
     chosen: Option<usize>,
-    /// The variables of a scheduler that picked it.
+    /// The variables of a scheduler that selected it.
     reason: Option<String>,
+    /// The paths of programs that some commands run; null where one is not found.
+    programs: BTreeMap<&'static str, Option<PathBuf>>,
+    verdict: String,
 }
 
 #[derive(Serialize)]
 struct Listed<'a> {
     #[serde(flatten)]
     report: &'a DeviceReport,
-    /// The names of the requirements that it does not meet.
+    /// The names of unmet requirements.
     missing: Vec<&'static str>,
 }
 
 /// Prints the report.
 ///
 /// # Errors
-/// There is no Vulkan, or no device that meets every requirement, or a scheduler's variables name none (what there is, is
-/// printed nevertheless).
+/// There is no Vulkan, no device meets every requirement, or a scheduler's variables name none; the list is printed
+/// nevertheless.
 pub fn run(args: &DoctorArgs) -> Result<()> {
     let devices = devices()?;
     let picked = SchedulerVariables::of_this_process().pick(&DeviceChoice::Best, &devices);
@@ -53,20 +60,55 @@ pub fn run(args: &DoctorArgs) -> Result<()> {
         }
     });
     let chosen = checked.as_ref().ok().copied();
+    let programs: BTreeMap<_, _> =
+        PROGRAMS.iter().map(|(name, _)| (*name, on_path(name))).collect();
+    let verdict = verdict(chosen.map(|index| &devices[index]), reason.as_deref());
     let text = if args.json {
         let listed =
             |report| Listed { report, missing: DeviceReport::all_missing(report).collect() };
         let devices = devices.iter().map(listed).collect();
-        serde_json::to_string_pretty(&Output { devices, chosen, reason })?
+        serde_json::to_string_pretty(&Output { devices, chosen, reason, programs, verdict })?
     } else {
-        table(&devices, chosen, reason.as_deref())
+        table(&devices) + &program_lines(&programs) + &verdict
     };
     writeln!(std::io::stdout().lock(), "{}", text.trim_end())?;
     checked?;
-    Ok(())
+    if args.json { Ok(()) } else { finish("", "nightsplat demo, or nightsplat diagnose photos") }
 }
 
-fn table(devices: &[DeviceReport], chosen: Option<usize>, reason: Option<&str>) -> String {
+/// Programs that commands run, and for what.
+const PROGRAMS: [(&str, &str); 2] =
+    [("colmap", "camera poses (nightsplat pose)"), ("ffmpeg", "video (pose CLIP, render --video)")];
+
+/// The path of a program on `PATH`.
+fn on_path(program: &str) -> Option<PathBuf> {
+    let path = std::env::var_os("PATH")?;
+    let name = format!("{program}{}", std::env::consts::EXE_SUFFIX);
+    std::env::split_paths(&path).map(|folder| folder.join(&name)).find(|file| file.is_file())
+}
+
+fn program_lines(programs: &BTreeMap<&'static str, Option<PathBuf>>) -> String {
+    let line = |(name, purpose): &(&'static str, &str)| match programs.get(name) {
+        Some(Some(path)) => format!("{name}  {}, for {purpose}\n", path.display()),
+        _ => format!("{name}  not found; install it for {purpose}: {}\n", sources(name)),
+    };
+    PROGRAMS.iter().map(line).collect::<String>() + "\n"
+}
+
+/// A line on the default device.
+fn verdict(chosen: Option<&DeviceReport>, reason: Option<&str>) -> String {
+    let Some(DeviceReport { name, kind, .. }) = chosen else {
+        return "not ready: no device meets the requirements".to_owned();
+    };
+    let reason = reason.map_or_else(String::new, |reason| format!(" ({reason})"));
+    let speed = match *kind {
+        "software" => "; a software device: minutes per scene, more with large photographs",
+        _ => "",
+    };
+    format!("ready: trains on {name}{reason}{speed}; --device selects another")
+}
+
+fn table(devices: &[DeviceReport]) -> String {
     let mut text = String::new();
     for (index, device) in devices.iter().enumerate() {
         let DeviceReport { name, kind, api_version, uuid, pci, subgroup_size, memory, .. } = device;
@@ -80,7 +122,8 @@ fn table(devices: &[DeviceReport], chosen: Option<usize>, reason: Option<&str>) 
         let requirements = &device.requirements;
         let gib = *memory as f64 / f64::from(1 << 30);
         text += &format!(
-            "{index}  {name}\n   {kind}, Vulkan {api_version}, subgroups of {subgroup_size}{others}, {gib:.1} GiB\n   uuid:{uuid}{pci}\n"
+            "{index}  {name}\n   {kind}, Vulkan {api_version}, subgroups of {subgroup_size}{others}, {gib:.1} \
+             GiB\n   uuid:{uuid}{pci}\n"
         );
         let width = requirements.iter().map(|requirement| requirement.name.len()).max();
         let width = width.unwrap_or(0);
@@ -88,22 +131,16 @@ fn table(devices: &[DeviceReport], chosen: Option<usize>, reason: Option<&str>) 
             let met = if requirement.met { "yes" } else { "no" };
             text += &format!("   {met:3}  {:width$}  {}\n", requirement.name, requirement.why);
         }
-        // An option, not a requirement.
+        // Optional.
         text += &match device.cooperative_matrix {
             Some(CooperativeMatrix { m, n, k }) => {
-                format!("   also {m}x{n}x{k} matrices of 16 bits, for --denoiser-precision half\n")
+                format!("   also {m}x{n}x{k} cooperative matrices of 16 bits, for --denoiser-precision half\n")
             }
-            None => "   no 16-bit matrices: --denoiser-precision half is single\n".to_owned(),
+            None => "   no 16-bit cooperative matrices: --denoiser-precision half falls back to single\n".to_owned(),
         };
         text += "\n";
     }
-    let reason = reason.map_or_else(String::new, |reason| format!(" ({reason})"));
-    match chosen {
-        Some(index) => {
-            text + &format!("device {index} is used{reason} unless --device picks another")
-        }
-        None => text + "no device will do",
-    }
+    text
 }
 
 #[cfg(test)]
@@ -130,9 +167,9 @@ mod tests {
     }
 
     #[test]
-    fn the_table_says_what_each_device_is_and_lacks_and_which_is_used() {
+    fn the_table_says_what_each_device_is_and_lacks_and_the_verdict_which_is_used() {
         let devices = [device("Abacus", false), device("Babbage", true), device("Curta", true)];
-        let text = table(&devices, Some(1), None);
+        let text = table(&devices);
         assert!(text.starts_with(
             "0  Abacus\n   discrete, Vulkan 1.3.0, subgroups of 32, 1.5 GiB\n   uuid:00-11\n"
         ));
@@ -141,18 +178,25 @@ mod tests {
         assert!(
             text.contains("   yes  Vulkan 1.3  it is needed\n   no   shiny       it is needed\n")
         );
-        assert!(text.contains("also 8x16x32 matrices") && text.contains("no 16-bit matrices"));
-        assert!(text.ends_with("device 1 is used unless --device picks another"));
-        let by_a_scheduler = table(&devices, Some(2), Some("CUDA_VISIBLE_DEVICES=1"));
         assert!(
-            by_a_scheduler.ends_with(
-                "device 2 is used (CUDA_VISIBLE_DEVICES=1) unless --device picks another"
-            )
+            text.contains("also 8x16x32 cooperative") && text.contains("no 16-bit cooperative")
         );
+        let printed = verdict(Some(&devices[1]), None);
+        assert_eq!(printed, "ready: trains on Babbage; --device selects another");
+        let printed = verdict(Some(&devices[2]), Some("CUDA_VISIBLE_DEVICES=1"));
+        assert!(printed.contains("Curta (CUDA_VISIBLE_DEVICES=1)"), "{printed}");
+        let software = DeviceReport { kind: "software", ..device("Abacus", true) };
+        assert!(verdict(Some(&software), None).contains("minutes per scene"));
+        assert!(verdict(None, None).starts_with("not ready"));
     }
 
     #[test]
-    fn where_no_device_will_do_none_is_chosen() {
-        assert!(table(&[device("Abacus", false)], None, None).ends_with("no device will do"));
+    fn a_program_that_is_missing_is_said_with_its_use_and_how_to_install_it() {
+        let printed = program_lines(&BTreeMap::from([("ffmpeg", Some("/usr/bin/ffmpeg".into()))]));
+        assert!(printed.contains("colmap  not found; install it for camera poses"), "{printed}");
+        assert!(
+            printed.contains("apt install colmap")
+                && printed.contains("ffmpeg  /usr/bin/ffmpeg, for")
+        );
     }
 }

@@ -1,64 +1,64 @@
-//! `nightsplat eval`: score a run on its test views.
+//! `nightsplat eval`: scores a run on its test views.
 
 use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Result;
 
-use super::finished_run::{FinishedRun, is_model};
-use super::{progress_bar, table};
-use crate::base::output::printable;
+use super::{finish, progress_bar, table, word};
+use crate::base::output::{check_writable, printable, write_whole};
 use crate::gpu::DeviceChoice;
-use crate::networks::lpips::{Lpips, Measure, Range};
+use crate::networks::lpips::{Lpips, Range};
 use crate::photographs::dataset::View;
-use crate::photographs::metrics::Scores;
-use crate::results::eval::{self, ResidualTransmittance, ScoreReference, ViewScore};
+use crate::results::eval::{self, ScoreReference};
+use crate::results::evaluation::{EvalPage, score_table};
+use crate::results::finished_run::{FinishedRun, is_model};
 use crate::results::run;
 use crate::train::OnOff;
 
 /// Score a run on the test views of its dataset.
 ///
-/// Renders every test view that has a normal-light reference image and compares the two in 8 bits: PSNR over all
-/// channels, the mean of the three channels' PSNRs (what the paper's code computes), and SSIM. Where no test view has one,
-/// each is compared with its own pseudo-GT, what the run's curve makes of its photograph, and that is said: it tells how
-/// well the model shows its targets, not how right these are. A run that was stopped is scored as it was at its last
-/// checkpoint.
+/// Renders every test view that has a reference image in normal light and compares the two at 8 bits: PSNR over all
+/// channels, the mean of the three channels' PSNRs (as in the paper's code), and SSIM. Without references, each view
+/// is compared with its own pseudo-GT, and the output says so: such a score tells how well the model fits its
+/// targets, not how good they are. An interrupted run is scored at its last checkpoint.
 ///
-/// Beside the scores stands the leftover transmittance, how much of the background each view shows: its mean, and what 99 %
-/// of the pixels stay below. No score tells a hole before black from a dark surface; a mean above 0.1 is a warning.
+/// The residual transmittance is how much background each view shows: its mean and its 99th percentile. Against a black
+/// background no score tells a hole from a dark surface; a mean above 0.1 prints a warning.
 #[derive(Clone, Debug, clap::Args)]
 pub struct EvalArgs {
-    /// The run directory that `nightsplat train` wrote, or a PLY of Gaussians with --dataset
+    /// Run directory, or a PLY of Gaussians with --dataset
     pub run: PathBuf,
-    /// Print what metrics.json holds instead of a table
+    /// Print JSON, as in metrics.json, instead of a table
     #[arg(long)]
     pub json: bool,
-    /// Where the dataset is now, or another copy of it; what differs from the run's views is said [default: where the run found it]
+    /// Dataset, if it moved since training [default: the run's]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
-    /// Score LPIPS too, the distance of two pictures to the eye of AlexNet or VGG-16: lower is more alike. The safetensors
-    /// file of weights tells which network it is; scripts/lpips-weights.py writes those that are published
+    /// Add LPIPS, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)
     #[arg(long, value_name = "WEIGHTS")]
     pub lpips: Option<PathBuf>,
-    /// What LPIPS gives its network of a picture in [0, 1]; numbers of different ranges or networks do not compare, so take
-    /// what the table you compare with took
+    /// Input range of the LPIPS network; scores of different ranges or networks do not compare
     #[arg(long, value_name = "RANGE", value_enum, default_value_t, requires = "lpips")]
     pub lpips_range: LpipsRange,
-    /// Write what was scored to RUN/eval/renders, and what it was compared with to RUN/eval/references or RUN/eval/targets; of MODEL.ply, below MODEL.eval
+    /// Write renders and references (or targets) to RUN/eval; of MODEL.ply, to MODEL.eval
     #[arg(long)]
     pub save_images: bool,
-    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: that of the run]
+    /// Write a page with scores, error maps, the worst view and the history of training
+    #[arg(long, value_name = "FILE.html")]
+    pub report: Option<PathBuf>,
+    /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the run's]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 
-/// `Range` on the command line.
+/// [`Range`] on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum LpipsRange {
-    /// Stretched to [-1, 1], for which the measure was made: `normalize=True` in lpips and torchmetrics, gsplat's AlexNet
+    /// [-1, 1], as LPIPS was trained: `normalize=True` in lpips and torchmetrics, gsplat's AlexNet
     #[default]
     Signed,
-    /// As it is, an oversight that became a custom: the code of 3DGS, gsplat's VGG-16, and papers that follow them
+    /// [0, 1], as in the code of 3DGS, gsplat's VGG-16 and papers that follow them
     Unit,
 }
 
@@ -76,6 +76,7 @@ impl From<LpipsRange> for Range {
 /// # Errors
 /// The folder holds no run with a model, its dataset is gone, or a file cannot be written.
 pub fn run(args: &EvalArgs) -> Result<()> {
+    args.report.iter().try_for_each(|path| check_writable(path))?;
     let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer } =
         FinishedRun::open(&args.run, args.dataset.as_deref(), args.device.as_ref())?;
     let load = |weights| Lpips::load(&gpu, weights, args.lpips_range.into());
@@ -86,6 +87,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         true => args.run.with_extension("eval"),
         false => args.run.join("eval"),
     };
+    let mut page = args.report.as_ref().map(|_| EvalPage::default());
     let bar = progress_bar(score_reference.view_count(&dataset));
     let render = |view: &View| {
         bar.set_message(printable(&view.name).into_owned());
@@ -100,6 +102,9 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         if args.save_images {
             compared.save(&images, score.against)?;
         }
+        if let Some(page) = &mut page {
+            page.add(score, compared);
+        }
         bar.inc(1);
         Ok(())
     })?;
@@ -108,9 +113,15 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     if scored.is_empty() {
         let root = dataset.root.display();
         tracing::warn!(
-            "{root}: no test view has a reference image or a photograph, so there is nothing to score"
+            "{root}: no test view has a reference image or a photograph: nothing to score"
         );
     }
+    let mut wrote = vec![];
+    if let (Some(page), Some(path)) = (page, &args.report) {
+        write_whole(path, page.html(&args.run, &scored, measure).as_bytes())?;
+        wrote.push(path.display().to_string());
+    }
+    wrote.extend(args.save_images.then(|| images.display().to_string()));
     let mut out = std::io::stdout().lock();
     if args.json {
         let recorded = run::load_metrics(&args.run);
@@ -125,7 +136,9 @@ pub fn run(args: &EvalArgs) -> Result<()> {
             eval::add_lpips(&mut metrics, &scored, measure);
         }
         eval::add_reference(&mut metrics, &config.tone);
-        for what in [run::SPENT, run::TARGET_EXPOSURE, run::ENDED, run::HELD_OUT_CURVE] {
+        for what in
+            [run::SPENT, run::TARGET_EXPOSURE, run::ENDED, run::TRAINED_WITH, run::HELD_OUT_CURVE]
+        {
             if let Some(known) = recorded.get(what) {
                 metrics[what] = known.clone();
             }
@@ -135,51 +148,15 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         }
         writeln!(out, "{metrics:#}")?;
     } else {
-        write!(out, "{}", score_table(&scored, measure))?;
+        write!(out, "{}", table::of(&score_table(&scored, measure)))?;
         if let Some(known) = config.tone.knows_references() {
             writeln!(out, "{}", eval::with_reference(&known))?;
         }
         if let Some(label) = eval::label(&scored) {
             writeln!(out, "{label}")?;
         }
+        let run = word(&args.run);
+        finish(&wrote.join(", "), &format!("nightsplat render {run} --split all --out pictures"))?;
     }
     Ok(())
-}
-
-fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> String {
-    let (mean, mean_r0) = eval::means(scored);
-    let mut header = ["view", "PSNR", "channel mean", "SSIM"].map(str::to_owned).to_vec();
-    header.extend(measure.map(Measure::title));
-    // Before the denoiser.
-    header.extend(mean_r0.iter().flat_map(|_| ["PSNR of R_0", "SSIM of R_0"]).map(str::to_owned));
-    let mean_transmittance =
-        ResidualTransmittance::mean(scored.iter().filter_map(|view| view.residual_transmittance));
-    header.extend(mean_transmittance.iter().flat_map(|_| ["leftover", "99 %"]).map(str::to_owned));
-    let row = |name: &str,
-               scores: &Scores,
-               r0: Option<&Scores>,
-               residual_transmittance: Option<ResidualTransmittance>| {
-        let Scores { psnr, psnr_channel_mean, ssim, lpips } = scores;
-        let mut row = vec![
-            name.to_owned(),
-            format!("{psnr:.2}"),
-            format!("{psnr_channel_mean:.2}"),
-            format!("{ssim:.4}"),
-        ];
-        row.extend(lpips.map(|lpips| format!("{lpips:.4}")));
-        row.extend(
-            r0.into_iter().flat_map(|r0| [format!("{:.2}", r0.psnr), format!("{:.4}", r0.ssim)]),
-        );
-        let residual_transmittance =
-            residual_transmittance.into_iter().flat_map(|own| [own.mean, own.q99]);
-        row.extend(residual_transmittance.map(|value| format!("{value:.4}")));
-        row
-    };
-    let mut rows = vec![header];
-    let of_view = |view: &ViewScore| {
-        row(&view.name, &view.scores, view.r0.as_ref(), view.residual_transmittance)
-    };
-    rows.extend(scored.iter().map(of_view));
-    rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref(), mean_transmittance)));
-    table::aligned(&rows)
 }

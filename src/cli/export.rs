@@ -1,65 +1,67 @@
-//! `nightsplat export`: a run's model in the formats of others.
+//! `nightsplat export`: writes the model of a run in other formats.
 
-use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Result;
+use clap::ValueEnum;
 use glam::{DAffine3, DVec3};
 
-use super::finished_run::{FinishedRun, is_model, load_model, needs_photographs};
-use crate::base::output::{printable, write_whole};
+use super::{finish, word};
+use crate::base::output::{check_writable, is_same_file, write_whole};
 use crate::camera::Camera;
 use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::results::export::page::{Bookmark, Page};
 use crate::results::export::{Format, Provenance, spz};
-use crate::splats::scene::Gaussians;
+use crate::results::finished_run::{FinishedRun, is_model, load_model, needs_photographs};
+use crate::splats::scene::{Gaussians, MAX_SH_DEGREE};
 use crate::train::TrainConfig;
 use crate::{Error, results::run};
 
 /// Write a run's model in the format of a viewer, as bright as it was trained to be.
 #[derive(Clone, Debug, clap::Args)]
-#[command(
-    after_help = "  nightsplat export run --to html             run/model.html: the splat, a viewer, photographs to compare
-  nightsplat export run --to spz --out a.spz  a tenth of the size, eight bits a number
-  nightsplat export run --to glb              glTF with KHR_gaussian_splatting, every number as it was trained"
-)]
+#[command(after_help = EXAMPLES)]
 pub struct ExportArgs {
-    /// The run directory that `nightsplat train` wrote, or a PLY of Gaussians
+    /// Run directory, or a PLY of Gaussians
     pub run: PathBuf,
-    /// The format
-    #[arg(long, value_enum, value_name = "FORMAT")]
+    /// Format
+    #[arg(long = "format", alias = "to", value_enum, value_name = "FORMAT")]
     pub to: To,
-    /// The file to write; one of that name is replaced [default: model with the format's ending, in the run]
+    /// File to write or replace [default: model.FORMAT in the run]
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
-    /// The version of SPZ: 4, or 3, which more readers know
+    /// Version of SPZ; more programs read 3
     #[arg(long, value_name = "3|4", default_value_t = 4, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub spz: u8,
-    /// For html: at most so many views to begin from, with their photographs
+    /// For html: number of views to start from, with their photographs
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub views: usize,
-    /// For html: where the dataset lies now [default: that of the run]
+    /// For html: dataset, if it moved since training [default: the run's]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
-    /// For html of a model with networks, the device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: that of the run]
+    /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the run's]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 
-/// What `--to` names.
+const EXAMPLES: &str = "Examples:
+  nightsplat export run --format html             run/model.html: a viewer, with photographs to compare
+  nightsplat export run --format spz --out a.spz  a tenth of the size, eight bits per number
+  nightsplat export run --format glb              glTF with KHR_gaussian_splatting, at full precision";
+
+/// The formats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum To {
-    /// The layout that every viewer opens, with a header that says where it comes from.
+    /// The layout of 3DGS, with its origin in the header
     Ply,
-    /// A tenth of the size; eight bits a number.
+    /// A tenth of the size, eight bits per number
     Spz,
-    /// glTF with `KHR_gaussian_splatting`.
+    /// glTF with `KHR_gaussian_splatting`
     Glb,
-    /// A fifteenth of the size; `PlayCanvas`.
+    /// A fifteenth of the size, by `PlayCanvas`
     Sog,
-    /// A page with a viewer of its own.
+    /// A self-contained page with a viewer
     Html,
 }
 
@@ -78,24 +80,33 @@ impl To {
 /// Writes the file.
 ///
 /// # Errors
-/// The folder holds no run with a model, the model does not fit the format, or the file cannot be written; nothing
-/// half-written is left.
+/// The folder holds no run with a model, the model does not fit the format, or the file cannot be written;
+/// no partial file is left.
 pub fn run(args: &ExportArgs) -> Result<()> {
+    let (out, wrote) = write(args)?;
+    let out = word(&out);
+    let next = match args.to {
+        To::Html => format!("open {out} in a browser"),
+        To::Spz | To::Sog | To::Glb => format!("open {out} in a viewer of Gaussian splats"),
+        To::Ply => format!("open {out} in a viewer of 3DGS models"),
+    };
+    finish(&wrote, &next)
+}
+
+/// Writes the file, and returns its path and a line on its contents.
+pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
+    check_ending(args)?;
     let (gaussians, config, own) = opened(args)?;
     let out = args.out.as_ref().unwrap_or(&own);
-    if args.to == To::Ply && is_same(out, &own) {
-        let problem =
-            "is the model itself, which has its header already; name another file with --out";
+    if args.to == To::Ply && is_same_file(out, &own) {
+        let problem = "is the model itself; name another file with --out";
         return Err(Error::output(out, problem).into());
     }
     if let Some(step) = run::stopped_at(&args.run) {
         tracing::warn!("{}: stopped at step {step} of {}", args.run.display(), config.steps);
     }
     if has_networks(&config) {
-        tracing::warn!(
-            "{}: its networks stay behind; what is exported is the splat alone",
-            args.run.display()
-        );
+        tracing::warn!("{}: the networks are not exported, only the Gaussians", args.run.display());
     }
     let provenance = provenance(args, &config);
     let format = match args.to {
@@ -107,17 +118,37 @@ pub fn run(args: &ExportArgs) -> Result<()> {
         To::Html => None,
     };
     match format {
+        // Viewers with a fixed layout expect the coefficients of degree 3.
+        Some(Format::Ply) => {
+            let padded = gaussians.with_sh_degree(MAX_SH_DEGREE);
+            Format::Ply.write(&padded, &provenance, out)?;
+        }
         Some(format) => format.write(&gaussians, &provenance, out)?,
         None => write_whole(out, page(args, &config, &gaussians, provenance)?.as_bytes())?,
     }
     let (shown, count) = (out.display().to_string(), gaussians.count);
     let kib = std::fs::metadata(out).map_or(0, |file| file.len()).div_ceil(1024);
     let brightness = if is_model(&args.run) { "" } else { ", as bright as their targets" };
-    let line = format!("{}: {count} Gaussians in {kib} KiB{brightness}", printable(&shown));
-    Ok(writeln!(std::io::stdout(), "{line}")?)
+    let wrote = format!("{shown}: {count} Gaussians in {kib} KiB{brightness}");
+    Ok((out.clone(), wrote))
 }
 
-/// The model as its file has it, which is as viewers show it; its settings, and the file to write where none is named.
+/// Refuses an output file whose ending is that of another format, and one that cannot be written.
+fn check_ending(args: &ExportArgs) -> crate::Result<()> {
+    let Some(out) = &args.out else { return Ok(()) };
+    let ending = out.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    let formats = To::value_variants();
+    if let Some(other) = formats.iter().find(|to| to.extension() == ending && **to != args.to) {
+        let (out, other, own) = (out.display(), other.extension(), args.to.extension());
+        let problem = format!(
+            "--out {out} is a file of --format {other}, not of --format {own}; change either"
+        );
+        return Err(Error::Usage(problem));
+    }
+    check_writable(out)
+}
+
+/// The model as stored, its settings, and the default output file.
 fn opened(args: &ExportArgs) -> crate::Result<(Gaussians, TrainConfig, PathBuf)> {
     let (from, extension) = (&args.run, args.to.extension());
     if is_model(from) {
@@ -136,26 +167,23 @@ fn has_networks(config: &TrainConfig) -> bool {
     config.model.denoiser || config.model.tonemapper
 }
 
-fn is_same(a: &Path, b: &Path) -> bool {
-    a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
-}
-
 fn provenance(args: &ExportArgs, config: &TrainConfig) -> Provenance {
     let dataset = config.dataset.file_name().unwrap_or_default().to_string_lossy().into_owned();
     if is_model(&args.run) {
         return Provenance { dataset, ..Provenance::default() };
     }
     let gain = run::load_metrics(&args.run)[run::TARGET_EXPOSURE]["model_gain"].as_f64();
-    let exposure = gain.map(|gain| format!("its photographs', times {gain:.2} before the curve"));
+    let exposure =
+        gain.map(|gain| format!("{gain:.2} times that of its photographs, before the curve"));
     Provenance {
         dataset,
         curve: config.tone.curve.to_string(),
-        exposure: exposure.unwrap_or_else(|| "of its targets".to_owned()),
+        exposure: exposure.unwrap_or_else(|| "that of its targets".to_owned()),
     }
 }
 
-/// The page, with a bookmark for some of the test views, or of all where none is held out. Its viewer is a pinhole: what a
-/// fisheye took is undistorted for it, to what lies within 60 degrees of the axis.
+/// The page, with bookmarks of test views, or of all views if there are none. Its viewer has a pinhole camera:
+/// photographs of a fisheye are undistorted and cropped to 60 degrees off the axis.
 fn page(
     args: &ExportArgs,
     config: &TrainConfig,
@@ -222,7 +250,7 @@ fn bookmarks(
     (0..count).map(bookmark).collect()
 }
 
-/// The same camera before positions that are relative to `origin`.
+/// The same camera in a world whose origin is moved to `origin`.
 fn moved(camera: &Camera, origin: DVec3) -> Camera {
     let DAffine3 { matrix3, translation } = camera.view_from_world;
     let view_from_world = DAffine3 { matrix3, translation: translation + matrix3 * origin };

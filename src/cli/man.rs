@@ -1,19 +1,20 @@
-//! `nightsplat man`: the help of every subcommand as man pages.
+//! `nightsplat man`: the help of every command as man pages.
 
+use std::io::Write;
 use std::iter;
 use std::path::PathBuf;
 
-use clap::CommandFactory;
+use clap::Command;
 use clap_mangen::Man;
 
-use super::Cli;
+use super::{finish, help};
+use crate::Error;
 use crate::base::output::write_whole;
-use crate::{Error, Result};
 
-/// Write the man pages into a folder: nightsplat.1, and one for each command
+/// Write man pages: nightsplat.1 and one per command
 #[derive(Clone, Debug, clap::Args)]
 pub struct ManArgs {
-    /// The folder, such as ~/.local/share/man/man1; it is created
+    /// Folder to write to, such as ~/.local/share/man/man1
     pub dir: PathBuf,
 }
 
@@ -21,17 +22,28 @@ pub struct ManArgs {
 ///
 /// # Errors
 /// The folder cannot be written.
-pub fn run(args: &ManArgs) -> Result<()> {
+pub fn run(args: &ManArgs) -> anyhow::Result<()> {
     let problem = |error: std::io::Error| Error::output(&args.dir, error.to_string());
     std::fs::create_dir_all(&args.dir).map_err(problem)?;
-    let mut command = Cli::command().disable_help_subcommand(true);
+    let mut command = help::command(true).disable_help_subcommand(true);
     command.build();
-    let nested = command.get_subcommands().flat_map(clap::Command::get_subcommands);
+    let nested = command.get_subcommands().flat_map(Command::get_subcommands);
     for command in iter::once(&command).chain(command.get_subcommands()).chain(nested) {
-        let page = Man::new(command.clone());
-        let mut text = vec![];
-        page.render(&mut text).map_err(problem)?;
-        write_whole(&args.dir.join(page.get_filename()), &text)?;
+        let name = Man::new(command.clone()).get_filename();
+        write_whole(&args.dir.join(name), &page(command).map_err(problem)?)?;
     }
-    Ok(())
+    finish(&format!("man pages to {}", args.dir.display()), "man nightsplat")
+}
+
+/// The page of a command. Its examples keep their lines.
+fn page(command: &Command) -> std::io::Result<Vec<u8>> {
+    let examples = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+    let mut page = vec![];
+    Man::new(command.clone().after_help("")).render(&mut page)?;
+    if !examples.is_empty() {
+        let lines = examples.replace('\\', "\\\\").replace('-', "\\-");
+        let lines = lines.lines().map(|line| format!("\\&{line}\n")).collect::<String>();
+        write!(page, ".SH EXAMPLES\n.nf\n{lines}.fi\n")?;
+    }
+    Ok(page)
 }

@@ -1,7 +1,9 @@
-//! `nightsplat pose`: from photographs without cameras to a dataset.
+//! `nightsplat pose`: estimates the cameras of photographs with COLMAP.
 
+mod cameras;
 mod clip;
 mod reconstruction;
+mod stages;
 mod tone_mapped;
 mod tool;
 
@@ -15,69 +17,78 @@ use anyhow::Result;
 
 use self::reconstruction::{Mapper, Matcher, Reconstruction};
 use self::tool::Tool;
+pub(super) use self::tool::sources;
+use super::{finish, word};
 use crate::Error;
+use crate::base::output::{check_writable, create_folder, write_whole};
+use crate::base::{input, tree};
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::photographs::dataset::Dataset;
+use crate::photographs::dataset::{Dataset, is_mask};
 use crate::photographs::image::files::{photographs_in, stem, unread_in};
 
-/// Find the cameras of dark photographs with COLMAP, and write a dataset that `train` takes.
+/// Estimate the cameras of dark photographs with COLMAP, and write a dataset for `train`.
 ///
-/// COLMAP finds next to nothing in the dark. This lifts the photographs first, all by one curve
-/// so that what matches stays alike, lets your `colmap` find the cameras in the lifted ones, and
-/// writes a dataset of the dark photographs with these cameras:
-///
-///   nightsplat pose photos --out scene
-///   nightsplat train scene --out run
-///
-/// The focal length that a JPEG's Exif names is where COLMAP begins. A clip goes through your
-/// `ffmpeg` first: of each window of 1 / --fps seconds the sharpest frame is taken.
+/// COLMAP finds few features in dark photographs. This command brightens them first, all by the same curve, runs your
+/// `colmap` on the result, and writes a dataset of the original photographs with the cameras that it found. The focal
+/// length in a JPEG's Exif is the initial value. Frames of a clip are extracted with your `ffmpeg`: the sharpest of
+/// each 1 / --fps seconds.
 #[derive(Clone, Debug, clap::Args)]
-#[command(verbatim_doc_comment)]
+#[command(after_help = EXAMPLE)]
 pub struct PoseArgs {
-    /// A folder of photographs of one scene, or a clip (.mp4, .mov, .mkv)
+    /// Folder of photographs of one scene, or a clip (.mp4, .mov, .mkv)
     pub photos: PathBuf,
-    /// The dataset to write; it appears once it is whole
+    /// Dataset to write; it appears when complete
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// The program `colmap`
+    /// Path of COLMAP
     #[arg(long, value_name = "PATH", default_value = "colmap")]
     pub colmap: PathBuf,
-    /// Which photographs are compared: each with each, or with those that follow it by name [default: sequential for a clip, else exhaustive]
+    /// Match every pair, or neighbours by name [default: sequential for a clip, else exhaustive]
     #[arg(long, value_enum)]
     pub matcher: Option<Matcher>,
-    /// How cameras are placed: one after the other, or all at once, which many photographs are faster by
+    /// Register cameras one by one, or all at once, which is faster for many photographs
     #[arg(long, value_enum, default_value_t = Mapper::Incremental)]
     pub mapper: Mapper,
-    /// The program `glomap`, which places all at once where your COLMAP is older than 4.0
+    /// Path of GLOMAP, for --mapper global with COLMAP before 4.0
     #[arg(long, value_name = "PATH", default_value = "glomap")]
     pub glomap: PathBuf,
-    /// COLMAP's model of the lens, the same for all photographs of one size
+    /// Option of a COLMAP command, as Mapper.init_min_tri_angle=4; may be given again
+    #[arg(long, value_name = "NAME=VALUE")]
+    pub colmap_option: Vec<String>,
+    /// COLMAP camera model; photographs of one size, lens and focal length share a camera
     #[arg(long, value_name = "NAME", default_value = "OPENCV")]
     pub camera_model: String,
-    /// How many frames a second of a clip to take
+    /// Frames per second to take of a clip
     #[arg(long, value_name = "F", default_value_t = 2.0)]
     pub fps: f64,
-    /// The program `ffmpeg`, for clips
+    /// Path of ffmpeg, for clips
     #[arg(long, value_name = "PATH", default_value = "ffmpeg")]
     pub ffmpeg: PathBuf,
-    /// Let COLMAP compute features on the GPU; it needs a display or CUDA for that
+    /// Let COLMAP use the GPU, which takes a display or CUDA
     #[arg(long)]
     pub colmap_gpu: bool,
-    /// Replace a dataset that `pose` wrote before
+    /// Replace a dataset that `pose` wrote
     #[arg(long)]
     pub overwrite: bool,
-    /// The device that lifts: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the best]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 
-/// Two cameras tell the shape of little.
+/// The calibrations that are shown, at most.
+const MOST_SHOWN: usize = 3;
+
+/// Fewer cameras constrain no shape.
 const FEWEST: usize = 3;
 
-/// Finds the cameras and writes the dataset.
+const EXAMPLE: &str = "Example:
+  nightsplat pose photos --out scene
+  nightsplat train scene --out run";
+
+/// Estimates the cameras and writes the dataset.
 ///
 /// # Errors
-/// A program is missing, fails or finds too few cameras; the photographs are not usable; the dataset exists.
+/// A program is missing, fails or finds too few cameras; the photographs are unusable; the dataset exists.
 pub fn run(args: &PoseArgs) -> Result<()> {
     if !(args.fps > 0.0 && args.fps <= 240.0) {
         return Err(Error::Usage(format!(
@@ -86,28 +97,35 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         ))
         .into());
     }
-    let is_clip = args.photos.is_file();
+    let is_clip = tree::is_file(&args.photos) && !tree::is_dir(&args.photos);
     let begin = Instant::now();
+    check_writable(&args.out)?;
     let mut out = Unfinished::new(&args.out, args.overwrite)?;
     let colmap = Tool::new(&args.colmap, "colmap", &out.log)
         .found(&format!("by hand: {}", by_hand(&args.photos, &args.out)))?;
     let matcher =
         args.matcher.unwrap_or(if is_clip { Matcher::Sequential } else { Matcher::Exhaustive });
     let reconstruction = Reconstruction::new(args, colmap, matcher, &out.work)?;
-    let photographs = if is_clip {
+    let folder = if tree::archive_of(&args.photos).is_some() {
+        Dataset::folder_of(&args.photos)?
+    } else {
+        args.photos.clone()
+    };
+    let mut photographs = if is_clip {
         let ffmpeg = Tool::new(&args.ffmpeg, "ffmpeg", &out.log).found("")?;
         clip::frames(&ffmpeg, &args.photos, args.fps, &out.work.join("frames"))?
     } else {
-        photographs(&args.photos)?
+        photographs(&folder)?
     };
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let tone_mapped = out.work.join("tone-mapped");
-    let gain = tone_mapped::write(&gpu, &photographs, &tone_mapped)?;
-    say(begin, &format!("{} photographs lifted (gain {gain:.1})", photographs.len()))?;
-    let models = reconstruction.models(&tone_mapped, |what| say(begin, what))?;
+    let gain = tone_mapped::write(&gpu, &mut photographs, &tone_mapped)?;
+    say(begin, &format!("{} photographs brightened (gain {gain:.1})", photographs.len()))?;
+    let models = reconstruction.models((&tone_mapped, &photographs), |what| say(begin, what))?;
     let (model, placed) = Dataset::largest_model(&models)?.filter(|(_, placed)| placed.len() >= FEWEST).ok_or_else(|| {
         let problem = format!(
-            "COLMAP found no cameras for these {} photographs: they show too little in common or no texture; take more of them, closer together, or expose longer ({} has its output)",
+            "COLMAP found no cameras for these {} photographs: too little overlap or texture; take more \
+             photographs, closer together, or expose longer ({} has its output)",
             photographs.len(),
             out.kept_log().display()
         );
@@ -118,67 +136,82 @@ pub fn run(args: &PoseArgs) -> Result<()> {
         .filter_map(|path| Some((stem(path.file_name()?.to_str()?), path)))
         .collect();
     let images = out.folder.join("images");
-    create(&images)?;
+    create_folder(&images)?;
     for name in &placed {
         let Some(path) = by_name.get(stem(name)) else { continue };
         link_or_copy(path, &images.join(path.file_name().unwrap_or_default()))?;
     }
-    keep_masks(&args.photos.join("masks"), &out.folder.join("masks"))?;
+    keep_masks(&folder.join("masks"), &out.folder.join("masks"))?;
+    if !is_clip {
+        for mask in photographs_in(&folder)?.iter().filter(|file| is_mask(file)) {
+            link_or_copy(mask, &images.join(mask.file_name().unwrap_or_default()))?;
+        }
+    }
     let sparse = out.folder.join("sparse/0");
-    create(&sparse)?;
+    create_folder(&sparse)?;
     for file in ["cameras.bin", "images.bin", "points3D.bin"] {
         link_or_copy(&model.join(file), &sparse.join(file))?;
     }
+    let lenses = Dataset::lenses(&sparse)?;
     out.finish()?;
     let (count, of) = (placed.len(), photographs.len());
     say(begin, &format!("{count} of {of} photographs have a camera -> {}", args.out.display()))?;
+    for lens in &lenses {
+        if let Some(problem) = cameras::implausible(lens) {
+            tracing::warn!(
+                "the calibration of {} is implausible: {problem}; photographs of several lenses may share it, or show too little \
+                 in common",
+                cameras::shown(lens)
+            );
+        }
+    }
     if 2 * count < of {
         tracing::warn!(
-            "most photographs have no camera: take more of them, closer together, or expose longer"
+            "most photographs have no camera; take more of them, closer together, or expose longer"
         );
     }
-    writeln!(
-        std::io::stdout(),
-        "{}: {count} of {of} photographs with their cameras; next: nightsplat train {} --out run",
+    let wrote = format!(
+        "{}: {count} of {of} photographs with their cameras, {} calibrated ({})",
         args.out.display(),
-        args.out.display()
-    )?;
-    Ok(())
+        if lenses.len() == 1 { "one".to_owned() } else { lenses.len().to_string() },
+        lenses.iter().take(MOST_SHOWN).map(cameras::shown).collect::<Vec<_>>().join("; ")
+    );
+    finish(&wrote, &format!("nightsplat train {} --out run", word(&args.out)))
 }
 
-/// What to type where nightsplat cannot.
+/// The commands to run COLMAP by hand.
 fn by_hand(photos: &Path, out: &Path) -> String {
     let (photos, out) = (photos.display(), out.display());
     format!(
-        "nightsplat tone apply {photos} --scene-statistics --out lifted && mkdir -p {out}/sparse && \
-         colmap feature_extractor --database_path {out}/database.db --image_path lifted --ImageReader.single_camera 1 && \
-         colmap exhaustive_matcher --database_path {out}/database.db && \
-         colmap mapper --database_path {out}/database.db --image_path lifted --output_path {out}/sparse && \
-         cp -r {photos} {out}/images"
+        "nightsplat tone apply {photos} --scene-statistics --out bright && mkdir -p {out}/sparse && colmap \
+         feature_extractor --database_path {out}/database.db --image_path bright --ImageReader.single_camera 1 \
+         && colmap exhaustive_matcher --database_path {out}/database.db && colmap mapper --database_path \
+         {out}/database.db --image_path bright --output_path {out}/sparse && cp -r {photos} {out}/images"
     )
 }
 
-/// The masks beside the photographs go with them.
+/// Links the masks into the dataset.
 fn keep_masks(masks: &Path, to: &Path) -> Result<()> {
     if !masks.is_dir() {
         return Ok(());
     }
-    create(to)?;
+    create_folder(to)?;
     for mask in photographs_in(masks)? {
         link_or_copy(&mask, &to.join(mask.file_name().unwrap_or_default()))?;
     }
     Ok(())
 }
 
-/// The photographs of a folder, of different names.
+/// The photographs of a folder; their names differ.
 fn photographs(folder: &Path) -> Result<Vec<PathBuf>> {
-    let paths = photographs_in(folder)?;
+    let mut paths = photographs_in(folder)?;
+    paths.retain(|path| !is_mask(path));
     if let Some(line) = unread_in(folder) {
         tracing::warn!("{line}");
     }
     if paths.len() < FEWEST {
         let problem = format!(
-            "holds {} photographs, at least {FEWEST} are needed; name the folder that holds them (PNG, JPEG, WebP, TIFF or EXR)",
+            "contains {} photographs (PNG, JPEG, WebP, TIFF or EXR); at least {FEWEST} are needed",
             paths.len()
         );
         return Err(Error::input(folder, problem).into());
@@ -187,7 +220,7 @@ fn photographs(folder: &Path) -> Result<Vec<PathBuf>> {
     for path in &paths {
         let own = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         if let Some(other) = seen.insert(stem(&own).to_owned(), own.clone()) {
-            let problem = format!("{other} and {own} are two photographs of one name; rename one");
+            let problem = format!("{other} and {own} have the same name; rename one");
             return Err(Error::input(folder, problem).into());
         }
     }
@@ -199,13 +232,11 @@ fn say(begin: Instant, what: &str) -> Result<()> {
     Ok(())
 }
 
-fn create(folder: &Path) -> crate::Result<()> {
-    fs::create_dir_all(folder)
-        .map_err(|error| Error::output(folder, format!("cannot be made: {error}")))
-}
-
-/// The same file under another name where the disk can do that, else a copy.
+/// Creates a hard link, or a copy where the file system has no links.
 fn link_or_copy(from: &Path, to: &Path) -> crate::Result<()> {
+    if tree::archive_of(from).is_some() {
+        return write_whole(to, &input::bytes(from)?);
+    }
     let from = from.canonicalize().unwrap_or_else(|_| from.to_owned());
     if fs::hard_link(&from, to).is_ok() {
         return Ok(());
@@ -215,15 +246,15 @@ fn link_or_copy(from: &Path, to: &Path) -> crate::Result<()> {
         .map_err(|error| Error::output(to, format!("cannot be written: {error}")))
 }
 
-/// A dataset that is being made under another name, and goes where it is not finished.
+/// A dataset under a temporary name, removed unless it is finished.
 struct Unfinished {
     target: PathBuf,
     replaces: bool,
-    /// What becomes the dataset.
+    /// The folder that becomes the dataset.
     folder: PathBuf,
-    /// What COLMAP works in.
+    /// Working folder of COLMAP.
     work: PathBuf,
-    /// What the programs say.
+    /// Output of the programs.
     log: PathBuf,
     is_finished: bool,
 }
@@ -245,18 +276,17 @@ impl Unfinished {
             return Err(Error::output(target, format!("exists already; {remedy}")));
         }
         if folder.exists() {
-            let problem =
-                "is what an interrupted `nightsplat pose` left, or one at work; remove it";
+            let problem = "belongs to an interrupted or running `nightsplat pose`; remove it";
             return Err(Error::output(folder, problem));
         }
         let work = folder.join("work");
-        create(&work)?;
+        create_folder(&work)?;
         let log = folder.join(LOG);
         let replaces = holds(target);
         Ok(Self { target: target.to_owned(), replaces, folder, work, log, is_finished: false })
     }
 
-    /// Where the log stays of what fails.
+    /// The log of a failed attempt.
     fn kept_log(&self) -> PathBuf {
         let mut path = self.target.as_os_str().to_owned();
         path.push(".");
@@ -264,29 +294,29 @@ impl Unfinished {
         path.into()
     }
 
-    /// The dataset under its own name.
+    /// Gives the dataset its name.
     fn finish(&mut self) -> crate::Result<()> {
         let failed = |error| Error::output(&self.target, format!("cannot be written: {error}"));
         fs::remove_dir_all(&self.work).map_err(failed)?;
         if self.replaces {
             fs::remove_dir_all(&self.target).map_err(failed)?;
         }
-        // An empty folder may stand there; a rename replaces it.
+        // The rename replaces an empty folder.
         fs::rename(&self.folder, &self.target).map_err(failed)?;
         self.is_finished = true;
-        // That of an attempt before.
+        // The log of an earlier attempt.
         let _ = fs::remove_file(self.kept_log());
         Ok(())
     }
 }
 
-/// The output of the programs, in the dataset.
+/// Name of the log in the dataset.
 const LOG: &str = "colmap.log";
 
 impl Drop for Unfinished {
     fn drop(&mut self) {
         if !self.is_finished {
-            // What failed is reported; a leftover of it is not.
+            // The cause is reported elsewhere; errors of the cleanup are not.
             let _ = fs::rename(&self.log, self.kept_log());
             let _ = fs::remove_dir_all(&self.folder);
         }

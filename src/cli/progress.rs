@@ -1,4 +1,4 @@
-//! What a run says while it trains.
+//! Progress of a run as a bar, lines or JSON.
 
 use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
@@ -10,30 +10,30 @@ use crate::results::eval::{self, ReferenceKind, ViewScore};
 use crate::results::run::Event;
 use crate::train::{MemoryEstimate, StepReport};
 
-/// How a run says what it does.
+/// The form of progress output.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum ProgressForm {
     /// A bar on standard error
     Bar,
     /// A line on standard error every ten seconds
     Plain,
-    /// A line of JSON on standard output for each event, steps every ten seconds, and nothing else there
+    /// One line of JSON per event on standard output, steps every ten seconds
     Json,
-    /// Nothing
+    /// None, only the result
     None,
 }
 
 impl ProgressForm {
-    /// What suits whoever reads standard error.
+    /// A bar if standard error is a terminal, else lines.
     pub(crate) fn of_terminal() -> Self {
         if std::io::stderr().is_terminal() { Self::Bar } else { Self::Plain }
     }
 }
 
-/// How long a run is silent.
+/// Time between two lines.
 const SILENCE: Duration = Duration::from_secs(10);
 
-/// What a run is going to take, in a line.
+/// The memory estimate in a line.
 fn foreseen(memory: &MemoryEstimate) -> String {
     let size = |bytes: u64| match bytes >> 20 {
         mebibytes @ 0..10_000 => format!("{mebibytes} MiB"),
@@ -41,7 +41,7 @@ fn foreseen(memory: &MemoryEstimate) -> String {
     };
     let MemoryEstimate { gaussians, device, host, peak_gaussians, peak_device, peak_host } = memory;
     let now = format!(
-        "memory: a step with {gaussians} Gaussians takes {} on the device, {} on the host",
+        "memory for {gaussians} Gaussians: {} on the device, {} on the host",
         size(*device),
         size(*host)
     );
@@ -49,21 +49,21 @@ fn foreseen(memory: &MemoryEstimate) -> String {
         return now;
     }
     let (peak_device, peak_host) = (size(*peak_device), size(*peak_host));
-    format!("{now}; up to {peak_gaussians}, {peak_device} and {peak_host}")
+    format!("{now}; for at most {peak_gaussians}, {peak_device} and {peak_host}")
 }
 
-/// Says what a run does, event by event.
+/// Reports the events of a run.
 #[derive(Debug)]
 pub(crate) struct Reporter {
     form: ProgressForm,
-    /// What JSON says of a run at its start.
+    /// Added to the JSON of the start event.
     facts: Value,
     bar: ProgressBar,
-    /// The last step, as far as that is known.
+    /// The last step, as far as known.
     steps: u64,
-    /// The run may end before it.
+    /// Whether early stopping may end the run before that.
     may_end_early: bool,
-    /// When the run began, and after which step.
+    /// Time and step of the start.
     begin: (Instant, u64),
     last_line: Instant,
 }
@@ -82,12 +82,12 @@ impl Reporter {
         }
     }
 
-    /// The same, which says so much more of a run at its start where it says JSON.
+    /// Adds facts to the JSON of the start event.
     pub(crate) fn with_facts(self, facts: Value) -> Self {
         Self { facts, ..self }
     }
 
-    /// Says it.
+    /// Reports an event.
     pub(crate) fn observe(&mut self, event: Event<'_>) {
         match event {
             Event::Started { step, steps, may_end_early, .. } => {
@@ -187,7 +187,7 @@ impl Reporter {
             }),
             _ => return,
         };
-        // Nobody reads on: the run is worth more than its report.
+        // A closed pipe does not stop the run.
         let _ = writeln!(std::io::stdout(), "{line}");
     }
 
@@ -204,11 +204,12 @@ impl Reporter {
         let (steps, left) = (self.steps, duration(left));
         let most = at_most(self.may_end_early);
         format!(
-            "step {step} of {most}{steps}: loss {loss:.4}, {gaussians} Gaussians, {each:.0} ms a step, {most}{left} left"
+            "step {step} of {most}{steps}: loss {loss:.4}, {gaussians} Gaussians, {each:.0} ms a step, \
+             {most}{left} left"
         )
     }
 
-    /// Milliseconds of a step so far, and the seconds left at that speed.
+    /// Mean milliseconds per step so far, and the seconds left at that speed.
     fn batching(&self, step: u64) -> (f64, f64) {
         let (begin, before) = self.begin;
         let each = begin.elapsed().as_secs_f64() / (step - before).max(1) as f64;
@@ -216,7 +217,7 @@ impl Reporter {
     }
 }
 
-/// The mean scores in a line; none where nothing was scored.
+/// The mean scores in a line; `None` if nothing was scored.
 pub(crate) fn summary(scored: &[ViewScore]) -> Option<String> {
     let (mean, r0) = eval::means(scored);
     let mean = mean?;
@@ -234,7 +235,7 @@ pub(crate) fn summary(scored: &[ViewScore]) -> Option<String> {
     ))
 }
 
-/// The means as JSON; null where nothing was scored.
+/// The means as JSON; null if nothing was scored.
 fn scores(scored: &[ViewScore]) -> Value {
     let means = eval::means(scored).0;
     means.map_or(Value::Null, |mean| {
@@ -248,7 +249,7 @@ fn scores(scored: &[ViewScore]) -> Value {
     })
 }
 
-/// Seconds as people say them.
+/// A duration in one or two units.
 fn duration(seconds: f64) -> String {
     match seconds.round() as u64 {
         seconds @ 0..60 => format!("{seconds} s"),
@@ -258,18 +259,18 @@ fn duration(seconds: f64) -> String {
 }
 
 fn say(line: &str) {
-    // Where standard error is closed there is nobody to tell.
+    // A closed standard error is no reason to stop.
     let _ = writeln!(std::io::stderr(), "{line}");
 }
 
-/// Step, loss, Gaussians, steps per second and time left.
+/// The bar: step, loss, Gaussians, steps per second and time left.
 fn style(may_end_early: bool) -> ProgressStyle {
     let most = at_most(may_end_early);
     let template = format!("{{bar:32}} {{pos}}/{{len}}  {{msg}}  {{per_sec}}  {most}{{eta}} left");
     ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
-/// The prefix of a number of steps, or of a time, while the run may end early.
+/// Prefix of a step count or time while early stopping is possible.
 fn at_most(may_end_early: bool) -> &'static str {
     if may_end_early { "at most " } else { "" }
 }

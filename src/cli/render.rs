@@ -1,65 +1,63 @@
-//! `nightsplat render`: pictures of a run from the cameras of its dataset, or along a path through them.
+//! `nightsplat render`: renders a run from the cameras of its dataset or along a path through them.
 
-mod video;
-
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 
-use super::finished_run::FinishedRun;
-use super::{ImageFormat, progress_bar};
-use crate::base::output::printable;
+use super::words::Words;
+use super::{ImageFormat, finish, progress_bar, word};
+use crate::Error;
+use crate::base::output::{check_writable, create_folder, printable};
 use crate::camera::{Camera, CameraPath};
 use crate::gpu::DeviceChoice;
-use crate::loss::exposure::Affine;
 use crate::photographs::dataset::{Dataset, Split, View};
 use crate::photographs::image::Image;
-use crate::photographs::tone::exposed_anew;
 use crate::results::eval::RenderLayer;
-use crate::{Error, results::run};
+use crate::results::finished_run::FinishedRun;
+use crate::results::video;
+use crate::results::view_exposures::ViewExposures;
 
-/// Render a run from the cameras of its dataset, whether they took an image or not, or along a path through them.
+/// Render a run from the cameras of its dataset, or along a path through them.
 ///
-/// A run that was stopped is shown as it was at its last checkpoint.
+/// Views need no photograph, only a pose. An interrupted run is rendered at its last checkpoint.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct RenderArgs {
-    /// The run directory that `nightsplat train` wrote, or a PLY of Gaussians with --dataset
+    /// Run directory, or a PLY of Gaussians with --dataset
     pub run: PathBuf,
-    /// Which cameras
+    /// Cameras of this split of the dataset
     #[arg(long, value_enum, required_unless_present = "path", conflicts_with = "path")]
     pub split: Option<SplitChoice>,
-    /// Fly in place of standing where the photographs were taken
+    /// Camera path instead of the dataset's cameras
     #[arg(long, value_enum)]
     pub path: Option<PathChoice>,
-    /// How many pictures a path has
-    #[arg(long, value_name = "N", default_value_t = 120, requires = "path", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    /// Frames of the path
+    #[arg(long, value_name = "N", default_value_t = 120, requires = "path")]
+    #[arg(value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub frames: u32,
-    /// Pictures a second of the video
+    /// Frames per second of the video
     #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u16).range(1..=1000))]
     pub fps: u16,
-    /// Make a video of a path's pictures as well, with the ffmpeg on your path; FILE.png: a moving PNG, without it
-    #[arg(long, value_name = "FILE", requires = "path")]
+    /// Also write a video, with ffmpeg, or an animated PNG for FILE.png
+    #[arg(long, value_name = "FILE")]
     pub video: Option<PathBuf>,
-    /// The folder to write to, one picture per view; pictures of the same names are replaced
+    /// Folder for the images, one per view; images of the same names are replaced
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Where the dataset is now, or another copy of it; what differs from the run's views is said [default: where the run found it]
+    /// Dataset, if it moved since training [default: the run's]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
-    /// What to show: rgb, denoised, depth, structure, illumination or noise [default: denoised where the model has a
-    /// denoiser, else rgb]. A PNG of depth stretches from the least to the largest value of the view
-    #[arg(long)]
+    /// Layer: rgb, denoised, depth, structure, illumination or noise; depth is scaled to the range of each view, but
+    /// in EXR [default: denoised with a denoiser, else rgb]
+    #[arg(long, value_parser = Words::<RenderLayer>::new(RenderLayer::ALL.map(RenderLayer::name)))]
     pub layer: Option<RenderLayer>,
-    /// Show every training view as bright as its target, where the photographs differ in exposure; without it, and where a
-    /// view was not trained on, the model's own exposure
+    /// Render each training view at the exposure of its target, not at the model's
     #[arg(long)]
     pub view_exposure: bool,
-    /// The files to write
+    /// Image format
     #[arg(long, value_enum, default_value_t)]
     pub format: ImageFormat,
-    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: that of the run]
+    /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the run's]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
@@ -69,14 +67,14 @@ const EXAMPLES: &str = "Examples:
   nightsplat render run --path orbit --frames 180 --out frames --video orbit.mp4
   nightsplat render run --path interpolate --out frames --video flight.png";
 
-/// How a camera flies.
+/// A camera path on the command line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum PathChoice {
-    /// Around the point nearest to all optical axes
+    /// Circle around the point nearest to all optical axes
     Orbit,
-    /// About the mean camera, two turns; for photographs from one side
+    /// Two turns about the mean camera, for photographs from one side
     Spiral,
-    /// Smoothly through all training cameras by name
+    /// Smooth path through all training cameras by name
     Interpolate,
 }
 
@@ -90,14 +88,14 @@ impl From<PathChoice> for CameraPath {
     }
 }
 
-/// Views by what they are for.
+/// The views to render.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum SplitChoice {
-    /// Those trained on.
+    /// Training views
     Train,
-    /// Those held out.
+    /// Test views
     Test,
-    /// Both.
+    /// All views
     All,
 }
 
@@ -111,23 +109,26 @@ impl SplitChoice {
     }
 }
 
-/// A picture to be made.
+/// An image to render.
 struct Shot {
-    /// Its file's name without extension.
+    /// File name without extension.
     name: String,
     camera: Camera,
 }
 
-/// Renders the views, or a path.
+/// Renders the views or the path.
 ///
 /// # Errors
-/// The folder holds no run with a model, its dataset is gone or has no such view, a file cannot be written, or there is no
-/// ffmpeg where a video is asked for.
+/// The folder holds no run with a model, its dataset is gone or has no such view, a file cannot be written, or a
+/// video needs ffmpeg and there is none.
 pub fn run(args: &RenderArgs) -> Result<()> {
     let RenderArgs { run, out, layer, view_exposure, format, device, .. } = args;
-    if let Some(video) = &args.video {
-        video::check(video, *format)?;
+    if let Some(video) = args.video.as_ref().filter(|_| *format == ImageFormat::Exr) {
+        let problem =
+            format!("--video {} needs PNG frames; leave out --format exr", video.display());
+        return Err(Error::Usage(problem).into());
     }
+    args.video.iter().chain([out]).try_for_each(|path| check_writable(path))?;
     let FinishedRun { dataset, mut model_renderer, .. } =
         FinishedRun::open(run, args.dataset.as_deref(), device.as_ref())?;
     let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
@@ -145,25 +146,26 @@ pub fn run(args: &RenderArgs) -> Result<()> {
             None => color(model_renderer.render_camera(camera)?.output().clone())?,
             Some(layer) if layer.is_color() => color(model_renderer.layer(camera, *layer)?)?,
             Some(layer) => {
-                save_numbers(model_renderer.layer(camera, *layer)?, *layer, *format, &path)?
+                save_numbers(model_renderer.layer(camera, *layer)?, *layer, *format, &path)?;
             }
         }
         bar.inc(1);
     }
     bar.finish_and_clear();
-    tracing::info!("{} pictures are in {}", shots.len(), out.display());
+    let mut wrote = format!("{} images to {}", shots.len(), out.display());
     if let Some(video) = &args.video {
         let files: Vec<PathBuf> = shots.iter().map(|shot| file(out, &shot.name, *format)).collect();
         video::make(video, out, &files, args.fps)?;
+        wrote += &format!(", {}", video.display());
     }
-    Ok(())
+    finish(&wrote, &format!("nightsplat export {} --format html", word(run)))
 }
 
 fn file(folder: &Path, name: &str, format: ImageFormat) -> PathBuf {
     folder.join(format!("{name}.{}", format.extension()))
 }
 
-/// What is to be seen, from where.
+/// The images to render.
 fn shots(args: &RenderArgs, dataset: &Dataset) -> crate::Result<Vec<Shot>> {
     let Some(path) = args.path else {
         let includes = |view: &&View| args.split.is_none_or(|split| split.includes(view));
@@ -178,60 +180,14 @@ fn shots(args: &RenderArgs, dataset: &Dataset) -> crate::Result<Vec<Shot>> {
     };
     let poses: Vec<Camera> = dataset.train_views().map(|view| view.camera).collect();
     let cameras = CameraPath::from(path).cameras(&poses, args.frames as usize)?.into_iter();
-    // As ffmpeg counts them.
+    // Numbered as ffmpeg expects.
     Ok(cameras
         .zip(0..)
         .map(|(camera, index)| Shot { name: format!("{index:05}"), camera })
         .collect())
 }
 
-/// The exposures of a run's training views beside the one of its model.
-enum ViewExposures {
-    /// Gain and bias, learned.
-    Learned(BTreeMap<String, Affine>),
-    /// Of the targets.
-    OfTargets(serde_json::Value),
-}
-
-impl ViewExposures {
-    fn of(run: &Path) -> crate::Result<Self> {
-        let learned = run::load_exposures(run)?;
-        if !learned.is_empty() {
-            return Ok(Self::Learned(learned));
-        }
-        let exposure = run::load_metrics(run)[run::TARGET_EXPOSURE].take();
-        if exposure["model_gain"].is_number() {
-            return Ok(Self::OfTargets(exposure));
-        }
-        let problem = "has targets of no exposure of their own: its curve has a gain by its constants; leave out --view-exposure";
-        Err(Error::input(run, problem))
-    }
-
-    /// The model's picture of a view at the exposure of the view's target.
-    fn applied(&self, view: &str, mut image: Image) -> Image {
-        let number = |value: &serde_json::Value| value.as_f64();
-        let exposure = match self {
-            Self::Learned(exposures) => {
-                let own = exposures.get(view);
-                return own.map_or(image.clone(), |own| own.applied(&image));
-            }
-            Self::OfTargets(exposure) => exposure,
-        };
-        let gains = number(&exposure["model_gain"]).zip(number(&exposure["gains"][view]));
-        let Some((from, to)) = gains else { return image };
-        let knots = exposed_anew([from, to], number(&exposure["scene"]["weight"]).unwrap_or(1.0));
-        for x in &mut image.data {
-            let inside = x.clamp(knots[0][0], knots[knots.len() - 1][0]);
-            let above = knots.partition_point(|knot| knot[0] <= inside).clamp(1, knots.len() - 1);
-            let [[x0, y0], [x1, y1]] = [knots[above - 1], knots[above]];
-            let y = y0 + (inside - x0) / (x1 - x0).max(f32::MIN_POSITIVE) * (y1 - y0);
-            *x = y + (*x - inside);
-        }
-        image
-    }
-}
-
-/// Numbers that are no colour: an EXR file holds them as they are.
+/// Saves a layer that is not colour; EXR keeps the values.
 fn save_numbers(
     mut image: Image,
     layer: RenderLayer,
@@ -250,11 +206,10 @@ fn save_numbers(
     image.save_png8(path)
 }
 
-/// Makes the folder, unless it is one of the dataset's, where the photographs have the names of the renders. The run
+/// Creates the folder unless it lies in the dataset, where renders would replace photographs of the same names. The run
 /// itself may lie there.
 fn make_folder(out: &Path, dataset: &Dataset, run: &Path) -> crate::Result<()> {
-    std::fs::create_dir_all(out)
-        .map_err(|error| Error::output(out, format!("cannot be made: {error}")))?;
+    create_folder(out)?;
     let is_in = |folder: &Path| {
         let paths = out.canonicalize().ok().zip(folder.canonicalize().ok());
         paths.is_some_and(|(out, folder)| out.starts_with(folder))

@@ -1,4 +1,5 @@
-//! Signals to a run: SIGINT and SIGTERM save and stop, a second one ends the process at once, SIGUSR1 saves and goes on.
+//! Signals to a run: SIGINT and SIGTERM save and stop, a second one ends the process at once, SIGUSR1 saves and
+//! continues.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -9,10 +10,10 @@ use signal_hook::flag;
 use crate::results::run::Requests;
 use crate::{Error, Result, Stop};
 
-/// What signals ask of the runs of this process, from now on.
+/// Installs the handlers and returns the requests that they set.
 ///
 /// # Errors
-/// The system takes no handler.
+/// The system refuses a handler.
 pub(super) fn requests() -> Result<Requests> {
     let requests = Requests::default();
     let refused =
@@ -20,7 +21,7 @@ pub(super) fn requests() -> Result<Requests> {
     let is_second = Arc::new(AtomicBool::new(false));
     for (signal, cause) in [(SIGINT, Stop::Interrupted), (SIGTERM, Stop::Terminated)] {
         let code = i32::from(cause.exit_code());
-        // In this order: the first signal finds the flag down and raises it.
+        // In this order: the first signal finds the flag clear and sets it.
         flag::register_conditional_shutdown(signal, code, Arc::clone(&is_second))
             .map_err(refused)?;
         flag::register(signal, Arc::clone(&is_second)).map_err(refused)?;

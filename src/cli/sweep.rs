@@ -1,15 +1,15 @@
-//! `nightsplat sweep`: train over a grid of settings, and rank what comes out.
+//! `nightsplat sweep`: trains over a grid of settings, and ranks the results.
 //!
 //! ```text
-//! OUT/sweep.toml        what is swept here; another sweep needs another folder
-//!     NAME/             a run directory per point, with log.txt beside what `train` writes
-//!     leaderboard.csv   a row per point, seeds averaged; .md the same
-//!     index.html        the leaderboard with plots and pictures
+//! OUT/sweep.toml        the sweep of this folder; another sweep needs another folder
+//!     NAME/             the run directory of a point, with the output of `train` in log.txt
+//!     leaderboard.csv   a row per point, seeds averaged; also as .md
+//!     index.html        the leaderboard with plots and images
 //!     costs.csv         time, energy and memory of each point
-//!     costs.html        scores against them, with fronts
+//!     costs.html        scores against these costs, with Pareto fronts
 //! ```
 //!
-//! Nothing but the costs depends on how fast a point was trained, or on how often the sweep was interrupted.
+//! Only the costs depend on the speed of the device and on interruptions.
 
 mod costs;
 mod grid;
@@ -33,59 +33,60 @@ use self::options::Options;
 use self::point::{ADAPTIVE, Axis, OFFSET, PARTS};
 use self::rows::Rows;
 pub(super) use self::run::parsed;
-use self::run::{Common, Run, absolute, difference};
-use super::progress_bar;
+use self::run::{Run, absolute, difference};
+use super::{finish, progress_bar};
 use crate::Error;
 use crate::base::input;
-use crate::base::output::write_whole;
+use crate::base::output::{check_writable, create_folder, write_whole};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::photographs::tone::Statistics;
 use crate::train::{Part, TrainConfig, diagnosed};
 
-/// Train over a grid of settings, each point in its own run directory, and rank the results.
+/// Train over a grid of settings, and rank the results.
 ///
-/// A point is one `nightsplat train` command, run as a process of its own. Interrupt the sweep at any time and give the
-/// same command again: finished points stay, those under way go on from what they saved. A point that fails is reported, and the
-/// others go on. More values may join a list later; another base or another set of lists needs another --out.
+/// Each point of the grid is one `nightsplat train` process. An interrupted sweep continues when the command is
+/// repeated: finished points are kept, unfinished ones resume. A failed point is reported, and the others continue.
+/// Lists may grow later; other lists or other common options need another --out.
 ///
-/// OUT/index.html ranks the points, OUT/costs.html draws their scores against time, energy and memory, and with --eval-every how
-/// each came there.
+/// OUT/index.html ranks the points; OUT/costs.html plots their scores against time, energy and memory.
 #[derive(Clone, Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub struct SweepArgs {
-    /// The dataset, as for `train`
+    /// Dataset, as for `train`
     pub dataset: PathBuf,
-    /// The folder of the sweep: a run directory per point, index.html, leaderboard.csv, leaderboard.md, costs.html, costs.csv
+    /// Folder for the run directories, index.html, costs.html and tables as CSV
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Trainings at once; they share the device
+    /// Number of trainings at once, on the same device
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     pub jobs: u16,
-    /// Print the command line of every point that is left, and train nothing
+    /// Print the commands of unfinished points; do not train
     #[arg(long)]
     pub dry_run: bool,
-    /// Print every figure as JSON instead of tables
+    /// Print JSON instead of tables
     #[arg(long)]
     pub json: bool,
-    /// A grid that has a name; the lists below replace its own or add to them
-    #[arg(long, value_enum, help_heading = "The grid")]
+    /// Named grid; lists replace its lists or add to them
+    #[arg(long, value_enum, help_heading = GRID)]
     table: Option<Grid>,
-    /// Values of alpha, the highest black level
-    #[arg(long, value_name = "LIST", help_heading = "The grid")]
+    /// Values of alpha, the maximum black level
+    #[arg(long, value_name = "LIST", help_heading = GRID)]
     alpha: Option<String>,
-    /// Values of beta: how fast the black level falls as the shadows are less crushed
-    #[arg(long, value_name = "LIST", help_heading = "The grid")]
+    /// Values of beta, the decay of the black level with brighter shadows
+    #[arg(long, value_name = "LIST", help_heading = GRID)]
     beta: Option<String>,
-    /// Fixed black levels delta0, and `adaptive` for that of alpha and beta
-    #[arg(long, value_name = "LIST", help_heading = "The grid")]
+    /// Fixed black levels delta0, or adaptive for that of alpha and beta
+    #[arg(long, value_name = "LIST", help_heading = GRID)]
     offset: Option<String>,
-    /// Values of any setting by its place in config.toml, such as `density.min_opacity=0.005,0.01`; may be repeated
-    #[arg(long, value_name = "KEY=LIST", help_heading = "The grid")]
+    /// Values of any key of config.toml, such as `density.min_opacity=0.005,0.01`; repeatable
+    #[arg(long, value_name = "KEY=LIST", help_heading = GRID)]
     grid: Vec<String>,
-    #[command(flatten, next_help_heading = "What every point is trained with")]
+    #[command(flatten)]
     options: Options,
 }
+
+pub(super) const GRID: &str = "Grid";
 
 const EXAMPLES: &str = "A LIST is comma-separated. Examples:
   nightsplat sweep photos --out sweep --curves all --downscale 4 --steps 300
@@ -93,18 +94,23 @@ const EXAMPLES: &str = "A LIST is comma-separated. Examples:
   nightsplat sweep photos --out presets --table presets --eval-every 50
   nightsplat sweep photos --out density --grid density.gradient_threshold=1e-4,2e-4 --jobs 2";
 
-/// Trains what is left of the grid and writes what it found.
+/// Trains the unfinished points and writes the results.
 ///
 /// # Errors
-/// A grid, an option or a dataset that makes no sense, before anything is trained; a folder that holds another sweep;
-/// points that failed, after the others are finished.
+/// Before training, an invalid grid, option or dataset, or a folder with another sweep; after it, failed points.
 pub fn run(args: &SweepArgs) -> Result<()> {
     let dataset = args.dataset.display();
-    run_titled(args, &format!("Sweep of {dataset}"), &[])
+    run_titled(args, &format!("Sweep of {dataset}"), &[], &[])
 }
 
-/// The same with a title and first paragraphs of the page.
-pub(super) fn run_titled(args: &SweepArgs, title: &str, intro: &[String]) -> Result<()> {
+/// As [`run`], with a title, an introduction and links for the page.
+pub(super) fn run_titled(
+    args: &SweepArgs,
+    title: &str,
+    intro: &[String],
+    links: &[[String; 2]],
+) -> Result<()> {
+    check_writable(&args.out)?;
     let (runs, dataset) = plan(args)?;
     let mut left = vec![];
     for run in &runs {
@@ -133,14 +139,15 @@ pub(super) fn run_titled(args: &SweepArgs, title: &str, intro: &[String]) -> Res
         rows: &rows,
         title: title.to_owned(),
         intro: intro.iter().cloned().chain([settings]).collect(),
+        links: links.to_vec(),
         adaptive_offset: adaptive_offset(&runs, &dataset),
         failures: &failures,
     };
-    // Scores do not need the device that the runs had; pictures do.
+    // Images need the device; scores do not.
     let pictures = match open(first) {
         Ok(gpu) => leaderboard.pictures(&runs, &dataset, &gpu)?,
         Err(problem) => {
-            tracing::warn!("{}: no pictures: {problem}", args.out.display());
+            tracing::warn!("{}: no images: {problem}", args.out.display());
             None
         }
     };
@@ -150,7 +157,9 @@ pub(super) fn run_titled(args: &SweepArgs, title: &str, intro: &[String]) -> Res
         writeln!(out, "{:#}", rows.json(&dataset.root, &failures))?;
     } else {
         let tables = [leaderboard.table(), rows.costs()].map(|table| super::table::of(&table));
-        writeln!(out, "{}\n{}", tables.join("\n"), args.out.join("index.html").display())?;
+        writeln!(out, "{}", tables.join("\n"))?;
+        let out = args.out.display();
+        finish(&format!("{out}/index.html, {out}/costs.html"), &format!("open {out}/index.html"))?;
     }
     if let Some(failure) = failures.first() {
         let (failed, all) = (failures.len(), runs.len());
@@ -163,7 +172,7 @@ fn open(config: &TrainConfig) -> crate::Result<Gpu> {
     Gpu::new(&config.device.parse::<DeviceChoice>()?)
 }
 
-/// The points of the grid, each checked as `train` would, and their dataset.
+/// The points of the grid, each checked as in `train`, and their dataset.
 fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
     let lists = [("alpha", &args.alpha), ("beta", &args.beta), (OFFSET, &args.offset)];
     let mut axes = vec![];
@@ -179,20 +188,19 @@ fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
     let shared = &args.options.shared;
     if args.table == Some(Grid::Parts) && shared.iter().any(|it| it == "--model" || it == "--parts")
     {
-        let problem = "--table parts trains every part by itself; leave out --model and --parts \
-                       (lita's L1 alone is --ssim-weight 0)";
+        let problem = "--table parts sets the parts; leave out --model and --parts (--ssim-weight 0 has \
+                       the loss of lita)";
         return Err(Error::Usage(problem.to_owned()));
     }
     let points = grid::points(&axes, args.table)?;
-    let (dataset, out) = (absolute(&args.dataset)?, absolute(&args.out)?);
-    let common = Common { dataset: &dataset, shared, out: &out };
+    let (dataset, out) = (absolute(&args.dataset)?, PathBuf::from(absolute(&args.out)?));
     let mut runs: Vec<Run> = vec![];
     for point in points {
-        let run = Run::new(point, common)?;
+        let run = Run::new(point, &dataset, shared, &out)?;
         match runs.iter().find(|other| other.config == run.config) {
             None => runs.push(run),
             Some(other) if args.table.is_some() => {
-                tracing::info!("{} is left out: it is the same run as {}", run.name, other.name);
+                tracing::info!("{} is skipped: it is the same run as {}", run.name, other.name);
             }
             Some(other) => {
                 let (one, other) = (&other.name, &run.name);
@@ -204,8 +212,8 @@ fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
     let first = &runs[0].config;
     let dataset = Dataset::load(&first.dataset, &diagnosed(first))?;
     if !dataset.test_views().any(|view| view.has_reference() || view.has_photograph()) {
-        let problem = "has no held-out view to score; list one in transforms_test.json or test.txt, or add photographs: \
-                       of eight, one is held out";
+        let problem = "has no held-out view to score; list one in transforms_test.json or test.txt, or add \
+         photographs: every eighth is held out";
         return Err(Error::input(&dataset.root, problem));
     }
     if !dataset.train_views().any(|view| view.depth.is_some()) {
@@ -214,10 +222,10 @@ fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
     Ok((runs, dataset))
 }
 
-/// Takes a folder that is empty, holds this sweep or holds nothing that a sweep would replace.
+/// Claims a folder that is empty, has this sweep, or has no file that a sweep would replace.
 ///
 /// # Errors
-/// The folder is taken, or cannot be written.
+/// The folder is in use or cannot be written.
 fn claim(args: &SweepArgs, runs: &[Run]) -> crate::Result<()> {
     let (folder, manifest) = (&args.out, manifest(args, runs)?);
     let path = folder.join("sweep.toml");
@@ -225,25 +233,24 @@ fn claim(args: &SweepArgs, runs: &[Run]) -> crate::Result<()> {
         let found = input::text(&path)?;
         if found != manifest {
             let differs = difference(&found, &manifest);
-            let problem = format!("holds another sweep ({differs}); choose another --out");
+            let problem = format!("contains another sweep ({differs}); choose another --out");
             return Err(Error::output(folder, problem));
         }
         return Ok(());
     }
     let files = leaderboard::FILES.iter().chain(&costs::FILES);
     if let Some(file) = files.into_iter().find(|file| folder.join(file).exists()) {
-        let problem = format!("holds {file}, which no sweep wrote; choose another --out");
+        let problem = format!("contains {file}, which no sweep wrote; choose another --out");
         return Err(Error::output(folder, problem));
     }
     if args.dry_run {
         return Ok(());
     }
-    std::fs::create_dir_all(folder)
-        .map_err(|error| Error::output(folder, format!("cannot be made: {error}")))?;
+    create_folder(folder)?;
     write_whole(&path, manifest.as_bytes())
 }
 
-/// What `sweep.toml` says: the sweep without the values of its lists.
+/// The contents of `sweep.toml`: the sweep without the values of its lists.
 fn manifest(args: &SweepArgs, runs: &[Run]) -> crate::Result<String> {
     #[derive(Serialize)]
     struct Manifest<'a> {
@@ -260,7 +267,7 @@ fn manifest(args: &SweepArgs, runs: &[Run]) -> crate::Result<String> {
     toml::to_string(&manifest).map_err(|error| Error::Usage(error.to_string()))
 }
 
-/// A sentence on what the runs are, and what all were given.
+/// A sentence on the number of runs and their common options.
 fn settings(runs: &[Run], seeds: &[String], shared: &[String]) -> String {
     let mut steps: Vec<u64> = runs.iter().map(|run| run.config.steps).collect();
     steps.sort_unstable();
@@ -269,9 +276,7 @@ fn settings(runs: &[Run], seeds: &[String], shared: &[String]) -> String {
     let mut text = format!("{} runs of {} steps", runs.len(), steps.join(" or "));
     if seeds.len() > 1 {
         let seeds = seeds.join(", ");
-        text += &format!(
-            "; scores are means over the seeds {seeds}, and bars their least and greatest"
-        );
+        text += &format!("; scores are means over the seeds {seeds}, and bars their range");
     }
     if !shared.is_empty() {
         text += &format!("; all with {}", shared.join(" "));
@@ -279,10 +284,10 @@ fn settings(runs: &[Run], seeds: &[String], shared: &[String]) -> String {
     text + ". The folder of each run has its config.toml."
 }
 
-/// delta0, the mean over the training views, where the sweep has the adaptive black level.
+/// Mean delta0 over the training views, if the sweep has the adaptive black level.
 fn adaptive_offset(runs: &[Run], dataset: &Dataset) -> Option<f64> {
     let run = runs.iter().find(|run| run.point.value(OFFSET) == Some(ADAPTIVE))?;
-    // Those that can be read: what cannot is said where it is trained on.
+    // Unreadable photographs are reported by the training.
     let images = dataset.train_views().filter_map(|view| view.loaded().ok().flatten());
     let offsets: Vec<f64> =
         images.map(|image| run.config.tone.offset(Statistics::of(&image.data).ratio())).collect();

@@ -1,31 +1,32 @@
-//! `nightsplat synth`: write a small dark multi-view set with known references.
+//! `nightsplat synth`: writes a small dark multi-view dataset with references.
 
 use std::path::PathBuf;
 
+use super::{finish, word};
+use crate::Error;
 use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
-use crate::{Error, Result};
 
-/// Write a small dark multi-view set, made from an analytic scene, in the layout of the LOM benchmark.
+/// Write a small dark multi-view dataset of an analytic scene, with references, in the layout of LOM.
 #[derive(Clone, Debug, clap::Args)]
 pub struct SynthArgs {
-    /// The folder to write to; made if it does not exist.
+    /// Folder to write to
     pub dir: PathBuf,
-    /// Photographs; every 8th is for testing.
+    /// Number of photographs; every 8th is a test view
     #[arg(long, default_value_t = SyntheticOptions::default().views)]
     pub views: usize,
-    /// Pixels per row.
+    /// Width, pixels
     #[arg(long, default_value_t = SyntheticOptions::default().width)]
     pub width: u32,
-    /// Rows.
+    /// Height, pixels
     #[arg(long, default_value_t = SyntheticOptions::default().height)]
     pub height: u32,
-    /// Changes the textures, the noise and the sampled points.
+    /// Seed of textures, noise and sampled points
     #[arg(long, default_value_t = SyntheticOptions::default().seed)]
     pub seed: u64,
-    /// Take the photographs with a fisheye (`OPENCV_FISHEYE`) that sees 130 degrees across the longer side
+    /// Use a fisheye lens (`OPENCV_FISHEYE`) of 130 degrees across the longer side
     #[arg(long)]
     pub fisheye: bool,
-    /// Write into a folder that is not empty; files of the same names are replaced.
+    /// Write into a folder that is not empty, replacing files of the same names
     #[arg(long)]
     pub overwrite: bool,
 }
@@ -34,13 +35,14 @@ pub struct SynthArgs {
 ///
 /// # Errors
 /// [`Error::Output`] where the folder is not empty and `--overwrite` is not given, and those of [`synthetic::write`].
-pub fn run(args: SynthArgs) -> Result<()> {
+pub fn run(args: SynthArgs) -> anyhow::Result<()> {
     let SynthArgs { dir, views, width, height, seed, fisheye, overwrite } = args;
     let is_empty = std::fs::read_dir(&dir).map_or(true, |mut entries| entries.next().is_none());
     if !is_empty && !overwrite {
-        return Err(Error::output(dir, "is not empty; choose another folder or pass --overwrite"));
+        let problem = "is not empty; choose another folder or pass --overwrite";
+        return Err(Error::output(dir, problem).into());
     }
     synthetic::write(&dir, &SyntheticOptions { views, width, height, seed, fisheye })?;
-    tracing::info!("{views} views of {width}x{height} are in {}", dir.display());
-    Ok(())
+    let wrote = format!("{}: {views} views of {width}x{height}", dir.display());
+    finish(&wrote, &format!("nightsplat train {} --out run", word(&dir)))
 }

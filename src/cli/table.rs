@@ -3,7 +3,7 @@
 use crate::base::output::printable;
 use crate::results::report::{Column, Table};
 
-/// A table of the report, as the terminal shows it.
+/// A table of the report as text.
 pub(super) fn of(table: &Table) -> String {
     let Table { label, columns, rows, .. } = table;
     let mut lines = vec![vec![label.clone()]];
@@ -18,7 +18,7 @@ pub(super) fn of(table: &Table) -> String {
     aligned(&lines)
 }
 
-/// The rows with their columns aligned: the first to the left, the others to the right.
+/// The rows with aligned columns: the first to the left, the others to the right.
 pub(super) fn aligned(rows: &[Vec<String>]) -> String {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let cell_width = |row: &Vec<String>, column: usize| {

@@ -1,4 +1,4 @@
-//! `nightsplat tone`: the tone curves there are, what one makes of photographs, and curves of one's own.
+//! `nightsplat tone`: lists tone curves, applies one to photographs, or fits one to pairs of photographs.
 
 use std::ffi::OsString;
 
@@ -19,13 +19,12 @@ pub struct ToneArgs {
 }
 
 #[derive(Clone, Debug, clap::Subcommand)]
-#[command(mut_subcommands = super::defaults::shown)]
 enum Command {
     List(list::ListArgs),
     Apply(Box<apply::ApplyArgs>),
     #[cfg(feature = "fit")]
     Fit(fit::FitArgs),
-    /// What `tone` took before it had subcommands; without the feature, `fit` too.
+    /// Arguments of the former `tone`, without a subcommand; `fit` where the feature is off.
     #[command(external_subcommand)]
     Other(Vec<OsString>),
 }
@@ -37,13 +36,14 @@ enum Command {
 pub fn run(args: &ToneArgs) -> Result<()> {
     match &args.command {
         Command::List(args) => list::run(args),
-        Command::Apply(args) => Ok(apply::run(args)?),
+        Command::Apply(args) => apply::run(args),
         #[cfg(feature = "fit")]
-        Command::Fit(args) => Ok(fit::run(args)?),
+        Command::Fit(args) => fit::run(args),
         Command::Other(words) => {
             let first = words.first().map(|word| word.to_string_lossy()).unwrap_or_default();
             let problem = match first.as_ref() {
-                "fit" => "this build has no `tone fit`; install nightsplat with the feature `fit`, which is on by default"
+                "fit" => "this build has no `tone fit`; install nightsplat with the feature `fit`, which is on \
+                 by default"
                     .to_owned(),
                 photos => format!("`nightsplat tone {photos}` is now `nightsplat tone apply {photos}`"),
             };

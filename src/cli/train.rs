@@ -1,6 +1,5 @@
 //! `nightsplat train`: dark photographs in, a run directory out.
 
-mod facts;
 mod options;
 
 use std::io::Write;
@@ -8,67 +7,77 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 
-use self::facts::Facts;
 pub(crate) use self::options::TrainOptions;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
-use super::signals;
-use crate::base::output::printable;
+use super::{finish, signals, word};
+use crate::base::output::{check_writable, printable};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
 use crate::results::run::{self, IfExists, RunDirectory, RunSummary, Session};
+use crate::results::run_facts::RunFacts;
 use crate::train::diagnose::Plan;
 use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
 
 /// Train a 3D Gaussian Splatting model from dark photographs.
 ///
-/// Each photograph is lifted by a tone curve into the pseudo-GT that supervises training; normal-light reference images,
-/// where the dataset has them, are only ever used for scores. What the model has is decided by looking at the photographs
-/// first (`nightsplat diagnose`), and said; any option wins over that. With --config, or a preset that states it all
-/// (paper, or a benchmark's), nothing is decided.
+/// A tone curve turns each photograph into a pseudo-GT, which supervises training. Reference images in normal light
+/// are used for scores only. Before training, the photographs are measured as in `nightsplat diagnose`, and the model
+/// is chosen from that; options override it. With --config, or a preset that states every setting (paper and the
+/// benchmarks), nothing is chosen.
 ///
-/// SIGINT and SIGTERM save and stop, with exit code 130 or 143, and a second one ends the process at once; SIGUSR1 saves and
-/// goes on. --resume goes on from there to the same bits; where the run is done it does nothing and succeeds.
+/// SIGINT and SIGTERM save a checkpoint and stop, with exit code 130 or 143; a second signal ends the process at
+/// once. SIGUSR1 saves a checkpoint and continues. --resume continues a run to the same bits; on a finished run it
+/// does nothing.
 #[derive(Clone, Debug, clap::Args)]
+#[command(after_help = EXAMPLE)]
 pub struct TrainArgs {
-    /// The dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model in sparse/, as `nightsplat pose` makes one
+    /// Dataset: a folder with transforms*.json (LOM, RealX3D, NeRF) or a COLMAP model, such as `nightsplat pose` writes
     pub dataset: PathBuf,
-    /// The run directory to write: config.toml, model.ply, the networks, train.csv, evals.csv, a checkpoint, metrics.json
+    /// Run directory to write: model.ply, config.toml, metrics.json, train.csv, checkpoints
     #[arg(long, value_name = "RUN")]
     pub out: PathBuf,
-    /// Replace the run that RUN already holds
+    /// Replace an existing run
     #[arg(long)]
     pub overwrite: bool,
-    /// Go on from the checkpoint in RUN, or begin where there is none; the model gets the same bits as in one go. Give the options that the run began with; --steps may be more, --max-gaussians less, and what is logged another
+    /// Continue from the checkpoint in RUN, or start if there is none
+    ///
+    /// Continue from the checkpoint in RUN, or start if there is none; the model gets the same bits as without
+    /// interruption. Repeat the options of the run: only --steps may grow, --max-gaussians shrink, and logging
+    /// change.
     #[arg(long, conflicts_with = "overwrite")]
     pub resume: bool,
-    /// The plan that `nightsplat diagnose --plan` wrote, in place of a diagnosis now; none: no plan, the defaults
+    /// Plan that `nightsplat diagnose --plan` wrote; none: defaults [default: diagnose the photographs]
     #[arg(long, value_name = "FILE|none")]
     pub plan: Option<PathBuf>,
-    /// How to say what the run does [default: a bar on a terminal, else plain]
+    /// Progress output [default: a bar on a terminal, else plain]
     #[arg(long, value_enum, value_name = "FORM")]
     pub progress: Option<ProgressForm>,
-    /// Print every setting with its value, who says it and what it does, and train nothing
+    /// Print every setting, its value and where that comes from; do not train
     #[arg(long)]
     pub explain: bool,
     #[command(flatten)]
     pub(crate) options: TrainOptions,
 }
 
+const EXAMPLE: &str = "Example:
+  nightsplat train photos --out run --preset fast --max-vram 4G";
+
 /// Trains, scores and writes the run directory.
 ///
 /// # Errors
-/// Whatever keeps the run from its end, in one line.
+/// Anything that stops the run.
 pub fn run(args: &TrainArgs) -> Result<()> {
     let mut requested = args.options.requested(&args.dataset)?;
     requested.settings(None)?.config()?.check()?;
+    check_writable(&args.out)?;
     match args.resume {
         true => RunDirectory::check_resumed(&args.out)?,
         false => RunDirectory::check(&args.out, args.overwrite)?,
     }
     let is_resumed = args.resume && args.out.join("config.toml").is_file();
     if is_resumed && args.options.gives("steps") {
-        // The views that it began with stay held out.
+        // The held-out views of the run stay held out.
         let views = i64::try_from(run::load_config(&args.out)?.stop.views)?;
         requested.options.push("stop.views", views.into(), Origin::Run)?;
     }
@@ -95,16 +104,12 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         return print_done(args, steps);
     }
     let form = args.progress.unwrap_or_else(ProgressForm::of_terminal);
-    let is_text = form != ProgressForm::Json;
+    let (is_text, is_quiet) = (form != ProgressForm::Json, form == ProgressForm::None);
     let mut out = std::io::stdout();
-    let facts = Facts::of(&gpu, &config, plan.as_ref(), &dataset);
-    if is_text {
-        write!(
-            out,
-            "{}{}",
-            facts.text(),
-            plan.as_ref().map(diagnose::decisions).unwrap_or_default()
-        )?;
+    let facts = RunFacts::of(&gpu, &config, plan.as_ref(), &dataset);
+    if is_text && !is_quiet {
+        let plan = plan.as_ref().map(diagnose::decisions).unwrap_or_default();
+        write!(out, "{}{plan}", facts.text())?;
     }
     let if_exists =
         if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
@@ -133,23 +138,25 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     if let Some(label) = eval::label(&scored) {
         writeln!(out, "the scores are {label}")?;
     }
-    writeln!(
-        out,
-        "{} steps, {gaussians} Gaussians, {:.0} s -> {}",
-        trainer.steps_done(),
-        spent.seconds,
-        args.out.display()
-    )?;
-    Ok(())
+    let (steps, seconds) = (trainer.steps_done(), spent.seconds);
+    writeln!(out, "{steps} steps, {gaussians} Gaussians, {seconds:.0} s")?;
+    let run = args.out.display();
+    finish(&format!("{run}/model.ply, {run}/metrics.json"), &next(args))
+}
+
+/// The command to run after training.
+fn next(args: &TrainArgs) -> String {
+    let run = word(&args.out);
+    format!("nightsplat export {run} --format html  (then open {run}/model.html)")
 }
 
 fn print_done(args: &TrainArgs, steps: u64) -> Result<()> {
     let done = format!("{} is done: {steps} steps", args.out.display());
-    Ok(writeln!(std::io::stdout(), "{}", printable(&done))?)
+    writeln!(std::io::stdout(), "{}", printable(&done))?;
+    finish("", &next(args))
 }
 
-/// The steps of the run that is to go on, if it is done and the files of its dataset are as they were: nothing is decoded for
-/// that.
+/// The step count of the run to resume if it is finished and the files of its dataset are unchanged. Decodes nothing.
 fn done_by_stamp(
     args: &TrainArgs,
     requested: &RequestedSettings,
@@ -159,7 +166,7 @@ fn done_by_stamp(
     run::done_steps_by_stamp(&args.out, &requested.settings(plan.as_ref())?.config()?)
 }
 
-/// What decides what no option says: a plan where one is named, a run keeps to, or the photographs ask for.
+/// Where settings that no option gives come from: a plan file, a diagnosis, or the defaults.
 fn planning<'a>(args: &TrainArgs, file: Option<&'a Path>, is_resumed: bool) -> PlanSource<'a> {
     match file {
         Some(file) => PlanSource::File(file),
@@ -170,7 +177,7 @@ fn planning<'a>(args: &TrainArgs, file: Option<&'a Path>, is_resumed: bool) -> P
     }
 }
 
-/// What `--overwrite` says.
+/// The effect of `--overwrite`.
 fn overwrite_or_refuse(overwrite: bool) -> IfExists {
     if overwrite { IfExists::Replace } else { IfExists::Refuse }
 }

@@ -1,11 +1,11 @@
-//! What the process may address (`ulimit -v`, `RLIMIT_AS`).
+//! The address space of the process (`ulimit -v`, `RLIMIT_AS`).
 //!
-//! Software devices compile kernels as they are used, and their compilers end a process that is refused memory, by a fault
-//! and without a word. So a limit below which that is certain is an error before the driver is loaded.
+//! Software devices compile kernels on first use, and their compilers crash without a message where memory is refused.
+//! A limit below which that is certain is therefore an error before the driver is loaded.
 
 use crate::{Error, Result};
 
-/// Measured on lavapipe: a tiny run takes this much with two threads; its kernels end in a fault from a tenth less on.
+/// Measured on lavapipe: a tiny run with two threads takes this much; with a tenth less its kernels crash.
 const LEAST: u64 = 1 << 30;
 
 /// # Errors
@@ -15,7 +15,8 @@ pub(super) fn check() -> Result<()> {
         Some(bytes) if bytes < LEAST => {
             let (has, needs) = (bytes >> 20, LEAST >> 20);
             let problem = format!(
-                "this process may address {has} MiB alone, a Vulkan driver needs {needs} MiB beside the data; raise `ulimit -v`"
+                "this process may address {has} MiB alone, a Vulkan driver needs {needs} MiB \
+             beside the data; raise `ulimit -v`"
             );
             Err(Error::NoDevice(problem))
         }

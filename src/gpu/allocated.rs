@@ -1,4 +1,4 @@
-//! Vulkan buffers with the memory behind them.
+//! Vulkan buffers and their memory.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -11,7 +11,7 @@ use super::limits::whole_quads;
 use super::{Bound, Retired, Shared, lock};
 use crate::{Error, Result};
 
-/// A Vulkan buffer and the memory behind it.
+/// A Vulkan buffer and its memory.
 #[derive(Debug)]
 pub(super) struct DeviceMemory {
     pub(super) shared: Arc<Shared>,
@@ -90,7 +90,7 @@ impl DeviceMemory {
         self.raw
     }
 
-    /// From its begin.
+    /// From its start.
     pub(super) fn bound(&self) -> Bound {
         Bound { raw: self.raw, offset: 0, size: vk::WHOLE_SIZE }
     }
@@ -100,7 +100,7 @@ impl Drop for DeviceMemory {
     fn drop(&mut self) {
         if let Some(allocation) = self.allocation.take() {
             self.shared.retire(Retired::Buffer(self.raw, allocation));
-            // Without work in flight nothing else would come by to free it.
+            // Without work in flight nothing else would free it.
             if self.shared.last_use.load(Ordering::Acquire) == 0 {
                 self.shared.collect(0);
             }

@@ -86,7 +86,7 @@ impl Gpu {
         self.uninit_in_windows(name, len)
     }
 
-    /// The same where passes bind windows alone: only memory limits its length.
+    /// The same for a buffer of which passes bind windows alone: only memory limits its length.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -100,7 +100,7 @@ impl Gpu {
         Ok(Buffer { memory, len, element: PhantomData })
     }
 
-    /// A buffer of `len` elements of zero bits.
+    /// A buffer of `len` zeroed elements.
     ///
     /// # Errors
     /// The buffer exceeds the binding limit or the memory of the device, or the device was lost.
@@ -108,7 +108,7 @@ impl Gpu {
         self.zeroed(self.uninit(name, len)?)
     }
 
-    /// A buffer with zero bits in the place of what it held.
+    /// Zeroes a buffer.
     ///
     /// # Errors
     /// The device was lost.
@@ -131,7 +131,7 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// Overwrites the first elements of a buffer, or of a slice of one, with `data` and waits until that is done.
+    /// Overwrites the first elements of a buffer, or of a slice of one, with `data`; blocks until that is done.
     ///
     /// # Errors
     /// `data` is longer than the buffer, or the device is out of memory or lost.

@@ -1,4 +1,4 @@
-//! What the device made of a pass against what the CPU reference makes of it.
+//! The result of a pass on the device against that of its CPU reference.
 
 use std::fmt;
 
@@ -7,40 +7,40 @@ use crate::{Error, Result};
 /// The relative error of one rounding to single precision.
 const ROUNDING: f64 = f32::EPSILON as f64 / 2.0;
 
-/// How far the 32-bit numbers of a buffer may be from the reference's.
+/// The allowed difference between the 32-bit numbers of a buffer and the reference's.
 ///
-/// Two NaNs agree, as do two zeros; a NaN on one side only differs. Vulkan lets a device flush numbers below the smallest
-/// normal one to zero, so wherever floats need not be exact that much is allowed beside.
+/// Two NaNs agree, as do two zeros; a NaN on one side only is a difference. Vulkan lets a device flush subnormal
+/// numbers to zero, so wherever floats need not be exact that much is allowed as well.
 #[derive(Clone, Debug, Default)]
 pub enum Tolerance {
-    /// Not at all: integers, copies, and what IEEE 754 rounds alike everywhere.
+    /// None: integers, copies, and operations that IEEE 754 rounds correctly.
     #[default]
     Exact,
-    /// So many roundings of the expected number.
+    /// This number of roundings of the expected number.
     Roundings(f64),
-    /// A bound for each number; the numbers beyond the list are exact.
+    /// A bound for each number; numbers beyond the list are exact.
     Each(Vec<f64>),
-    /// Two 16-bit floats in a word, each the reference's or a neighbour of it.
+    /// Two 16-bit floats in a word, each equal to the reference's or adjacent to it.
     Halves,
-    /// One partial sum per workgroup, of which only the sum counts: how it is parted is the device's choice.
+    /// One partial sum per workgroup, of which only the total counts: the device chooses the partition.
     Sum(f64),
 }
 
-/// What one pass of a checked recording did.
+/// The result of one pass of a checked recording.
 #[derive(Clone, Debug)]
 pub struct CheckedPass {
-    /// What was recorded: the label of the submission.
+    /// The label of the submission.
     pub recording: String,
     /// The kernel.
     pub kernel: &'static str,
-    /// The largest error, in units of what is allowed: at most 1 where the pass agrees. None where the pass was not
+    /// The largest error, in units of the bound: at most 1 where the pass agrees. `None` where the pass was not
     /// compared, because it works on counts or indices that differ already.
     pub error: Option<f64>,
     /// The first number that differs.
     pub difference: Option<Difference>,
 }
 
-/// A number of which device and reference differ by more than roundings explain.
+/// A number that differs by more than roundings explain.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Difference {
     /// The pass, counted from 0 in its report.
@@ -49,15 +49,15 @@ pub struct Difference {
     pub kernel: &'static str,
     /// The buffer, as the shader calls it.
     pub buffer: &'static str,
-    /// The place among the buffer's 32-bit numbers; of the sum of partial sums 0.
+    /// The index among the buffer's 32-bit numbers; 0 for the total of partial sums.
     pub index: usize,
-    /// What the device left there.
+    /// The device's value.
     pub device: f64,
-    /// What the reference left there.
+    /// The reference's value.
     pub reference: f64,
-    /// How far they may be apart.
+    /// The allowed difference.
     pub bound: f64,
-    /// How many numbers of the buffer differ.
+    /// The number of elements of the buffer that differ.
     pub count: usize,
 }
 
@@ -72,20 +72,20 @@ impl fmt::Display for Difference {
     }
 }
 
-/// Every pass of the recordings that were checked, in order.
+/// All passes of the checked recordings, in order.
 #[derive(Clone, Debug, Default)]
 pub struct CheckReport {
-    /// In the order in which they ran.
+    /// In order of execution.
     pub passes: Vec<CheckedPass>,
 }
 
 impl CheckReport {
-    /// Where device and reference first differ; nowhere on a sound device.
+    /// The first difference between device and reference; `None` on a sound device.
     pub fn first_difference(&self) -> Option<&Difference> {
         self.passes.iter().find_map(|pass| pass.difference.as_ref())
     }
 
-    /// Takes over the passes of a later report.
+    /// Appends the passes of a later report.
     pub fn extend(&mut self, later: Self) {
         let before = self.passes.len();
         self.passes.extend(later.passes.into_iter().map(|mut pass| {
@@ -104,7 +104,7 @@ impl CheckReport {
         }
     }
 
-    /// Each kernel once, in the order of its first pass, with how often it ran and its largest error.
+    /// Each kernel once, in the order of its first pass, with its number of passes and its largest error.
     pub fn kernels(&self) -> Vec<(&'static str, usize, f64)> {
         let mut kernels: Vec<(&'static str, usize, f64)> = vec![];
         for pass in &self.passes {
@@ -119,7 +119,7 @@ impl CheckReport {
     }
 }
 
-/// A buffer before the pass, as the device left it, and as the reference did.
+/// A buffer before the pass, and after it on the device and in the reference.
 pub(super) struct Versions<'a> {
     pub(super) before: &'a [u32],
     pub(super) device: &'a [u32],
@@ -127,7 +127,7 @@ pub(super) struct Versions<'a> {
     pub(super) is_float: bool,
 }
 
-/// How the numbers of a buffer compare: the largest error in units of its bound, and the first that exceeds it.
+/// The comparison of a buffer's numbers: the largest error in units of its bound, and the first that exceeds it.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Comparison {
     pub(super) error: f64,
@@ -137,7 +137,7 @@ pub(super) struct Comparison {
 }
 
 impl Versions<'_> {
-    /// `workgroups` says how many partial sums there are.
+    /// `workgroups` is the number of partial sums.
     pub(super) fn compare(&self, tolerance: &Tolerance, workgroups: usize) -> Comparison {
         let number = |word: u32| {
             if self.is_float { f64::from(f32::from_bits(word)) } else { f64::from(word) }
@@ -177,7 +177,7 @@ impl Versions<'_> {
     }
 }
 
-/// Of two words with two halves each those that are farther apart, by their places among all halves in order.
+/// Of two words with two halves each, the pair of halves that is farther apart, by index among all halves.
 fn farthest_halves(device: u32, reference: u32) -> (f64, f64) {
     let place = |half: u32| {
         let bits = half & 0x7fff;
@@ -193,7 +193,7 @@ fn farthest_halves(device: u32, reference: u32) -> (f64, f64) {
     if (low.0 - low.1).abs() > (high.0 - high.1).abs() { low } else { high }
 }
 
-/// What `count` numbers can lose where the device flushes subnormal ones.
+/// The error of `count` numbers that a device flushes to zero.
 fn flushed(count: usize) -> f64 {
     count as f64 * f64::from(f32::MIN_POSITIVE)
 }

@@ -1,7 +1,8 @@
-//! Checked recordings: every pass alone, and what it leaves against what its CPU reference makes of the same buffers.
+//! Checked recordings: each pass runs alone, and its result is compared with that of its CPU reference on the same
+//! buffers.
 //!
-//! A pass works on what the device made of the passes before it, so a difference is named where it arises. Slow, and
-//! meant to be: it is for tests, `nightsplat check` and drivers.
+//! A pass works on the device's results of earlier passes, so a difference is reported where it arises. This is slow by
+//! design: it is for tests, `nightsplat check` and drivers.
 
 use std::collections::HashMap;
 use std::sync::atomic::Ordering;
@@ -48,15 +49,15 @@ pub(super) struct Checked<'g> {
     pool: vk::CommandPool,
     recording: &'g str,
     report: CheckReport,
-    /// An integer differs: whoever takes it for an index may leave its buffers.
+    /// An integer differs: a kernel that uses it as an index may leave its buffers.
     has_wrong_integers: bool,
 }
 
 impl Gpu {
-    /// Does `work`, and checks every pass that it submits to this device from this thread: runs it alone and compares
-    /// all that it writes with what its reference makes of the same buffers. The device's results stay, so whatever is
-    /// done comes out as it would unchecked, bit for bit. What a host records itself ([`Gpu::record_into`]) and what is
-    /// profiled is not checked.
+    /// Runs `work` and checks every pass that this thread submits to this device meanwhile: each runs alone, and all
+    /// that it writes is compared with its reference on the same buffers. The device's results are kept, so the outcome
+    /// is that of an unchecked run, bit for bit. Not checked: recordings of a host ([`Gpu::record_into`]) and profiled
+    /// ones.
     pub fn checked<R>(&self, work: impl FnOnce() -> R) -> (R, CheckReport) {
         let scope = CheckedScope { checks: &self.shared.checks, outer: self.shared.checks.take() };
         scope.checks.put(CheckReport::default());
@@ -65,10 +66,10 @@ impl Gpu {
     }
 }
 
-/// While it lives, this thread's submissions are checked; also where the work panics, checking ends with it.
+/// While it lives, this thread's submissions are checked; a panic of the work ends that too.
 struct CheckedScope<'a> {
     checks: &'a Checks,
-    /// The report of the work around it.
+    /// The report of an enclosing check.
     outer: Option<CheckReport>,
 }
 
@@ -92,8 +93,8 @@ impl Drop for CheckedScope<'_> {
 }
 
 impl Shared {
-    /// Records and runs every pass on its own; gives the timeline value of the last. Whatever comes of it, what ran is
-    /// in the report.
+    /// Records and runs each pass on its own; returns the timeline value of the last. On failure too, the report has
+    /// the passes that ran.
     pub(super) fn record_checked(
         self: &Arc<Self>,
         queue: &Queue,
@@ -111,7 +112,7 @@ impl Shared {
 }
 
 impl Checked<'_> {
-    /// Records and runs; gives the timeline value of the last submission.
+    /// Records and runs; returns the timeline value of the last submission.
     fn run(&mut self, shared: &Arc<Shared>, value: u64, record: Record<'_>) -> Result<u64> {
         let mut recorder = Recorder::new(shared, shared.begin(self.pool)?, value, None);
         recorder.observer = Some(self);
@@ -171,8 +172,8 @@ impl PassObserver for Checked<'_> {
         Ok(())
     }
 
-    /// Submits what is recorded, waits for it, and begins anew. Under the pass's name: should the device be lost, it is
-    /// known where.
+    /// Submits the recording so far, waits for it, and starts a new one under the pass's name, so that a lost device is
+    /// attributed to it.
     fn run_recorded(&mut self, recorder: &mut Recorder<'_>, pass: &str) -> Result<()> {
         let shared = recorder.shared();
         recorder.finish();

@@ -1,7 +1,7 @@
-//! Which of a machine's devices is used: what the user asks for, and what a scheduler's variables leave visible.
+//! Device selection: the user's choice, and the devices that a scheduler's variables leave visible.
 //!
-//! Schedulers hand out GPUs by `CUDA_VISIBLE_DEVICES`, `ROCR_VISIBLE_DEVICES` and `HIP_VISIBLE_DEVICES`, which Vulkan does not
-//! read: without this, every job of a node would land on its first GPU.
+//! Schedulers assign GPUs by `CUDA_VISIBLE_DEVICES`, `ROCR_VISIBLE_DEVICES` and `HIP_VISIBLE_DEVICES`, which Vulkan
+//! ignores: without this module every job of a node would run on its first GPU.
 
 use std::fmt;
 use std::str::FromStr;
@@ -16,13 +16,13 @@ pub enum DeviceChoice {
     /// that `CUDA_VISIBLE_DEVICES`, `ROCR_VISIBLE_DEVICES` and `HIP_VISIBLE_DEVICES` leave, in their order.
     #[default]
     Best,
-    /// By position in [`devices`](super::devices), whatever the variables say; so are all below.
+    /// By index in [`devices`](super::devices). This choice and those below ignore the variables.
     Index(usize),
-    /// By a part of the name, in any case of letters.
+    /// By a part of the name, case-insensitive.
     Name(String),
     /// By the first digits of `VkPhysicalDeviceIDProperties::deviceUUID`: lower-case hexadecimal, without dashes.
     Uuid(String),
-    /// By where it sits on the PCI bus.
+    /// By PCI address.
     Pci(PciAddress),
     /// A software device.
     Cpu,
@@ -31,8 +31,8 @@ pub enum DeviceChoice {
 impl FromStr for DeviceChoice {
     type Err = Error;
 
-    /// A number is an index, `uuid:`, `pci:` and `cpu` what they say, an empty text the best device, and anything else a
-    /// part of the name.
+    /// A number is an index; `uuid:`, `pci:` and `cpu` are those choices; an empty text is the best device; anything
+    /// else is a part of the name.
     fn from_str(text: &str) -> Result<Self> {
         if let Some(uuid) = text.strip_prefix("uuid:") {
             let problem = || {
@@ -55,7 +55,7 @@ impl FromStr for DeviceChoice {
 }
 
 impl fmt::Display for DeviceChoice {
-    /// As in a sentence that says that there is no such device.
+    /// Completes "there is no Vulkan device".
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Best => f.write_str("at all"),
@@ -68,7 +68,7 @@ impl fmt::Display for DeviceChoice {
     }
 }
 
-/// The digits of a UUID, or of its beginning, with or without dashes and the `GPU-` of NVIDIA's tools.
+/// The digits of a UUID or of a prefix of one, with or without dashes and the `GPU-` of NVIDIA's tools.
 fn uuid_digits(text: &str) -> Option<String> {
     let text = text.to_lowercase();
     let digits = text.strip_prefix("gpu-").unwrap_or(&text).replace('-', "");
@@ -76,27 +76,27 @@ fn uuid_digits(text: &str) -> Option<String> {
     is_uuid.then_some(digits)
 }
 
-/// What a scheduler says by variables that Vulkan does not read.
+/// The variables of schedulers, which Vulkan does not read.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct SchedulerVariables {
-    /// `CUDA_VISIBLE_DEVICES`: of NVIDIA's devices, numbers and UUIDs.
+    /// `CUDA_VISIBLE_DEVICES`: indices and UUIDs of NVIDIA devices.
     cuda: Option<String>,
-    /// `CUDA_DEVICE_ORDER`: what the numbers count.
+    /// `CUDA_DEVICE_ORDER`: what the indices count.
     cuda_order: Option<String>,
-    /// `ROCR_VISIBLE_DEVICES`: of AMD's devices, numbers and UUIDs.
+    /// `ROCR_VISIBLE_DEVICES`: indices and UUIDs of AMD devices.
     rocr: Option<String>,
-    /// `HIP_VISIBLE_DEVICES`: numbers among those that `ROCR_VISIBLE_DEVICES` leaves.
+    /// `HIP_VISIBLE_DEVICES`: indices into those that `ROCR_VISIBLE_DEVICES` leaves.
     hip: Option<String>,
 }
 
-/// The device that is used.
+/// The selected device.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct SelectedDevice {
-    /// Its position.
+    /// Its index.
     pub(crate) index: usize,
-    /// The variables that picked it, if any did, and what they count.
+    /// The variables that selected it, if any, and what they count.
     pub(crate) reason: Option<String>,
-    /// The variables' numbers may mean other devices.
+    /// The variables' indices may mean other devices.
     pub(crate) is_doubtful: bool,
 }
 
@@ -114,8 +114,8 @@ impl SchedulerVariables {
         }
     }
 
-    /// The device that `choice` means. Where it is the best and none meets all requirements, the first, to be named with
-    /// what it lacks.
+    /// The device of a choice. Where it is the best and none meets all requirements, the first, so that an error can
+    /// name what it lacks.
     ///
     /// # Errors
     /// There is no such device, or the variables name one that Vulkan does not have, or leave none.
@@ -160,7 +160,8 @@ impl SchedulerVariables {
             return Err(no_such_device(&format!("{set} leaves no device"), devices));
         };
         let counted = if is_doubtful {
-            ", counted along the PCI bus; CUDA counts the fastest first unless CUDA_DEVICE_ORDER=PCI_BUS_ID: set that, or name UUIDs"
+            ", counted along the PCI bus; CUDA counts the fastest first unless CUDA_DEVICE_ORDER=PCI_BUS_ID: \
+                       set that, or name UUIDs"
         } else {
             ""
         };
@@ -168,8 +169,8 @@ impl SchedulerVariables {
         Ok(SelectedDevice { index, reason, is_doubtful })
     }
 
-    /// The devices that the variables name, in their order; where they name none, all that they do not hide. And whether
-    /// they may mean others.
+    /// The devices that the variables name, in their order, else all that they do not hide; and whether the variables
+    /// may mean others.
     fn visible(&self, devices: &[DeviceReport]) -> Result<(Vec<usize>, bool)> {
         let nvidia =
             VisibleDevices::new("CUDA_VISIBLE_DEVICES", of_vendor(devices, NVIDIA), devices)
@@ -183,7 +184,8 @@ impl SchedulerVariables {
             (rocr, _) => rocr,
         };
         let vendors = [(NVIDIA, nvidia), (AMD, amd)];
-        // Some schedulers set the variables of every vendor: one without devices matters where no other names any.
+        // Some schedulers set the variables of all vendors: one that names no device matters only where no other names
+        // any.
         let is_answered = vendors.iter().any(|(_, named)| {
             named.as_ref().is_ok_and(|named| named.is_narrowed && !named.devices.is_empty())
         });
@@ -209,8 +211,8 @@ impl SchedulerVariables {
         Ok((named, is_doubtful))
     }
 
-    /// Whether a number may mean another device to CUDA: it counts the fastest first unless told otherwise, which among
-    /// equal devices is the order of the bus.
+    /// Whether an index may mean another device to CUDA: by default it counts the fastest first, which among equal
+    /// devices is bus order.
     fn cuda_counts_otherwise(&self, devices: &[DeviceReport]) -> bool {
         let of_vendor: Vec<_> =
             of_vendor(devices, NVIDIA).into_iter().map(|index| &devices[index]).collect();
@@ -222,11 +224,11 @@ impl SchedulerVariables {
     }
 }
 
-/// What is left of a vendor's devices.
+/// The visible devices of a vendor.
 struct VisibleDevices<'a> {
     variable: &'static str,
     devices: Vec<usize>,
-    /// By a variable.
+    /// The variable.
     is_narrowed: bool,
     all: &'a [DeviceReport],
 }
@@ -236,7 +238,7 @@ impl<'a> VisibleDevices<'a> {
         Self { variable, devices, is_narrowed: false, all }
     }
 
-    /// Those of the devices that the variable's list names; all where it is not set.
+    /// Those of the devices that the variable lists; all where it is not set.
     fn narrow(self, list: Option<&str>) -> Result<Self> {
         let Some(list) = list.map(str::trim) else { return Ok(self) };
         let is_none = ["", "-1", "NoDevFiles"].contains(&list);
@@ -266,7 +268,7 @@ impl<'a> VisibleDevices<'a> {
     }
 }
 
-/// A vendor's devices in the order of the bus; those of unknown place behind them.
+/// A vendor's devices in bus order; those without a known address last.
 fn of_vendor(devices: &[DeviceReport], vendor: u32) -> Vec<usize> {
     let mut indices: Vec<_> = (0..devices.len()).filter(|&i| devices[i].vendor == vendor).collect();
     indices.sort_by_key(|&index| (devices[index].pci.is_none(), devices[index].pci));
@@ -330,7 +332,7 @@ mod tests {
         SchedulerVariables { cuda, cuda_order: Some("PCI_BUS_ID".to_owned()), rocr, hip }
     }
 
-    /// The name of the device that is picked, or what is said instead.
+    /// The name of the selected device, or the error message.
     fn best(variables: &SchedulerVariables, devices: &[DeviceReport]) -> String {
         match variables.pick(&DeviceChoice::Best, devices) {
             Ok(picked) => devices[picked.index].name.clone(),

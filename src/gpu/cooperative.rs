@@ -1,11 +1,11 @@
-//! Cooperative matrices of 16 bits: an option, which a device of our own gets where it offers it.
+//! Cooperative matrices of 16 bits: optional, enabled on an own device that supports them.
 
 use ash::{khr, vk};
 
 use super::supported::Supported;
 
-/// Rows of the first factor, columns of the second, and what both share, of the products that kernels build on:
-/// 16-bit factors, sums in single precision, a subgroup's work.
+/// The shape of the matrix products that kernels use, rows x columns x shared side: 16-bit factors, sums in single
+/// precision, one subgroup each.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 pub struct CooperativeMatrix {
     /// Rows of the first factor and of the sum.
@@ -22,7 +22,7 @@ const MAX_SIDE: u32 = 16;
 /// The extension a device is created with to use [`CooperativeMatrix`].
 pub(super) const EXTENSION: &std::ffi::CStr = khr::cooperative_matrix::NAME;
 
-/// The largest product that the device offers; none without the extension or one of the features it needs.
+/// The largest product that the device supports; `None` without the extension or one of the features it needs.
 pub(super) fn supported(
     entry: &ash::Entry,
     instance: &ash::Instance,
@@ -60,7 +60,7 @@ pub(super) fn supported(
                 && [shape.c_type, shape.result_type] == [single; 2]
                 && shape.scope == vk::ScopeKHR::SUBGROUP
                 && [shape.m_size, shape.n_size, shape.k_size].iter().all(|&side| side <= MAX_SIDE)
-                // A matrix begins at a multiple of sixteen bytes, whichever of its sides lies along the memory.
+                // A matrix starts at a multiple of sixteen bytes, whichever of its sides is contiguous.
                 && [shape.m_size, shape.n_size, shape.k_size].iter().all(|&side| side % 8 == 0)
         })
         .map(|shape| CooperativeMatrix { m: shape.m_size, n: shape.n_size, k: shape.k_size })

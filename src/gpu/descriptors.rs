@@ -1,4 +1,4 @@
-//! How a pass is given its buffers: descriptors are pushed into the recording, or where a device cannot, written to sets.
+//! Binding the buffers of a pass: descriptors are pushed into the recording or, where a device cannot, written to sets.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use super::pipeline::Objects;
 use super::{Bound, Retired, Shared};
 use crate::Result;
 
-/// What a device takes.
+/// How a device takes descriptors.
 pub(super) enum Descriptors {
     Pushed(khr::push_descriptor::Device),
     InSets,
@@ -35,16 +35,16 @@ impl Descriptors {
     }
 }
 
-/// The sets of one recording; none where descriptors are pushed.
+/// The sets of one recording; empty where descriptors are pushed.
 #[derive(Debug)]
 pub(super) struct Sets {
     shared: Arc<Shared>,
     pools: Vec<vk::DescriptorPool>,
-    /// In the last pool.
+    /// Sets left in the last pool.
     left: u32,
 }
 
-/// Sets of a pool, each with room for [`MAX_BUFFERS`].
+/// Sets of a pool, each of [`MAX_BUFFERS`] descriptors.
 const SETS_OF_A_POOL: u32 = 64;
 
 impl Sets {
@@ -104,7 +104,7 @@ impl Sets {
         Ok(())
     }
 
-    /// A set that nothing was written to.
+    /// An unwritten set.
     fn next(&mut self, layout: vk::DescriptorSetLayout) -> Result<vk::DescriptorSet> {
         let shared = &self.shared;
         if self.left == 0 {

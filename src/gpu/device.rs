@@ -34,8 +34,9 @@ use crate::{Error, Result};
 
 /// A device that a host application lends, as raw handles, so that C++ hosts and other Vulkan bindings work.
 ///
-/// The host must have enabled [`required_device_features`] on the device, had better enable `VK_KHR_push_descriptor` where
-/// there is one, as passes are recorded faster then, and keeps device, instance and queue alive for as long as the [`Gpu`] and everything made with it.
+/// The host must have enabled [`required_device_features`] on the device. It should enable `VK_KHR_push_descriptor`
+/// where that is supported, which makes recording faster. It keeps device, instance and queue alive for as long as the
+/// [`Gpu`] and everything made with it.
 #[derive(Clone, Copy, Debug)]
 pub struct HostDevice {
     /// The address of `vkGetInstanceProcAddr` of the host's loader.
@@ -71,7 +72,7 @@ impl Gpu {
         Self::open(choice, validate, true)
     }
 
-    /// Opens a device with validation and synchronization validation; its tiles are the built-in ones.
+    /// Opens a device with validation and synchronization validation; its tile sizes are the built-in ones.
     ///
     /// # Errors
     /// As [`Gpu::new`], or the validation layer is not installed.
@@ -96,7 +97,9 @@ impl Gpu {
             let OwnedInstance { entry, instance, .. } = &owned;
             let properties = Properties {
                 cooperative_matrix: cooperative::supported(entry, instance, physical, &supported),
-                has_maximal_reconvergence: reconvergence::supported(instance, physical, &supported),
+                has_uniform_subgroup_control_flow: reconvergence::supported(
+                    instance, physical, &supported,
+                ),
                 has_pipeline_statistics: has_pipeline_statistics(&supported),
                 ..properties(instance, physical, &supported)?
             };
@@ -116,7 +119,7 @@ impl Gpu {
         }
     }
 
-    /// Takes a device that the host application lends. Nothing of the host's is destroyed, changed or printed to.
+    /// Takes a device that the host application lends. Nothing of the host's is destroyed or changed.
     ///
     /// # Errors
     /// The device lacks a requirement, or `get_instance_proc_addr` is null.
@@ -226,7 +229,7 @@ impl Gpu {
 // ---------------------------------------------------------------------------
 // Physical device
 
-/// The device that is meant, by what the machine's devices and a scheduler's variables say.
+/// The physical device of a choice, with the variables of schedulers.
 fn choose(owned: &OwnedInstance, choice: &DeviceChoice) -> Result<(vk::PhysicalDevice, Supported)> {
     let all = physical_devices(&owned.instance)?;
     let reports =
@@ -277,13 +280,14 @@ fn properties(
         timestamp_period: limits.timestamp_period,
         is_cpu: supported.properties.device_type == vk::PhysicalDeviceType::CPU,
         cooperative_matrix: None,
-        has_maximal_reconvergence: false,
+        has_uniform_subgroup_control_flow: false,
         has_push_descriptors: supported.has_push_descriptors(),
         has_pipeline_statistics: false,
     })
 }
 
-/// Mesa's software device ends all loops of an invocation after so many turns in total (`LP_MAX_TGSI_LOOP_ITERATIONS`).
+/// Mesa's software device ends all loops of an invocation after this number of iterations in total
+/// (`LP_MAX_TGSI_LOOP_ITERATIONS`).
 const LLVMPIPE_LOOP_ITERATIONS: u32 = 65_535;
 
 fn create_device(
@@ -320,7 +324,7 @@ fn create_device(
     }
     let mut uniform = vk::PhysicalDeviceShaderSubgroupUniformControlFlowFeaturesKHR::default()
         .shader_subgroup_uniform_control_flow(true);
-    if properties.has_maximal_reconvergence {
+    if properties.has_uniform_subgroup_control_flow {
         extensions.push(reconvergence::EXTENSION.as_ptr());
         info = info.push_next(&mut uniform);
     }
@@ -343,14 +347,14 @@ fn create_device(
     }
 }
 
-/// One file per device and driver, in the user's cache folder.
+/// The pipeline cache: one file per device and driver, in the user's cache folder.
 fn cache_path(supported: &Supported) -> Option<PathBuf> {
     let p = &supported.properties;
     let name = format!("{:x}-{:x}-{:x}.pipelines", p.vendor_id, p.device_id, p.driver_version);
     Some(cache_folder()?.join(name))
 }
 
-/// Ours in the user's.
+/// Our folder in the user's cache folder.
 fn cache_folder() -> Option<PathBuf> {
     let folder = std::env::var_os("XDG_CACHE_HOME")
         .map(PathBuf::from)

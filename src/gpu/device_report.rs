@@ -1,4 +1,4 @@
-//! What `doctor` says of every device.
+//! The report of `doctor` on every device.
 
 use ash::vk;
 
@@ -11,36 +11,36 @@ use super::pci::PciAddress;
 use super::supported::Supported;
 use crate::Result;
 
-/// One device and how it meets the requirements, for `doctor`.
+/// One device and whether it meets the requirements, for `doctor`.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct DeviceReport {
     /// The device's name.
     pub name: String,
     /// discrete, integrated, virtual, software or other.
     pub kind: &'static str,
-    /// Vulkan version.
+    /// The Vulkan version.
     pub api_version: String,
-    /// The vendor's number, as PCI has them.
+    /// The PCI vendor id.
     pub vendor: u32,
-    /// `VkPhysicalDeviceIDProperties::deviceUUID`, which NVIDIA's tools give behind `GPU-`.
+    /// `VkPhysicalDeviceIDProperties::deviceUUID`, which NVIDIA's tools print after `GPU-`.
     pub uuid: String,
-    /// Where it sits on the PCI bus, if it does and says so.
+    /// The PCI address, where the device has one and reports it.
     pub pci: Option<PciAddress>,
-    /// Lanes of a subgroup in our kernels.
+    /// Lanes of a subgroup in the kernels.
     pub subgroup_size: u32,
-    /// What it could be, by `NIGHTSPLAT_SUBGROUP`.
+    /// The sizes that `NIGHTSPLAT_SUBGROUP` accepts.
     pub subgroup_sizes: Vec<u32>,
     /// Bytes of device-local memory.
     pub memory: u64,
-    /// What bounds a scene and a view.
+    /// Limits on scenes and views.
     pub limits: DeviceLimits,
-    /// The matrices that `--denoiser-precision half` builds on, where the device offers any.
+    /// The matrices of `--denoiser-precision half`, where the device supports them.
     pub cooperative_matrix: Option<CooperativeMatrix>,
     /// Every requirement.
     pub requirements: Vec<RequirementReport>,
 }
 
-/// What a device can do at most.
+/// Limits of a device.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
 pub struct DeviceLimits {
     /// Bytes that one storage buffer binding can span.
@@ -51,7 +51,7 @@ pub struct DeviceLimits {
     pub max_workgroups: u32,
     /// Invocations of a workgroup.
     pub max_workgroup_invocations: u32,
-    /// Bytes that a workgroup shares.
+    /// Bytes of shared memory of a workgroup.
     pub max_shared_memory: u32,
     /// Storage buffers that one kernel binds.
     pub max_storage_buffers: u32,
@@ -118,7 +118,7 @@ pub(super) fn report(
         vendor: supported.properties.vendor_id,
         uuid: hyphenated(&supported.uuid),
         pci: supported.pci,
-        // What the variable asks of another device is no matter here.
+        // What the variable requires of another device does not matter here.
         subgroup_size: supported.lanes().unwrap_or(supported.subgroups.own),
         subgroup_sizes: supported.subgroups.all(),
         memory: device_memory(instance, physical),
@@ -147,7 +147,7 @@ pub(super) fn device_memory(instance: &ash::Instance, physical: vk::PhysicalDevi
     local.map(|heap| heap.size).sum()
 }
 
-/// A UUID as everyone writes it.
+/// A UUID in its usual form.
 fn hyphenated(uuid: &[u8; 16]) -> String {
     let hex = |bytes: &[u8]| bytes.iter().map(|byte| format!("{byte:02x}")).collect::<String>();
     let groups = [&uuid[..4], &uuid[4..6], &uuid[6..8], &uuid[8..10], &uuid[10..]];

@@ -1,4 +1,4 @@
-//! Copies of buffers that submissions bring to the host.
+//! Readback of buffers by submissions.
 
 use std::marker::PhantomData;
 
@@ -39,7 +39,8 @@ impl Recorder<'_> {
     /// Copies a buffer, or a slice of one, as it is at this point of the recording to the host.
     ///
     /// # Errors
-    /// The device is out of memory, or the recording is [`Gpu::record_into`]'s: only the host knows when the copy is there.
+    /// The device is out of memory, or the recording is [`Gpu::record_into`]'s: only the host knows when the copy is
+    /// done.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn download<'a, T: bytemuck::Pod>(
         &mut self,
@@ -49,7 +50,7 @@ impl Recorder<'_> {
         self.download_bound(buffer.name(), buffer.bound())
     }
 
-    /// The same for a buffer of which only that is at hand what a pass binds.
+    /// The same for a pass's binding, where the buffer itself is not at hand.
     pub(super) fn download_bound<T: bytemuck::Pod>(
         &mut self,
         name: &str,

@@ -1,7 +1,7 @@
-//! Failures on purpose: the n-th allocation finds no memory, or the device is lost from the n-th submission on.
+//! Injected faults: the n-th allocation finds no memory, or the device is lost from the n-th submission on.
 //!
-//! Tests ask for them of a [`Gpu`](super::Gpu), or by the variable `NIGHTSPLAT_FAULT` of a process (`allocation:17`,
-//! `submission:5`, counted from 1). Nothing else sets it.
+//! Tests inject them into a [`Gpu`](super::Gpu), or into a process by the variable `NIGHTSPLAT_FAULT` (`allocation:17`,
+//! `submission:5`, counted from 1).
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -11,12 +11,12 @@ use crate::{Error, Result};
 
 const VARIABLE: &str = "NIGHTSPLAT_FAULT";
 
-/// What has been counted so far, and where it fails; 0: nowhere.
+/// Counts so far, and the count that fails; 0: none.
 #[derive(Debug, Default)]
 pub(super) struct Faults {
     allocations: AtomicU64,
     failing_allocation: AtomicU64,
-    /// Of the buffers that were asked for, where somebody wants to know.
+    /// The names of the allocated buffers, where a test records them.
     names: Mutex<Option<Vec<String>>>,
     submissions: AtomicU64,
     losing_submission: AtomicU64,
@@ -25,7 +25,7 @@ pub(super) struct Faults {
 
 impl Faults {
     /// # Errors
-    /// [`Error::Usage`] where the variable asks for something that cannot fail.
+    /// [`Error::Usage`] where the variable names another fault.
     pub(super) fn from_environment() -> Result<Self> {
         let faults = Self::default();
         let Ok(text) = std::env::var(VARIABLE) else { return Ok(faults) };
@@ -44,25 +44,25 @@ impl Faults {
         Ok(faults)
     }
 
-    /// Fails the allocation of this number, from now on.
+    /// Fails the allocation with this number, counted from now on.
     pub(super) fn fail_allocation(&self, number: u64) {
         *lock(&self.names) = Some(vec![]);
         self.allocations.store(0, Ordering::Relaxed);
         self.failing_allocation.store(number, Ordering::Relaxed);
     }
 
-    /// Loses the device at the submission of this number, from now on.
+    /// Loses the device at the submission with this number, counted from now on.
     pub(super) fn lose_at_submission(&self, number: u64) {
         self.submissions.store(0, Ordering::Relaxed);
         self.losing_submission.store(number, Ordering::Relaxed);
     }
 
-    /// The buffers that were asked for since one was to fail.
+    /// The buffers that were allocated since a failure was set.
     pub(super) fn allocations(&self) -> Vec<String> {
         lock(&self.names).take().unwrap_or_default()
     }
 
-    /// Counts an allocation; true for the one that is to fail.
+    /// Counts an allocation; true if it is to fail.
     pub(super) fn fails_allocation(&self, name: &str) -> bool {
         if let Some(names) = lock(&self.names).as_mut() {
             names.push(name.to_owned());

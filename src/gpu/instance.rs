@@ -1,4 +1,4 @@
-//! The Vulkan loader, an instance of our own, and the physical devices that it lists.
+//! The Vulkan loader, our instance, and the physical devices that it lists.
 
 use std::ffi::CStr;
 use std::path::PathBuf;
@@ -8,7 +8,7 @@ use ash::{ext, khr, vk};
 use super::validation;
 use crate::{Error, Result};
 
-/// What to install where there is no Vulkan; the same words for a missing loader and a missing driver.
+/// What to install where Vulkan is missing, loader or driver.
 const INSTALL: &str = "install a Vulkan driver, or the software device: on Debian \
      `apt install libvulkan1 mesa-vulkan-drivers`";
 
@@ -55,7 +55,7 @@ impl OwnedInstance {
 
 pub(super) fn loader_error(result: vk::Result) -> Error {
     match result {
-        // The loader's words for no driver at all.
+        // The loader's answer where there is no driver.
         vk::Result::ERROR_INCOMPATIBLE_DRIVER => no_device(),
         _ => Error::NoDevice(format!("Vulkan did not start ({result}): {INSTALL}")),
     }
@@ -101,7 +101,7 @@ pub(super) fn instance(validate: bool) -> Result<OwnedInstance> {
         extensions.extend([ext::debug_utils::NAME, ext::validation_features::NAME]);
     }
     let mut flags = vk::InstanceCreateFlags::empty();
-    // Without it, a loader hides devices that fall short of Vulkan in what we do not use: MoltenVK.
+    // Without it, a loader hides devices that are not fully conformant, such as MoltenVK.
     if instance_has(&entry, khr::portability_enumeration::NAME)? {
         extensions.push(khr::portability_enumeration::NAME);
         flags |= vk::InstanceCreateFlags::ENUMERATE_PORTABILITY_KHR;
@@ -133,7 +133,7 @@ pub(super) fn instance(validate: bool) -> Result<OwnedInstance> {
     }
 }
 
-/// All devices, the most capable kind first; the driver's order within a kind.
+/// All devices, the most capable type first, in the driver's order within a type.
 pub(super) fn physical_devices(instance: &ash::Instance) -> Result<Vec<vk::PhysicalDevice>> {
     // SAFETY: the instance is live.
     let mut all = unsafe { instance.enumerate_physical_devices() }.map_err(loader_error)?;

@@ -1,4 +1,4 @@
-//! What a compute shader tells the host about itself.
+//! What the host knows of a compute shader.
 
 use std::fmt::Debug;
 
@@ -16,7 +16,7 @@ pub struct Binding {
     pub index: u32,
     /// False where the shader says `readonly`.
     pub writable: bool,
-    /// Its 32-bit numbers are floats; else they are integers.
+    /// Its elements are 32-bit floats; else integers.
     pub is_float: bool,
 }
 
@@ -25,20 +25,20 @@ pub struct Binding {
 pub struct Bound {
     /// The Vulkan buffer.
     pub raw: vk::Buffer,
-    /// Where its elements begin, in bytes.
+    /// The offset of its elements, in bytes.
     pub offset: u64,
-    /// Bytes of its elements.
+    /// The size of its elements, in bytes.
     pub size: u64,
 }
 
-/// What Vulkan must know of a compute shader; the same for every type of kernel.
+/// What Vulkan needs to know of a compute shader; the same for every type of kernel.
 #[derive(Debug)]
 pub struct Interface {
-    /// The shader's stem: also its label in captures, timings and errors.
+    /// The stem of the shader's file; also its label in captures, timings and errors.
     pub name: &'static str,
-    /// The module, little-endian words.
+    /// The SPIR-V module, as little-endian words.
     pub spirv: &'static [u8],
-    /// Threads of a workgroup; zero along x stands for the device's subgroup size.
+    /// Threads of a workgroup; 0 along x stands for the device's subgroup size.
     pub workgroup_size: [u32; 3],
     /// The specialization constant that takes the subgroup size, where a workgroup is one subgroup.
     pub subgroup_size_id: Option<u32>,
@@ -48,9 +48,9 @@ pub struct Interface {
     pub params_size: usize,
 }
 
-/// A compute shader and everything the host must know to launch it.
+/// A compute shader and all that the host needs to launch it.
 ///
-/// Implemented by `build.rs` from the SPIR-V; never by hand.
+/// Implemented by `build.rs` from the SPIR-V.
 pub trait Kernel: 'static {
     /// The untyped side.
     const INTERFACE: &'static Interface;
@@ -66,24 +66,24 @@ pub trait Kernel: 'static {
     fn constants(constants: &Self::Constants) -> Vec<(u32, u32)>;
 }
 
-/// What a kernel's buffers are in host memory. Implemented by `build.rs`.
+/// The buffers of a kernel in host memory. Implemented by `build.rs`.
 #[cfg(feature = "check")]
 pub trait OnHost: Kernel {
     /// The buffers in host memory.
     type Slices<'a>;
-    /// How far each buffer that it writes may be from the reference's.
+    /// The allowed difference from the reference, for each buffer that it writes.
     type Tolerances: Default + Into<Vec<Tolerance>>;
     /// The slices whose 32-bit numbers these are, in binding order.
     fn slices(words: &mut [Vec<u32>]) -> Self::Slices<'_>;
 }
 
-/// A kernel that passes can be recorded of: with feature `check` one that has a reference.
+/// A kernel whose passes can be recorded: with feature `check`, one that has a reference.
 #[cfg(feature = "check")]
 pub trait Recordable: Reference {}
 #[cfg(feature = "check")]
 impl<K: Reference> Recordable for K {}
 
-/// A kernel that passes can be recorded of.
+/// A kernel whose passes can be recorded.
 #[cfg(not(feature = "check"))]
 pub trait Recordable: Kernel {}
 #[cfg(not(feature = "check"))]
@@ -91,15 +91,16 @@ impl<K: Kernel> Recordable for K {}
 
 /// The CPU reference of a kernel: same parameters, same buffers, plain loops.
 ///
-/// It takes from a slice what parameters and counts say and nothing else: a buffer may be longer than a view needs, and
-/// what lies beyond is anything.
+/// It reads from a slice what parameters and counts say and no more: a buffer may be longer than a view needs, and its
+/// tail is undefined.
 #[cfg(feature = "check")]
 pub trait Reference: OnHost {
     /// Does to the slices what the kernel does to the buffers.
     fn run(params: &Self::Params, constants: &Self::Constants, slices: Self::Slices<'_>);
 
-    /// How far the kernel's results may be from those of [`Reference::run`] on the same slices: the rounding of single
-    /// precision, and either side of a cutoff where that decides. Exact where a reference does not say otherwise.
+    /// The allowed difference between the kernel's results and those of [`Reference::run`] on the same slices:
+    /// roundings of single precision, and both sides of a cutoff where that decides. Exact unless a reference overrides
+    /// it.
     fn tolerances(
         params: &Self::Params,
         constants: &Self::Constants,

@@ -1,20 +1,20 @@
-//! Numbers that all our kernels keep to, and so every device must.
+//! Limits that all kernels keep to, and so every device must support.
 
 use std::ops::RangeInclusive;
 
 use ash::vk;
 
-/// The most buffers that one pass binds.
+/// The most buffers of one pass.
 pub(super) const MAX_BUFFERS: u32 = 16;
 
-/// The subgroup sizes that our kernels are written for.
+/// The subgroup sizes that the kernels support.
 pub(super) const SUBGROUP_SIZES: RangeInclusive<u32> = 4..=128;
 
-/// Invocations of our largest workgroups.
+/// Invocations of the largest workgroups.
 pub(super) const WORKGROUP: u32 = 256;
 
-/// What is made and bound for so many bytes: Vulkan has no empty buffers, an empty array still binds; and whole quads, for
-/// kernels that read four values at a time.
+/// The allocated and bound size for `bytes`: never empty, as Vulkan has no empty buffers, and whole quads, for kernels
+/// that read four values at a time.
 pub(super) fn whole_quads(bytes: u64) -> u64 {
     bytes.max(1).next_multiple_of(16)
 }

@@ -1,4 +1,4 @@
-//! How much memory there is on a device, what we take of it, and what we may.
+//! Memory of a device: in all, in use, and our limit.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -7,7 +7,8 @@ use gpu_allocator::AllocationSizes;
 
 use super::Gpu;
 
-/// The allocator asks for memory in blocks that begin small and double: a small model takes little, a large one few blocks.
+/// The allocator reserves blocks that start small and double: a small model takes little memory, a large one few
+/// blocks.
 pub(super) fn block_sizes() -> AllocationSizes {
     const MIB: u64 = 1 << 20;
     AllocationSizes::new(16 * MIB, 8 * MIB)
@@ -15,23 +16,23 @@ pub(super) fn block_sizes() -> AllocationSizes {
         .with_max_host_memblock_size(64 * MIB)
 }
 
-/// What the driver says of the memory that is the device's own, all processes together (`VK_EXT_memory_budget`).
+/// The driver's report on device-local memory, of all processes together (`VK_EXT_memory_budget`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MemoryBudget {
-    /// Bytes that this process may take before it gets slow or fails, what it has included.
+    /// Bytes that this process may use before it gets slow or fails, including those in use.
     pub budget: u64,
-    /// Bytes that this process takes now.
+    /// Bytes in use by this process.
     pub usage: u64,
 }
 
-/// What it takes to ask.
+/// What a query needs.
 pub(super) struct BudgetQuery {
     instance: ash::Instance,
     physical: vk::PhysicalDevice,
 }
 
 impl BudgetQuery {
-    /// None where the device does not offer the extension.
+    /// `None` where the device does not support the extension.
     pub(super) fn of(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Self> {
         // SAFETY: the handle was enumerated from the instance.
         let extensions = unsafe { instance.enumerate_device_extension_properties(physical) };
@@ -62,7 +63,7 @@ impl BudgetQuery {
 }
 
 impl Gpu {
-    /// What the driver says of the device's memory now; none where it does not tell.
+    /// The current budget of the device's memory; `None` where the driver does not report it.
     pub fn memory_budget(&self) -> Option<MemoryBudget> {
         self.shared.budget.as_ref().map(BudgetQuery::ask)
     }
@@ -72,7 +73,7 @@ impl Gpu {
         self.shared.usage.now.load(Ordering::Acquire)
     }
 
-    /// The most that [`Gpu::memory_in_use`] has been.
+    /// The peak of [`Gpu::memory_in_use`].
     pub fn peak_memory(&self) -> u64 {
         self.shared.usage.peak.load(Ordering::Acquire)
     }
@@ -82,7 +83,7 @@ impl Gpu {
         self.shared.collect(self.shared.reached());
     }
 
-    /// Counts the peak anew, from what is in use now.
+    /// Restarts the peak from the memory in use now.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn reset_peak_memory(&self) {
         self.free_unused();
@@ -90,7 +91,7 @@ impl Gpu {
         peak.store(now.load(Ordering::Acquire), Ordering::Release);
     }
 
-    /// From now on, a buffer that would take [`Gpu::memory_in_use`] beyond so many bytes is refused as if memory were out.
+    /// Limits [`Gpu::memory_in_use`] to `bytes`: a buffer beyond that fails as if memory were out.
     pub fn limit_memory(&self, bytes: u64) {
         self.shared.usage.limit.store(bytes, Ordering::Release);
     }
@@ -110,7 +111,7 @@ impl Default for MemoryUsage {
     }
 }
 
-/// Memory that there is, but not for us.
+/// Memory that exists but exceeds our limit.
 #[derive(Debug, thiserror::Error)]
 #[error("{now} of {limit} bytes are taken")]
 pub(super) struct MemoryLimitExceeded {
@@ -120,7 +121,7 @@ pub(super) struct MemoryLimitExceeded {
 
 impl MemoryUsage {
     /// # Errors
-    /// So many bytes more are beyond the limit.
+    /// `bytes` more exceed the limit.
     pub(super) fn admit(&self, bytes: u64) -> Result<(), MemoryLimitExceeded> {
         let (now, limit) = (self.now.load(Ordering::Acquire), self.limit.load(Ordering::Acquire));
         if now.saturating_add(bytes) > limit {

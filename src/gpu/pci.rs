@@ -1,11 +1,11 @@
-//! Where devices sit on the PCI bus.
+//! PCI addresses of devices.
 
 use std::fmt;
 use std::str::FromStr;
 
 use crate::{Error, Result};
 
-/// Where a device sits on the PCI bus.
+/// A PCI address.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct PciAddress {
     /// The domain, 0 on most machines.
@@ -19,7 +19,7 @@ pub struct PciAddress {
 }
 
 impl fmt::Display for PciAddress {
-    /// As `lspci -D` has it: `0000:65:00.0`.
+    /// In the form of `lspci -D`: `0000:65:00.0`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { domain, bus, device, function } = self;
         write!(f, "{domain:04x}:{bus:02x}:{device:02x}.{function:x}")

@@ -126,7 +126,7 @@ pub(super) unsafe fn raw_pipeline(
 ) -> Result<vk::Pipeline, vk::Result> {
     let mut code = ash::util::read_spv(&mut Cursor::new(interface.spirv))
         .map_err(|_| vk::Result::ERROR_INITIALIZATION_FAILED)?;
-    if !shared.properties.has_maximal_reconvergence {
+    if !shared.properties.has_uniform_subgroup_control_flow {
         code = reconvergence::unasked(&code);
     }
     if let Some(id) = interface.subgroup_size_id {
@@ -151,7 +151,7 @@ pub(super) unsafe fn raw_pipeline(
         .specialization_info(&specialization);
     if interface.subgroup_size_id.is_some() {
         stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
-        // Where a device cannot be told the size, its only size is the one it reports.
+        // Where a device cannot be told the subgroup size, its only size is the one it reports.
         if shared.properties.subgroup_size_is_selectable {
             stage = stage.push_next(&mut required);
         }

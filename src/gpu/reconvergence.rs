@@ -1,17 +1,17 @@
-//! That a subgroup whose lanes agree stays together, whatever the other subgroups of its workgroup do: kernels in which several
-//! subgroups share a tile ask for it in their GLSL, and a device that promises it is held to that.
+//! Subgroup-uniform control flow: a subgroup whose lanes agree stays converged, whatever the other subgroups of its
+//! workgroup do. Kernels in which several subgroups share a tile request it in their GLSL.
 //!
-//! The core of Vulkan promises it of whole workgroups alone. A device without `VK_KHR_shader_subgroup_uniform_control_flow` gets
-//! such kernels without the question, and is relied on to do what all known drivers do.
+//! Core Vulkan guarantees it for whole workgroups only. A device without `VK_KHR_shader_subgroup_uniform_control_flow`
+//! gets the kernels without the request, and is relied on to behave as all known drivers do.
 
 use ash::{khr, vk};
 
 use super::supported::Supported;
 
-/// The extension a device is created with to be asked.
+/// The device extension.
 pub(super) const EXTENSION: &std::ffi::CStr = khr::shader_subgroup_uniform_control_flow::NAME;
 
-/// What a module says of it, by the SPIR-V specification and `SPV_KHR_subgroup_uniform_control_flow`.
+/// How a module requests it, by the SPIR-V specification and `SPV_KHR_subgroup_uniform_control_flow`.
 const NAME: &str = "SPV_KHR_subgroup_uniform_control_flow";
 const EXECUTION_MODE: u32 = 4421;
 const OP_EXTENSION: u32 = 10;
@@ -19,7 +19,7 @@ const OP_EXECUTION_MODE: u32 = 16;
 /// Words before the first instruction.
 const HEADER: usize = 5;
 
-/// Whether the device makes the promise.
+/// Whether the device supports the feature.
 pub(super) fn supported(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
@@ -35,7 +35,7 @@ pub(super) fn supported(
     feature.shader_subgroup_uniform_control_flow == vk::TRUE
 }
 
-/// The module without the question.
+/// The module without the request.
 pub(super) fn unasked(code: &[u32]) -> Vec<u32> {
     let (header, mut rest) = code.split_at(HEADER.min(code.len()));
     let mut kept = header.to_vec();
@@ -78,7 +78,7 @@ mod tests {
         instruction(OP_EXTENSION, &bytes.chunks(4).map(word).collect::<Vec<_>>())
     }
 
-    /// A driver that does not know the extension refuses a module that names it, and a mode without it.
+    /// A driver that does not know the extension rejects a module that names it, and a mode without it.
     #[test]
     fn the_question_and_nothing_else_goes() {
         const LOCAL_SIZE: u32 = 17;

@@ -1,4 +1,4 @@
-//! Records passes: bindings, parameters, dispatch, and the barriers that their hazards demand.
+//! Records passes: bindings, parameters, dispatch, and the barriers that their hazards require.
 
 use std::collections::HashMap;
 use std::ffi::CString;
@@ -15,12 +15,13 @@ use super::pipeline::Objects;
 use super::{Binding, Bound, Buffer, Gpu, Interface, Pipeline, Properties, Recordable, Shared};
 use crate::{Error, Result};
 
-/// How many invocations a dispatch needs; the kernel knows its workgroup size.
+/// The invocations of a dispatch; the kernel knows its workgroup size.
 #[derive(Clone, Copy, Debug)]
 pub enum Threads {
-    /// At least so many threads; a one-dimensional extent is folded where the device takes fewer workgroups along x.
+    /// At least this number of threads; a one-dimensional extent is folded where the device takes fewer workgroups
+    /// along x.
     Exactly([u32; 3]),
-    /// So many workgroups, folded alike.
+    /// This number of workgroups, folded likewise.
     Workgroups([u32; 3]),
 }
 
@@ -35,21 +36,21 @@ pub struct Recorder<'g> {
     pub(super) value: u64,
     queries: Option<vk::QueryPool>,
     pub(super) labels: Vec<&'static str>,
-    /// Buffers touched since the last barrier; true when written.
+    /// Buffers accessed since the last barrier; true if written.
     pending: HashMap<vk::Buffer, bool>,
-    /// Runs every pass alone and compares it with its reference, in place of its being recorded.
+    /// Runs each pass alone and compares it with its reference instead of recording it.
     #[cfg(feature = "check")]
     pub(super) observer: Option<&'g mut (dyn PassObserver + 'g)>,
 }
 
-/// What a recording of the host application's binds; nothing on a device with `VK_KHR_push_descriptor`.
+/// The descriptor sets of a host's recording; empty on a device with `VK_KHR_push_descriptor`.
 #[derive(Debug)]
 #[must_use = "it stays until the host's submission is done"]
 pub struct HostRecording {
     _sets: Sets,
 }
 
-/// Runs passes in a way of its own in place of their being recorded.
+/// Runs passes in its own way instead of recording them.
 #[cfg(feature = "check")]
 pub(super) trait PassObserver: std::fmt::Debug {
     /// Does what recording and submitting the pass would do.
@@ -58,14 +59,14 @@ pub(super) trait PassObserver: std::fmt::Debug {
     /// The extent exceeds what the device can launch, or the device was lost.
     fn pass(&mut self, recorder: &mut Recorder<'_>, pass: &ObservedPass<'_>) -> Result<()>;
 
-    /// Submits what is recorded, waits for it, and begins anew.
+    /// Submits the recording so far, waits for it, and starts a new one.
     ///
     /// # Errors
     /// The device was lost.
     fn run_recorded(&mut self, recorder: &mut Recorder<'_>, label: &str) -> Result<()>;
 }
 
-/// A pass whose types are left behind.
+/// A pass without its types.
 #[cfg(feature = "check")]
 pub(super) struct ObservedPass<'a> {
     pub(super) objects: &'a Objects,
@@ -75,21 +76,21 @@ pub(super) struct ObservedPass<'a> {
     pub(super) reference: &'a ReferenceOf<'a>,
 }
 
-/// Makes of the words of a pass's buffers what its reference does, and gives the tolerances from other such words.
+/// Runs the reference on the words of a pass's buffers; returns the tolerances from other such words.
 #[cfg(feature = "check")]
 pub(super) type ReferenceOf<'a> = dyn Fn(&mut [Vec<u32>], &mut [Vec<u32>]) -> Vec<Tolerance> + 'a;
 
 /// The timeline value of a recording that the host application submits: none of ours.
 pub(super) const HOST_SUBMITS: u64 = 0;
 
-/// Timestamps that fit one recording; passes beyond are not timed.
+/// Timestamps of one recording; later passes are not timed.
 pub(super) const MAX_TIMESTAMPS: u32 = 4096;
 
-/// What `vkCmdUpdateBuffer` takes at most, in bytes.
+/// The most that `vkCmdUpdateBuffer` takes, in bytes.
 const MAX_UPDATE: usize = 65_536;
 
 impl<'g> Recorder<'g> {
-    /// Starts with a barrier behind everything submitted before.
+    /// Starts with a barrier after everything submitted before.
     pub(super) fn new(
         shared: &'g Arc<Shared>,
         commands: vk::CommandBuffer,
@@ -120,7 +121,7 @@ impl<'g> Recorder<'g> {
         self.value
     }
 
-    /// Records one pass: label, barrier if a hazard demands it, bindings, params, dispatch, timestamp.
+    /// Records one pass: label, barrier if a hazard requires it, bindings, parameters, dispatch, timestamp.
     ///
     /// # Errors
     /// The extent exceeds what the device can launch.
@@ -192,8 +193,8 @@ impl<'g> Recorder<'g> {
         }
     }
 
-    /// Overwrites the first elements of `buffer` with `data`, which the command buffer itself holds: for a few numbers that the
-    /// host knows when it records.
+    /// Overwrites the first elements of `buffer` with `data`, which is stored in the command buffer: for a few numbers
+    /// that the host knows when it records.
     ///
     /// # Errors
     /// `data` is longer than the buffer, or than the 64 KiB that Vulkan takes.
@@ -216,7 +217,7 @@ impl<'g> Recorder<'g> {
         Ok(())
     }
 
-    /// Copies the first elements of `source` to `target`, as many as both hold.
+    /// Copies elements from the start of `source` to `target`, as many as both hold.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn copy<T: bytemuck::Pod>(&mut self, source: &Buffer<T>, target: &mut Buffer<T>) {
         let (source, target) = (source.bound(), target.bound());
@@ -250,7 +251,8 @@ impl<'g> Recorder<'g> {
         unsafe { self.shared.device.cmd_pipeline_barrier2(self.commands, &info) };
     }
 
-    /// One barrier behind everything, if a buffer in `uses` was written since the last, or is now and was read.
+    /// Records one full barrier if a buffer in `uses` was written since the last barrier, or is written now and was
+    /// read.
     fn synchronize(&mut self, uses: impl Iterator<Item = (vk::Buffer, bool)> + Clone) {
         let hazard = uses
             .clone()
@@ -297,7 +299,7 @@ impl<'g> Recorder<'g> {
         }
     }
 
-    /// A buffer that is bound in windows may be longer than a binding; one that is bound may not.
+    /// A buffer that is bound in windows may be longer than a binding; one that is bound whole may not.
     fn check_sizes(&self, bindings: &[Binding], bound: &[Bound]) -> Result<()> {
         let Properties { name: device, max_storage_buffer_range: limit, .. } =
             &self.shared.properties;
@@ -310,7 +312,7 @@ impl<'g> Recorder<'g> {
         }
     }
 
-    /// Spreads workgroups along x over y where the device takes fewer along one dimension.
+    /// Folds workgroups along x into y where the device takes fewer along one dimension.
     fn fold(&self, pass: &'static str, [x, y, z]: [u32; 3]) -> Result<[u32; 3]> {
         let max = self.shared.properties.max_workgroups;
         let folded = if x > max && y == 1 { [max, x.div_ceil(max), z] } else { [x, y, z] };

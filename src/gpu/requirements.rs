@@ -1,4 +1,4 @@
-//! What every device must offer: one table, read by device selection, `doctor` and the embedding check.
+//! The requirements on a device: one table, read by device selection, `doctor` and the embedding check.
 
 use ash::vk;
 
@@ -15,7 +15,7 @@ const SUBGROUP_OPERATIONS: vk::SubgroupFeatureFlags = vk::SubgroupFeatureFlags::
         | vk::SubgroupFeatureFlags::SHUFFLE.as_raw(),
 );
 
-/// One thing that every device must offer.
+/// One requirement.
 #[derive(Clone, Copy)]
 pub struct Requirement {
     /// The Vulkan name of the feature, extension or limit.
@@ -37,7 +37,7 @@ impl Requirement {
     }
 }
 
-/// Everything a device must offer, most fundamental first.
+/// All requirements, the most fundamental first.
 pub const REQUIREMENTS: &[Requirement] = &[
     Requirement {
         name: "Vulkan 1.3",
@@ -109,8 +109,9 @@ pub const REQUIREMENTS: &[Requirement] = &[
     },
 ];
 
-/// The features a device must be created with, to chain into `VkDeviceCreateInfo`; with the extension
-/// `VK_KHR_push_descriptor`, where there is one, passes are recorded faster. For hosts that lend their device to [`Gpu::from_host`](super::Gpu::from_host).
+/// The features that a device must be created with, to chain into `VkDeviceCreateInfo`, for hosts that lend their
+/// device to [`Gpu::from_host`](super::Gpu::from_host). With the extension `VK_KHR_push_descriptor`, where it is
+/// supported, recording is faster.
 pub fn required_device_features()
 -> (vk::PhysicalDeviceVulkan12Features<'static>, vk::PhysicalDeviceVulkan13Features<'static>) {
     let vulkan12 = vk::PhysicalDeviceVulkan12Features::default()
@@ -147,7 +148,7 @@ mod tests {
     use super::*;
     use crate::gpu::subgroups::SubgroupSizes;
 
-    /// A device that meets every requirement, just so.
+    /// A device that meets every requirement and no more.
     fn sufficient() -> Supported {
         let mut properties =
             vk::PhysicalDeviceProperties { api_version: vk::API_VERSION_1_3, ..Default::default() };

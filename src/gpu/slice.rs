@@ -1,4 +1,4 @@
-//! Borrowed views of buffers: what passes bind. They follow the rules of `&` and `&mut`, which is why `build.rs` may tell the
+//! Borrowed slices of buffers: what passes bind. They follow the rules of `&` and `&mut`, so `build.rs` may tell the
 //! driver that no two buffers of a pass overlap where one is written.
 
 use std::marker::PhantomData;
@@ -8,50 +8,50 @@ use super::Bound;
 use super::allocated::DeviceMemory;
 use crate::{Error, Result};
 
-/// Elements of a buffer to read.
+/// Read-only elements of a buffer.
 #[derive(Clone, Copy, Debug)]
 pub struct Slice<'a, T> {
     memory: &'a DeviceMemory,
-    /// Where it begins in the memory, in elements.
+    /// The offset in the memory, in elements.
     first: usize,
     len: usize,
     element: PhantomData<&'a T>,
 }
 
-/// Elements of a buffer to read and write; while it lives, nothing else reads or writes them. None can be made while a [`Slice`] of
-/// them lives:
+/// Elements of a buffer to read and write; while it lives, nothing else reads or writes them. None can be made while a
+/// [`Slice`] of them lives:
 ///
 /// ```compile_fail,E0502
 /// # use nightsplat::gpu::{Buffer, Gpu};
-/// # use nightsplat::kernels::window_gather;
-/// fn copied_onto_itself(buffer: &mut Buffer<f32>) -> window_gather::Buffers<'_> {
-///     window_gather::Buffers { image: buffer.slice(), content: buffer.slice_mut() }
+/// # use nightsplat::kernels::crop_gather;
+/// fn copied_onto_itself(buffer: &mut Buffer<f32>) -> crop_gather::Buffers<'_> {
+///     crop_gather::Buffers { image: buffer.slice(), content: buffer.slice_mut() }
 /// }
 /// ```
 ///
-/// and none at all of a buffer that is only shared:
+/// and none of a buffer that is only shared:
 ///
 /// ```compile_fail,E0596
 /// # use nightsplat::gpu::{Buffer, Gpu};
-/// # use nightsplat::kernels::window_gather;
+/// # use nightsplat::kernels::crop_gather;
 /// fn written_through_a_shared_reference<'a>(
 ///     image: &'a Buffer<f32>,
 ///     content: &'a Buffer<f32>,
-/// ) -> window_gather::Buffers<'a> {
-///     window_gather::Buffers { image: image.slice(), content: content.slice_mut() }
+/// ) -> crop_gather::Buffers<'a> {
+///     crop_gather::Buffers { image: image.slice(), content: content.slice_mut() }
 /// }
 /// ```
 ///
-/// Two buffers, of which one may be written, are what a pass takes:
+/// A pass takes two buffers, of which one may be written:
 ///
 /// ```
 /// # use nightsplat::gpu::{Buffer, Gpu};
-/// # use nightsplat::kernels::window_gather;
+/// # use nightsplat::kernels::crop_gather;
 /// fn copied_to_another<'a>(
 ///     image: &'a Buffer<f32>,
 ///     content: &'a mut Buffer<f32>,
-/// ) -> window_gather::Buffers<'a> {
-///     window_gather::Buffers { image: image.slice(), content: content.slice_mut() }
+/// ) -> crop_gather::Buffers<'a> {
+///     crop_gather::Buffers { image: image.slice(), content: content.slice_mut() }
 /// }
 /// ```
 #[derive(Debug)]
@@ -62,7 +62,7 @@ pub struct SliceMut<'a, T> {
     element: PhantomData<&'a mut T>,
 }
 
-/// Vulkan lets no device ask for more of where a binding begins, in bytes.
+/// The largest alignment of a binding that Vulkan lets a device require, in bytes.
 const ALIGNMENT: usize = 256;
 
 impl<'a, T: bytemuck::Pod> Slice<'a, T> {
@@ -76,7 +76,7 @@ impl<'a, T: bytemuck::Pod> Slice<'a, T> {
         self.len
     }
 
-    /// True for a slice of no elements.
+    /// True if it has no elements.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
@@ -86,10 +86,10 @@ impl<'a, T: bytemuck::Pod> Slice<'a, T> {
         self.memory.name()
     }
 
-    /// Some of its elements.
+    /// A range of its elements.
     ///
     /// # Errors
-    /// They are out of range, or begin at no multiple of 256 bytes, where every device lets a binding begin.
+    /// The range is out of bounds, or starts at no multiple of 256 bytes, where every device lets a binding start.
     pub(crate) fn range(self, range: Range<usize>) -> Result<Self> {
         let first = self.first + offset_of::<T>(self.memory, self.len, &range)?;
         Ok(Self { first, len: range.len(), ..self })
@@ -102,7 +102,7 @@ impl<'a, T: bytemuck::Pod> Slice<'a, T> {
 }
 
 impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
-    /// The first `len` elements of memory whose owner is borrowed for it alone.
+    /// The first `len` elements of memory whose owner is mutably borrowed.
     pub(super) fn new(memory: &'a DeviceMemory, len: usize) -> Self {
         Self { memory, first: 0, len, element: PhantomData }
     }
@@ -123,13 +123,13 @@ impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
         Slice { memory, first, len, element: PhantomData }
     }
 
-    /// The same elements for one use; this can be used again behind it.
+    /// Reborrows it: this can be used again afterwards.
     pub fn reborrow(&mut self) -> SliceMut<'_, T> {
         let Self { memory, first, len, .. } = *self;
         SliceMut { memory, first, len, element: PhantomData }
     }
 
-    /// Some of its elements.
+    /// A range of its elements.
     ///
     /// # Errors
     /// As `Slice::range`.
@@ -138,7 +138,7 @@ impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
         Ok(Self { first, len: range.len(), ..self })
     }
 
-    /// Several parts of it, for a pass that binds each on its own. Parts may be empty, in any order and with gaps between.
+    /// Several parts of it, for a pass that binds each separately. Parts may be empty, in any order and with gaps.
     ///
     /// # Errors
     /// Two parts overlap, or as `Slice::range`.
@@ -182,7 +182,7 @@ impl<'a> SliceMut<'a, f32> {
     }
 }
 
-/// Where a range of `len` elements begins, checked.
+/// The offset of a range of elements, checked; `len` is the slice's.
 fn offset_of<T>(memory: &DeviceMemory, len: usize, range: &Range<usize>) -> Result<usize> {
     let name = memory.name();
     if range.start > range.end || range.end > len {
@@ -199,7 +199,7 @@ fn offset_of<T>(memory: &DeviceMemory, len: usize, range: &Range<usize>) -> Resu
     Ok(range.start)
 }
 
-/// Vulkan has no empty bindings: what stands for one is at the begin, where every buffer has some bytes.
+/// Vulkan has no empty bindings: an empty slice binds the start, where every buffer has some bytes.
 fn bound<T>(memory: &DeviceMemory, first: usize, len: usize) -> Bound {
     let first = if len == 0 { 0 } else { first };
     let [offset, size] = [first, len].map(|n| (n * size_of::<T>()) as u64);

@@ -1,4 +1,4 @@
-//! What the driver tells of the kernels that it compiled: registers, spills, memory.
+//! The driver's statistics of compiled kernels: registers, spills, memory.
 
 use std::ffi::CStr;
 
@@ -7,20 +7,20 @@ use ash::{khr, vk};
 use super::{Kernel, Pipeline, pipeline};
 use crate::Result;
 
-/// The extension a device is created with to tell statistics, where it offers it.
+/// The device extension for statistics.
 pub(super) const EXTENSION: &CStr = khr::pipeline_executable_properties::NAME;
 
-/// One number of a compiled kernel; each driver has its own.
+/// One statistic of a compiled kernel; names differ by driver.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Statistic {
-    /// What is counted, in the driver's words.
+    /// Its name and description, in the driver's words.
     pub name: String,
-    /// How many.
+    /// Its value.
     pub value: f64,
 }
 
 impl<K: Kernel> Pipeline<K> {
-    /// Every number that the driver tells of the kernel; none where it does not tell any. Compiles the kernel again.
+    /// The driver's statistics of a kernel; empty where the driver has none. Compiles the kernel again.
     ///
     /// # Errors
     /// The driver refuses the kernel.

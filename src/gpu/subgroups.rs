@@ -1,17 +1,17 @@
-//! How many lanes a subgroup of our kernels has, where the device leaves that open.
+//! The subgroup size of the kernels, where the device leaves a choice.
 
 use super::limits::{SUBGROUP_SIZES, WORKGROUP};
-/// Names another size than the built-in one of the device.
+/// The variable with another size than the built-in one of the device.
 pub const SUBGROUP_VARIABLE: &str = "NIGHTSPLAT_SUBGROUP";
 
 const AMD: u32 = 0x1002;
 
-/// What a device says of its subgroups.
+/// The subgroup sizes of a device.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SubgroupSizes {
-    /// What it takes where nothing is asked for.
+    /// The default size.
     pub(super) own: u32,
-    /// Kernels can ask for another.
+    /// Kernels can require another.
     pub(super) are_selectable: bool,
     pub(super) least: u32,
     pub(super) most: u32,
@@ -20,7 +20,7 @@ pub(super) struct SubgroupSizes {
 }
 
 impl SubgroupSizes {
-    /// All that kernels can be compiled for.
+    /// All sizes that kernels can be compiled for.
     pub(super) fn all(self) -> Vec<u32> {
         if !self.are_selectable {
             return vec![self.own];
@@ -34,18 +34,18 @@ impl SubgroupSizes {
         powers.filter(fit).collect()
     }
 
-    /// AMD's drivers report 64, which RDNA issues as two halves of 32 one behind the other: half as many lanes that wait for
-    /// the last splat of a tile are the better choice for kernels that part ways (AMD, RDNA whitepaper, 2019). GCN and CDNA
-    /// have 64 alone. Everywhere else the driver knows.
+    /// AMD's drivers report 64, which RDNA issues as two successive halves of 32. With half as many lanes that wait for
+    /// the last splat of a tile, 32 is the better choice for divergent kernels (AMD, RDNA whitepaper, 2019). GCN and
+    /// CDNA have 64 alone. Elsewhere the driver's choice holds.
     fn built_in(self, vendor: u32) -> u32 {
         if vendor == AMD && self.all().contains(&32) { 32 } else { self.own }
     }
 }
 
-/// The lanes of our kernels: the built-in number, or the one that is asked for.
+/// The lanes of the kernels: the built-in number, or the requested one.
 ///
 /// # Errors
-/// The device does not have it; says what it has.
+/// The device does not have the requested size; the message names those that it has.
 pub(super) fn lanes(
     sizes: SubgroupSizes,
     vendor: u32,

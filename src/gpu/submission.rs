@@ -1,4 +1,4 @@
-//! Hands recorded work to the queue and waits for it.
+//! Submits recorded work and waits for it.
 
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, MutexGuard};
@@ -10,7 +10,7 @@ use super::recorder::MAX_TIMESTAMPS;
 use super::{Gpu, Queue, Recorder, Retired, Shared, lock};
 use crate::{Error, Result};
 
-/// What fills a command buffer.
+/// A closure that records into a command buffer.
 pub(super) type Record<'a> = Box<dyn FnOnce(&mut Recorder<'_>) -> Result<()> + 'a>;
 
 /// Work in flight.
@@ -20,7 +20,7 @@ pub struct Submission {
     value: u64,
 }
 
-/// How long one pass took on the device.
+/// The time of one pass on the device.
 #[derive(Clone, Copy, Debug)]
 pub struct PassTime {
     /// The kernel.
@@ -47,11 +47,11 @@ struct Recording<'a> {
 }
 
 impl Shared {
-    /// Takes the queue; refuses where this thread has it, which would wait for itself.
+    /// Locks the queue; refuses where this thread has it already, which would deadlock.
     fn begin_recording(&self, label: &str) -> Result<Recording<'_>> {
         if let Some(outer) = lock(&self.progress).recorded_here() {
             return Err(Error::Usage(format!(
-                "`{label}` cannot be submitted while `{outer}` is recorded; do it before or behind that"
+                "`{label}` cannot be submitted while `{outer}` is recorded; do it before or after that"
             )));
         }
         let queue = lock(&self.queue);
@@ -69,11 +69,12 @@ impl Drop for Recording<'_> {
 impl Gpu {
     /// Records passes and submits them; does not wait.
     ///
-    /// The queue is held while `record` runs: other threads that submit wait. What submits by itself, such as
-    /// [`Gpu::write`], [`Gpu::zeros`] or [`crate::splats::render::Renderer::reserve`], belongs before or behind the recording.
+    /// The queue is locked while `record` runs: other threads that submit wait. Calls that submit themselves, such as
+    /// [`Gpu::write`], [`Gpu::zeros`] or [`crate::splats::render::Renderer::reserve`], must come before or after the
+    /// recording.
     ///
     /// # Errors
-    /// What `record` returns (nothing is submitted then), this thread is recording already, or the device was lost.
+    /// The error of `record` (nothing is submitted then), this thread is recording already, or the device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn submit(
         &self,
@@ -86,7 +87,7 @@ impl Gpu {
     /// Records passes, submits them and waits.
     ///
     /// # Errors
-    /// What `record` returns (nothing is submitted then), this thread is recording already, or the device was lost.
+    /// The error of `record` (nothing is submitted then), this thread is recording already, or the device was lost.
     pub fn run(
         &self,
         label: &str,
@@ -95,7 +96,7 @@ impl Gpu {
         self.submit(label, record)?.wait()
     }
 
-    /// As [`Gpu::run`], and measures how long each pass took.
+    /// As [`Gpu::run`], and measures the time of each pass.
     ///
     /// # Errors
     /// As [`Gpu::submit`]; [`Error::MissingFeature`] where the device's queue has no timestamps.
@@ -136,7 +137,7 @@ impl Gpu {
         unsafe { self.shared.device.get_query_pool_results(queries, 0, &mut ticks, flags) }
             .map_err(|result| self.shared.error("vkGetQueryPoolResults", result))?;
         let period = f64::from(self.shared.properties.timestamp_period) * 1e-6;
-        // The bits beyond are undefined, and those that count wrap around.
+        // The bits beyond are undefined, and the valid ones wrap around.
         let counting = u64::MAX >> (64 - self.shared.properties.timestamp_bits.clamp(1, 64));
         let milliseconds =
             |pair: &[u64]| (pair[1].wrapping_sub(pair[0]) & counting) as f64 * period;
@@ -160,16 +161,17 @@ impl Gpu {
         let pool = unsafe { shared.device.create_command_pool(&pool_info, None) }
             .map_err(fail("vkCreateCommandPool"))?;
         let value = lock(&shared.progress).submitted + 1;
-        // From here on, whatever is dropped may be in this recording.
+        // From here on, a dropped object may be in this recording.
         shared.last_use.store(value, Ordering::Release);
         let queue = &recording.queue;
         let submitted = self.record_with(queue, pool, value, label, queries, record);
-        // Where nothing was submitted, what was dropped meanwhile waits for the next submission, of the same value.
+        // Where nothing was submitted, objects dropped meanwhile wait for the next submission, which has the same
+        // value.
         shared.retire(Retired::Commands(pool));
         submitted.map(|(value, labels)| (Submission { shared: Arc::clone(shared), value }, labels))
     }
 
-    /// Records and submits; gives the timeline value of the last submission and what was recorded.
+    /// Records and submits; returns the timeline value of the last submission and the recording.
     fn record_with(
         &self,
         queue: &Queue,

@@ -1,4 +1,4 @@
-//! What a physical device offers.
+//! What a physical device supports.
 
 use std::collections::BTreeSet;
 use std::ffi::CStr;
@@ -10,14 +10,14 @@ use super::pci::PciAddress;
 use super::subgroups::{SUBGROUP_VARIABLE, SubgroupSizes, lanes};
 use crate::{Error, Result};
 
-/// `off` in this variable binds descriptor sets also where a device could be pushed to. It changes no bit.
+/// `off` in this variable binds descriptor sets even where descriptors can be pushed. The bits are the same.
 pub const PUSH_VARIABLE: &str = "NIGHTSPLAT_PUSH_DESCRIPTORS";
 
-/// The device extensions that a device of our own is created with where it has them.
+/// The device extensions that are enabled where they are supported.
 pub(super) const OPTIONAL_EXTENSIONS: &[&CStr] =
     &[khr::push_descriptor::NAME, khr::portability_subset::NAME];
 
-/// What a physical device offers, gathered once.
+/// What a physical device supports, queried once.
 pub(super) struct Supported {
     pub(super) properties: vk::PhysicalDeviceProperties,
     pub(super) uuid: [u8; vk::UUID_SIZE],
@@ -54,7 +54,7 @@ impl Supported {
         let mut properties = vk::PhysicalDeviceProperties2::default()
             .push_next(&mut vulkan11)
             .push_next(&mut vulkan13_properties);
-        // Some drivers complain of what they do not know.
+        // Some drivers reject structures that they do not know.
         if has(khr::push_descriptor::NAME) {
             properties = properties.push_next(&mut push);
         }
@@ -123,16 +123,16 @@ impl Supported {
         self.extensions.contains(extension.to_string_lossy().as_ref())
     }
 
-    /// Whether passes may push their descriptors, and the user does not forbid it.
+    /// Whether passes push their descriptors: supported, and not disabled by the user.
     pub(super) fn has_push_descriptors(&self) -> bool {
         let is_forbidden = std::env::var_os(PUSH_VARIABLE).is_some_and(|value| value == "off");
         self.max_push_descriptors >= MAX_BUFFERS && !is_forbidden
     }
 
-    /// The lanes of our kernels: the built-in number, or that of the variable.
+    /// The subgroup size of the kernels: the built-in one, or that of the variable.
     ///
     /// # Errors
-    /// The variable names what the device does not have.
+    /// The variable names a size that the device does not have.
     pub(super) fn lanes(&self) -> Result<u32> {
         let wanted = std::env::var(SUBGROUP_VARIABLE).ok().filter(|value| !value.is_empty());
         lanes(self.subgroups, self.properties.vendor_id, wanted.as_deref()).map_err(|problem| {

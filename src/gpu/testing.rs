@@ -1,4 +1,4 @@
-//! One validated device for all tests of a process.
+//! The validated device that all tests of a process share, and injected faults.
 
 use std::cell::Cell;
 use std::sync::atomic::Ordering;
@@ -10,8 +10,8 @@ use super::{DeviceChoice, Gpu, Shared};
 
 static GPU: OnceLock<Gpu> = OnceLock::new();
 
-/// The device that tests share: validation and synchronization validation are on, and whatever they say fails the
-/// process as it ends, with the name of the test. `NIGHTSPLAT_DEVICE` picks another device than the default.
+/// The device that tests share, with validation and synchronization validation: any message fails the process at its
+/// exit, with the name of the test. `NIGHTSPLAT_DEVICE` selects another device than the default.
 ///
 /// # Panics
 /// There is no device or no validation layer: a test without them proves nothing.
@@ -19,7 +19,7 @@ pub fn gpu() -> Gpu {
     GPU.get_or_init(|| open(|_| ())).clone()
 }
 
-/// Another device with validation, whose passes bind descriptor sets wherever it is.
+/// Another device with validation, whose passes bind descriptor sets.
 ///
 /// # Panics
 /// As [`gpu`].
@@ -27,7 +27,7 @@ pub fn gpu_that_binds_sets() -> Gpu {
     open(|shared| shared.descriptors = super::descriptors::Descriptors::InSets)
 }
 
-/// Another device with validation, which takes it that no binding spans more bytes than these.
+/// Another device with validation, with this limit on the bytes of a binding.
 ///
 /// # Panics
 /// As [`gpu`].
@@ -35,7 +35,7 @@ pub fn gpu_that_binds(bytes: u64) -> Gpu {
     open(|shared| shared.properties.max_storage_buffer_range = bytes)
 }
 
-/// Another device with validation, which takes it that a dispatch has no more workgroups along either dimension.
+/// Another device with validation, with this limit on the workgroups of a dispatch along either dimension.
 ///
 /// # Panics
 /// As [`gpu`].
@@ -67,7 +67,7 @@ pub fn misuse(gpu: &Gpu) {
     }
 }
 
-/// How many dispatches and barriers were recorded for the device since it was opened.
+/// The numbers of dispatches and barriers recorded for the device since it was opened.
 pub fn recorded(gpu: &Gpu) -> [u64; 2] {
     let super::Recorded { dispatches, barriers } = &gpu.shared.recorded;
     [dispatches, barriers].map(|count| count.load(Ordering::Relaxed))
@@ -78,29 +78,29 @@ pub fn is_checked(gpu: &Gpu) -> bool {
     gpu.shared.checks.are_on()
 }
 
-/// Lets the allocation of this number fail, counted from 1 now on.
+/// Fails the allocation with this number, counted from 1 now on.
 pub fn fail_allocation(gpu: &Gpu, number: u64) {
     gpu.shared.faults.fail_allocation(number);
 }
 
-/// The names of the buffers that were asked for since [`fail_allocation`], in order.
+/// The names of the buffers allocated since [`fail_allocation`], in order.
 pub fn allocations(gpu: &Gpu) -> Vec<String> {
     gpu.shared.faults.allocations()
 }
 
-/// Loses the device at the submission of this number, counted from 1 now on.
+/// Loses the device at the submission with this number, counted from 1 now on.
 pub fn lose_at_submission(gpu: &Gpu, number: u64) {
     gpu.shared.faults.lose_at_submission(number);
 }
 
-/// A wrong wiring: of the pass's parameters, `bits` of 32-bit number `word` reach the device flipped.
+/// A wiring defect: of the pass's parameters, `bits` of 32-bit word `word` reach the device flipped.
 #[derive(Clone, Copy, Debug)]
 pub struct Defect {
     /// The kernel.
     pub kernel: &'static str,
-    /// Which number of its parameters.
+    /// The index of the word among its parameters.
     pub word: usize,
-    /// Which bits of it.
+    /// The bits to flip.
     pub bits: u32,
 }
 
@@ -108,7 +108,7 @@ thread_local! {
     static DEFECT: Cell<Option<Defect>> = const { Cell::new(None) };
 }
 
-/// Does `work` on a device that has the defect, as far as it is checked.
+/// Runs `work` on a device that has the defect, in checked passes.
 pub fn with_defect<R>(defect: Defect, work: impl FnOnce() -> R) -> R {
     struct Planted;
     impl Drop for Planted {
@@ -117,7 +117,7 @@ pub fn with_defect<R>(defect: Defect, work: impl FnOnce() -> R) -> R {
         }
     }
     DEFECT.set(Some(defect));
-    // Out again also where the work panics.
+    // Removed where the work panics too.
     let _planted = Planted;
     work()
 }

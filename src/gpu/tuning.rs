@@ -1,4 +1,5 @@
-//! The fastest tiles of this device, as `nightsplat bench --tune` found them: a small file in the user's cache folder.
+//! The fastest tile sizes of this device, as measured by `nightsplat bench --tune`: a small file in the user's cache
+//! folder.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -10,22 +11,22 @@ use super::{Gpu, Properties};
 use crate::base::output::write_whole;
 use crate::{Error, Result};
 
-/// Names a file in place of the one in the user's cache folder, or is `off`: no file.
+/// The variable with the path of another file, or `off`: no file.
 pub const TUNE_VARIABLE: &str = "NIGHTSPLAT_TUNE";
 
-/// The pixels that a workgroup of the rasteriser owns. In files it is two numbers, or three where more than one subgroup
-/// share it.
+/// The pixels that a workgroup of the rasteriser renders. In files: two numbers, or three where several subgroups share
+/// it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "Vec<u32>", into = "Vec<u32>")]
 pub struct Tile {
     /// Width and height, in pixels.
     pub size: [u32; 2],
-    /// Each owns a part, one above the other: 1, 2 or 4.
+    /// The number of subgroups, each of which has a part, one above the other: 1, 2 or 4.
     pub subgroups: u32,
 }
 
 impl Tile {
-    /// As high as all its parts.
+    /// The height of all parts.
     fn part(self) -> Option<[u32; 2]> {
         let [width, height] = self.size;
         let divides = [1, 2, 4].contains(&self.subgroups) && height.is_multiple_of(self.subgroups);
@@ -33,7 +34,7 @@ impl Tile {
     }
 }
 
-/// Of one subgroup.
+/// A tile of one subgroup.
 impl From<[u32; 2]> for Tile {
     fn from(size: [u32; 2]) -> Self {
         Self { size, subgroups: 1 }
@@ -68,7 +69,7 @@ impl fmt::Display for Tile {
     }
 }
 
-/// The fastest tile for renders of so many channels.
+/// The fastest tile for renders of `channels` values per pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TunedTile {
@@ -78,7 +79,7 @@ pub struct TunedTile {
     pub tile: Tile,
 }
 
-/// What was measured, and where.
+/// The measurements, with device and driver.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Tuning {
@@ -88,7 +89,7 @@ struct Tuning {
 }
 
 impl Properties {
-    /// Whether subgroups can own such tiles: every part has 1 to 32 rows of lanes, and all lanes make one workgroup.
+    /// Whether subgroups can share such tiles: each part has 1 to 32 rows of lanes, and all lanes fit a workgroup.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn suits_tile(&self, tile: impl Into<Tile>) -> bool {
         let tile = tile.into();
@@ -102,8 +103,8 @@ impl Properties {
 }
 
 impl Gpu {
-    /// The tile that was fastest on this device and driver for the nearest number of channels; none where nothing was
-    /// measured, or the device is lent or opened to be validated.
+    /// The tile that was fastest on this device and driver for the nearest number of channels; `None` without
+    /// measurements, or where the device is lent or opened for validation.
     pub(crate) fn tuned_tile(&self, channels: usize) -> Option<Tile> {
         let path = self.tuning_path()?;
         let tiles = self.shared.tuned_tiles.get_or_init(|| load(path, self.properties()));
@@ -111,7 +112,7 @@ impl Gpu {
         tiles.iter().min_by_key(far).map(|tuned| tuned.tile)
     }
 
-    /// Keeps what was measured for the next time this device is opened; gives the file, or none where none is kept.
+    /// Saves the measurements for later runs; returns the file, or `None` where there is none.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -130,7 +131,7 @@ impl Gpu {
     }
 }
 
-/// The file of this kind of device; it says itself which driver it is of.
+/// The file of this type of device; it records the driver.
 pub(super) fn path(cache: Option<PathBuf>, vendor: u32, device: u32) -> Option<PathBuf> {
     match std::env::var_os(TUNE_VARIABLE).filter(|value| !value.is_empty()) {
         Some(value) if value == "off" => None,
@@ -139,7 +140,7 @@ pub(super) fn path(cache: Option<PathBuf>, vendor: u32, device: u32) -> Option<P
     }
 }
 
-/// The tiles in the file; none, and a line in the log, where they are not of this device.
+/// The tiles in the file; empty, with a line in the log, where they are not of this device.
 fn load(path: &Path, properties: &Properties) -> Vec<TunedTile> {
     let tiles = match std::fs::read(path) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return vec![],
@@ -187,7 +188,7 @@ mod tests {
             is_cpu: false,
             cooperative_matrix: None,
             has_push_descriptors: true,
-            has_maximal_reconvergence: false,
+            has_uniform_subgroup_control_flow: false,
             has_pipeline_statistics: false,
         }
     }

@@ -1,4 +1,4 @@
-//! The validation layer's messages: logged as they come, and where tests ask for it the failure of the process.
+//! The messages of the validation layer: logged as they come and, in tests, a failure of the process.
 
 use std::ffi::{CStr, c_int, c_void};
 use std::io::Write;
@@ -9,17 +9,17 @@ use ash::vk;
 /// The Khronos layer that checks every call, and here every hazard.
 pub(super) const LAYER: &CStr = c"VK_LAYER_KHRONOS_validation";
 
-/// Layers of before race between the labels of command buffers that two threads record, and crash
+/// Older layers have a race between the labels of command buffers that two threads record, and crash
 /// (KhronosGroup/Vulkan-ValidationLayers#5172).
 pub(super) const FIRST_SAFE_WITH_LABELS: u32 = vk::make_api_version(0, 1, 3, 243);
 
 /// Set in the environment of the processes that tests start, so that they [`fail_at_exit`].
 const FAIL_VARIABLE: &str = "NIGHTSPLAT_FAIL_ON_VALIDATION";
 
-/// The exit code of a process that validation has failed: that of a test binary in which a test failed.
+/// The exit code of a process that validation fails: that of a test binary with a failed test.
 const FAILED: c_int = 101;
 
-/// Everything that was said to this process, each with the name of the thread, which for a test is its own.
+/// All messages so far, each with the name of the thread, which in a test is the test's.
 static MESSAGES: Mutex<Vec<String>> = Mutex::new(vec![]);
 
 /// A messenger for the layer's warnings and errors.
@@ -45,7 +45,7 @@ unsafe extern "system" fn on_message(
     // SAFETY: the loader passes valid callback data with a NUL-terminated message.
     let message = unsafe { CStr::from_ptr((*data).p_message) }.to_string_lossy();
     tracing::error!(target: "vulkan", "{message}");
-    // The layer calls from the thread whose call it objects to.
+    // The layer calls from the thread that made the offending call.
     let thread = std::thread::current();
     super::lock(&MESSAGES).push(format!("{}: {message}", thread.name().unwrap_or("a thread")));
     vk::FALSE
@@ -56,7 +56,7 @@ unsafe extern "C" {
     fn _exit(code: c_int) -> !;
 }
 
-/// From now on a process to which the layer says anything fails as it ends, whatever its tests found, and says what.
+/// Makes a process with any message of the layer fail at its exit, whatever its tests found, and print the messages.
 pub(super) fn fail_at_exit() {
     static ONCE: Once = Once::new();
     // SAFETY: the function lives as long as the process, and does not unwind.
@@ -66,7 +66,7 @@ pub(super) fn fail_at_exit() {
 extern "C" fn fail_with_messages() {
     let messages = super::lock(&MESSAGES);
     if !messages.is_empty() {
-        // A closed stderr leaves the exit code to tell.
+        // With a closed stderr, the exit code alone tells.
         let _ = writeln!(std::io::stderr(), "validation failed in\n{}", messages.join("\n"));
         // SAFETY: always sound; `exit` must not be called again while it runs.
         unsafe { _exit(FAILED) };

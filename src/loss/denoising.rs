@@ -1,4 +1,4 @@
-//! The denoising terms: the denoised image stays near the target, in the paper's form near the render, and smooth.
+//! The denoising terms: the denoised image stays near the target (paper's variant: near the render), and smooth.
 
 use glam::UVec2;
 
@@ -12,7 +12,7 @@ pub(super) const SPEC: LossSpec =
     LossSpec { terms: &[Term::DENOISING, Term::TOTAL_VARIATION], on: TermOn::Networks };
 
 impl Term {
-    /// Mean squared difference of the denoised image and what it is held to.
+    /// Mean squared difference between the denoised image and its target.
     pub const DENOISING: Self = Self {
         column: "denoising",
         name: "denoising",
@@ -31,13 +31,13 @@ impl Term {
 /// The weights of the terms.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DenoisingWeights {
-    /// Of the mean squared difference of the denoised image and what it is held to.
+    /// Of the mean squared difference between the denoised image and its target.
     pub mse: f64,
     /// Of the total variation of the denoised image.
     pub total_variation: f64,
 }
 
-/// What one step's denoising terms read.
+/// The inputs of one step.
 #[derive(Clone, Copy, Debug)]
 pub struct DenoisingInputs<'a> {
     /// Width and height in pixels.
@@ -46,11 +46,11 @@ pub struct DenoisingInputs<'a> {
     pub loss_region: LossRegion,
     /// (3, H, W)
     pub denoised: &'a Buffer<f32>,
-    /// What it is held to, (3, H, W).
+    /// Its target, (3, H, W).
     pub render: &'a Buffer<f32>,
 }
 
-/// Where the gradients go, (3, H, W) each; both are written, not added to.
+/// The outputs, (3, H, W) each; both gradients are written, not added to.
 #[derive(Debug)]
 pub struct DenoisingGradients<'a> {
     /// With respect to the denoised image.
@@ -72,7 +72,7 @@ pub struct DenoisingLoss {
 }
 
 impl DenoisingLoss {
-    /// The kernel, without scratch memory: see [`DenoisingLoss::reserve`].
+    /// Builds the kernel; [`DenoisingLoss::reserve`] allocates.
     ///
     /// # Errors
     /// A weight is negative or not finite, or the device is out of memory.
@@ -96,7 +96,7 @@ impl DenoisingLoss {
         self.weights.mse > 0.0 || self.weights.total_variation > 0.0
     }
 
-    /// Scratch memory for views of `size`, and for those reserved for before.
+    /// Allocates scratch memory for views up to `size`; it never shrinks.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -109,11 +109,11 @@ impl DenoisingLoss {
         Ok(())
     }
 
-    /// Writes both gradients for the whole view, 0 outside the interior, and both terms to the log.
+    /// Writes both gradients for the whole view, 0 outside the loss region, and both terms to the log.
     ///
     /// # Errors
-    /// The view is empty or larger than those reserved for, the interior is empty or not inside it, a buffer is shorter
-    /// than it, or the log has no such slot.
+    /// The view is empty or larger than those reserved for, the loss region is empty or not inside it, a buffer is too
+    /// short, or the log has no such slot.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -131,7 +131,7 @@ impl DenoisingLoss {
         }
         log.check()?;
         let UVec2 { x: columns, y: rows } = loss_region.size;
-        // One column or row has no pair of neighbours across.
+        // A single column or row has no pairs of neighbours.
         let pair_scale = |pairs: u32| if pairs == 0 { 0.0 } else { 2.0 / (3.0 * pairs as f32) };
         let mean_scale = 1.0 / value_count(loss_region.size) as f32;
         pass.dispatch(
@@ -167,7 +167,7 @@ impl DenoisingLoss {
         )
     }
 
-    /// One subgroup each; as many as there are partial sums.
+    /// One subgroup per workgroup; one workgroup per partial sum.
     fn workgroups(&self, size: UVec2) -> u32 {
         value_count(UVec2::new(size.x, size.y.div_ceil(self.rows))).div_ceil(self.subgroup_size)
     }

@@ -40,7 +40,7 @@ impl Term {
         Self { column: "depth_local", name: "local depth", ..Self::DEPTH };
 }
 
-/// The term with the depth of every view that has one, (H, W) each.
+/// Builds the term with the depth of every view that has one, (H, W) each.
 #[derive(Debug)]
 struct DepthTerm {
     loss: DepthLoss,
@@ -74,10 +74,10 @@ impl LossTerm for DepthTerm {
     }
 }
 
-/// What the depth term weighs and where it looks.
+/// The weight of the depth term, and its boxes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DepthSettings {
-    /// Of P over the view, and of the mean of P over the boxes.
+    /// The weight of P over the view, and of the mean of P over the boxes.
     pub weight: f64,
     /// The side of a box in pixels, where the view is large enough for it.
     pub box_side: u32,
@@ -95,12 +95,12 @@ impl Default for DepthSettings {
 pub struct DepthBoxes {
     /// The side of a box in pixels.
     pub side: u32,
-    /// How many there are: half as many as fit side by side, at least one. None in a view below 4 x 4.
+    /// Their number: half as many as fit side by side, at least one; 0 in a view below 4 x 4.
     pub count: u32,
 }
 
 impl DepthBoxes {
-    /// Boxes of side `box_side`, or of half the shorter side of a view of `size` that is smaller than that.
+    /// Boxes of side `box_side`, at most half the shorter side of a view of `size`.
     pub fn new(size: UVec2, box_side: u32) -> Self {
         let shorter = size.min_element();
         let side = if shorter >= box_side { box_side } else { shorter / 2 };
@@ -112,14 +112,14 @@ impl DepthBoxes {
     }
 }
 
-/// What one step's depth term reads.
+/// The inputs of one step.
 #[derive(Clone, Copy, Debug)]
 pub struct DepthInputs<'a> {
     /// Width and height in pixels.
     pub size: UVec2,
     /// (channels, H, W)
     pub render: &'a Buffer<f32>,
-    /// The channel that holds the depth.
+    /// The depth channel.
     pub plane: u32,
     /// (H, W), larger is farther.
     pub depth: &'a Buffer<f32>,
@@ -146,7 +146,7 @@ pub struct DepthLoss {
     box_values: Buffer<f32>,
 }
 
-/// How the regions of a view are parted into chunks.
+/// How the regions of a view are split into chunks.
 #[derive(Clone, Copy)]
 struct Chunks {
     boxes: DepthBoxes,
@@ -161,7 +161,7 @@ impl Chunks {
 }
 
 impl DepthLoss {
-    /// The kernels, without scratch memory: see [`DepthLoss::reserve`].
+    /// Builds the kernels; [`DepthLoss::reserve`] allocates.
     ///
     /// # Errors
     /// The weight is negative or not finite, a box has fewer than 2 x 2 pixels, or the device is out of memory.
@@ -195,7 +195,7 @@ impl DepthLoss {
         DepthBoxes::new(size, self.settings.box_side)
     }
 
-    /// Scratch memory for views of `size`, and for those reserved for before.
+    /// Allocates scratch memory for views up to `size`; it never shrinks.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -213,10 +213,11 @@ impl DepthLoss {
         Ok(())
     }
 
-    /// Writes the plane of `d_render`, (channels, H, W), and both values to the log; without boxes the local one is left out.
+    /// Writes the plane of `d_render`, (channels, H, W), and both values to the log; without boxes, the global one
+    /// only.
     ///
     /// # Errors
-    /// The view is empty or larger than those reserved for, a buffer is shorter than it, or the log has no such slot.
+    /// The view is empty or larger than those reserved for, a buffer is too short, or the log has no such slot.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,

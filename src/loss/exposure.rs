@@ -1,8 +1,8 @@
-//! Per-view exposure and colour, learned: photographs of one scene that are not equally bright show one model.
+//! Learned exposure and colour per view, for photographs of one scene that are not equally bright.
 //!
-//! What a training view is compared with is not the render c but e = gain c + bias, an affine of the encoded values for each
-//! channel of each view. The model has one brightness: whatever is learned, the mean of gains over the training views is 1 and
-//! that of biases 0, exactly ([`Exposures::center`]), so that a view shows the model as it is where its exposure is the mean.
+//! A target is compared with e = gain c + bias, an affine of the encoded colours c of the render, for each channel of
+//! each view. The brightness of the model is fixed: after every step the mean of the gains over the training views is 1
+//! and that of the biases 0, exactly ([`Exposures::center`]), so that a view of mean exposure shows the model itself.
 
 mod affine;
 pub mod table;
@@ -21,7 +21,7 @@ use crate::{Error, Result};
 
 settings! {
 "exposure.rates."
-/// How fast exposures are learned: Adam's rate, of gains.
+/// Adam's learning rate of gains.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ExposureRates {
     /// Adam's rate of the gains at the start.
@@ -64,7 +64,7 @@ pub struct Exposures {
 }
 
 impl Exposures {
-    /// Exposures that begin as these, centred; without memory for views: see [`Exposures::reserve`].
+    /// Exposures with these initial values, centred; [`Exposures::reserve`] allocates for views.
     ///
     /// # Errors
     /// There is no view, a gain is not above 0, or the device is out of memory.
@@ -100,7 +100,7 @@ impl Exposures {
         Ok(exposures)
     }
 
-    /// Memory for views of `size`, and for those reserved for before.
+    /// Allocates for views up to `size`; it never shrinks.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -116,7 +116,7 @@ impl Exposures {
         Ok(())
     }
 
-    /// Records what `view` shows of a render, (3 or more, H, W); [`Exposures::exposed`] has it.
+    /// Records `view`'s exposure of a render, (3 or more, H, W), to [`Exposures::exposed`].
     ///
     /// # Errors
     /// There is no such view, it is larger than those reserved for, or the render is smaller.
@@ -130,7 +130,7 @@ impl Exposures {
         self.dispatch(pass, false, view, size, render)
     }
 
-    /// Records the target of `view`, (3, H, W), as it would be at the neutral exposure; [`Exposures::exposed`] has it.
+    /// Records the target of `view`, (3, H, W), with its exposure undone, to [`Exposures::exposed`].
     ///
     /// # Errors
     /// As [`Exposures::expose`].
@@ -165,7 +165,7 @@ impl Exposures {
         )
     }
 
-    /// What was exposed or neutralised last, (3, H, W).
+    /// The last exposed render or neutralised target, (3, H, W).
     pub fn exposed(&self) -> &Buffer<f32> {
         &self.exposed
     }
@@ -207,7 +207,7 @@ impl Exposures {
         )
     }
 
-    /// Records what follows Adam's step: afterwards the mean over the views is the identity again.
+    /// Records the centring after Adam's step: the mean over the views is the identity again.
     ///
     /// # Errors
     /// There is no status word.
@@ -226,7 +226,7 @@ impl Exposures {
         )
     }
 
-    /// The exposure of every view as it is now.
+    /// The current exposure of every view.
     ///
     /// # Errors
     /// The device was lost.

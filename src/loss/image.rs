@@ -1,7 +1,8 @@
-//! A render against an image: L = (1 - w) mean|a - b| + w (1 - mean SSIM), means over all values of the interior.
+//! The loss between a render and an image: L = (1 - w) mean|a - b| + w (1 - mean SSIM), means over all values of the
+//! loss region.
 //!
-//! `a` is the render, not clamped, and `b` what it is held to. SSIM is that of 3DGS: 11 x 11 Gaussian window with sigma 1.5, per channel, zero padding. R_0 is held to the pseudo-GT, and
-//! the tonemapper's output to the dark photograph itself.
+//! `a` is the render, not clamped, and `b` the image. SSIM is that of 3DGS: an 11 x 11 Gaussian window with sigma 1.5,
+//! per channel, zero padding. R_0 is compared with the target, and the tonemapper's output with the dark photograph.
 
 use glam::UVec2;
 
@@ -14,7 +15,7 @@ use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{l1, ssim};
 use crate::{Error, Result};
 
-/// R_0 and the pseudo-GT.
+/// R_0 and the target.
 pub(super) const TARGET: LossSpec = LossSpec {
     terms: &[Term::L1, Term::SSIM],
     on: TermOn::Colors(|gpu, config, gradient| {
@@ -61,8 +62,8 @@ impl Term {
     };
 }
 
-/// How the SSIM kernel marches over a view: the columns of a lane, the rows of a subgroup, and the floats that its loads and
-/// stores are aligned to.
+/// The layout of the SSIM kernel: columns per lane, rows per subgroup, and the alignment of its loads and stores in
+/// floats.
 #[derive(Clone, Copy, Debug)]
 struct SsimLayout {
     columns: u32,
@@ -71,9 +72,9 @@ struct SsimLayout {
 }
 
 impl SsimLayout {
-    /// What suits the device, the first that fits a view: on a processor loads and stores cost the most, so that a subgroup
-    /// is as wide as the first-level cache holds what its registers do not, and goes far; a GPU needs narrow strips, which
-    /// stay in registers.
+    /// The layouts that suit the device; the first that fits a view is used. On a CPU loads and stores cost most, so
+    /// that a subgroup is as wide as the L1 cache allows for what registers do not hold, and has many rows; a GPU needs
+    /// narrow strips, whose state stays in registers.
     fn on(gpu: &Gpu) -> Vec<Self> {
         let properties = gpu.properties();
         match properties.is_cpu {
@@ -92,7 +93,7 @@ impl SsimLayout {
         size.x.is_multiple_of(self.alignment)
     }
 
-    /// The subgroups for a channel of a view of `size`, where one has so many lanes.
+    /// The number of subgroups for a channel of a view of `size`, with this number of lanes each.
     fn subgroups(self, size: UVec2, lanes: u32) -> u32 {
         let halo = (2 * ssim::RADIUS as u32).next_multiple_of(self.alignment);
         let outputs = lanes * self.columns - 2 * halo;
@@ -100,21 +101,22 @@ impl SsimLayout {
     }
 }
 
-/// The columns that a subgroup of a GPU loads at least: the fewer, the more of them are its ends, which have no outputs.
+/// The least columns that a subgroup of a GPU loads: the fewer there are, the larger the share of the borders, which
+/// have no outputs.
 const GPU_COLUMNS: u32 = 64;
 
-/// What a loss compares and how.
+/// The settings of a loss between images.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LossSettings {
     /// w, in [0, 1].
     pub ssim_weight: f64,
     /// The columns of the log for mean|a - b| and for mean SSIM.
     pub terms: [Term; 2],
-    /// What it does with the gradient.
+    /// How it updates the gradient.
     pub gradient: Gradient,
 }
 
-/// What one step's loss reads.
+/// The inputs of one step.
 #[derive(Clone, Copy, Debug)]
 pub struct LossInputs<'a> {
     /// Width and height in pixels.
@@ -140,7 +142,7 @@ pub struct Loss {
 
 #[derive(Debug)]
 enum Kernels {
-    /// The SSIM weight is zero: no SSIM is evaluated.
+    /// The SSIM weight is zero: SSIM is not evaluated.
     L1 {
         whole: Pipeline<l1::Kernel>,
         loss_region: Pipeline<l1::Kernel>,
@@ -157,7 +159,7 @@ struct Ssim {
 }
 
 impl Loss {
-    /// The kernels, without scratch memory: see [`Loss::reserve`].
+    /// Builds the kernels; [`Loss::reserve`] allocates.
     ///
     /// # Errors
     /// The weight is outside [0, 1], or the device is out of memory.
@@ -200,7 +202,7 @@ impl Loss {
         })
     }
 
-    /// Scratch memory for views of `size`, and for those reserved for before.
+    /// Allocates scratch memory for views up to `size`; it never shrinks.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -214,12 +216,12 @@ impl Loss {
         Ok(())
     }
 
-    /// Writes dL/d render, (3, H, W), to `d_render` or adds it, also outside the interior, and writes the means of |a - b| and of SSIM to
-    /// the log. Where the SSIM weight is 0, SSIM is neither evaluated nor logged.
+    /// Writes dL/d render, (3, H, W), to `d_render` or adds it, also outside the loss region, and writes the means of
+    /// |a - b| and of SSIM to the log. Where the SSIM weight is 0, SSIM is neither evaluated nor logged.
     ///
     /// # Errors
-    /// The view is empty or larger than those that scratch memory is reserved for, the interior is empty or not inside
-    /// it, a buffer is shorter than the view, or the log has no such slot.
+    /// The view is empty or larger than those reserved for, the loss region is empty or not inside it, a buffer is
+    /// shorter than the view, or the log has no such slot.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -293,7 +295,7 @@ impl Loss {
 }
 
 impl Kernels {
-    /// One subgroup each; as many as there are partial sums.
+    /// One subgroup per workgroup; one workgroup per partial sum.
     fn workgroups(&self, size: UVec2) -> u32 {
         match self {
             Self::L1 { values_per_workgroup, .. } => {

@@ -8,7 +8,7 @@ use crate::{Error, Result};
 /// The terms of one step.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StepLosses {
-    /// The status word behind the last term: the step counts only if it is 0.
+    /// The status word after the last term: the step counts only if it is 0.
     pub status: u32,
     /// One per term.
     values: Vec<f32>,

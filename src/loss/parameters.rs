@@ -1,10 +1,11 @@
-//! Terms on the parameters of the Gaussians: mean opacity, mean standard deviation and anisotropy, each times its weight.
+//! Terms on the parameters of the Gaussians: mean opacity, mean standard deviation and anisotropy, each times its
+//! weight.
 //!
-//! L = a mean sigmoid(o) + b mean exp(s) + c mean max(max s - min s - ln r, 0), a, b and c the weights, o the raw opacities,
-//! s the logarithms of the three standard deviations. The first two are the regularisers of 3DGS-MCMC (Kheradmand et al.
-//! 2024). The third is that of `PhysGaussian` (Xie et al. 2024), of the logarithm of the ratio: its gradient does not grow
-//! with the ratio. They look at no view, so they are recorded after the gradient of the render has become that of the
-//! parameters, and add to it.
+//! L = a mean sigmoid(o) + b mean exp(s) + c mean max(max s - min s - ln r, 0), a, b and c the weights, o the raw
+//! opacities, s the logarithms of the three standard deviations. The first two are the regularisers of 3DGS-MCMC
+//! (Kheradmand et al. 2024). The third is that of `PhysGaussian` (Xie et al. 2024), of the logarithm of the ratio: its
+//! gradient does not grow with the ratio. They look at no view, so they are recorded after the gradient of the render
+//! has become that of the parameters, and add to it.
 
 use super::log::{LogSlot, PartialSums};
 use super::{LossSpec, Term, TermOn};
@@ -50,7 +51,7 @@ pub struct ParameterWeights {
     opacity_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
     /// Weight of the mean standard deviation, in units of the frame; 3DGS-MCMC has 0.01.
     scale_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
-    /// Weight of the mean excess of ln(longest / shortest standard deviation) over ln(loss.anisotropy_limit).
+    /// Weight of the mean excess of ln(longest / shortest standard deviation) over ln(`loss.anisotropy_limit`).
     anisotropy_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
     /// The ratio of longest to shortest standard deviation that costs nothing.
     anisotropy_limit: f64 = 3.0 => Rule::from_to(1.0, 1e6);
@@ -112,7 +113,8 @@ impl ParameterTerms {
         weights.is_on().then(new).transpose()
     }
 
-    /// Records the terms of a step: adds to the gradients, planes of floats in the same batches, and writes the means to the log.
+    /// Records the terms of a step: adds to the gradients, planes of floats in the same batches, and writes the means
+    /// to the log.
     ///
     /// # Errors
     /// A buffer is shorter than its batches, the log has no such slot, or the device is out of memory.

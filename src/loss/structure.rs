@@ -1,4 +1,4 @@
-//! The structure term: a plane of the render against the structure of the pseudo-GT.
+//! The structure term: the structure channel of the render against the structure of the target.
 
 use glam::UVec2;
 
@@ -22,7 +22,7 @@ pub(super) const SPEC: LossSpec = LossSpec {
 };
 
 impl Term {
-    /// Mean |structure - that of the target|.
+    /// Mean |structure - structure of the target|.
     pub const STRUCTURE: Self = Self {
         column: "structure",
         name: "structure",
@@ -31,7 +31,7 @@ impl Term {
     };
 }
 
-/// The term with the structure of every view's pseudo-GT, (H, W) each.
+/// Builds the term with the structure of every view's target, (H, W) each.
 #[derive(Debug)]
 struct StructureTerm {
     loss: StructureLoss,
@@ -69,14 +69,14 @@ impl LossTerm for StructureTerm {
     }
 }
 
-/// What one step's structure term reads.
+/// The inputs of one step.
 #[derive(Clone, Copy, Debug)]
 pub struct StructureInputs<'a> {
     /// Width and height in pixels.
     pub size: UVec2,
     /// (channels, H, W), not clamped.
     pub render: &'a Buffer<f32>,
-    /// The channel that holds the structure.
+    /// The structure channel.
     pub plane: u32,
     /// (H, W), from [`crate::photographs::structure::StructureTarget`].
     pub structure: &'a Buffer<f32>,
@@ -93,7 +93,7 @@ pub struct StructureLoss {
 }
 
 impl StructureLoss {
-    /// The kernel, without scratch memory: see [`StructureLoss::reserve`].
+    /// Builds the kernel; [`StructureLoss::reserve`] allocates.
     ///
     /// # Errors
     /// The weight is negative or not finite, or the device is out of memory.
@@ -109,7 +109,7 @@ impl StructureLoss {
         })
     }
 
-    /// Scratch memory for views of `size`, and for those reserved for before.
+    /// Allocates scratch memory for views up to `size`; it never shrinks.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -124,7 +124,7 @@ impl StructureLoss {
     /// Writes the plane of `d_render`, (channels, H, W), and the mean to the log.
     ///
     /// # Errors
-    /// The view is empty or larger than those reserved for, a buffer is shorter than it, or the log has no such slot.
+    /// The view is empty or larger than those reserved for, a buffer is too short, or the log has no such slot.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,

@@ -11,12 +11,12 @@ use crate::{Error, Result};
 /// The most output channels that one subgroup takes.
 const OUT_BLOCK: u32 = 8;
 
-/// Rows whose pixels make one partial sum of the gradient of the weights.
+/// Rows of one partial sum of the weight gradient.
 const STRIP_ROWS: u32 = 16;
-/// Of matrices a subgroup takes more channels, and fewer rows: as many subgroups.
+/// With matrices, a subgroup takes more channels and fewer rows, so that there are as many subgroups.
 pub(super) const HALF_STRIP_ROWS: u32 = 4;
 
-/// What follows the sum of a convolution.
+/// The activation of a convolution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub(super) enum Activation {
@@ -25,7 +25,7 @@ pub(super) enum Activation {
     Sigmoid = conv3x3::SIGMOID,
 }
 
-/// What a convolution adds to, in place of overwriting it.
+/// The output that a convolution adds to instead of overwriting it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum AccumulateInto {
     Nothing,
@@ -35,24 +35,24 @@ pub(super) enum AccumulateInto {
     InputGradient,
 }
 
-/// How precise the factors of a convolution are; its sums are in single precision.
+/// The precision of the factors of a convolution; sums are in single precision.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
     /// 32 bits.
     #[default]
     Single,
-    /// 16 bits, by cooperative matrices, where the device offers them, else as `Single`.
+    /// 16 bits, by cooperative matrices where the device supports them, else as `Single`.
     Half,
 }
 
 impl Precision {
-    /// What the device offers of it.
+    /// The precision that the device supports.
     pub(super) fn on(self, gpu: &Gpu) -> Self {
         if self.matrix(gpu).is_some() { Self::Half } else { Self::Single }
     }
 
-    /// The matrices that factors are in; none where they have 32 bits.
+    /// The matrix shape of the factors; `None` for 32 bits.
     pub(super) fn matrix(self, gpu: &Gpu) -> Option<CooperativeMatrix> {
         gpu.properties().cooperative_matrix.filter(|_| self == Self::Half)
     }
@@ -70,7 +70,7 @@ impl std::str::FromStr for Precision {
     }
 }
 
-/// A convolution's kernels; its weights lie at an offset of the network's parameters.
+/// A convolution's kernels; its weights are at an offset of the network's parameters.
 #[derive(Debug)]
 pub(super) struct Conv {
     inputs: u32,
@@ -89,7 +89,7 @@ pub(super) struct WeightGradientInputs<'a> {
 }
 
 impl Conv {
-    /// Where a buffer is said to be added to, what it holds stays in the sum.
+    /// Builds the kernels. A buffer that is added to keeps its content in the sum.
     ///
     /// # Errors
     /// The driver refuses a kernel.
@@ -159,7 +159,7 @@ impl Conv {
     }
 }
 
-/// What a product is for.
+/// The variant of the kernel.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ConvVariant {
     pub(super) activation: Activation,
@@ -167,7 +167,7 @@ pub(super) struct ConvVariant {
     pub(super) accumulate: bool,
 }
 
-/// The kernel that convolves, and the pixels and channels that a subgroup takes.
+/// The convolution kernel, and the pixels and channels per subgroup.
 #[derive(Debug)]
 pub(super) struct Product {
     kernel: Pipeline<conv3x3::Kernel>,
@@ -221,7 +221,7 @@ impl Product {
     }
 }
 
-/// The kernel that sums the gradient of a layer's weights over strips, and the output channels that a subgroup takes.
+/// The kernel that sums the weight gradient over strips, and the output channels per subgroup.
 #[derive(Debug)]
 struct WeightGradient {
     kernel: Pipeline<conv3x3_weight_gradient::Kernel>,
@@ -260,7 +260,7 @@ impl WeightGradient {
     }
 }
 
-/// The partial sums of the gradient of a layer, and where they are added.
+/// The partial sums of a layer's gradient, and the offset that they are added to.
 #[derive(Debug)]
 pub(super) struct Strips<'a> {
     /// Holds [`partial_count`] values.
@@ -268,7 +268,7 @@ pub(super) struct Strips<'a> {
     pub(super) gradients: &'a mut Buffer<f32>,
 }
 
-/// The kernel that adds up the strips.
+/// The kernel that sums the strips.
 #[derive(Debug)]
 pub(super) struct Reduce(Pipeline<reduce_strips::Kernel>);
 
@@ -295,12 +295,12 @@ impl Reduce {
     }
 }
 
-/// Weights and biases of a layer.
+/// The number of weights and biases of a layer.
 fn layer_len(inputs: u32, outputs: u32) -> u32 {
     outputs * (9 * inputs + 1)
 }
 
-/// Floats that the partial sums of a layer's gradient take at most.
+/// The most floats of the partial sums of a layer's gradient.
 pub(super) fn partial_count(
     size: UVec2,
     [inputs, outputs]: [u32; 2],

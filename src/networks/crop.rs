@@ -1,8 +1,8 @@
-//! Windows: the rectangle of a view that the networks run on.
+//! Padded crops: the rectangle of a view that the networks run on.
 //!
-//! The networks' losses are means over pixels, so a random crop estimates them without bias. What a crop's pixels get
-//! from the networks depends on a margin around them, the receptive field: the window is the crop with its margin, cut
-//! off at the image, where the zero padding of the whole view is right anyway.
+//! The networks' losses are means over pixels, so a random crop estimates them without bias. The output of a crop's
+//! pixels depends on a margin around them, the receptive field: a padded crop is the crop with its margin, clipped to
+//! the image, where the zero padding is that of the whole view.
 
 use std::ops::Range;
 
@@ -13,29 +13,29 @@ use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{crop_gather, crop_scatter};
 use crate::{Error, Result};
 
-/// A rectangle of a view, and within it the crop that counts.
+/// A padded crop of a view, and the crop in it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PaddedCrop {
-    /// The window's corner in the view, pixels.
+    /// The padded crop's corner in the view, pixels.
     pub origin: UVec2,
-    /// Its size, pixels.
+    /// The padded crop's size, pixels.
     pub size: UVec2,
-    /// The crop's corner in the window, pixels.
+    /// The crop's corner in the padded crop, pixels.
     pub crop_origin: UVec2,
     /// The crop's size, pixels.
     pub crop_size: UVec2,
 }
 
 impl PaddedCrop {
-    /// A whole view of this size.
+    /// The whole view.
     pub fn whole(view: UVec2) -> Self {
         Self { origin: UVec2::ZERO, size: view, crop_origin: UVec2::ZERO, crop_size: view }
     }
 
-    /// A random crop with `margin` pixels around it: one of the equal cells, at most `side` pixels wide and high, that
-    /// part the view. It is the cell of a uniformly drawn pixel, so that means over crops have the mean over the view
-    /// as their expectation: a crop at a random corner would see the view's middle more often than its edges.
-    /// The draw depends on the stream and `draw` alone.
+    /// A random crop with a margin of `margin` pixels: one of the equal cells, at most `side` pixels wide and high,
+    /// into which the view is divided. It is the cell of a uniformly drawn pixel, so that the expectation of means over
+    /// crops is the mean over the view: a crop at a random corner would favour the middle of the view. The draw depends
+    /// on the stream and `draw` alone.
     pub fn random(view: UVec2, side: u32, margin: u32, stream: &Stream, draw: u64) -> Self {
         let cells = UVec2::new(view.x.div_ceil(side), view.y.div_ceil(side));
         let uniform = |axis: u64, extent: u32| {
@@ -56,7 +56,7 @@ impl PaddedCrop {
     }
 }
 
-/// Copies windows out of images, and adds them back.
+/// Copies padded crops out of images, and adds them back.
 #[derive(Debug)]
 pub struct CropKernels {
     gather: Pipeline<crop_gather::Kernel>,
@@ -64,7 +64,7 @@ pub struct CropKernels {
 }
 
 impl CropKernels {
-    /// The kernels on this device.
+    /// Builds the kernels.
     ///
     /// # Errors
     /// The device refuses a pipeline.

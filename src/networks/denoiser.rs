@@ -1,4 +1,4 @@
-//! The denoiser: stages that each estimate the noise that is left and take it from the render.
+//! The denoiser: stages that each estimate the remaining noise and subtract it from the render.
 //!
 //! ```text
 //! I_0 = noise map, I_k = R_k for k >= 1; R_0 = render
@@ -6,11 +6,11 @@
 //! R_{k+1} = clamp(R_0 - (I_k + sigmoid(conv_out(f))), 0, 1)
 //! ```
 //!
-//! That is the paper's form. In the identity form `I_0 = R_0` and `R_{k+1} = I_k - conv_out(f)`, with the last layer zero at
-//! first: R_K begins as the render, and no gradient dies behind a sigmoid or a clamp.
+//! That is the paper's variant. In the identity variant `I_0 = R_0` and `R_{k+1} = I_k - conv_out(f)`, with the last
+//! layer zero at first: R_K begins as the render, and no gradient vanishes in a sigmoid or a clamp.
 //!
-//! Activations are kept for one stage at a time, or for every stage where [`Denoiser::keep_activations`] finds room: without
-//! it the backward pass computes those of the earlier stages again, from their inputs `R_k`, to the same bits.
+//! Activations are kept for one stage at a time, or for every stage where [`Denoiser::keep_activations`] finds memory:
+//! without it the backward pass recomputes those of the earlier stages from their inputs `R_k`, to the same bits.
 
 mod memory;
 
@@ -39,16 +39,16 @@ settings! {
 /// (docs/benchmarks.md).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DenoiserSettings {
-    /// Stages of the denoiser: estimates of the noise, each with its own weights.
+    /// Stages of the denoiser, each with its own weights.
     stages: u32 = 1 => Rule::Whole(1, 16), "--denoiser-stages N";
-    /// Repeats of the inner convolution and norm in a stage of the denoiser.
+    /// Inner convolutions per stage of the denoiser.
     repeats: u32 = 2 => Rule::Whole(1, 64), "--denoiser-repeats N";
-    /// Feature maps of the denoiser.
+    /// Channels of the denoiser.
     channels: u32 = 8 => Rule::Whole(1, 512), "--denoiser-channels N";
-    /// single, or half: 16-bit factors in the inner convolution where the device has matrices of them.
+    /// Precision of the denoiser: single, or half, which takes 16-bit cooperative matrices.
     precision: Precision = Precision::Single => Rule::OneOf(&["single", "half"]), "--denoiser-precision P";
-    /// How the networks begin and end, the tonemapper too: identity, which lets through what goes in until something better
-    /// is learned, or paper.
+    /// How the networks begin and end, the tonemapper too: identity, which lets through what goes in until something
+    /// better is learned, or paper.
     variant: NetworkVariant = NetworkVariant::Identity => Rule::OneOf(&["identity", "paper"]);
 }
 }
@@ -72,7 +72,7 @@ impl DenoiserSettings {
         self.check_rows()
     }
 
-    /// In the precision that the device offers.
+    /// The precision that the device supports.
     fn held_on(self, gpu: &Gpu) -> Self {
         Self { precision: self.precision.on(gpu), ..self }
     }
@@ -87,7 +87,7 @@ impl DenoiserSettings {
 pub struct Denoiser {
     gpu: Gpu,
     settings: DenoiserSettings,
-    /// The same in the precision that the device offers.
+    /// The same with the precision that the device supports.
     held: DenoiserSettings,
     parameters: Parameters,
     stages: Vec<Stage>,
@@ -95,11 +95,11 @@ pub struct Denoiser {
     reserved: DenoiserExtent,
     memory: DenoiserMemory,
     earlier: EarlierStages,
-    /// The size of the forward pass that the memory holds.
+    /// The size of the last forward pass.
     recorded: Option<UVec2>,
 }
 
-/// Where the layers of a stage lie in the parameters.
+/// The offsets of a stage's layers in the parameters.
 #[derive(Clone, Copy, Debug)]
 struct Stage {
     number: usize,
@@ -126,7 +126,7 @@ impl Denoiser {
     /// Adam's learning rate in LITA-GS.
     pub const LEARNING_RATE: f64 = 5e-5;
 
-    /// Draws the weights; memory for a view comes with [`Denoiser::reserve`].
+    /// Draws the weights; [`Denoiser::reserve`] allocates for views.
     ///
     /// # Errors
     /// A setting is out of range, the driver refuses a kernel, or the device is out of memory.
@@ -167,7 +167,7 @@ impl Denoiser {
         })
     }
 
-    /// What it was made with.
+    /// Its settings.
     pub fn settings(&self) -> DenoiserSettings {
         self.settings
     }
@@ -177,12 +177,12 @@ impl Denoiser {
         &self.parameters
     }
 
-    /// As [`Denoiser::parameters`], to be changed.
+    /// As [`Denoiser::parameters`], mutable.
     pub fn parameters_mut(&mut self) -> &mut Parameters {
         &mut self.parameters
     }
 
-    /// Makes the last layer of every stage zero: in the identity form what goes in comes out.
+    /// Zeroes the last layer of every stage: in the identity variant the output is the input.
     ///
     /// # Errors
     /// The device was lost.
@@ -194,30 +194,30 @@ impl Denoiser {
         self.gpu.write(&mut self.parameters.values, &values)
     }
 
-    /// How far a pixel's result looks, in pixels, beside the norms, which look at the whole view.
+    /// The radius of a pixel's receptive field, in pixels, not counting the norms, which read the whole view.
     pub fn margin(&self) -> u32 {
         self.settings.stages * (self.settings.repeats + 2)
     }
 
-    /// The memory that [`Denoiser::reserve`] takes for a view.
+    /// The memory of [`Denoiser::reserve`] for a view.
     #[cfg(feature = "testing")]
     pub fn bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
         DenoiserExtent::of(settings, size).bytes(settings)
     }
 
-    /// The memory that [`Denoiser::keep_activations`] takes for a view beside it.
+    /// The additional memory of [`Denoiser::keep_activations`] for a view.
     #[cfg(feature = "testing")]
     pub fn kept_bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
         EarlierStages::bytes(settings, DenoiserExtent::of(settings, size))
     }
 
-    /// Whether the device binds every map of a view of `size`.
+    /// Whether the device can bind every map of a view of `size`.
     pub fn fits_on(gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> bool {
         let held = settings.held_on(gpu);
         DenoiserExtent::of(held, size).check(gpu, held, size).is_ok()
     }
 
-    /// Takes the memory for views up to `size`, unless it is there already.
+    /// Allocates for views up to `size`; it never shrinks.
     ///
     /// # Errors
     /// A map exceeds what the device can bind, or the device is out of memory.
@@ -228,7 +228,7 @@ impl Denoiser {
         }
         let gpu = &self.gpu;
         needed.check(gpu, self.held, size)?;
-        // The old memory goes first: both together may not fit.
+        // The old memory is freed first: both together may not fit.
         self.recorded = None;
         let extent = needed.max(std::mem::take(&mut self.reserved));
         self.memory = DenoiserMemory::new(gpu, self.held, DenoiserExtent::default())?;
@@ -237,8 +237,8 @@ impl Denoiser {
         Ok(())
     }
 
-    /// Keeps the activations of every stage in views up to `size` from now on, where that takes no more than `most` bytes and
-    /// the device has them; says whether it does. No bit of a result follows from it.
+    /// Keeps the activations of every stage in views up to `size` from now on, if that takes no more than `most` bytes
+    /// and the device has them; returns whether it does. Results are bit-identical either way.
     ///
     /// # Errors
     /// The device was lost.
@@ -260,13 +260,13 @@ impl Denoiser {
         Ok(true)
     }
 
-    /// `R_K` of the last forward pass, (3, H, W), at the beginning of a buffer that is as long as what was reserved.
+    /// `R_K` of the last forward pass, (3, H, W), at the start of a buffer of the reserved length.
     pub fn denoised(&self) -> &Buffer<f32> {
         &self.memory.denoised[self.memory.denoised.len() - 1]
     }
 
-    /// Records the passes from `I_0`, the noise map or in the identity form the render, and the render, each (3, H, W), to
-    /// [`Denoiser::denoised`].
+    /// Records the forward pass from `I_0`, the noise map or in the identity variant the render, and the render, each
+    /// (3, H, W), to [`Denoiser::denoised`].
     ///
     /// # Errors
     /// The view is empty or no memory is reserved for it, or an image is shorter than the view.
@@ -307,9 +307,9 @@ impl Denoiser {
         Ok(())
     }
 
-    /// Records the passes from `dL/dR_K` back: overwrites the gradients of the parameters, writes `d_input` and adds to
-    /// `d_render`, each (3, H, W), what the render says beside `I_0`: nothing in the identity form. Inputs and parameters are
-    /// those of the forward pass before it.
+    /// Records the backward pass from `dL/dR_K`: overwrites the gradients of the parameters, writes `d_input` and adds
+    /// to `d_render`, each (3, H, W), the gradient of the render beside `I_0`: zero in the identity variant. Inputs and
+    /// parameters must be those of the preceding forward pass.
     ///
     /// # Errors
     /// There is no forward pass of that size before it, or an image is shorter than the view.
@@ -345,7 +345,7 @@ impl Denoiser {
                 let values = &parameters.values;
                 kernels.stage_forward(pass, size, stage, values, stage_input, activations)?;
             }
-            // The two images take turns, so that what a stage reads is never what it writes.
+            // Two images alternate, so that a stage never reads what it writes.
             let [even, odd] = &mut memory.d_denoised;
             let (own, other) = if k % 2 == 0 { (even, odd) } else { (odd, even) };
             let d_output = if k == last { d_denoised } else { &*other };
@@ -474,7 +474,7 @@ impl Kernels {
             let source = (activations.features(repeat), &activations.packed[repeat]);
             let d_target = Map { single: &*d_convolved, packed: &mut *d_packed };
             let strips = Strips { partials: &mut *partials, gradients: &mut *gradients };
-            // Along the shortcut the gradient stays as it is: the convolution's is added to it.
+            // The shortcut passes the gradient on: that of the convolution is added to it.
             let layer = stage.inner(values);
             self.conv.backward(pass, size, layer, source, d_target, d_features, strips)?;
         }
@@ -489,7 +489,7 @@ impl Kernels {
 }
 
 impl Stage {
-    /// The layer that is repeated.
+    /// The repeated layer.
     fn inner(self, values: &Buffer<f32>) -> InnerLayer<'_> {
         InnerLayer { number: self.number, offset: self.conv, values }
     }

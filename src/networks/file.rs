@@ -1,4 +1,4 @@
-//! Networks on disk: safetensors, with `PyTorch`'s names, shapes and order.
+//! Network files: safetensors with `PyTorch`'s names, shapes and order.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::Path;
@@ -19,25 +19,25 @@ const SETTINGS: &str = "networks";
 /// A safetensors file whose header is read once.
 pub(crate) struct TensorFile<'a> {
     metadata: Metadata,
-    /// Behind the header.
+    /// The data after the header.
     data: &'a [u8],
 }
 
 impl<'a> TensorFile<'a> {
     /// # Errors
-    /// The header is damaged, or says that there is more or less than there is.
+    /// The header is damaged, or contradicts the size of the data.
     pub(crate) fn of(bytes: &'a [u8]) -> std::result::Result<Self, SafeTensorError> {
         let (header_bytes, metadata) = SafeTensors::read_metadata(bytes)?;
-        // The length of the header stands before it.
+        // The length of the header precedes it.
         Ok(Self { metadata, data: &bytes[size_of::<u64>() + header_bytes..] })
     }
 
-    /// What the header says under `key` beside the tensors.
+    /// The metadata under `key`.
     pub(crate) fn note(&self, key: &str) -> Option<&str> {
         self.metadata.metadata().as_ref()?.get(key).map(String::as_str)
     }
 
-    /// Every tensor's name and bytes, in the order of the file.
+    /// Every tensor's name and bytes, in file order.
     pub(crate) fn tensors(&self) -> Vec<(String, &'a [u8])> {
         let names = self.metadata.offset_keys().into_iter();
         let bytes = |name: String| Some((self.tensor(&name)?.1, name));
@@ -51,7 +51,7 @@ impl<'a> TensorFile<'a> {
         Some((info, &self.data[begin..end]))
     }
 
-    /// The values of a tensor of 32-bit floats; else what is wrong with it.
+    /// The values of a tensor of 32-bit floats; an error describes the problem.
     pub(crate) fn floats(
         &self,
         name: &str,
@@ -102,7 +102,7 @@ pub fn save(path: &Path, networks: &[&Parameters], gpu: &Gpu) -> Result<()> {
     write_whole(path, &bytes)
 }
 
-/// Reads each network's values from the tensors `network.tensor`; all networks are read, or none is changed.
+/// Reads each network's values from the tensors `network.tensor`: all networks, or none on failure.
 ///
 /// # Errors
 /// The file is missing or damaged, a value is not finite, or the file holds a network of another configuration.

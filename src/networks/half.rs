@@ -1,4 +1,4 @@
-//! A 3x3 convolution by matrices of 16 bits: its kernels, and its factors as matrices take them.
+//! A 3x3 convolution by 16-bit matrices: its kernels, and its packed factors.
 
 use glam::UVec2;
 
@@ -10,12 +10,12 @@ use crate::kernels::{
     conv3x3_half, conv3x3_weight_gradient_half, largest_magnitude, pack_map, pack_weights,
 };
 
-/// The most matrices of output channels that one subgroup takes, by four rows of pixels: sixteen sums in registers.
+/// The most matrices of output channels per subgroup, times four rows of pixels: sixteen sums in registers.
 const BLOCKS: u32 = 4;
-/// The same of the gradient of the weights, by nine taps: eighteen sums.
+/// The same for the weight gradient, times nine taps: eighteen sums.
 const STRIP_BLOCKS: u32 = 2;
 
-/// Values whose largest magnitude one subgroup finds.
+/// Values per subgroup of the search for the largest magnitude.
 const CHUNK: u32 = 2048;
 
 /// Eight halves.
@@ -29,7 +29,7 @@ pub(super) struct PackedMap {
 }
 
 impl PackedMap {
-    /// One of so many eights.
+    /// Allocates this number of groups of eight halves.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -38,7 +38,7 @@ impl PackedMap {
         Ok(Self { largest, halves: gpu.uninit("packed_map", packed_count)? })
     }
 
-    /// The eights of a view.
+    /// The groups of eight halves of a view.
     pub(super) fn packed_count(size: UVec2, channels: u32) -> usize {
         let columns = size.x.next_multiple_of(PACKED_COLUMNS) as usize + 2;
         let rows = size.y.next_multiple_of(PACKED_ROWS) as usize + 2;
@@ -53,7 +53,7 @@ pub(super) struct PackedWeights {
     halves: [Buffer<HalfVec8>; 2],
 }
 
-/// Where a convolution goes.
+/// The direction of a convolution.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Direction {
     /// From input to output.
@@ -62,12 +62,13 @@ pub(super) enum Direction {
     Backward = 1,
 }
 
-/// The kernels of a convolution between as many channels; a layer's weights and biases lie at an offset of the values.
+/// The kernels of a convolution with equal numbers of input and output channels; a layer's weights and biases are at an
+/// offset of the values.
 #[derive(Debug)]
 pub(super) struct HalfConv {
     channels: u32,
     matrix: CooperativeMatrix,
-    /// Matrices of output channels to a subgroup.
+    /// Matrices of output channels per subgroup.
     blocks: u32,
     strip_blocks: u32,
     largest: Pipeline<largest_magnitude::Kernel>,
@@ -119,7 +120,7 @@ impl HalfConv {
         })
     }
 
-    /// Memory for the weights of a layer.
+    /// Allocates for the weights of a layer.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -133,7 +134,7 @@ impl HalfConv {
         9 * self.channels.next_multiple_of(PACKED_CHANNELS).pow(2) / 8
     }
 
-    /// Packs the weights of the layer at `offset`, for the way back once they are for the way there.
+    /// Packs the weights of the layer at `offset`; for the backward direction after the forward one.
     pub(super) fn pack_weights(
         &self,
         pass: &mut Recorder<'_>,
@@ -199,7 +200,7 @@ impl HalfConv {
         )
     }
 
-    /// Writes or adds what the packed `source` makes on a way, (C, H, W), by the weights packed for it.
+    /// Writes or adds the convolution of the packed `source` in a direction, (C, H, W), with the weights packed for it.
     #[expect(clippy::too_many_arguments, reason = "a layer, its place and its images")]
     pub(super) fn product(
         &self,
@@ -233,7 +234,8 @@ impl HalfConv {
         )
     }
 
-    /// Adds the gradients of weights and biases, from the packed input and the gradient of the output, packed and as it is.
+    /// Adds the gradients of weights and biases, from the packed input and the gradient of the output, packed and
+    /// unpacked.
     pub(super) fn weight_gradient(
         &self,
         pass: &mut Recorder<'_>,

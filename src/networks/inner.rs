@@ -1,4 +1,4 @@
-//! The convolution that a stage of the denoiser repeats, in single precision or by matrices of 16 bits.
+//! The repeated convolution of a denoiser stage, in single precision or by 16-bit matrices.
 
 use glam::UVec2;
 
@@ -7,14 +7,14 @@ use super::half::{Direction, HalfConv, PackedMap, PackedWeights};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
 
-/// Its kernels, with the weights of every layer as they take them.
+/// Its kernels, with the packed weights of every layer.
 #[derive(Debug)]
 pub(super) enum Inner {
     Single(Conv),
     Half { conv: HalfConv, layers: Vec<PackedWeights> },
 }
 
-/// A layer: which it is, and where it lies in the values.
+/// A layer: its number, and its offset in the values.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct InnerLayer<'a> {
     pub(super) number: usize,
@@ -22,7 +22,7 @@ pub(super) struct InnerLayer<'a> {
     pub(super) values: &'a Buffer<f32>,
 }
 
-/// A map, and where it is packed for matrices.
+/// A map, and its packed form.
 #[derive(Debug)]
 pub(super) struct Map<'a> {
     pub(super) single: &'a Buffer<f32>,
@@ -47,7 +47,7 @@ impl Inner {
         Ok(Self::Half { conv, layers })
     }
 
-    /// Packs the weights of a layer for a way, once a step: for the way back once they are for the way there.
+    /// Packs the weights of a layer for a direction, once per step; for the backward direction after the forward one.
     pub(super) fn prepare(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -83,8 +83,9 @@ impl Inner {
         }
     }
 
-    /// Adds the gradients of weights and biases, and writes or adds that of the input, `d_source`, from that of the output,
-    /// `d_target`. The input is as the forward pass read it, in single precision, and as it left it packed, where it is.
+    /// Adds the gradients of weights and biases, and writes or adds that of the input, `d_source`, from that of the
+    /// output, `d_target`. The input must be that of the forward pass, in single precision, and packed as the forward
+    /// pass left it.
     #[expect(clippy::too_many_arguments, reason = "a layer, its place, two maps and two gradients")]
     pub(super) fn backward(
         &self,

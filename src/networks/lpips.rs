@@ -1,4 +1,4 @@
-//! LPIPS (Zhang et al. 2018, version 0.1): how far two pictures are apart to a network's eye. Lower is more alike.
+//! LPIPS (Zhang et al. 2018, version 0.1): a perceptual distance between two images. Lower is more alike.
 
 use std::path::Path;
 
@@ -11,22 +11,22 @@ use crate::networks::{TensorFile, Trunk, published};
 use crate::photographs::image::Image;
 use crate::{Error, Result};
 
-/// What makes a picture the network's input: minus `SHIFT`, over `SCALE`, for each channel. It is meant for [-1, 1].
+/// The normalisation of the network's input: minus `SHIFT`, over `SCALE`, for each channel. It is meant for [-1, 1].
 const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
 const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
 
-/// The values that black and white have when they are given to the measure.
+/// The input range of black and white.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Range {
-    /// [-1, 1], as the measure's authors made it.
+    /// [-1, 1], as the authors of LPIPS define it.
     #[default]
     Signed,
-    /// [0, 1], as the code of 3DGS gives it pictures.
+    /// [0, 1], as in the code of 3DGS.
     Unit,
 }
 
 impl Range {
-    /// Each of them.
+    /// All ranges.
     pub const ALL: [Self; 2] = [Self::Signed, Self::Unit];
 
     /// The name on the command line.
@@ -45,23 +45,23 @@ impl Range {
     }
 }
 
-/// Which LPIPS a number is: those of two measures do not compare.
+/// A version of LPIPS: values of different versions are not comparable.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Measure {
-    /// Whose activations are compared.
+    /// The network.
     pub network: Network,
-    /// What the network is given.
+    /// The input range.
     pub range: Range,
 }
 
 impl Measure {
-    /// Each of them.
+    /// All versions.
     pub fn all() -> impl Iterator<Item = Self> {
         let of = |network| Range::ALL.map(|range| Self { network, range });
         Network::ALL.into_iter().flat_map(of)
     }
 
-    /// The name of its numbers in JSON: `lpips` for the default, else network and range behind it, as `lpips_vgg_unit`.
+    /// The key of its values in JSON: `lpips` for the default, else with network and range, as `lpips_vgg_unit`.
     pub fn key(self) -> String {
         if self == Self::default() {
             return "lpips".to_owned();
@@ -69,7 +69,7 @@ impl Measure {
         format!("lpips_{}_{}", self.network.name(), self.range.name())
     }
 
-    /// The head of a column of its numbers.
+    /// The head of its column in tables.
     pub fn title(self) -> String {
         if self == Self::default() {
             return "LPIPS".to_owned();
@@ -78,22 +78,22 @@ impl Measure {
     }
 }
 
-/// The measure, on the device.
+/// LPIPS on the device.
 #[derive(Debug)]
 pub struct Lpips {
     trunk: Trunk,
     range: Range,
-    /// How much each channel counts of each layer that is compared.
+    /// The weight of each channel of each compared layer.
     weights: Vec<Vec<f32>>,
 }
 
 impl Lpips {
-    /// The measure with the weights of a safetensors file: the tensors of `lpips.LPIPS(net='alex')` or `(net='vgg')` under
-    /// its names. They tell which network it is.
+    /// Loads the weights of a safetensors file: the tensors of `lpips.LPIPS(net='alex')` or `(net='vgg')` under its
+    /// names. They determine the network.
     ///
     /// # Errors
-    /// [`Error::Input`]: the file is no network's, or names what is missing, of another shape or not finite; the device is out
-    /// of memory.
+    /// [`Error::Input`]: the file is not of a known network, or a tensor is missing, of another shape or not finite;
+    /// the device is out of memory.
     pub fn load(gpu: &Gpu, path: impl AsRef<Path>, range: Range) -> Result<Self> {
         let path = path.as_ref();
         let bytes = input::bytes(path)?;
@@ -108,16 +108,16 @@ impl Lpips {
         Ok(Self { trunk, range, weights: weights.collect::<Result<_>>()? })
     }
 
-    /// Which LPIPS its distances are.
+    /// The version of its distances.
     pub fn measure(&self) -> Measure {
         Measure { network: self.trunk.network, range: self.range }
     }
 
-    /// The distance of two pictures of one size, sRGB in [0, 1]; 0 for equal ones.
+    /// The distance between two images of one size, sRGB in [0, 1]; 0 for equal ones.
     ///
     /// # Errors
-    /// [`Error::Usage`] where the sizes differ, are too small, or are too large for a binding of the device; the device is out
-    /// of memory or lost.
+    /// [`Error::Usage`] where the sizes differ, are too small, or are too large for a binding of the device; the device
+    /// is out of memory or lost.
     pub fn distance(&self, gpu: &Gpu, render: &Image, reference: &Image) -> Result<f64> {
         let size = |image: &Image| UVec2::new(image.width, image.height);
         if size(render) != size(reference) {
@@ -144,7 +144,7 @@ impl Lpips {
 
 /// The mean over the pixels of the weighted squared differences of the unit vectors across the channels.
 fn layer_distance(a: &[f32], b: &[f32], weights: &[f32]) -> f64 {
-    /// The published measure's, which keeps zero vectors zero.
+    /// The published measure's, which maps zero vectors to zero.
     const EPSILON: f64 = 1e-10;
     let pixels = a.len() / weights.len();
     let lengths = |values: &[f32]| -> Vec<f64> {

@@ -1,4 +1,5 @@
-//! Norm, `ReLU` and shortcut of a repeat: f' = f + relu(gamma (z - mean) / deviation + beta) with statistics of the image.
+//! Norm, `ReLU` and shortcut of a repeat: f' = f + relu(gamma (z - mean) / deviation + beta), with the statistics of
+//! the image.
 
 use glam::Vec2;
 
@@ -9,7 +10,7 @@ use crate::kernels::{
     norm_merge, norm_statistics,
 };
 
-/// Values of a channel that one subgroup takes.
+/// Values of a channel per subgroup.
 const CHUNK: u32 = 1024;
 
 /// The kernels of a norm that is used several times.
@@ -24,7 +25,7 @@ pub(super) struct Norm {
     backward: Pipeline<norm_backward::Kernel>,
 }
 
-/// What a norm remembers between forward and backward, and scratch memory.
+/// State between forward and backward, and scratch memory.
 #[derive(Debug)]
 pub(super) struct NormMemory {
     /// (uses, C)
@@ -35,7 +36,7 @@ pub(super) struct NormMemory {
     sums: Buffer<Vec2>,
 }
 
-/// One use of a norm: how many pixels, where its parameters are, and which use of them it is.
+/// One use of a norm: pixels, offset of its parameters, and index of the use.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct NormUse {
     pub(super) pixel_count: u32,
@@ -65,7 +66,7 @@ pub(super) struct Backward<'a> {
     pub(super) d_source: &'a mut Buffer<f32>,
 }
 
-/// The push constants, which all six kernels share.
+/// The push constants of all six kernels.
 macro_rules! params {
     ($norm:ident, $of:ident, $kernel:ident) => {
         $kernel::Params {
@@ -197,7 +198,7 @@ impl NormMemory {
         })
     }
 
-    /// Floats that it takes.
+    /// Its size in floats.
     pub(super) fn floats(pixels: usize, channels: usize, uses: usize) -> usize {
         2 * channels * (uses + pixels.div_ceil(CHUNK as usize) + 1)
     }

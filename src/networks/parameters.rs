@@ -5,14 +5,14 @@ use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu};
 use crate::splats::optimizer::{AdamBuffers, Learnable, Moments};
 
-/// Where a tensor lies in the array, under its name in `PyTorch`.
+/// The location of a tensor in the array, under its name in `PyTorch`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Tensor {
     /// For example `0.conv_in.weight`.
     pub name: String,
     /// For the weights of a convolution (out, in, 3, 3).
     pub shape: Vec<usize>,
-    /// Its first element.
+    /// The index of its first element.
     pub offset: usize,
 }
 
@@ -23,20 +23,20 @@ impl Tensor {
     }
 }
 
-/// All parameters of a network, their gradients and what Adam keeps of them.
+/// The parameters of a network, their gradients and Adam's moments.
 #[derive(Debug)]
 pub struct Parameters {
     /// The network's name in files.
     pub name: &'static str,
     /// Adam's learning rate.
     pub learning_rate: f64,
-    /// Every tensor, one behind the other.
+    /// All tensors, contiguous.
     pub values: Buffer<f32>,
-    /// dL/d values, as the last backward pass left them.
+    /// dL/d values of the last backward pass.
     pub gradients: Buffer<f32>,
     moments: Moments,
     tensors: Vec<Tensor>,
-    /// What the shapes follow from, as JSON.
+    /// The settings that determine the shapes, as JSON.
     settings: String,
 }
 
@@ -46,7 +46,7 @@ impl Parameters {
         &self.tensors
     }
 
-    /// What the shapes follow from, as JSON.
+    /// The settings that determine the shapes, as JSON.
     pub fn settings(&self) -> &str {
         &self.settings
     }
@@ -71,7 +71,7 @@ impl Learnable for Parameters {
     }
 }
 
-/// Lays out the tensors of a network and draws their first values.
+/// Lays out the tensors of a network and draws their initial values.
 #[derive(Debug)]
 pub(super) struct Layout {
     random: Stream,
@@ -84,7 +84,8 @@ impl Layout {
         Self { random, tensors: vec![], values: vec![] }
     }
 
-    /// Weights (out, in, 3, 3), then biases (out), uniform in +-1 / sqrt(9 in): `PyTorch`'s default (Kaiming, a = sqrt 5).
+    /// Weights (out, in, 3, 3), then biases (out), uniform in +-1 / sqrt(9 in): `PyTorch`'s default (Kaiming, a = sqrt
+    /// 5).
     pub(super) fn conv(&mut self, name: &str, inputs: u32, outputs: u32) -> u32 {
         let (inputs, outputs) = (inputs as usize, outputs as usize);
         let bound = 1.0 / (9.0 * inputs as f64).sqrt();
@@ -95,7 +96,7 @@ impl Layout {
         offset
     }
 
-    /// As [`Layout::conv`], all zero: a layer that gives nothing, and learns.
+    /// As [`Layout::conv`], all zero: the output is zero, and it still learns.
     pub(super) fn zero_conv(&mut self, name: &str, inputs: u32, outputs: u32) -> u32 {
         let (inputs, outputs) = (inputs as usize, outputs as usize);
         let offset = self.tensor(format!("{name}.weight"), vec![outputs, inputs, 3, 3], |_| 0.0);

@@ -4,7 +4,7 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::relu_backward;
 
-/// Stops gradients where a `ReLU` gave zero.
+/// Zeroes gradients where a `ReLU` gave zero.
 #[derive(Debug)]
 pub(super) struct ReluBackward(Pipeline<relu_backward::Kernel>);
 
@@ -15,7 +15,8 @@ impl ReluBackward {
         Ok(Self(gpu.pipeline(&relu_backward::Constants::default())?))
     }
 
-    /// Records it for the first `value_count` values of `activations`, what the `ReLU` gave, and of their gradient.
+    /// Records it for the first `value_count` values of `activations`, the outputs of the `ReLU`, and of their
+    /// gradient.
     pub(super) fn record(
         &self,
         pass: &mut Recorder<'_>,

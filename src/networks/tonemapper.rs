@@ -1,4 +1,4 @@
-//! The tonemapper: three convolutions that turn illumination times denoised image into what the camera saw.
+//! The tonemapper: three convolutions from illumination times denoised image to the dark photograph.
 
 use glam::UVec2;
 
@@ -19,14 +19,14 @@ const STREAM: u64 = 6;
 /// Feature maps of both inner layers.
 const CHANNELS: u32 = 16;
 
-/// conv 3 to 16, `ReLU`, conv 16 to 16, `ReLU`, conv 16 to 3, nothing behind it; zero padding 1. In the identity form what
-/// goes in is added to what comes out.
+/// conv 3 to 16, `ReLU`, conv 16 to 16, `ReLU`, conv 16 to 3, no activation; zero padding 1. In the identity variant
+/// the input is added to the output.
 #[derive(Debug)]
 pub struct Tonemapper {
     gpu: Gpu,
     variant: NetworkVariant,
     parameters: Parameters,
-    /// Where the layers lie in the parameters.
+    /// The offsets of the layers in the parameters.
     offsets: [u32; 3],
     convs: [Conv; 3],
     product: Pipeline<product::Kernel>,
@@ -34,7 +34,7 @@ pub struct Tonemapper {
     relu_backward: ReluBackward,
     reserved: [usize; 2],
     memory: TonemapperMemory,
-    /// The size of the forward pass that the memory holds.
+    /// The size of the last forward pass.
     recorded: Option<UVec2>,
 }
 
@@ -57,7 +57,7 @@ impl Tonemapper {
     /// Adam's learning rate in LITA-GS.
     pub const LEARNING_RATE: f64 = 1e-4;
 
-    /// Draws the weights; memory for a view comes with [`Tonemapper::reserve`].
+    /// Draws the weights; [`Tonemapper::reserve`] allocates for views.
     ///
     /// # Errors
     /// The driver refuses a kernel, or the device is out of memory.
@@ -100,22 +100,22 @@ impl Tonemapper {
         &self.parameters
     }
 
-    /// As [`Tonemapper::parameters`], to be changed.
+    /// As [`Tonemapper::parameters`], mutable.
     pub fn parameters_mut(&mut self) -> &mut Parameters {
         &mut self.parameters
     }
 
-    /// How far a pixel's result looks, in pixels.
+    /// The radius of a pixel's receptive field, in pixels.
     pub fn margin(&self) -> u32 {
         self.convs.len() as u32
     }
 
-    /// Whether the device binds every map of a view of `size`.
+    /// Whether the device can bind every map of a view of `size`.
     pub fn fits_on(gpu: &Gpu, size: UVec2) -> bool {
         check_maps(gpu, size).is_ok()
     }
 
-    /// Takes the memory for views up to `size`, unless it is there already.
+    /// Allocates for views up to `size`; it never shrinks.
     ///
     /// # Errors
     /// A map exceeds what the device can bind, or the device is out of memory.
@@ -126,7 +126,7 @@ impl Tonemapper {
         let [pixels, partials] = lengths(size);
         check_maps(&self.gpu, size)?;
         let extent = [pixels.max(self.reserved[0]), partials.max(self.reserved[1])];
-        // The old memory goes first: both together may not fit.
+        // The old memory is freed first: both together may not fit.
         (self.recorded, self.reserved) = (None, [0; 2]);
         self.memory = TonemapperMemory::new(&self.gpu, [0; 2])?;
         self.memory = TonemapperMemory::new(&self.gpu, extent)?;
@@ -138,13 +138,12 @@ impl Tonemapper {
         lengths(size).into_iter().zip(self.reserved).all(|(needed, held)| needed <= held)
     }
 
-    /// The image of the last forward pass, (3, H, W), not clamped, at the beginning of a buffer that is as long as what
-    /// was reserved.
+    /// The output of the last forward pass, (3, H, W), not clamped, at the start of a buffer of the reserved length.
     pub fn output(&self) -> &Buffer<f32> {
         &self.memory.output
     }
 
-    /// Records the passes from illumination and denoised image, each (3, H, W), to [`Tonemapper::output`].
+    /// Records the forward pass from illumination and denoised image, each (3, H, W), to [`Tonemapper::output`].
     ///
     /// # Errors
     /// The view is empty or no memory is reserved for it, or an image is shorter than the view.
@@ -184,8 +183,8 @@ impl Tonemapper {
         Ok(())
     }
 
-    /// Records the passes from dL/d output back: overwrites the gradients of the parameters, writes `d_illumination`
-    /// and adds to `d_denoised`, each (3, H, W). Inputs and parameters are those of the forward pass before it.
+    /// Records the backward pass from dL/d output: overwrites the gradients of the parameters, writes `d_illumination`
+    /// and adds to `d_denoised`, each (3, H, W). Inputs and parameters must be those of the preceding forward pass.
     ///
     /// # Errors
     /// There is no forward pass of that size before it, or an image is shorter than the view.

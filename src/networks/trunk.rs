@@ -1,5 +1,5 @@
-//! The convolutions of the networks whose activations LPIPS compares pictures by, as torchvision has them: AlexNet
-//! (Krizhevsky 2014) and VGG-16 (Simonyan and Zisserman 2015).
+//! The trunks of LPIPS: convolutional layers as in torchvision, AlexNet (Krizhevsky 2014) and VGG-16 (Simonyan and
+//! Zisserman 2015).
 
 use std::path::Path;
 
@@ -12,28 +12,28 @@ use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{conv_strided, max_pool};
 use crate::{Error, Result};
 
-/// A network that LPIPS looks through.
+/// The network of LPIPS.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Network {
-    /// AlexNet, the choice of the measure's authors for comparing pictures.
+    /// AlexNet, the authors' choice for comparing images.
     #[default]
     Alex,
-    /// VGG-16, what 3DGS and many after it report.
+    /// VGG-16, as reported by 3DGS and many later papers.
     Vgg,
 }
 
-/// A convolution, behind it a ReLU.
+/// A convolution with a ReLU.
 struct TrunkLayer {
     /// Of its tensors in `lpips`.
     name: &'static str,
     channels: [u32; 2],
-    /// Taps to a side.
+    /// Width and height of the kernel.
     window: u32,
     stride: u32,
     padding: u32,
     /// Max pooling before the layer: the side of its window in pixels; its stride is 2.
     pool: Option<u32>,
-    /// LPIPS looks at its activations.
+    /// Whether LPIPS compares its activations.
     is_compared: bool,
 }
 
@@ -77,17 +77,17 @@ static VGG16: [TrunkLayer; 13] = [
     conv("net.slice5.28", [512, 512], 3).compared(),
 ];
 
-/// Pixels from one window of a pool to the next.
+/// The stride of a pool in pixels.
 const POOL_STRIDE: u32 = 2;
 
-/// What a message about a file of weights ends with.
+/// The remedy in messages about a file of weights.
 const REMEDY: &str = "scripts/lpips-weights.py writes AlexNet's or VGG-16's";
 
 impl Network {
-    /// Each of them.
+    /// All networks.
     pub const ALL: [Self; 2] = [Self::Alex, Self::Vgg];
 
-    /// What `lpips` and our files call it.
+    /// Its name in `lpips` and in our files.
     pub fn name(self) -> &'static str {
         match self {
             Self::Alex => "alex",
@@ -95,7 +95,7 @@ impl Network {
         }
     }
 
-    /// What people call it.
+    /// Its title.
     pub fn title(self) -> &'static str {
         match self {
             Self::Alex => "AlexNet",
@@ -110,7 +110,7 @@ impl Network {
         }
     }
 
-    /// The least width and height that leave the last layer a pixel.
+    /// The least width and height for which the last layer has a pixel.
     fn min_size(self) -> u32 {
         match self {
             Self::Alex => 31,
@@ -118,19 +118,19 @@ impl Network {
         }
     }
 
-    /// How many channels each layer that is compared has.
+    /// The number of channels of each compared layer.
     pub(crate) fn compared_channels(self) -> impl Iterator<Item = usize> {
         let compared = self.layers().iter().filter(|layer| layer.is_compared);
         compared.map(|layer| layer.channels[1] as usize)
     }
 
-    /// The tensor that no other network has: they all begin and end alike but for where the last convolution stands.
+    /// The tensor that identifies the network: only the position of the last convolution differs.
     fn last_tensor(self) -> String {
         let name = self.layers().last().map_or("", |layer| layer.name);
         format!("{name}.weight")
     }
 
-    /// The network whose last convolution a file holds.
+    /// The network of a file, by its last convolution.
     ///
     /// # Errors
     /// [`Error::Input`]: it holds no network's.
@@ -149,7 +149,7 @@ impl Network {
 #[derive(Debug)]
 pub(crate) struct Trunk {
     pub(crate) network: Network,
-    /// Of each layer in turn weights (out, in, window, window), then biases (out).
+    /// Of each layer in order: weights (out, in, window, window), then biases (out).
     values: Buffer<f32>,
     strided: Pipeline<conv_strided::Kernel>,
     /// For windows of 3.
@@ -158,10 +158,11 @@ pub(crate) struct Trunk {
 }
 
 impl Trunk {
-    /// The network of a file, whose tensors have the names of `lpips`'s.
+    /// Loads the network of a file, whose tensors have the names of `lpips`.
     ///
     /// # Errors
-    /// The file lacks a tensor, or has one of another shape or with a value that is not finite; the device is out of memory.
+    /// The file lacks a tensor, or has one of another shape or with a value that is not finite; the device is out of
+    /// memory.
     pub(crate) fn new(
         gpu: &Gpu,
         path: &Path,
@@ -189,7 +190,7 @@ impl Trunk {
     }
 
     /// # Errors
-    /// The last layer would have no pixel of such a picture, or one binding cannot span an image of it.
+    /// The last layer would have no pixel, or one binding cannot hold an image of it.
     pub(crate) fn check(&self, gpu: &Gpu, size: UVec2) -> Result<()> {
         let UVec2 { x: width, y: height } = size;
         let (title, least) = (self.network.title(), self.network.min_size());
@@ -211,13 +212,13 @@ impl Trunk {
         }
         let device = &gpu.properties().name;
         Err(Error::Usage(format!(
-            "LPIPS of {title} at {width}x{height} needs {bytes} bytes at once, {device} binds {limit} at most; take another \
-             device, weights of AlexNet, or a run on smaller pictures"
+            "LPIPS of {title} at {width}x{height} needs {bytes} bytes at once, {device} binds {limit} at most; take \
+             another device, weights of AlexNet, or a run on smaller pictures"
         )))
     }
 
-    /// What each layer that is compared makes of a picture (3, H, W) whose size was [checked](Self::check): its activations,
-    /// (channels, pixels).
+    /// The activations of each compared layer for an image (3, H, W) whose size was [checked](Self::check), (channels,
+    /// pixels).
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -308,7 +309,7 @@ impl Trunk {
 }
 
 impl TrunkLayer {
-    /// Pixels of what is convolved and of what comes out, for a picture that comes in.
+    /// Pixels of the convolution's input and output, for an input image.
     fn sizes(&self, size: UVec2) -> [UVec2; 2] {
         let within = self.pool.map_or(size, |window| (size - window) / POOL_STRIDE + 1);
         [within, (within + 2 * self.padding - self.window) / self.stride + 1]

@@ -5,11 +5,16 @@
 //! same name is a test view's reference image (`View::reference`), used for scores only and loaded for test views only.
 
 mod allowance;
+mod borders;
 mod colmap;
+mod dark_references;
 mod depth;
 mod fingerprint;
+mod layout;
 mod listed;
 mod listing;
+mod loaded;
+mod locate;
 mod masks;
 mod members;
 mod names;
@@ -18,6 +23,7 @@ mod original;
 mod packed;
 mod pixels;
 mod place;
+mod ply;
 mod points;
 mod prepare;
 mod similarity;
@@ -30,18 +36,21 @@ mod undistort;
 mod unused;
 
 use std::borrow::Cow;
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
 use glam::{DVec3, UVec2};
 
-use crate::camera::Camera;
+use crate::camera::{Camera, Lens};
 use crate::photographs::image::files::Files;
-use crate::photographs::image::{Image, Mask};
+use crate::photographs::image::{Image, Mask, MaskFile};
+use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 pub use fingerprint::Fingerprint;
+use layout::Layout;
 use listed::{ListedView, Listing};
 use listing::{list, warn};
+pub(crate) use masks::is_beside as is_mask;
 use members::with_held_out;
 pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
 pub use original::Original;
@@ -212,8 +221,8 @@ pub struct Photograph {
     pub input: PathBuf,
     /// The normal-light photograph to score against; test views only.
     pub reference: Option<PathBuf>,
-    /// The mask, whose black pixels do not count.
-    pub mask: Option<PathBuf>,
+    /// The mask.
+    pub(crate) mask: Option<MaskFile>,
 }
 
 /// A triangulated point of the scene.
@@ -265,12 +274,15 @@ impl Dataset {
     ) -> Result<Self> {
         options.check()?;
         let files = Files::default();
-        let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
-        log_split(root, &frames, options);
-        split(root, &mut frames, options.test_every, &files)?;
+        let layout = Layout::of(root)?;
+        let Listing { mut frames, mut skipped, remarks, clouds } =
+            list(&layout, options.images.as_deref(), &files)?;
+        log_split(&layout.root, &frames, options);
+        split(&layout.root, &mut frames, options.test_every, &files)?;
 
-        let sources = sources(root, &frames, options, &files, &mut skipped);
-        let views = pixels::load(sources, options, look, &mut skipped)?;
+        let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
+        let gains = white_balance_gains(&layout.root, &sources, options)?;
+        let views = pixels::load(sources, options, (look, gains), &mut skipped)?;
         if !views.iter().any(|view| view.split == Split::Train) {
             let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
             let problem = format!(
@@ -281,7 +293,7 @@ impl Dataset {
         // Behind what may end it: an error is said alone.
         warn(&remarks);
         let views = with_held_out(views, options.hold_out);
-        let points = points(root, &views)?;
+        let points = points(&layout, &views, &clouds)?;
         for line in &skipped {
             tracing::warn!("skipped {line}");
         }
@@ -300,19 +312,22 @@ impl Dataset {
 
     /// What says which views are held out, in words.
     pub(crate) fn split_rule(root: &Path, options: &LoadOptions) -> String {
-        let has_test = transforms::find(root).iter().any(|(_, split)| *split == Some(Split::Test));
+        let layout = Layout::of(root).ok();
+        let listings = layout.as_ref().map(Layout::listings).unwrap_or_default();
+        let has_test = listings.iter().any(|(_, split)| *split == Some(Split::Test));
+        let root = layout.as_ref().map_or(root, |layout| &layout.root);
         match options.test_every {
             Some(0) => "none, as asked for".to_owned(),
             Some(every) => format!("every {every}th by name, as asked for"),
             None if has_test => "as the transforms files say".to_owned(),
-            None if root.join("test.txt").is_file() => "as test.txt says".to_owned(),
+            None if split::test_list(root).is_some() => "as test.txt says".to_owned(),
             None => format!("every {TEST_EVERY}th by name"),
         }
     }
 
     /// Whether `root` is a folder that [`Dataset::load`] finds cameras in.
     pub(crate) fn is_at(root: &Path) -> bool {
-        !transforms::find(root).is_empty() || !colmap::find(root, &["cameras", "images"]).is_empty()
+        Layout::of(root).is_ok_and(|layout| layout.has_listing())
     }
 
     /// Of the models that COLMAP left in the folders of `folder` the one that places the most photographs, with their names.
@@ -324,6 +339,24 @@ impl Dataset {
         let Some((model, _)) = colmap::largest(&models, |_| true)? else { return Ok(None) };
         let names = colmap::read_images(model)?.into_iter().map(|image| image.name);
         Ok(Some((model.to_owned(), names.collect())))
+    }
+
+    /// The calibrated lenses of a COLMAP model.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where the model is damaged.
+    #[cfg(feature = "cli")]
+    pub(crate) fn lenses(model: &Path) -> Result<Vec<Lens>> {
+        Ok(colmap::read_cameras(model)?.into_values().collect())
+    }
+
+    /// The folder that holds what an archive holds: its one folder where there is nothing beside.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where it is no archive that can be read.
+    #[cfg(feature = "cli")]
+    pub(crate) fn folder_of(archive: &Path) -> Result<PathBuf> {
+        Ok(Layout::of(archive)?.root)
     }
 
     /// The files of the views below `root`, sorted by name, without reading a pixel.
@@ -346,15 +379,32 @@ impl Dataset {
     ) -> Result<(Vec<Photograph>, Vec<String>, Vec<String>)> {
         options.check()?;
         let files = Files::default();
-        let Listing { mut frames, mut skipped, remarks } = list(root, &files)?;
-        split(root, &mut frames, options.test_every, &files)?;
-        let sources = sources(root, &frames, options, &files, &mut skipped);
+        let layout = Layout::of(root)?;
+        let Listing { mut frames, mut skipped, remarks, .. } =
+            list(&layout, options.images.as_deref(), &files)?;
+        split(&layout.root, &mut frames, options.test_every, &files)?;
+        let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
         let photograph = |source: Source| {
             let Source { name, split, input, reference, mask, .. } = source;
             Some(Photograph { name, split, input: input?, reference, mask })
         };
         Ok((sources.into_iter().filter_map(photograph).collect(), skipped, remarks))
     }
+}
+
+/// The gains of the photographs; `None` where the options ask for none.
+///
+/// # Errors
+/// There is no such photograph, or nothing neutral to be measured in it.
+fn white_balance_gains(
+    root: &Path,
+    sources: &[Source],
+    options: &LoadOptions,
+) -> Result<Option<WhiteBalanceGains>> {
+    let photographs = || {
+        sources.iter().filter_map(|source| Some((source.name.as_str(), source.input.as_deref()?)))
+    };
+    options.white_balance.as_ref().map(|balance| balance.gains(root, photographs())).transpose()
 }
 
 /// Which files each view reads. A training view without its photograph is left out, a test view stays as a pose.
@@ -367,16 +417,24 @@ fn sources(
 ) -> Vec<Source> {
     let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
     let training_folders: BTreeSet<&str> = training.map(ListedView::folder).collect();
+    // What is listed as one view's is no reference image of another's.
+    let listed: HashSet<&PathBuf> = frames.iter().filter_map(|frame| frame.file.as_ref()).collect();
     let mut sources = Vec::new();
     for frame in frames {
         let split = frame.split.unwrap_or(Split::Train);
         // A test listing names the normal-light photographs (LOM, RealX3D) unless training frames lie there too.
         let lists_input = split == Split::Train || training_folders.contains(frame.folder());
-        let input = frame.input(root, lists_input, files);
+        let input = match &options.images {
+            // Where the user says where they lie, nothing is guessed.
+            Some(_) => frame.file.clone(),
+            None => frame.input(root, lists_input, files),
+        };
         let reference = match &options.reference {
             _ if split == Split::Train => None,
             Some(folder) => frame.find(folder, files),
-            None => frame.reference(root, input.as_ref(), files),
+            None => frame
+                .reference(root, input.as_ref(), files)
+                .filter(|file| frame.file.as_ref() == Some(file) || !listed.contains(file)),
         };
         if input.is_none() && reference.is_none() {
             let kept = if split == Split::Test { "; its pose is kept" } else { "" };
@@ -385,12 +443,12 @@ fn sources(
         if input.is_some() || split == Split::Test {
             let input = input.filter(|_| split == Split::Train || options.load_low_test);
             let depth = (options.depth.load && split == Split::Train)
-                .then(|| frame.depth(root, options.depth.folder.as_deref(), files))
+                .then(|| frame.depth_file(root, options.depth.folder.as_deref(), files))
                 .flatten();
             let mask = masks::find(root, frame, files);
             let ListedView { name, lens, view_from_world, .. } = frame.clone();
             let camera = (lens, view_from_world);
-            sources.push(Source::new((name, split), camera, [input, reference, mask, depth]));
+            sources.push(Source::new((name, split), camera, [input, reference, depth], mask));
         }
     }
     if let Some(folder) = &options.reference
@@ -426,8 +484,11 @@ impl ListedView {
         beside.or_else(|| self.file.clone().filter(|_| lists_input))
     }
 
-    /// The depth map: named like the photograph, or that behind `depth_`.
-    fn depth(&self, root: &Path, folder: Option<&Path>, files: &Files) -> Option<PathBuf> {
+    /// The depth map: the one that is listed; named like the photograph, or that behind `depth_`.
+    fn depth_file(&self, root: &Path, folder: Option<&Path>, files: &Files) -> Option<PathBuf> {
+        if folder.is_none() && self.depth.is_some() {
+            return self.depth.clone();
+        }
         let folders = match folder {
             Some(folder) => vec![folder.to_owned()],
             None => DEPTH_FOLDERS.map(|name| root.join(name)).to_vec(),

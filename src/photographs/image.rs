@@ -1,13 +1,17 @@
 //! Photographs as planar float images, and the files they come from and go to.
 //!
-//! Values are sRGB-encoded, as an 8-bit file stores them divided by 255. EXR files hold linear light by
-//! convention; they are encoded on the way in and decoded on the way out (IEC 61966-2-1, linear toe included,
-//! the power law continued above 1).
+//! Values are sRGB-encoded, as an 8-bit file stores them divided by 255. A file in another colour space is converted when it
+//! is read (`colour`). EXR files hold linear light by convention; they are encoded on the way in and decoded on the way out
+//! (IEC 61966-2-1, linear toe included, the power law continued above 1).
 
 #[cfg(feature = "io")]
 mod budget;
 #[cfg(feature = "io")]
 mod codec;
+#[cfg(feature = "io")]
+mod colour;
+#[cfg(feature = "io")]
+mod decoded;
 #[cfg(feature = "io")]
 mod exif;
 #[cfg(feature = "io")]
@@ -30,11 +34,17 @@ pub(crate) use codec::PictureFile;
 #[cfg(all(feature = "io", test))]
 pub(crate) use codec::openings;
 #[cfg(feature = "io")]
+pub(crate) use colour::ColourTally;
+#[cfg(feature = "io")]
 pub use exif::exposure_value;
+#[cfg(feature = "cli")]
+pub(crate) use exif::lens_name;
 #[cfg(feature = "io")]
 pub use jpeg::exif_segment;
 #[cfg(feature = "io")]
 pub use mask::Mask;
+#[cfg(feature = "io")]
+pub(crate) use mask::MaskFile;
 #[cfg(feature = "io")]
 pub use orientation::Orientation;
 use rayon::prelude::*;

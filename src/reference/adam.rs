@@ -33,7 +33,8 @@ pub(super) fn from_halves(word: u32) -> [f32; 2] {
     [word & 0xffff_0000, word << 16].map(f32::from_bits)
 }
 
-/// Both moments after the step as the device has them, where no product and sum are fused, and the chance of its rounding.
+/// Both moments after the step as on the device, where no product and sum are fused, and the random number of their
+/// rounding.
 pub(super) fn moments_after(step: u32, [p, g, m, v]: [f32; 4]) -> ([f32; 2], u32) {
     let g = clamp_gradient(g);
     let m = BETA1 as f32 * m + (1.0 - BETA1) as f32 * g;
@@ -101,7 +102,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// Twice the running error: the reference rounds too. Half moments are rounded alike everywhere.
+    /// Twice the running error, as the reference rounds too. Half moments are rounded identically.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let Slices { parameters, gradients, first_moments, second_moments, both_moments, status } =
             slices;

@@ -47,8 +47,8 @@ impl Reference for Kernel {
         }
     }
 
-    /// A number at the border of being rounded up may be rounded down. Moments are rounded alike everywhere, but for subnormal
-    /// ones, which may be flushed.
+    /// A number at the border of being rounded up may be rounded down. Moments are rounded alike everywhere, but for
+    /// subnormal ones, which may be flushed.
     fn tolerances(_: &Params, constants: &Constants, _: Slices<'_>) -> Tolerances {
         let parameters = Tolerance::Halves;
         if constants.half_moments {

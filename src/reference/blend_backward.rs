@@ -1,4 +1,4 @@
-//! The gradients that one pixel leaves on its splats, in f64.
+//! The gradients of one pixel with respect to its splats, in f64.
 
 use glam::{DVec2, UVec2};
 
@@ -10,8 +10,8 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::RECORD_HEAD;
 
-/// Adds to `gradient_records` (splats, record) what one pixel with the values `render` and the gradient `d_render` says:
-/// the gradients of mean2d, conic and opacity, to which the first `shaping` channels speak, and of the colours.
+/// Adds the gradients of one pixel with the values `render` and the gradient `d_render` to `gradient_records` (splats,
+/// record): those of mean2d, conic and opacity, from the first `shaping` channels, and those of the colours.
 #[expect(clippy::too_many_arguments, reason = "a pixel, its splats and its gradients")]
 pub fn blend_pixel_backward(
     splats: &[Splat],
@@ -59,7 +59,8 @@ struct Pixel {
     d_render: Vec<f64>,
 }
 
-/// Adds up what `visit` adds for every pixel to the records of its tile's list, and writes each to its slot.
+/// Sums the contributions of all pixels to the records of their tile's list, and writes each record to its
+/// intersection.
 fn for_each_tile(
     params: &Params,
     constants: &Constants,
@@ -103,9 +104,9 @@ fn for_each_tile(
     }
 }
 
-/// Adds to `bounds` how far the shares of one pixel in the records may be off: the light still to come is off by what
-/// the render may be off, which 1 / (1 - alpha) magnifies; the rest is relative to the magnitude of the share, which
-/// counts whole where a rounding decides about it.
+/// Adds to `bounds` the error bound of one pixel's contribution to the records: the light still to come has the error
+/// of the render, which 1 / (1 - alpha) magnifies; the rest is relative to the magnitude of the contribution, which
+/// counts in full where a rounding decides whether it exists.
 fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mut [f64]) {
     let (channels, tile) =
         (constants.channels as usize, UVec2::new(constants.tile_width, constants.tile_height));
@@ -127,7 +128,7 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
         let relative = if model.is_fragile { 1.0 } else { rounded };
         let d_alpha = (2.0 * light_error + relative * (light + share)) / (1.0 - fragment.alpha);
         let d_sigma = fragment.alpha * d_alpha;
-        // An offset may be off by the rounding of a tile's extent.
+        // An offset has the rounding error of a tile's extent.
         let offset = fragment.d.abs() + 1.0;
         bound[0] += d_sigma * (conic.x * offset.x + conic.y.abs() * offset.y);
         bound[1] += d_sigma * (conic.y.abs() * offset.x + conic.z * offset.y);

@@ -1,4 +1,4 @@
-//! The light of one pixel, in f64, by going through everything in its tile.
+//! The colour of one pixel, in f64, over all splats of its tile.
 
 use glam::{DVec2, UVec2, Vec3};
 
@@ -29,7 +29,7 @@ pub fn blend_pixel(
     (render, transmittance)
 }
 
-/// What a tile blends, front to back.
+/// The splats of a tile, front to back.
 pub(super) struct TileList {
     pub(super) intersection_ids: Vec<u32>,
     pub(super) splats: Vec<Splat>,
@@ -64,7 +64,7 @@ impl TileList {
     }
 }
 
-/// Where the run of every tile lies among the sorted intersections, and how long it is.
+/// Offset and length of every tile's run among the sorted intersections.
 fn tile_runs(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<(UVec2, u32)> {
     let mut first = 0;
     let tiles = 0..params.tile_columns * params.size.y.div_ceil(constants.tile_height);
@@ -153,7 +153,7 @@ fn background(params: &Params, constants: &Constants) -> Vec<f64> {
     params.background[..constants.channels as usize].iter().map(|&c| c.into()).collect()
 }
 
-/// The pixels of a tile that lie in the image, row by row.
+/// The pixels of a tile that are inside the image, row by row.
 pub(super) fn tile_pixels(
     index: u32,
     tile_columns: u32,

@@ -1,8 +1,8 @@
-//! The rounding model of the blending kernels: what single precision may make of one pixel.
+//! The rounding model of the blending kernels: the error of one pixel in single precision.
 //!
-//! sigma is a sum whose terms round a few times each; exp adds 3 + 2 sigma units; an alpha moves the pixel by at most
+//! sigma is a sum whose terms round a few times each; exp adds 3 + 2 sigma units; an alpha changes the pixel by at most
 //! 2 max|c| T. Products and sums over the list add a rounding per splat. Where a rounding decides whether a splat is
-//! blended, capped or the last, the pixel may be on either side: what that moves it by is part of the bound.
+//! blended, capped or the last, either outcome is accepted: the difference is part of the bound.
 
 use glam::{DVec2, UVec2};
 
@@ -10,9 +10,9 @@ use super::rounding::UNIT;
 use super::splat::{Fragment, Splat};
 use crate::kernels::splat::{ALPHA_MIN, TRANSMITTANCE_MIN};
 
-/// One pixel, and how far a device may be from it.
+/// One pixel, and the allowed error of a device.
 pub(super) struct PixelModel {
-    /// All that the device may blend, front to back, with the bound of each alpha's relative error.
+    /// All splats that the device may blend, front to back, with the bound of each alpha's relative error.
     pub(super) fragments: Vec<(Fragment, f64)>,
     /// The bound of a channel's error, over the largest magnitude of a colour; also that of the transmittance.
     pub(super) error: f64,

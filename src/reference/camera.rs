@@ -118,7 +118,8 @@ impl Camera {
         }
     }
 
-    /// The gradient of the camera, from those of what it makes of a point: of a shift of all points in the view, which is
+    /// The gradient of the camera, from those of what it makes of a point: of a shift of all points in the view, which
+    /// is
     /// `d_shift`, and of their turn about the camera, of focal lengths, principal point and distortion.
     #[cfg(feature = "testing")]
     pub fn gradient(

@@ -30,8 +30,8 @@ pub fn camera_backward(
     camera.gradient(point, camera.rotation * d_mean, d_mean2d, d_rows)
 }
 
-/// The inputs of Gaussian `i` as numbers, and how far each may be off: mean, rotation, scales, conic, the gradients of the
-/// mean, of the splat's mean and of its conic.
+/// The inputs of Gaussian `i` as numbers, and how far each may be off: mean, rotation, scales, conic, the gradients of
+/// the mean, of the splat's mean and of its conic.
 fn inputs(params: &Params, constants: &Constants, slices: &Slices<'_>, i: usize) -> [Vec<f64>; 2] {
     const OFF: f64 = 256.0 * UNIT;
     let n = params.gaussian_count as usize;

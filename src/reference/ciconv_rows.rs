@@ -1,10 +1,10 @@
-//! `CIConv` in double precision: what the rows pass leaves, and its taps.
+//! `CIConv` in double precision: the rows pass and its taps.
 
 use super::rounding::UNIT;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ciconv_rows::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// What R, G and B add to E, `E_lambda` and `E_lambda_lambda` (Geusebroek et al. 2001).
+/// The weights of R, G and B in E, `E_lambda` and `E_lambda_lambda` (Geusebroek et al. 2001).
 const COLOR_MODEL: [[f64; 3]; 3] = [[0.06, 0.63, 0.27], [0.30, 0.04, -0.35], [0.34, -0.60, 0.17]];
 
 /// The Gaussian of scale 0.8 and its derivative at -6..=6; the sums of magnitudes are 1.
@@ -18,7 +18,7 @@ pub(super) fn taps() -> [[f64; 13]; 2] {
     [normalized(&bell), normalized(&|u| u * bell(u))]
 }
 
-/// One plane correlated with `taps`: `at(u)` is the neighbour `u` away, none beyond the border.
+/// One plane correlated with `taps`: `at(u)` is the neighbour at offset `u`, `None` beyond the border.
 pub(super) fn correlate(taps: &[f64], at: impl Fn(isize) -> Option<f64>) -> f64 {
     let radius = taps.len() as isize / 2;
     (-radius..=radius).map(|u| taps[(u + radius) as usize] * at(u).unwrap_or(0.0)).sum()
@@ -55,7 +55,8 @@ impl Reference for Kernel {
         }
     }
 
-    /// Thirteen products and additions of sums of three: eighteen roundings of the terms' magnitudes, and the constants'.
+    /// Thirteen products and additions of sums of three: eighteen roundings of the terms' magnitudes, and the
+    /// constants'.
     fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
         let taps = taps();
         let bounds =

@@ -13,7 +13,7 @@ pub(super) fn for_each_tap(
     for y in 0..height {
         for x in 0..width {
             for tap in 0..9 {
-                // One row and one column of padding: what wraps around lies outside too.
+                // One row and one column of padding: what wraps around is outside as well.
                 let (from_x, from_y) =
                     ((x + tap % 3).wrapping_sub(1), (y + tap / 3).wrapping_sub(1));
                 if from_x < width && from_y < height {
@@ -64,7 +64,7 @@ pub fn data_gradient(
     d_input
 }
 
-/// What the kernel's constant `ACTIVATION` stands for.
+/// The activation of the kernel's constant `ACTIVATION`.
 pub fn activate(activation: u32, x: f64) -> f64 {
     match activation {
         // A NaN stays one.
@@ -95,7 +95,7 @@ pub(super) fn sums(
     }
 }
 
-/// What a sum of products rounds by, in whatever order: a rounding for each of its terms' magnitudes.
+/// The rounding error of a sum of products in any order: one rounding of the magnitude of each term.
 pub(super) fn sum_error(params: &Params, magnitude: f64) -> f64 {
     f64::from(9 * params.in_channels + 2) * UNIT * magnitude
 }

@@ -7,7 +7,7 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::conv3x3;
 use crate::kernels::conv3x3_half::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// The scaled sums that the factors make, and of the magnitudes of their terms; what the largest of both are.
+/// The scaled sums and the sums of the magnitudes of their terms; the largest magnitudes of the factors.
 struct Scaled {
     sums: Vec<f64>,
     magnitudes: Vec<f64>,
@@ -27,12 +27,12 @@ impl Scaled {
     }
 }
 
-/// What the sum of two packed factors is divided by.
+/// The divisor of the sum of two packed factors.
 fn unit(slices: &Slices<'_>) -> f64 {
     scale(slices.largest_weight[0]) * scale(slices.largest_source[0])
 }
 
-/// What is added to a sum of channel `pixel / plane`.
+/// The value that is added to a sum of channel `pixel / plane`.
 fn bias(params: &Params, constants: &Constants, values: &[f32], pixel: usize) -> f64 {
     let channel = pixel / params.size.element_product() as usize;
     if constants.biased { values[params.biases as usize + channel].into() } else { 0.0 }
@@ -48,7 +48,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// The sum of products, and a rounding of each of those that follow.
+    /// The sum of products, and the rounding of each later operation.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let (unit, scaled) = (unit(&slices), Scaled::new(params, &slices));
         let bound = |(pixel, &magnitude): (usize, &f64)| {

@@ -3,7 +3,7 @@ use glam::UVec2;
 use crate::gpu::Reference;
 use crate::kernels::crop_gather::{Kernel, Params, Slices};
 
-/// Where each value of a window lies in the image, in the window's order.
+/// The index in the image of each value of a padded crop, in the crop's order.
 pub(super) fn places(
     size: UVec2,
     origin: UVec2,

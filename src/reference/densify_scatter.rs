@@ -1,4 +1,4 @@
-//! What comes of a Gaussian that multiplies.
+//! The children of a densified Gaussian.
 
 use std::f32::consts::TAU;
 
@@ -27,7 +27,7 @@ fn random_normal3(key: u32) -> Vec3 {
     Vec3::new(radius[0] * angle[0].cos(), radius[0] * angle[0].sin(), radius[1] * angle[1].cos())
 }
 
-/// One of what comes of a Gaussian.
+/// A child of a Gaussian.
 pub(super) struct Child {
     pub(super) of: usize,
     /// The first or the second.
@@ -36,7 +36,7 @@ pub(super) struct Child {
     pub(super) is_new: bool,
 }
 
-/// The copies of all `count` Gaussians that belong to a batch of the new: how many lie before it, and how many it is of.
+/// The children that belong to a batch of new Gaussians, of all `count` Gaussians: the batch's offset and length.
 pub(super) fn copies<'a>(
     count: usize,
     actions: &'a [u32],
@@ -57,7 +57,7 @@ pub(super) fn copies<'a>(
     })
 }
 
-/// What density control changes of a Gaussian.
+/// The attributes that density control changes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Shape {
     /// World units.
@@ -68,7 +68,7 @@ pub struct Shape {
     pub raw_opacity: f32,
 }
 
-/// One half of a Gaussian, which `rotation` turns, along its longest axis: the first or the second.
+/// One half, the first or the second, of a Gaussian with this `rotation`, split along its longest axis.
 pub fn half_of(parent: &Shape, rotation: Quat, copy: u32) -> Shape {
     let log_scales = parent.log_scales;
     let (axis, longest) = (log_scales.max_position(), log_scales.max_element());
@@ -84,7 +84,7 @@ pub fn half_of(parent: &Shape, rotation: Quat, copy: u32) -> Shape {
     }
 }
 
-/// A Gaussian whose position is drawn from the normal distribution that `parent` is.
+/// A Gaussian whose position is drawn from the normal distribution of `parent`.
 fn drawn(parent: &Shape, rotation: Quat, is_split: bool, key: u32) -> Shape {
     let shrink = if is_split { PAPER_LOG_SPLIT_FACTOR as f32 } else { 0.0 };
     Shape {
@@ -94,7 +94,7 @@ fn drawn(parent: &Shape, rotation: Quat, is_split: bool, key: u32) -> Shape {
     }
 }
 
-/// Where the planes of what density control changes begin, of `count` Gaussians.
+/// The offsets of the planes that density control changes, for `count` Gaussians.
 fn changed(count: usize) -> [usize; 3] {
     [Attribute::Means, Attribute::LogScales, Attribute::RawOpacities]
         .map(|attribute| attribute.column(0) * count)
@@ -149,9 +149,9 @@ impl Reference for Kernel {
         }
     }
 
-    /// Drawn positions are off by a cosine's error, which scales and the radius of the draw, 5.8 at most, magnify; those
-    /// of a half by what an exponential and the axes are off by, its opacity by what the logarithm of a quotient is. What
-    /// else there is is copied.
+    /// Drawn positions have the error of a cosine, magnified by scales and the radius of the draw, 5.8 at most; those
+    /// of a half the errors of an exponential and of the axes, its opacity that of the logarithm of a quotient.
+    /// Everything else is copied.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
         let mut bounds = vec![0.0; slices.new_parameters.len()];

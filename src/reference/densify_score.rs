@@ -1,4 +1,4 @@
-//! How much each Gaussian asks to multiply, and what a split of it would change in the views of cameras.
+//! The score of each Gaussian for densification, and the estimated change of the cameras' views by a split.
 
 use glam::{DMat3, DVec2, DVec3, DVec4};
 
@@ -22,9 +22,9 @@ fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
     }
 }
 
-/// An estimate of the mean squared change of a view where two halves take the place of a Gaussian, in units of the squared
-/// contrast of what it covers: the share of the view that it covers, times the square of its opacity and of the relative
-/// change of depth.
+/// An estimate of the mean squared change of a view by a split, in units of the squared contrast of what the Gaussian
+/// covers: the fraction of the view that it covers, times the square of its opacity and of the relative change of
+/// depth.
 pub(super) fn view_change(near: f64, camera: &Camera, gaussian: &Gaussian) -> f64 {
     let opacity = sigmoid(gaussian.raw_opacity);
     let scale = DMat3::from_diagonal(gaussian.log_scale.exp());
@@ -52,7 +52,7 @@ pub(super) fn view_change(near: f64, camera: &Camera, gaussian: &Gaussian) -> f6
     covered.element_product() * (opacity * shift / depth).powi(2)
 }
 
-/// The most that a split of Gaussian `i` changes in a camera's view; NaN where one is.
+/// The largest change of a camera's view by a split of Gaussian `i`; NaN if any is.
 fn largest_change(params: &Params, slices: &Slices<'_>, i: usize) -> f64 {
     let n = params.gaussian_count as usize;
     fn of<const WIDTH: usize>(
@@ -105,10 +105,10 @@ impl Reference for Kernel {
         }
     }
 
-    /// A division is good to five roundings, and the reference's to one: as many units of a key, which is made of bits,
-    /// and a unit is up to two roundings. At the threshold, whether there is a candidate hangs on it. So it does where a
-    /// view would change by about the bound: by a thousandth of it, as exponentials, differences of depths and the edges
-    /// of what is covered are good to that wherever a parameter is below about 1 000.
+    /// A division has an error of five roundings, and the reference's one: as many units of a key, which is made of
+    /// bits, and a unit is up to two roundings. At the threshold they decide whether there is a candidate. The same
+    /// holds where a view would change by about the bound: within a thousandth of it, the precision of exponentials,
+    /// differences of depths and the edges of splats wherever a parameter is below about 1 000.
     fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
         const ROUNDINGS: f64 = 6.0;
         let (threshold, bound) =

@@ -17,7 +17,7 @@ fn covered(params: &Params, constants: &Constants, splat: &ProjectedSplat) -> Ve
     (top..bottom).flat_map(row).collect()
 }
 
-/// The Gaussian of every rank, with its slots.
+/// The Gaussian of every rank, with its intersections.
 fn reserved(
     params: &Params,
     constants: &Constants,
@@ -54,7 +54,8 @@ impl Reference for Kernel {
         }
     }
 
-    /// Where a border of the ellipse lies within rounding of that of a tile, its Gaussian may or may not cover the tile.
+    /// Where an edge of the ellipse is within rounding of an edge of a tile, the Gaussian may or may not cover the
+    /// tile.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let mut tiles = vec![0.0; slices.tiles.len()];
         let mut intersection_ranges = vec![0.0; 2 * slices.intersection_ranges.len()];
@@ -77,7 +78,7 @@ impl Reference for Kernel {
     }
 }
 
-/// The splat, with its borders off by their roundings.
+/// The splat, with its edges moved by their rounding errors.
 fn moved(splat: &ProjectedSplat) -> [ProjectedSplat; 2] {
     let extent = extent_error(splat.opacity) * f64::from(splat.half_extent.x);
     let off = (extent + 8.0 * UNIT * f64::from(splat.mean2d.x.abs())) as f32;

@@ -1,4 +1,4 @@
-//! What an exposure is, in any number.
+//! Application of an exposure, in any number type.
 
 use super::rounding::{Rounded, values};
 use crate::gpu::Reference;
@@ -6,7 +6,7 @@ use crate::kernels::expose::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use crate::photographs::tone::Real;
 
-/// Gain and bias of a channel of a view, in any number.
+/// Gain and bias of a channel of a view, in any number type.
 pub fn gain_and_bias<T: Real>(exposures: &[T], view: usize, channel: usize) -> [T; 2] {
     let at = view * EXPOSURE_WIDTH as usize + channel;
     [T::of(1.0) + exposures[at], T::of(BIAS_SCALE) * exposures[at + 3]]

@@ -19,25 +19,25 @@ pub struct Gaussian {
     pub log_scale: DVec3,
     /// Before the sigmoid.
     pub raw_opacity: f64,
-    /// What is blended beside colour.
+    /// Blended values beside colour.
     pub features: Vec<f64>,
     /// All stored SH coefficients, degree 0 first, RGB.
     pub sh: Vec<DVec3>,
 }
 
-/// How an array of attributes is laid out.
+/// The layout of an array of attributes.
 #[derive(Clone, Copy, Debug)]
 pub struct Planes {
     /// Gaussians in the array.
     pub count: usize,
-    /// Features of each.
+    /// Features per Gaussian.
     pub feature_count: usize,
-    /// The degree that is stored.
+    /// The stored SH degree.
     pub sh_degree: u32,
 }
 
 impl Planes {
-    /// Those of so many Gaussians whose splats have so many channels: colour, and the features behind it.
+    /// The planes of this many Gaussians whose splats have this many channels: colour, and the features after it.
     pub(super) fn of(gaussian_count: u32, channels: u32, sh_degree: u32) -> Self {
         let feature_count = channels as usize - 3;
         Self { count: gaussian_count as usize, feature_count, sh_degree }
@@ -48,7 +48,7 @@ impl Planes {
         self.count * column_count(self.feature_count, self.sh_degree)
     }
 
-    /// Where Gaussian `i` has its floats, in the order of [`Gaussian`].
+    /// The indices of the floats of Gaussian `i`, in the order of [`Gaussian`].
     fn places(self, i: usize) -> impl Iterator<Item = usize> {
         let columns = column_count(self.feature_count, self.sh_degree);
         let planes = planes(self.feature_count, columns);
@@ -58,7 +58,7 @@ impl Planes {
         })
     }
 
-    /// The floats that an array stands for, which may hold its last plane in halves.
+    /// The array as floats; its last plane may be in halves.
     pub(super) fn floats(self, parameters: &[f32], half_rest: bool) -> Cow<'_, [f32]> {
         let Self { count: gaussians, feature_count: features, sh_degree } = self;
         let columns = column_count(features, sh_degree);
@@ -91,7 +91,7 @@ impl Planes {
         }
     }
 
-    /// Writes Gaussian `i` through `set`, which takes the place in the array and the value.
+    /// Writes Gaussian `i` through `set`, which takes index and value.
     pub fn store(self, gaussian: &Gaussian, i: usize, mut set: impl FnMut(usize, f64)) {
         let sh = |range: Range<usize>| gaussian.sh[range].iter().flat_map(DVec3::to_array);
         let values = (gaussian.mean.to_array().into_iter())

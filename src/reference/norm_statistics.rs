@@ -26,8 +26,8 @@ impl Reference for Kernel {
         }
     }
 
-    /// The first mean is off by the rounding of a sum. What it is off by is in every deviation, and the sum of these
-    /// corrects it: the second mean is off by a rounding of its own and those of the deviations' sum.
+    /// The first mean has the rounding error of a sum. The sum of the deviations corrects it: the second mean has its
+    /// own rounding and that of the deviations' sum.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let bounds = chunks(params, constants, slices.source).into_iter().flat_map(|chunk| {
             let ([mean, squares], n) = (moments(&chunk), chunk.len() as f64);

@@ -1,4 +1,4 @@
-//! Factors of 16-bit matrices as `include/packed.glsl` has them, on the host.
+//! Factors of 16-bit matrices as in `include/packed.glsl`, on the host.
 
 use glam::UVec2;
 use half::f16;
@@ -21,12 +21,12 @@ fn exponent(largest: u32) -> i32 {
     (largest >> 23).clamp(23, 254) as i32 - 127
 }
 
-/// What a factor is multiplied with whose largest magnitude has these bits.
+/// The scale of a factor whose largest magnitude has these bits.
 pub(super) fn scale(largest: u32) -> f64 {
     f64::from(14 - exponent(largest)).exp2()
 }
 
-/// The bits of the half that is nearest to a number in single precision, subnormal, infinite and NaN too.
+/// The bits of the half nearest to a single, including subnormal, infinite and NaN.
 pub(super) fn nearest(value: f64) -> u32 {
     f16::from_f32(value as f32).to_bits().into()
 }
@@ -41,7 +41,7 @@ fn at(packed: &[Eight], index: u32) -> f64 {
     f16::from_bits(half as u16).to_f64()
 }
 
-/// What is in a packed map, as planes (C, H, W): halves, which single precision holds.
+/// The values of a packed map, as planes (C, H, W): halves, which single precision represents exactly.
 pub(super) fn map(size: UVec2, count: u32, packed: &[Eight]) -> Vec<f32> {
     let (columns, own) = (extent(size).x, channels(count));
     let pixel = |i: u32| (i / size.x + 1) * columns + i % size.x + 1;
@@ -49,7 +49,7 @@ pub(super) fn map(size: UVec2, count: u32, packed: &[Eight]) -> Vec<f32> {
     (0..count).flat_map(plane).map(|value| value as f32).collect()
 }
 
-/// What is in a layer's packed weights, as (to, from, tap).
+/// The values of a layer's packed weights, as (to, from, tap).
 pub(super) fn weights([from, to]: [u32; 2], packed: &[Eight]) -> Vec<f32> {
     let [own_from, own_to] = [from, to].map(channels);
     let taps =
@@ -57,8 +57,8 @@ pub(super) fn weights([from, to]: [u32; 2], packed: &[Eight]) -> Vec<f32> {
     (0..to * from).flat_map(taps).map(|value| value as f32).collect()
 }
 
-/// How far the sum of so many products of packed factors may be off, of terms with such a sum of magnitudes and such largest
-/// magnitudes, all of them scaled. A matrix may cut off where an addition rounds, and flush what is subnormal.
+/// The error of a sum of this many products of packed factors, given the sum of magnitudes of the terms and the largest
+/// magnitudes, all scaled. A matrix unit may truncate where an addition rounds, and flush subnormal numbers.
 pub(super) fn sum_error(count: u32, magnitude: f64, largest: [f64; 2]) -> f64 {
     let count = f64::from(count);
     let cut = 4.0 * (count + 2.0) * super::rounding::UNIT * magnitude;

@@ -29,8 +29,8 @@ fn extremes<T: PartialOrd + Copy>(log_scales: [T; 3]) -> [usize; 2] {
     })
 }
 
-/// The three weights, of opacity, standard deviation and anisotropy, times the means over the Gaussians with these planes,
-/// and the gradient. `log_ratio` is the logarithm of the ratio that costs nothing.
+/// The three weights, of opacity, standard deviation and anisotropy, times the means over the Gaussians with these
+/// planes, and the gradient. `log_ratio` is the logarithm of the ratio that costs nothing.
 #[cfg(feature = "testing")]
 pub fn parameter_terms(
     planes: &[f64],

@@ -69,7 +69,8 @@ pub fn project_gaussian_backward(
     }
 }
 
-/// From the gradient of a conic to those of the rows of U, of which cov2d = U U^T + 0.3 I, and of the logarithms of the scales.
+/// From the gradient of a conic to those of the rows of U, of which cov2d = U U^T + 0.3 I, and of the logarithms of the
+/// scales.
 pub(super) fn conic_backward(
     conic: DVec3,
     [u0, u1]: [DVec3; 2],
@@ -156,8 +157,8 @@ impl<'a> ProjectionInputs<'a> {
         project_gaussian_backward(&self.camera, self.params.sh_degree, gaussian, splat, d_splat)
     }
 
-    /// What roundings make of the gradient of a quaternion where the terms cancel, as they do for a sphere, which has none:
-    /// its entries are sums of products whose magnitudes these are.
+    /// What roundings make of the gradient of a quaternion where the terms cancel, as they do for a sphere, which has
+    /// none: its entries are sums of products whose magnitudes these are.
     fn quat_error(&self, gaussian: &Gaussian, splat: &Splat, d_splat: &DSplat) -> f64 {
         let ([a, b, c], d) = (splat.conic.abs().to_array(), d_splat.conic.abs());
         let d_xx = a * a * d.x + a * b * d.y + b * b * d.z;
@@ -181,8 +182,8 @@ impl<'a> ProjectionInputs<'a> {
     }
 }
 
-/// The sum of the records of a Gaussian with these slots. Those of few slots are added up in f32 in the kernel's very order;
-/// those of many by the lanes of a subgroup, in an order that is the device's.
+/// The sum of the records of a Gaussian with these slots. Those of few slots are added up in f32 in the kernel's very
+/// order; those of many by the lanes of a subgroup, in an order that is the device's.
 pub(super) fn summed_record(
     channels: u32,
     intersection_ids: UVec2,

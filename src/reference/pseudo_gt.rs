@@ -7,7 +7,7 @@ use crate::kernels::curves::{
 use crate::kernels::pseudo_gt::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::photographs::tone::{Real, interpolate, measurable, profiled};
 
-/// What is stored of a value.
+/// The stored code of a value.
 fn stored(code_bits: u32, slices: &Slices<'_>, i: usize) -> f32 {
     if code_bits == 32 {
         return slices.values[i];

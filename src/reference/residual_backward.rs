@@ -3,8 +3,8 @@
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::residual_backward::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// What the gradient `d` of the result of [`super::residual::residual`] becomes behind the clamp, which lets it pass
-/// within 0 and 1, bounds included: the gradient of `R_0`, and the negative of those of I and u.
+/// The gradient `d` of the result of [`super::residual::residual`] before the clamp, which passes it within 0 and 1,
+/// bounds included: the gradient of `R_0`, and the negative of those of I and u.
 pub fn clamp_backward(difference: f64, d: f64) -> f64 {
     if (0.0..=1.0).contains(&difference) { d } else { 0.0 }
 }
@@ -32,7 +32,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// A difference and two products; what else there is rounds alike everywhere.
+    /// A difference and two products; all other operations round identically.
     fn tolerances(_: &Params, _: &Constants, _: Slices<'_>) -> Tolerances {
         Tolerances { d_update: Tolerance::Roundings(4.0), ..Tolerances::default() }
     }

@@ -1,5 +1,5 @@
-//! What single precision may make of a formula: numbers with a bound of their error, as the Vulkan specification
-//! ("Precision of core SPIR-V instructions") bounds each operation. Fused multiply-adds round once less.
+//! Rounding error in single precision: numbers with an error bound, as the Vulkan specification ("Precision of core
+//! SPIR-V instructions") bounds each operation. Fused multiply-adds round once less.
 
 use std::cmp::Ordering;
 use std::ops::{Add, Div, Mul, Neg, Sub};
@@ -14,13 +14,13 @@ pub const UNIT: f64 = f32::EPSILON as f64 / 2.0;
 /// The largest absolute error of a sine or cosine.
 pub(super) const TRIGONOMETRIC: f64 = 1.0 / 2048.0;
 
-/// Roundings that one number takes part in while a subgroup adds up `count`: a lane's run of them, then the lanes, of
+/// The most roundings of one term while a subgroup sums `count`: in a lane's run of them, then across the lanes, of
 /// which there are 4 to 128.
 pub(super) fn chain(count: usize) -> f64 {
     count as f64 / 4.0 + 128.0
 }
 
-/// Backward stability: how far the numbers of `f` may be off where each of its inputs is off by its error, to first order.
+/// Forward error of `f` to first order, where each of its inputs has its error.
 pub(super) fn sensitivity(
     inputs: &[f64],
     errors: &[f64],
@@ -37,7 +37,7 @@ pub(super) fn sensitivity(
     bounds
 }
 
-/// A number, and how far single precision may be from it: running error analysis (Higham 2002, section 3.3).
+/// A number with the bound of its error in single precision: running error analysis (Higham 2002, section 3.3).
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Rounded {
     /// The number itself.
@@ -57,7 +57,7 @@ impl Rounded {
         Self { error: self.error + count * UNIT * (self.value.abs() + self.error), ..self }
     }
 
-    /// As it is, but for an error of the argument that it grows with `slope`.
+    /// The same value, with the error of an argument magnified by `slope`.
     fn from_argument(value: f64, argument: f64, slope: f64) -> Self {
         let error = if argument == 0.0 { 0.0 } else { argument * slope };
         Self { value, error }
@@ -78,7 +78,7 @@ impl Rounded {
         Self { value: self.value.abs(), ..self }
     }
 
-    /// The greater or the lesser of both, which `choose` gives.
+    /// The greater or the lesser of both, as `choose` selects.
     fn between(self, choose: impl Fn(f64, f64) -> f64, other: Self) -> Self {
         let value = choose(self.value, other.value);
         let high = choose(self.value + self.error, other.value + other.error);
@@ -86,7 +86,7 @@ impl Rounded {
         Self { value, error: (high - value).max(value - low) }
     }
 
-    /// The other side of `limit` is within a rounding.
+    /// Whether `limit` is within a rounding.
     pub(super) fn may_cross(self, limit: f64) -> bool {
         (self.value - limit).abs() <= self.error
     }
@@ -103,7 +103,7 @@ impl Rounded {
         Self { value, error: own + argument }
     }
 
-    /// What a reference in double precision, rounded at its end, may be off by.
+    /// The error of a reference in double precision that is rounded at its end.
     pub(super) fn bound(self) -> f64 {
         self.error + UNIT * self.value.abs()
     }
@@ -116,12 +116,12 @@ pub(super) fn rounded_tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> R
     y.at_least(Rounded::of(0.0)).at_most(Rounded::of(1.0))
 }
 
-/// The numbers themselves, as a reference leaves them.
+/// The values, as a reference returns them.
 pub(super) fn values(numbers: impl IntoIterator<Item = Rounded>) -> impl Iterator<Item = f32> {
     numbers.into_iter().map(|number| number.value as f32)
 }
 
-/// A bound for each number of a buffer, from what a reference in double precision makes of it.
+/// A bound for each element of a buffer, from a reference in double precision.
 impl FromIterator<Rounded> for Tolerance {
     fn from_iter<I: IntoIterator<Item = Rounded>>(numbers: I) -> Self {
         Self::Each(numbers.into_iter().map(Rounded::bound).collect())
@@ -184,7 +184,7 @@ impl Neg for Rounded {
     }
 }
 
-/// A number that can wait behind a condition.
+/// A number that a condition can select.
 pub trait Gated: Real {
     /// Itself where `y` is above 0, else 0.
     fn where_positive(self, y: Self) -> Self;

@@ -1,4 +1,4 @@
-//! A projected splat: which tiles and pixels it covers in f32 as `include/splat.glsl` says, and its light in f64.
+//! A projected splat: its tiles and pixels in f32 as in `include/splat.glsl`, and its alpha in f64.
 
 use glam::{DVec2, DVec3, UVec2};
 
@@ -6,17 +6,17 @@ use super::rounding::UNIT;
 use crate::kernels::ProjectedSplat;
 use crate::kernels::splat::{ALPHA_MIN, RECORD_HEAD, TRANSMITTANCE_MIN};
 
-/// Numbers of a gradient record as it is stored: in vectors of three, the last one filled up with zeros.
+/// Floats of a gradient record as stored: in vectors of three, padded with zeros.
 pub(super) fn stored_record(channels: u32) -> usize {
     (RECORD_HEAD + channels).next_multiple_of(3) as usize
 }
 
-/// Numbers of a splat's values as they are stored, the same way.
+/// Floats of a splat's values as stored, likewise.
 pub(super) fn stored_color(channels: u32) -> usize {
     channels.next_multiple_of(3) as usize
 }
 
-/// What of a [`ProjectedSplat`] makes its light.
+/// The part of a [`ProjectedSplat`] that determines its alpha.
 #[derive(Clone, Copy, Debug)]
 pub struct Splat {
     /// Pixels.
@@ -45,12 +45,12 @@ impl Splat {
     }
 }
 
-/// What one splat does to one pixel.
+/// A splat's contribution to one pixel.
 #[derive(Clone, Copy, Debug)]
 pub struct Fragment {
-    /// The splat's place in the list.
+    /// The splat's index in the list.
     pub index: usize,
-    /// The splat's mean as seen from the pixel's centre, pixels.
+    /// From the pixel's centre to the splat's mean, pixels.
     pub d: DVec2,
     /// exp(-sigma).
     pub falloff: f64,
@@ -60,7 +60,7 @@ pub struct Fragment {
     pub before: f64,
 }
 
-/// The fragments of `splats`, front to back, at a pixel's centre, and the transmittance behind them.
+/// The fragments of `splats`, front to back, at a pixel's centre, and the transmittance after them.
 pub fn fragments(splats: &[Splat], pixel: DVec2, alpha_max: f64) -> (Vec<Fragment>, f64) {
     let mut fragments = vec![];
     let mut before = 1.0;

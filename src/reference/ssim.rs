@@ -64,8 +64,8 @@ fn ssim_of_moments<T: Real>(a: T, b: T, aa: T, bb: T, ab: T) -> Ssim<T> {
     Ssim { value, d_moments: [d_mean, -value / b2, two * a1 * scale] }
 }
 
-/// The gradient of `l1_scale` sum|a - b| - `ssim_scale` sum SSIM with respect to one channel of the render `a`, sums over
-/// the pixels from `begin` to before `end`.
+/// The gradient of `l1_scale` sum|a - b| - `ssim_scale` sum SSIM with respect to one channel of the render `a`, sums
+/// over the pixels from `begin` to before `end`.
 #[cfg(feature = "testing")]
 pub fn gradient(
     [width, height]: [usize; 2],

@@ -26,6 +26,8 @@ pub struct Report {
     pub title: String,
     /// The paragraphs under the heading.
     pub intro: Vec<String>,
+    /// Links under the introduction: address and text.
+    pub links: Vec<[String; 2]>,
     /// Rows of pictures, in order.
     pub comparisons: Vec<Comparison>,
     /// What is so, in words, in order.
@@ -65,10 +67,21 @@ pub struct Picture {
     pub image: Image,
 }
 
+impl Picture {
+    /// An image shrunk to at most `width` pixels.
+    pub(crate) fn shrunk(caption: &str, scores: String, image: &Image, width: u32) -> Self {
+        let width = image.width.min(width);
+        let height = u64::from(image.height) * u64::from(width) / u64::from(image.width.max(1));
+        let image = image.resized(width, height as u32);
+        Self { caption: caption.to_owned(), scores, image }
+    }
+}
+
 impl Report {
-    /// The page as HTML: pictures, facts, tables, plots.
+    /// The page as HTML: facts, pictures, tables, plots.
     pub fn html(&self) -> String {
-        self.page(&(self.pictures_html() + &self.tables_html() + &self.plots_html()))
+        let facts: String = self.facts.iter().map(Facts::html).collect();
+        self.page(&(facts + &self.pictures_html() + &self.tables_html() + &self.plots_html()))
     }
 
     /// The same with the plots first and the tables last.
@@ -77,8 +90,7 @@ impl Report {
     }
 
     fn tables_html(&self) -> String {
-        let facts = self.facts.iter().map(Facts::html);
-        facts.chain(self.tables.iter().map(Table::html)).collect()
+        self.tables.iter().map(Table::html).collect()
     }
 
     fn plots_html(&self) -> String {
@@ -103,6 +115,10 @@ impl Report {
         // Writing to a string cannot fail, so the results below hold nothing.
         for paragraph in &self.intro {
             let _ = writeln!(html, "<p>{}</p>", escape(paragraph));
+        }
+        for [address, text] in &self.links {
+            let (address, text) = (escape(address), escape(text));
+            let _ = writeln!(html, "<p><a href=\"{address}\">{text}</a></p>");
         }
         html + body + "</body>\n</html>\n"
     }

@@ -18,7 +18,7 @@ mod train;
 pub use directory::{Progress, RunDirectory, load_progress};
 pub use done::{done_steps, done_steps_by_stamp};
 pub use events::{Event, RunSummary};
-pub(crate) use files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE};
+pub(crate) use files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE, TRAINED_WITH};
 pub use load::{
     is_finished, load_config, load_exposures, load_metrics, load_model, load_networks, other_views,
     plan_of, stopped_at,

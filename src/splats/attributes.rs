@@ -1,10 +1,10 @@
-//! The one table of what every Gaussian has: columns in memory, learning rates, PLY properties.
+//! The table of the attributes of a Gaussian: columns in memory, learning rates, PLY properties.
 //!
-//! Plain data without dependencies, since the build script reads it, too: the shaders include `attributes.glsl`, which
-//! is made from it. Parameters are planes in one float array: all means, then all quats, and so on in the order of the
-//! rows. The features and the higher SH coefficients, whose width depends on the scene, come last.
+//! Plain data without dependencies, since the build script reads it too and generates `attributes.glsl` for the
+//! shaders. Parameters are planes in one float array: all means, then all quats, and so on in the order of the rows.
+//! Features and higher SH coefficients, whose width depends on the scene, come last.
 
-/// Something that every Gaussian has.
+/// An attribute of a Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Attribute {
     /// Position in the world.
@@ -17,37 +17,37 @@ pub enum Attribute {
     RawOpacities,
     /// SH coefficients of degree 0, RGB; the colour is 0.5 + [`SH_C0`](crate::splats::scene::SH_C0) times this.
     Dc,
-    /// What is blended beside colour, in the order of [`FEATURES`](crate::splats::scene::FEATURES).
+    /// Blended values beside colour, in the order of [`FEATURES`](crate::splats::scene::FEATURES).
     Features,
     /// SH coefficients above degree 0, coefficient-major, RGB.
     Rest,
 }
 
-/// All that is to know about one attribute.
+/// The description of an attribute.
 #[derive(Debug)]
 pub struct AttributeSpec {
-    /// Which attribute this row describes.
+    /// The attribute of this row.
     pub attribute: Attribute,
-    /// The name used in config.toml; `NAME_COLUMN` in GLSL.
+    /// The name in config.toml; `NAME_COLUMN` in GLSL.
     pub name: &'static str,
     /// Floats per Gaussian.
     pub width: Width,
-    /// What they are.
+    /// Its content.
     pub content: &'static str,
     /// Adam's initial learning rate (3DGS's `OptimizationParams`).
     pub learning_rate: f64,
     /// The PLY properties (INRIA layout).
     pub ply: Ply,
-    /// The attribute's place among the attributes in a PLY file.
+    /// The attribute's position among the attributes in a PLY file.
     pub ply_place: usize,
 }
 
 /// The floats per Gaussian of an attribute.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Width {
-    /// Always as many.
+    /// Fixed.
     Fixed(usize),
-    /// As many as the scene has features.
+    /// The scene's number of features.
     Features,
     /// Three for each SH coefficient above degree 0.
     Rest,
@@ -56,11 +56,11 @@ pub enum Width {
 /// The names of an attribute's PLY properties.
 #[derive(Clone, Copy, Debug)]
 pub enum Ply {
-    /// Each by itself.
+    /// One by one.
     Named(&'static [&'static str]),
-    /// A prefix and the number of the component.
+    /// A prefix and the component's number.
     Numbered(&'static str),
-    /// Those of the features that the scene has.
+    /// Those of the scene's features.
     Features,
 }
 
@@ -141,35 +141,36 @@ pub fn column_count(feature_count: usize, sh_degree: u32) -> usize {
     Attribute::Rest.column(feature_count) + 3 * rest_coefficients(sh_degree)
 }
 
-/// How many numbers planes are made of.
+/// The dimensions of a buffer of planes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PlaneCounts {
     /// The number of Gaussians.
     pub gaussians: usize,
-    /// Numbers of each.
+    /// Floats per Gaussian.
     pub columns: usize,
-    /// How many of these are features.
+    /// Those of the features.
     pub features: usize,
 }
 
 impl PlaneCounts {
-    /// Numbers of all planes.
+    /// Floats of all planes.
     pub fn total(self) -> usize {
         self.gaussians * self.columns
     }
 
-    /// Numbers of each Gaussian before its SH coefficients above degree 0.
+    /// Floats per Gaussian before the SH coefficients above degree 0.
     pub fn before_rest(self) -> usize {
         Attribute::Rest.column(self.features)
     }
 
-    /// The SH coefficients above degree 0 of each, every channel counted.
+    /// SH coefficients above degree 0 per Gaussian, all channels.
     pub fn rest(self) -> usize {
         self.columns.saturating_sub(self.before_rest())
     }
 }
 
-/// First column and width of every plane, of Gaussians of `column_count` floats, of which `feature_count` are features.
+/// First column and width of every plane, for `column_count` floats per Gaussian, of which `feature_count` are
+/// features.
 pub fn planes(feature_count: usize, column_count: usize) -> [(usize, usize); ATTRIBUTES.len()] {
     ATTRIBUTES.each_ref().map(|spec| {
         let column = spec.attribute.column(feature_count);
@@ -188,7 +189,7 @@ impl Attribute {
         &ATTRIBUTES[self as usize]
     }
 
-    /// The floats per Gaussian that come before this attribute: its plane begins at this times the number of Gaussians.
+    /// Floats per Gaussian before this attribute: its plane begins at this times the number of Gaussians.
     pub fn column(self, feature_count: usize) -> usize {
         let width = |spec: &AttributeSpec| match spec.width {
             Width::Fixed(width) => width,

@@ -1,7 +1,7 @@
-//! Gaussians in batches: planes of more of them than one binding spans lie batch behind batch.
+//! Gaussians in batches: planes that exceed one binding are stored batch after batch.
 //!
-//! A pass over Gaussians is dispatched for one batch after the other, and bound to the slices that hold it. Most devices
-//! bind gigabytes, and there is one batch; some bind 128 MiB, the planes of half a million Gaussians of SH degree 3.
+//! A pass over Gaussians is dispatched once per batch and bound to its slices. Most devices bind gigabytes, and there
+//! is one batch; some bind 128 MiB, the planes of half a million Gaussians of SH degree 3.
 
 use std::ops::Range;
 
@@ -10,7 +10,7 @@ use crate::gpu::{Buffer, Gpu, Slice, SliceMut};
 use crate::splats::attributes::PlaneCounts;
 use crate::splats::attributes::planes;
 
-/// How planes lie in a buffer.
+/// The layout of planes in a buffer.
 #[derive(Clone, Copy, Debug)]
 pub struct Batches {
     planes: PlaneCounts,
@@ -18,42 +18,43 @@ pub struct Batches {
     size: usize,
 }
 
-/// Gaussians whose planes follow each other.
+/// Gaussians whose planes are contiguous.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Batch {
-    /// How many Gaussians lie before it.
+    /// The number of Gaussians before it.
     pub first: usize,
-    /// How many it is of.
+    /// Its number of Gaussians.
     pub count: usize,
     columns: usize,
 }
 
-/// A batch begins at a multiple of this, where every device lets a binding begin, whatever it has of each Gaussian.
+/// A batch starts at a multiple of this many Gaussians: so its binding starts where every device allows, whatever the
+/// element size.
 const ALIGNMENT: usize = 64;
 
 impl Batches {
-    /// Of planes of floats: a batch of every one fits a binding.
+    /// Batches of planes of floats: each binding holds a batch.
     pub fn new(gpu: &Gpu, planes: PlaneCounts) -> Self {
         let floats = gpu.properties().max_storage_buffer_range / size_of::<f32>() as u64;
-        // A kernel counts floats in 32 bits.
+        // Kernels count floats in 32 bits.
         let floats = floats.min(u64::from(u32::MAX)) as usize;
         let size = (floats / planes.columns.max(1) / ALIGNMENT).max(1) * ALIGNMENT;
         Self { planes, size }
     }
 
-    /// The same Gaussians with so many words each in the place of their floats.
+    /// The same Gaussians with `columns` words each in place of their floats.
     pub(crate) fn with_columns(self, columns: usize) -> Self {
         Self { planes: PlaneCounts { columns, ..self.planes }, ..self }
     }
 
-    /// One after the other; of no Gaussians an empty one.
+    /// The batches in order; one empty batch if there are no Gaussians.
     pub fn iter(&self) -> impl Iterator<Item = Batch> + use<> {
         let Self { planes: PlaneCounts { gaussians: count, columns, .. }, size } = *self;
         let begins = (0..count.max(1)).step_by(size);
         begins.map(move |first| Batch { first, count: size.min(count - first), columns })
     }
 
-    /// A buffer of planes in batches, from planes of all Gaussians.
+    /// A buffer of planes in batches, from the planes of all Gaussians.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -64,7 +65,7 @@ impl Batches {
         Ok(buffer)
     }
 
-    /// A buffer of planes whose contents are undefined.
+    /// A buffer of uninitialised planes.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -72,7 +73,7 @@ impl Batches {
         gpu.uninit_in_windows(name, self.planes.total())
     }
 
-    /// A buffer of planes of zeros.
+    /// A buffer of zeroed planes.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -80,7 +81,7 @@ impl Batches {
         gpu.zeroed(self.uninit(gpu, name)?)
     }
 
-    /// Overwrites the planes in a buffer with others, which are of all Gaussians.
+    /// Overwrites the planes in a buffer by those of all Gaussians.
     ///
     /// # Errors
     /// The buffer is shorter, or the device is out of memory or lost.
@@ -117,7 +118,7 @@ impl Batches {
         Ok(planes)
     }
 
-    /// Where a float of a buffer is among the planes of all Gaussians.
+    /// The index of a float of a buffer among the planes of all Gaussians.
     pub fn place_of(&self, float: usize) -> usize {
         let mut before = 0;
         for part in self.parts() {
@@ -129,7 +130,7 @@ impl Batches {
         float
     }
 
-    /// What of the planes of all Gaussians lies where in a buffer, from its begin on.
+    /// Ranges of a buffer, in order, with the ranges of the planes of all Gaussians that they hold.
     fn parts(&self) -> impl Iterator<Item = Range<usize>> + use<> {
         let PlaneCounts { gaussians: count, columns, features } = self.planes;
         self.iter().flat_map(move |batch| {
@@ -142,7 +143,7 @@ impl Batches {
 }
 
 impl Batch {
-    /// What a buffer of planes in batches holds of it.
+    /// Its slice of a buffer of planes in batches.
     ///
     /// # Errors
     /// The buffer is shorter.
@@ -150,7 +151,7 @@ impl Batch {
         self.rows(planes, self.columns)
     }
 
-    /// The same to write.
+    /// The same, mutable.
     ///
     /// # Errors
     /// The buffer is shorter.
@@ -161,7 +162,7 @@ impl Batch {
         self.rows_mut(planes, self.columns)
     }
 
-    /// What a buffer of `each` elements per Gaussian, those of one after those of another, holds of it.
+    /// Its slice of a buffer of `each` elements per Gaussian, Gaussian-major.
     ///
     /// # Errors
     /// The buffer is shorter.
@@ -173,7 +174,7 @@ impl Batch {
         rows.into().range(self.range(each))
     }
 
-    /// The same to write.
+    /// The same, mutable.
     ///
     /// # Errors
     /// The buffer is shorter.
@@ -189,12 +190,12 @@ impl Batch {
         self.first * each..(self.first + self.count) * each
     }
 
-    /// How many Gaussians it is of, as kernels count.
+    /// Its number of Gaussians, as kernels count.
     pub fn gaussian_count(&self) -> u32 {
         self.count as u32
     }
 
-    /// How many lie before it, as kernels count.
+    /// The number of Gaussians before it, as kernels count.
     pub fn first_gaussian(&self) -> u32 {
         self.first as u32
     }

@@ -1,12 +1,13 @@
-//! Density control: Gaussians that the views pull at multiply, faint ones go (Kerbl et al. 2023, section 5.2).
+//! Density control: Gaussians with large view-space gradients are densified, faint ones pruned (Kerbl et al. 2023,
+//! section 5.2).
 //!
 //! ```text
-//! score -> sort by need -> decide -> scan of the offspring -> counts to the host -> scatter
+//! score -> sort by need -> decide -> scan of child counts -> counts to the host -> scatter
 //! ```
 //!
-//! The device decides; the host reads four counts and makes room. What comes of the Gaussians is written plane set by
-//! plane set into the buffer that is free, which the gradients of the last step leave: no memory beyond what training
-//! holds, and buffers grow with headroom, so most rounds allocate nothing.
+//! The device decides; the host reads four counters and allocates. The new Gaussians are written one plane set after
+//! the other into the spare buffer, at first that of the last step's gradients: no memory beyond what training holds.
+//! Buffers grow with headroom, so most rounds allocate nothing.
 
 use std::iter;
 use std::str::FromStr;
@@ -27,14 +28,14 @@ use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
 use crate::splats::sort::{Count, RadixSort, Scan};
 use crate::{Error, Result};
 
-/// What comes of a Gaussian that multiplies.
+/// How a Gaussian is densified.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DensityControl {
-    /// Two halves along its longest axis that together cover what it covered: the render stays nearly as it was.
+    /// Split into two halves along the longest axis that together cover what it covered: the render hardly changes.
     #[default]
     Conserving,
-    /// LITA-GS's: a small one gets a copy at a position drawn from it, a large one is replaced by two smaller ones at
+    /// As LITA-GS: a small one is cloned to a position drawn from it, a large one is replaced by two smaller ones at
     /// drawn positions. Opacities are never reset and large Gaussians are not pruned.
     Paper,
 }
@@ -54,70 +55,70 @@ impl FromStr for DensityControl {
     }
 }
 
-/// Which Gaussians multiply and which go.
+/// Which Gaussians are densified and which are pruned.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DensifySettings {
-    /// What comes of those that multiply.
+    /// How they are densified.
     pub control: DensityControl,
-    /// Mean norm of the screen-space gradient, in normalised device units, above which a Gaussian multiplies.
+    /// Mean norm of the screen-space gradient, in normalised device units, above which a Gaussian is densified.
     pub gradient_threshold: f64,
-    /// The largest standard deviation, in world units, up to which the paper's control clones; beyond, it splits.
+    /// Standard deviation up to which the paper's control clones, in world units; beyond, it splits.
     pub split_scale: f64,
-    /// Fainter Gaussians go, in (0, 1).
+    /// Fainter Gaussians are pruned, in (0, 1).
     pub min_opacity: f64,
-    /// There never come to be more; growth goes to those with the largest gradients.
+    /// Upper limit; growth favours the largest gradients.
     pub max_gaussians: usize,
-    /// The near plane of the cameras, world units.
+    /// The near plane of the cameras, in world units.
     pub near: f64,
-    /// Where the drawn positions come from.
+    /// The seed of drawn positions.
     pub seed: u64,
 }
 
-/// What there is of every Gaussian beside its parameters: what Adam keeps, what the steps since the last round have gathered,
-/// and a buffer to work with.
+/// State per Gaussian beside its parameters: Adam's moments, statistics since the last round, and a spare buffer.
 #[derive(Debug)]
 pub struct DensifyInputs<'a> {
     /// Carried over to the new Gaussians.
     pub moments: &'a mut Moments,
     /// Sums of the norms of the screen-space gradients, in normalised device units.
     pub grad_norm_sums: &'a mut Buffer<f32>,
-    /// In how many steps the Gaussian was seen.
+    /// The number of steps in which the Gaussian was visible.
     pub visit_counts: &'a mut Buffer<u32>,
-    /// The gradients, as planes; what they hold is lost.
+    /// The gradients, as planes; overwritten.
     pub gradients: &'a mut Buffer<f32>,
 }
 
-/// When a round takes place.
+/// A round of density control.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Round {
-    /// The step it follows.
+    /// The step that it follows.
     pub step: u64,
-    /// How many rounds are left, this one included. Each takes its share of the room below the limit; 1 takes it all.
+    /// Rounds that are left, this one included. Each may use its share of the headroom below the limit; 1 uses all of
+    /// it.
     pub rounds_left: u64,
-    /// The most Gaussians that the views leave room for; [`DensifySettings::max_gaussians`] holds as well.
+    /// The most Gaussians that memory and views allow; [`DensifySettings::max_gaussians`] holds as well.
     pub most: usize,
 }
 
-/// How often a round is tried at the most; the last trial splits nothing.
+/// The most trials of a round; the last one splits nothing.
 const TRIALS: usize = 5;
 
-/// The largest mean squared change of a camera's view by one split, in units of the squared contrast of what the Gaussian
-/// covers, as `view_change` in `densify_score.comp` estimates it. It keeps a split from
-/// changing a view of 30 dB by .1 dB where the contrast is .3 (docs/benchmarks.md).
+/// The largest mean squared change of a camera's view by one split, in units of the squared contrast of what the
+/// Gaussian covers, as `view_change` in `densify_score.comp` estimates it. It keeps a split from changing a view of 30
+/// dB by 0.1 dB where the contrast is 0.3 (docs/benchmarks.md).
 pub const LARGEST_CHANGE: f32 = 2e-4;
 
-/// What one round did.
+/// The result of a round.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DensifyReport {
-    /// Gaussians that got a copy.
+    /// Cloned Gaussians.
     pub cloned: usize,
-    /// Gaussians that two smaller ones replaced.
+    /// Gaussians that were replaced by two smaller ones.
     pub split: usize,
-    /// Gaussians that went.
+    /// Pruned Gaussians.
     pub pruned: usize,
-    /// Gaussians there are now.
+    /// Gaussians after the round.
     pub count: usize,
-    /// Gaussians that would have multiplied had there been room.
+    /// Candidates beyond the limit, which were not densified.
     pub refused: usize,
 }
 
@@ -126,7 +127,7 @@ pub struct DensifyReport {
 pub struct Densifier {
     gpu: Gpu,
     settings: DensifySettings,
-    /// What conserving splits may not change. None of the paper's control.
+    /// The cameras whose views conserving splits must not change; empty for the paper's control.
     cameras: Buffer<kernels::Camera>,
     score: Pipeline<densify_score::Kernel>,
     decide: Pipeline<densify_decide::Kernel>,
@@ -166,8 +167,8 @@ impl Scratch {
 }
 
 impl Densifier {
-    /// The kernels on this device. A Gaussian is not split where that would change what one of `cameras` sees, in world
-    /// space; the paper's control splits it all the same.
+    /// Builds the kernels. A Gaussian is not split where that would change the view of one of `cameras`, in world
+    /// space; the paper's control ignores them.
     ///
     /// # Errors
     /// A setting makes no sense, or the device refuses a pipeline.
@@ -203,16 +204,16 @@ impl Densifier {
         })
     }
 
-    /// One round of density control: prunes and splits `gaussians`, or clones them under the paper's control. The statistics
-    /// are to be zeroed for the new count; buffers that were too short for it are longer.
+    /// One round of density control: prunes and splits `gaussians`, or clones them under the paper's control. The
+    /// caller zeroes the statistics for the new count; buffers grow as needed.
     ///
-    /// `keeps` looks at the new Gaussians before anything is final, and says which share of the splits
-    /// may stay: 1 or more for all of them. Else the round is tried again with as many fewer, those with the largest
+    /// `keeps` inspects the new Gaussians before they are committed and returns the fraction of the splits that may
+    /// stay: 1 or more for all of them. Otherwise the round is repeated with that fraction, those with the largest
     /// gradients first, and at last with none.
     ///
     /// # Errors
-    /// A buffer is shorter than the Gaussians need, `keeps` fails, or the device is out of memory: the Gaussians are as
-    /// they were then. Or the device is lost.
+    /// A buffer is shorter than the Gaussians need, `keeps` fails, or the device is out of memory: the Gaussians are
+    /// unchanged then. Or the device is lost.
     pub fn densify(
         &mut self,
         gaussians: &mut DeviceGaussians,
@@ -246,12 +247,12 @@ impl Densifier {
         Err(Error::Usage("density control: the last trial of a round splits nothing".to_owned()))
     }
 
-    /// What a round takes beside the Gaussians, for each, in bytes.
+    /// Memory of a round beside the Gaussians, in bytes per Gaussian.
     pub(crate) fn bytes_per_gaussian(&self) -> usize {
         5 * size_of::<u32>() + self.sort.bytes_per_item()
     }
 
-    /// Leaves every fate and every place on the device, and returns the counts.
+    /// Leaves actions and offsets on the device, and returns the counters.
     fn decide(
         &mut self,
         gaussians: &DeviceGaussians,
@@ -330,7 +331,7 @@ impl Densifier {
         download.map_or_else(|| Ok(vec![]), |counters| counters.wait())
     }
 
-    /// Writes the new parameters beside the old ones: to the words of `spare_buffers`, or the gradients.
+    /// Writes the new parameters to the words of `spare_buffers`, or over the gradients.
     fn scatter(
         &self,
         gaussians: &DeviceGaussians,
@@ -373,8 +374,8 @@ impl Densifier {
         })
     }
 
-    /// Makes what was scattered the parameters, and carries the moments over: each plane set leaves its own buffer as the
-    /// next one's spare.
+    /// Commits the scattered parameters and carries the moments over: the buffer of each plane set becomes the spare of
+    /// the next.
     fn commit(
         &self,
         gaussians: &mut DeviceGaussians,
@@ -420,14 +421,14 @@ impl Densifier {
         Ok(())
     }
 
-    /// Every batch with each of the new ones that its Gaussians go to.
+    /// Every batch with each of the new batches that its Gaussians go to.
     fn pairs(&self, layout: &Layout, report: &DensifyReport) -> Vec<(Batch, Batch)> {
         let new = Layout { count: report.count, ..*layout }.batches(&self.gpu);
         let old = layout.batches(&self.gpu);
         old.iter().flat_map(|from| new.iter().map(move |to| (from, to))).collect()
     }
 
-    /// What takes the place of all buffers where one is too short for `count` Gaussians, allocated before one of them goes.
+    /// Replacements of all buffers where one is too short for `count` Gaussians, allocated before any is freed.
     fn spare_buffers(
         &self,
         gaussians: &DeviceGaussians,
@@ -438,7 +439,7 @@ impl Densifier {
         let DeviceGaussians { layout, parameters, .. } = gaussians;
         let (columns, capacity) = (layout.floats().columns, capacity(count, limit));
         let buffer = |columns| self.gpu.uninit_in_windows("planes", capacity * columns);
-        // Parameters with halves are too short to take turns with floats.
+        // Parameters with halves are shorter than planes of floats, and cannot take their place.
         let (turns, words) = match layout.sh_rest {
             StorageFormat::Single => (Some(parameters), None),
             StorageFormat::Half => (None, Some(buffer(layout.words())?)),
@@ -461,15 +462,15 @@ impl Densifier {
 
 /// Buffers for more Gaussians.
 struct SpareBuffers {
-    /// One for each plane set, the gradients among them, or none where their own take turns.
+    /// One for each plane set, the gradients included; empty where the existing ones suffice.
     planes: Vec<Buffer<f32>>,
-    /// What parameters with halves go to.
+    /// The target of parameters with halves.
     words: Option<Buffer<f32>>,
     statistics: Option<(Buffer<f32>, Buffer<u32>)>,
 }
 
 impl SpareBuffers {
-    /// Puts a longer buffer in the place of `spare`, which goes once the device is done with it; none where there is room.
+    /// Replaces `spare` by a longer buffer, if there is one; the old one is freed once the device is done with it.
     fn widen(&mut self, spare: &mut Buffer<f32>) {
         if let Some(longer) = self.planes.pop() {
             *spare = longer;
@@ -477,7 +478,7 @@ impl SpareBuffers {
     }
 }
 
-/// How many Gaussians to make room for where there are to be `count`: half as many again, within the limit.
+/// The capacity to allocate for `count` Gaussians: half as many again, within the limit.
 pub(crate) fn capacity(count: usize, limit: usize) -> usize {
     (count + count / 2).min(limit).max(count)
 }

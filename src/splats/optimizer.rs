@@ -1,4 +1,4 @@
-//! Adam over the Gaussians' planes and over what else is learned, and the schedules of its learning rates.
+//! Adam for the planes of the Gaussians and for other parameters, and the learning-rate schedules.
 
 mod finite;
 mod learnable;
@@ -17,18 +17,18 @@ use crate::splats::batches::Batch;
 use crate::splats::packed_sh::StorageFormat;
 use crate::{Error, Result};
 
-/// The exponential means of the gradients and of their squares: planes, as the parameters are, in buffers or in slices of
-/// buffers.
+/// Adam's exponential moving averages of gradients and squared gradients: planes in the layout of the parameters, in
+/// buffers or in slices of buffers.
 #[derive(Debug)]
 pub enum Moments<P = Buffer<f32>> {
     /// Both in 32 bits.
     Single {
-        /// Of the gradients.
+        /// First moments.
         first: P,
-        /// Of their squares.
+        /// Second moments.
         second: P,
     },
-    /// Both in the bits of one float: the upper half of the first's bits above that of the second's.
+    /// Both in one word: 16 bits of the first above 16 bits of the second.
     Half(P),
 }
 
@@ -41,7 +41,7 @@ impl Moments {
         Self::of(StorageFormat::Single, |name| gpu.zeros(name, len))
     }
 
-    /// Moments of what makes their planes, by name.
+    /// Moments whose planes `make` allocates, by name.
     pub(crate) fn of(
         bits: StorageFormat,
         mut plane: impl FnMut(&'static str) -> Result<Buffer<f32>>,
@@ -110,7 +110,7 @@ impl<P> Moments<P> {
         }
     }
 
-    /// In how many bits they are.
+    /// Their storage format.
     pub fn bits(&self) -> StorageFormat {
         match self {
             Self::Single { .. } => StorageFormat::Single,
@@ -120,7 +120,7 @@ impl<P> Moments<P> {
 }
 
 impl<'a> Moments<SliceMut<'a, f32>> {
-    /// The same for one use.
+    /// Reborrows them.
     #[cfg(feature = "io")]
     fn reborrow(&mut self) -> Moments<SliceMut<'_, f32>> {
         match self {
@@ -131,7 +131,7 @@ impl<'a> Moments<SliceMut<'a, f32>> {
         }
     }
 
-    /// What a kernel binds: the first, the second, and what holds both; those there are not are empty.
+    /// The bindings of a kernel: first moments, second moments, packed moments; those that do not apply are empty.
     fn bindings(self) -> Result<[SliceMut<'a, f32>; 3]> {
         match self {
             Self::Single { first, second } => {
@@ -147,19 +147,19 @@ impl<'a> Moments<SliceMut<'a, f32>> {
     }
 }
 
-/// The planes that a step of [`Adam`] works on; each holds `column_count * gaussian_count` floats or more.
+/// The planes that a step of [`Adam`] updates; each holds `column_count * gaussian_count` floats or more.
 #[derive(Debug)]
 pub struct AdamBuffers<'a> {
-    /// What is optimised.
+    /// The parameters.
     pub parameters: SliceMut<'a, f32>,
-    /// dL/d parameters; one that is not finite counts as zero.
+    /// dL/d parameters; non-finite entries count as zero.
     pub gradients: Slice<'a, f32>,
     /// The moments, updated.
     pub moments: Moments<SliceMut<'a, f32>>,
 }
 
 impl AdamBuffers<'_> {
-    /// The same for one step of two.
+    /// Reborrows them.
     #[cfg(feature = "io")]
     pub(crate) fn reborrow(&mut self) -> AdamBuffers<'_> {
         let Self { parameters, gradients, moments } = self;
@@ -175,14 +175,14 @@ impl AdamBuffers<'_> {
 #[derive(Debug)]
 pub struct Adam {
     gpu: Gpu,
-    /// With moments of 32 bits and, once there are any, of 16.
+    /// Kernels for 32-bit moments and, built on first use, for 16-bit ones.
     floats: [OnceLock<Pipeline<adam::Kernel>>; 2],
-    /// The same for SH coefficients in halves.
+    /// The same for packed SH coefficients.
     halves: [OnceLock<Pipeline<adam_rest::Kernel>>; 2],
 }
 
 impl Adam {
-    /// The kernel on this device; those for halves come when there are some.
+    /// Builds the kernel; those for packed coefficients are built on first use.
     ///
     /// # Errors
     /// The device refuses it.
@@ -193,10 +193,11 @@ impl Adam {
         Ok(adam)
     }
 
-    /// Records step number `step`, from 1, over `planes`, which may be the first of more. Nothing changes while the first element of `status`, the sticky word, is not zero.
+    /// Records step number `step`, from 1, over `planes`, which may be the first of more. Nothing changes while the
+    /// first word of `status` is nonzero.
     ///
     /// # Errors
-    /// A buffer is shorter than that, the step is 0, or the device refuses the kernel.
+    /// A buffer is too short, the step is 0, or the device refuses the kernel.
     pub fn record(
         &self,
         pass: &mut Recorder<'_>,
@@ -235,7 +236,7 @@ impl Adam {
         )
     }
 
-    /// The same for the SH coefficients above degree 0 of `planes` where they are stored in halves.
+    /// The same for the packed SH coefficients above degree 0 of `planes`.
     ///
     /// # Errors
     /// As [`Adam::record`].
@@ -315,7 +316,8 @@ fn check(
     Ok(())
 }
 
-/// 1 - b1^t and 1 / sqrt(1 - b2^t), taken in double precision: 1 - 0.999^t loses four digits to cancellation at t = 1.
+/// 1 - b1^t and 1 / sqrt(1 - b2^t), computed in double precision: 1 - 0.999^t loses four digits to cancellation at t =
+/// 1.
 fn corrections(step: u64) -> (f64, f32) {
     let uncorrected = |beta: f64| 1.0 - beta.powf(step as f64);
     (uncorrected(0.9), (1.0 / uncorrected(0.999).sqrt()) as f32)

@@ -1,25 +1,24 @@
-//! Numbers that are kept in 16 bits: SH coefficients above degree 0, two in a word of the planes, as include/half.glsl has
-//! them.
+//! SH coefficients above degree 0 in 16 bits, two in a word of the planes, as in include/half.glsl.
 
 use serde::{Deserialize, Serialize};
 
 use crate::kernels::half::{LARGEST_HALF, SMALLEST_HALF};
 use crate::splats::attributes::PlaneCounts;
 
-/// How numbers of a training are stored; they are computed in 32 bits.
+/// Storage format of trained numbers; arithmetic is in 32 bits.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum StorageFormat {
-    /// 32.
+    /// 32-bit float.
     #[default]
     #[serde(rename = "32")]
     Single,
-    /// 16, rounded up or down by chance, which is a hash: the same in every run.
+    /// 16-bit float, rounded stochastically by a hash: the same in every run.
     #[serde(rename = "16")]
     Half,
 }
 
 impl StorageFormat {
-    /// Words of each Gaussian whose SH coefficients above degree 0 are stored so.
+    /// Words per Gaussian whose SH coefficients above degree 0 have this format.
     pub(crate) fn words(self, planes: PlaneCounts) -> usize {
         match self {
             Self::Single => planes.columns,
@@ -28,28 +27,28 @@ impl StorageFormat {
     }
 }
 
-/// How Gaussians with halves differ from those of floats alone.
+/// Layout of Gaussians with packed SH coefficients.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PackedSh {
     count: usize,
-    /// Words of each before the halves.
+    /// Words per Gaussian before the packed ones.
     before: usize,
-    /// Coefficients of each.
+    /// SH coefficients above degree 0 per Gaussian.
     own: usize,
 }
 
 impl PackedSh {
-    /// What takes the place of planes of floats.
+    /// The packed form of planes of floats.
     pub(crate) fn new(planes: PlaneCounts) -> Self {
         Self { count: planes.gaussians, before: planes.before_rest(), own: planes.rest() }
     }
 
-    /// Words of each.
+    /// Words per Gaussian.
     pub(crate) fn columns(self) -> usize {
         self.before + self.own.div_ceil(2)
     }
 
-    /// Planes of floats with halves in the place of the coefficients, each the nearest.
+    /// Packs the coefficients of planes of floats, each rounded to nearest.
     pub(crate) fn pack(self, floats: &[f32]) -> Vec<f32> {
         let word = |pair: &[f32]| {
             let halves = [0, 1].map(|k| u32::from(pair.get(k).map_or(0, |&value| nearest(value))));
@@ -60,7 +59,7 @@ impl PackedSh {
         planes.iter().copied().chain(words).collect()
     }
 
-    /// The floats that planes with halves stand for.
+    /// Unpacks planes to floats.
     pub(crate) fn unpack(self, words: &[f32]) -> Vec<f32> {
         let (planes, rest) = words.split_at(self.before * self.count);
         let floats = rest.chunks_exact(self.own.div_ceil(2).max(1)).flat_map(|own| {
@@ -71,20 +70,20 @@ impl PackedSh {
     }
 }
 
-/// What a half stands for. None is subnormal, infinite or NaN.
+/// The value of a half. None is subnormal, infinite or NaN.
 pub(crate) fn value(half: u16) -> f32 {
     let (sign, magnitude) = (u32::from(half >> 15), u32::from(half & 0x7fff));
     let shifted = if magnitude == 0 { 0 } else { (magnitude << 13) + ((127 - 15) << 23) };
     f32::from_bits(sign << 31 | shifted)
 }
 
-/// The half that is nearest to a number, of two the even one.
+/// Rounds to the nearest half, ties to even.
 pub(crate) fn nearest(value: f32) -> u16 {
     let (smallest, largest) = (SMALLEST_HALF as f32, LARGEST_HALF as f32);
     let magnitude = value.abs().min(largest);
     let sign = u16::from(value.is_sign_negative()) << 15;
     if magnitude < smallest {
-        // Of zero and the smallest.
+        // Zero or the smallest half.
         return sign | if magnitude > smallest / 2.0 { 1 << 10 } else { 0 };
     }
     let bits = magnitude.to_bits() - ((127 - 15) << 23);

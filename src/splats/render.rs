@@ -1,12 +1,12 @@
-//! The differentiable rasteriser: Gaussians and a camera in, a render out; its gradient in, theirs out.
+//! The differentiable rasteriser: Gaussians and a camera to a render, and the gradient of the render to theirs.
 //!
 //! ```text
 //! project -> sort by depth -> order_counts -> emit -> sort by tile -> blend_forward
 //!     -> [loss] -> blend_backward -> project_backward
 //! ```
 //!
-//! Counts stay on the device. Where the intersections of a view exceed the memory reserved for them, a status flag is
-//! raised, nothing is rendered or updated, and the host grows the buffers and redoes the step ([`Renderer::grow`]).
+//! Counts stay on the device. Where the intersections of a view exceed the reserved memory, a status flag is set,
+//! nothing is rendered or updated, and the host grows the buffers and repeats the step ([`Renderer::grow`]).
 
 mod buffers;
 mod cameras;
@@ -40,44 +40,44 @@ pub use cameras::{Viewpoint, Viewpoints};
 use limits::{longest_run, splats_per_turn};
 pub use settings::RenderSettings;
 
-/// What changes from render to render.
+/// Parameters of one render.
 #[derive(Clone, Copy, Debug)]
 pub struct RenderOptions {
-    /// Degree of the spherical harmonics used, at most the one stored.
+    /// The SH degree in use, at most the stored one.
     pub sh_degree: u32,
-    /// What is seen where no splat is, RGB; features are zero there.
+    /// Background colour, RGB; features have background 0.
     pub background: [f32; 3],
 }
 
-/// How the screen-space gradient enters the statistics of density control.
+/// Near-camera damping of the screen-space gradient in the statistics of density control.
 #[derive(Clone, Copy, Debug)]
 pub struct Damping {
-    /// 0 to 1: the fraction that is damped.
+    /// The damped fraction, 0 to 1.
     pub weight: f32,
     /// Depth from which nothing is damped, in world units.
     pub depth: f32,
 }
 
-/// Where the backward pass leaves its results, each for all Gaussians.
+/// Outputs of the backward pass, for all Gaussians.
 #[derive(Debug)]
 pub struct Gradients<'a> {
-    /// (columns x Gaussians): gradient of every parameter.
+    /// (columns x Gaussians): the gradient of every parameter.
     pub parameters: &'a mut Buffer<f32>,
     /// (Gaussians): sums of the norms of the screen-space gradients in normalised device units.
     pub grad_norm_sums: &'a mut Buffer<f32>,
-    /// (Gaussians): in how many steps each was seen.
+    /// (Gaussians): the number of steps in which each was visible.
     pub visit_counts: &'a mut Buffer<u32>,
 }
 
-/// Renders Gaussians, forward and backward. Holds the memory of one view.
+/// Renders Gaussians, forward and backward. Owns the memory of one view.
 #[derive(Debug)]
 pub struct Renderer {
     gpu: Gpu,
     settings: RenderSettings,
     tile: Tile,
-    /// The most splats of one tile that the blending kernels follow.
+    /// The most splats of one tile that the blending kernels can process.
     longest_run: u32,
-    /// By camera model; those of a model come with the first view of it, a pinhole's at once.
+    /// By camera model; those of the pinhole are built at once, others on first use.
     projections: BTreeMap<u32, Projections>,
     order_counts: Pipeline<order_counts::Kernel>,
     emit: Pipeline<emit::Kernel>,
@@ -89,7 +89,7 @@ pub struct Renderer {
 }
 
 impl Renderer {
-    /// Builds the kernels; memory comes with [`Renderer::reserve`].
+    /// Builds the kernels; [`Renderer::reserve`] allocates.
     ///
     /// # Errors
     /// The driver refuses a kernel, or the tile does not suit the device.
@@ -102,7 +102,7 @@ impl Renderer {
         let projections = Projections::new(gpu, &settings, tile.size, pinhole)?;
         let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
-        // What every kernel that includes `splat.glsl` is specialised with, and what some are beside it.
+        // Specialization constants of all kernels that include `splat.glsl`, and those that some have in addition.
         macro_rules! constants {
             ($kernel:ident $(, $own:ident)*) => {
                 $kernel::Constants { alpha_max, channels, tile_width, tile_height, $($own,)* }
@@ -135,7 +135,7 @@ impl Renderer {
         })
     }
 
-    /// Renders Gaussians of another SH degree from now on.
+    /// Switches to another SH degree.
     ///
     /// # Errors
     /// The driver refuses a kernel; the renderer is as it was.
@@ -153,7 +153,7 @@ impl Renderer {
         Ok(())
     }
 
-    /// How many intersections the last render had; waits for it.
+    /// The number of intersections of the last render; waits for it.
     ///
     /// # Errors
     /// The device was lost.
@@ -167,12 +167,12 @@ impl Renderer {
         &self.frame.render
     }
 
-    /// How much of the background the last render lets through, (H, W): 1 where no splat is.
+    /// The transmittance of the last render, (H, W): 1 where there is no splat.
     pub fn transmittances(&self) -> &Buffer<f32> {
         &self.frame.transmittances
     }
 
-    /// What the driver tells of the blend kernels, forward and backward; none where it tells nothing.
+    /// The driver's statistics of the blending kernels, forward and backward; empty where it has none.
     ///
     /// # Errors
     /// The driver refuses a kernel.
@@ -181,41 +181,41 @@ impl Renderer {
         Ok(forward.zip(self.blend_backward.statistics()?).map(<[_; 2]>::from))
     }
 
-    /// Everything that the passes of the last render handed each other.
+    /// The intermediate buffers of the last render.
     #[doc(hidden)]
     pub fn frame(&self) -> &RenderBuffers {
         &self.frame
     }
 
-    /// The status words: see [`Status`]. Kernels that change parameters look at the first and do nothing unless it is 0.
+    /// The status words: see [`Status`]. Kernels that change parameters do nothing while the first is nonzero.
     pub fn status(&self) -> &Buffer<u32> {
         &self.frame.status
     }
 
-    /// The last render and the status words, for a loss that reads the one and raises flags in the other.
+    /// The last render and the status words, for a loss that reads the former and sets flags in the latter.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn render_and_status(&mut self) -> (&Buffer<f32>, &mut Buffer<u32>) {
         (&self.frame.render, &mut self.frame.status)
     }
 
-    /// What to say of a view whose [`Status::splats_per_tile`] is too large for this device.
+    /// The error for a view whose [`Status::splats_per_tile`] exceeds the limit.
     pub(crate) fn too_many_splats(&self, view: String, splats: u32) -> Error {
         let [width, height] = self.tile.size;
         let (tile, device) = (format!("{width}x{height}"), self.gpu.properties().name.clone());
         Error::TileLimit { view, splats, tile, device, limit: self.longest_run }
     }
 
-    /// Lowers every flag of the status.
+    /// Clears all status flags.
     pub fn clear_status(&mut self, pass: &mut Recorder<'_>) {
         pass.fill(&mut self.frame.status, 0);
     }
 
-    /// Records the render of `gaussians` as a camera sees them, or a patch of what it sees. The first view of a camera model
-    /// builds the kernels for it.
+    /// Records the render of `gaussians` from a camera, or a patch of it. The first view of a camera model builds its
+    /// kernels.
     ///
     /// # Errors
-    /// The Gaussians are not made of what the settings say; they or the image exceed what was reserved; a pass exceeds what
-    /// the device launches; or the driver refuses a kernel.
+    /// The Gaussians are of another shape than the settings say; they or the image exceed what was reserved; a pass
+    /// exceeds what the device can launch; or the driver refuses a kernel.
     pub fn forward<'a>(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -260,11 +260,11 @@ impl Renderer {
         )
     }
 
-    /// Records the gradients of the Gaussians, given `d_render`, that of the render recorded last (channels, H, W), which was
-    /// of the same viewpoint.
+    /// Records the gradients of the Gaussians, given `d_render` (channels, H, W), the gradient of the last recorded
+    /// render, which must be of the same viewpoint.
     ///
     /// # Errors
-    /// The Gaussians are not made of what the settings say, or a pass exceeds what the device launches.
+    /// The Gaussians are of another shape than the settings say, or a pass exceeds what the device can launch.
     #[expect(clippy::too_many_arguments, reason = "what the forward pass takes, and its gradient")]
     pub fn backward<'a>(
         &mut self,
@@ -362,7 +362,7 @@ impl Renderer {
         })
     }
 
-    /// Refuses Gaussians that the kernels would read as others, or that there is no memory for.
+    /// Refuses Gaussians in another layout than the kernels read, or more than there is memory for.
     fn check(&self, layout: &Layout) -> Result<()> {
         let RenderSettings { shape, rest, .. } = self.settings;
         let reserved = self.frame.splats.len();
@@ -383,7 +383,7 @@ impl Renderer {
         Err(Error::Usage(problem))
     }
 
-    /// From projected splats to each tile's list of them, front to back.
+    /// From projected splats to the sorted list of each tile, front to back.
     fn record_bins(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -425,7 +425,7 @@ impl Renderer {
             Threads::Exactly([gaussian_count, 1, 1]),
         )?;
         let intersection_ranges = Count { counts: &frame.counts, index: 0 };
-        // One value more than there are tiles: padding sorts behind them all.
+        // One value more than there are tiles: padding sorts last.
         let bits = u32::BITS - view.tile_count().leading_zeros();
         self.tile_sort.record(
             pass,
@@ -464,7 +464,7 @@ impl Renderer {
     }
 }
 
-/// The kernels that read Gaussians and camera: of all kernels these alone know the SH degree and the camera model.
+/// The kernels that read Gaussians and cameras, the only ones that depend on the SH degree and the camera model.
 #[derive(Debug)]
 struct Projections {
     forward: Pipeline<project::Kernel>,
@@ -502,7 +502,7 @@ impl Projections {
 /// A viewpoint as the kernels take it, and the columns and rows of tiles of its image.
 struct View<'a> {
     model: u32,
-    /// None: those of the renderer.
+    /// `None`: the renderer's own.
     cameras: Option<&'a Buffer<kernels::Camera>>,
     camera_index: u32,
     size: UVec2,

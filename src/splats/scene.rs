@@ -25,10 +25,10 @@ pub use crate::kernels::sh::MAX_SH_DEGREE;
 /// The constant basis function of the spherical harmonics, to eight digits: an ulp below the shaders'.
 pub const SH_C0: f32 = 0.282_094_79;
 
-/// What the Gaussians of a scene are made of, beside the ellipsoid and its opacity.
+/// The attributes of a scene's Gaussians beside the ellipsoid and its opacity.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Shape {
-    /// The SH degree that there is room for, 0 to 3.
+    /// The SH degree with allocated coefficients, 0 to 3.
     pub sh_degree: u32,
     /// What is blended beside colour.
     pub features: Features,
@@ -68,11 +68,12 @@ pub fn width(shape: impl Into<Shape>) -> usize {
 pub struct Gaussians {
     /// The number of Gaussians.
     pub count: usize,
-    /// What they are made of.
+    /// Their attributes.
     pub shape: Shape,
     /// `count * width(shape)` floats.
     pub parameters: Vec<f32>,
-    /// The world position that the means are relative to: f32 is too coarse for positions far from the world's own origin.
+    /// The world position that the means are relative to: f32 is too coarse for positions far from the world's own
+    /// origin.
     pub origin: DVec3,
 }
 
@@ -95,7 +96,8 @@ impl Gaussians {
         planes(self.shape.features.width(), width(self.shape))[attribute as usize]
     }
 
-    /// The same Gaussians out of a frame, relative to an origin that lets f32 hold them: [`TrainingFrame::file_origin`].
+    /// The same Gaussians transformed from the training frame to the world, relative to an origin that f32 can
+    /// represent: [`TrainingFrame::file_origin`].
     #[cfg(feature = "io")]
     pub(crate) fn to_world(&self, frame: &TrainingFrame) -> Self {
         let origin = frame.file_origin();
@@ -107,7 +109,7 @@ impl Gaussians {
         Self { origin, ..self.moved(position, -frame.scale.ln()) }
     }
 
-    /// Gaussians of the world in a frame: what [`Gaussians::to_world`] gave comes back.
+    /// Gaussians of the world in the training frame: the inverse of [`Gaussians::to_world`].
     #[cfg(feature = "io")]
     pub(crate) fn to_frame(&self, frame: &TrainingFrame) -> Self {
         if *frame == TrainingFrame::WORLD && self.origin == DVec3::ZERO {
@@ -118,7 +120,7 @@ impl Gaussians {
         Self { origin: DVec3::ZERO, ..self.moved(position, frame.scale.ln()) }
     }
 
-    /// The same with room for another SH degree: coefficients that come are zero, those beyond it go.
+    /// The same with another SH degree: new coefficients are zero, those beyond it are dropped.
     pub fn with_sh_degree(&self, sh_degree: u32) -> Self {
         let mut other = Self::zeros(self.count, Shape { sh_degree, ..self.shape });
         other.origin = self.origin;
@@ -131,7 +133,7 @@ impl Gaussians {
         other
     }
 
-    /// The same with these features: those that come are zero, others go.
+    /// The same with these features: new ones are zero, others are dropped.
     pub(crate) fn with_features(&self, features: Features) -> Self {
         let mut other = Self::zeros(self.count, Shape { features, ..self.shape });
         other.origin = self.origin;
@@ -153,7 +155,7 @@ impl Gaussians {
         other
     }
 
-    /// The least SH degree that there has to be room for.
+    /// The lowest SH degree that holds all nonzero coefficients.
     pub(crate) fn sh_degree_in_use(&self) -> u32 {
         let own = rest_coefficients(self.shape.sh_degree);
         let used = |rest: &[Vec3]| rest.iter().rposition(|c| *c != Vec3::ZERO).map_or(0, |k| k + 1);
@@ -183,7 +185,7 @@ impl Gaussians {
     }
 }
 
-/// One way in and one way out of every plane, as the elements it is made of.
+/// Accessors of every plane, as the elements that it is made of.
 macro_rules! accessors {
     ($($(#[$doc:meta])* $attribute:ident: $read:ident, $write:ident -> $element:ty,)*) => {
         impl Gaussians {$(
@@ -212,7 +214,7 @@ accessors! {
     RawOpacities: raw_opacities, raw_opacities_mut -> f32,
     /// SH coefficients of degree 0, RGB, (count).
     Dc: dc, dc_mut -> Vec3,
-    /// What is blended beside colour, (count, features).
+    /// Blended values beside colour, (count, features).
     Features: features, features_mut -> f32,
     /// SH coefficients above degree 0, RGB, (count, (degree + 1)^2 - 1).
     Rest: rest, rest_mut -> Vec3,

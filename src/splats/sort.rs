@@ -1,11 +1,10 @@
-//! Exclusive scan and stable radix sort of numbers whose count lives on the device.
+//! Exclusive scan and stable radix sort of arrays whose length is on the device.
 //!
-//! Both are reduce-then-scan: an upsweep sums up partitions of consecutive items, the last of its workgroups turns the
-//! sums into what precedes each partition (the spine), a downsweep finishes within the partitions. Two kernels where a
-//! decoupled look-back would need one, but that one needs forward-progress guarantees that Vulkan does not give. One
-//! subgroup owns a partition, so no kernel waits at a barrier, and every result is the same bit for bit on every device
-//! and in every run. A dispatch has a workgroup for every partition that the buffers have room for; those beyond the
-//! count leave at once.
+//! Both are reduce-then-scan: an upsweep sums partitions of consecutive items, the last of its workgroups scans the
+//! sums (the spine), and a downsweep finishes within the partitions. A decoupled look-back would need one kernel
+//! instead of two, but also forward-progress guarantees that Vulkan does not give. One subgroup owns a partition, so no
+//! kernel waits at a barrier, and results are bit-identical on every device and in every run. A dispatch has a
+//! workgroup for every partition of the buffers' capacity; those beyond the count return at once.
 
 mod radix;
 mod scan;
@@ -16,12 +15,12 @@ pub use scan::Scan;
 use crate::gpu::Buffer;
 use crate::{Error, Result};
 
-/// A number of items that the device knows and the host does not.
+/// A number of items that is on the device only.
 #[derive(Clone, Copy, Debug)]
 pub struct Count<'a> {
-    /// Numbers that earlier passes have written.
+    /// The buffer of counts.
     pub counts: &'a Buffer<u32>,
-    /// Which of them.
+    /// The index of the count.
     pub index: u32,
 }
 
@@ -37,7 +36,7 @@ impl Count<'_> {
     }
 }
 
-/// The length that all of `lens` share, as the kernels take it.
+/// The common length of `lens`, as the kernels take it.
 ///
 /// # Errors
 /// The lengths differ, or exceed 32 bits.

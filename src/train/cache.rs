@@ -26,6 +26,9 @@ pub struct CacheSize(pub u64);
 /// Suffixes and their powers of 2.
 const UNITS: [(char, u32); 4] = [('K', 10), ('M', 20), ('G', 30), ('T', 40)];
 
+/// A smaller number needs a unit, bytes.
+const MIN_BYTES: f64 = 1_048_576.0;
+
 impl std::str::FromStr for CacheSize {
     type Err = Error;
 
@@ -37,11 +40,14 @@ impl std::str::FromStr for CacheSize {
         let bytes = number
             .parse::<f64>()
             .map(|number| number * 2.0_f64.powi(unit.map_or(0, |(_, power)| *power).cast_signed()));
-        // Positive phrasing: a NaN fails the test too.
+        // Positive phrasing: a NaN fails the test too. A small number without a unit is meant in gibibytes.
         match bytes {
+            Ok(bytes) if plain == upper && unit.is_none() && bytes > 0.0 && bytes < MIN_BYTES => {
+                Err(Error::Usage(format!("`{text}` is in bytes; write its unit, as in {text}G")))
+            }
             Ok(bytes) if (0.0..1e18).contains(&bytes) => Ok(Self(bytes as u64)),
             _ => Err(Error::Usage(format!(
-                "`{text}` is not a memory size; write bytes, or 512M, 4G, 1.5G"
+                "`{text}` is no size of memory; write it with its unit, as in 512M, 4G or 1.5G"
             ))),
         }
     }
@@ -53,7 +59,7 @@ impl std::fmt::Display for CacheSize {
         let unit = UNITS.iter().rev().find(|(_, power)| bytes > 0 && bytes % (1 << power) == 0);
         match unit {
             Some((letter, power)) => write!(out, "{}{letter}", bytes >> power),
-            None => write!(out, "{bytes}"),
+            None => write!(out, "{bytes}B"),
         }
     }
 }
@@ -347,14 +353,15 @@ mod tests {
             ("512m", 512 << 20, "512M"),
             ("1.5 GiB", 3 << 29, "1536M"),
             ("100kB", 100 << 10, "100K"),
-            ("1000", 1000, "1000"),
-            ("0", 0, "0"),
+            ("1000B", 1000, "1000B"),
+            ("1048577", 1_048_577, "1048577B"),
+            ("0", 0, "0B"),
         ] {
             let size: CacheSize = text.parse().unwrap();
             assert_eq!((size.0, size.to_string().as_str()), (bytes, printed), "{text}");
             assert_eq!(size.to_string().parse::<CacheSize>().unwrap(), size);
         }
-        for text in ["", "G", "-1G", "much", "4X", "NaN"] {
+        for text in ["", "G", "-1G", "much", "4X", "NaN", "4", "1000"] {
             assert!(text.parse::<CacheSize>().is_err(), "{text}");
         }
     }

@@ -20,6 +20,7 @@ use crate::loss::{LossConfig, ParameterWeights};
 use crate::networks::NetworkVariant;
 use crate::photographs::dataset::{DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize};
 use crate::photographs::tone::ToneSettings;
+use crate::photographs::white_balance::WhiteBalance;
 use crate::splats::densify::DensityControl;
 use crate::splats::optimizer::Schedule;
 use crate::splats::packed_sh::StorageFormat;
@@ -64,65 +65,72 @@ settings! {
 pub struct TrainConfig {
     /// The dataset's folder.
     dataset: PathBuf = PathBuf::new() => Rule::PATH;
-    /// A folder of reference images with the photographs' names, for scores only.
-    reference: Option<PathBuf> = None, "what lies beside the photographs" => Rule::PATH, "--reference DIR";
-    /// Start from the Gaussians of a PLY, of a run or of another program, in the dataset's world, instead of the
-    /// dataset's points; every SH degree is in use from the first step.
+    /// The folder that holds the photographs by their listed names.
+    images: Option<PathBuf> = None, "where the dataset's listing says" => Rule::PATH, "--images DIR";
+    /// Folder of reference images, under the names of the photographs, for scores only.
+    reference: Option<PathBuf> = None, "found beside the photographs" => Rule::PATH, "--reference DIR";
+    /// Initial Gaussians from a PLY in the dataset's coordinates, instead of the dataset's points; all SH degrees are
+    /// in use from the first step.
     init: Option<PathBuf> = None, "the dataset's points" => Rule::PATH, "--init MODEL.ply";
-    /// Masks (masks/NAME.png or masks/NAME.jpg.png of the dataset) hide what is white, not what is black.
+    /// Masks (masks/NAME.png or masks/NAME.jpg.png) hide white instead of black.
     invert_masks: bool = false => Rule::Flag, "--invert-masks";
-    /// Undistort fisheye photographs to a pinhole of 60 degrees off the axis instead of training on them as they are;
-    /// other distorted lenses are always undistorted.
+    /// Mask black borders and corners that the photographs have in the same place, as undistorting leaves them.
+    mask_borders: bool = true => Rule::Flag;
+    /// White balance of the photographs before they are measured: gains R,G,B of linear light; the colour temperature
+    /// of the light in kelvin; VIEW,x,y,w,h, a neutral area of one photograph in pixels as stored; or
+    /// VIEW,x1,y1,..,x4,y4, the corners of a chart of 24 patches, from the dark skin patch round by the blue-green, the
+    /// black and the white one.
+    white_balance: Option<WhiteBalance> = None, "none" => WHITE_BALANCE, "--white-balance WHITE";
+    /// Undistort fisheye photographs to pinhole ones, cropped to 60 degrees off the axis, instead of training with the
+    /// fisheye model; other distorted photographs are always undistorted.
     undistort: bool = false => Rule::Flag, "--undistort";
-    /// Training steps, one view each.
+    /// Training steps (iterations), one view each.
     steps: u64 = 5000 => Rule::at_least(1), in "steps", "--steps N";
     /// Resize the photographs by 1/F.
     downscale: f64 = 1.0 => DOWNSCALE, "--downscale F";
-    /// Resize photographs whose longest side is then still larger to this; 0 or none: no limit. Brightness is measured,
-    /// and the curve applied, at their own size.
+    /// Maximum longest side of the photographs, to which larger ones are shrunk; 0 or none: no limit. The tone curve is
+    /// applied at full resolution.
     max_resolution: u32 = 1600 => Rule::Whole(0, u32::MAX as u64), in "pixels", "--max-resolution N|none";
-    /// Train in patches on photographs of more pixels than this: less memory a step, more steps a photograph.
-    patch_pixels: Option<u64> = None, "as many as the device binds"
+    /// Train larger photographs in patches of at most this size, with less memory per step and more steps per epoch.
+    patch_pixels: Option<u64> = None, "the most that the device can bind"
         => Rule::at_least(MIN_PATCH), in "pixels", "--patch-pixels N";
-    /// Use every Nth view by name as a test view, whatever split the dataset has; 0: none, train on all.
-    test_every: Option<usize> = None, "the dataset's split, else every 8th"
-        => Rule::COUNT, in "views", "--test-every N";
-    /// Memory for photographs, such as 4G, on the device and decoded on the host; the rest waits on disk, which takes
-    /// time but changes no bit.
-    cache: Option<CacheSize> = None, "a quarter of the memory of each" => MEMORY, in "bytes", "--cache SIZE";
-    /// Device-memory limit, such as 4G: densification stops below it; exceeding it all the same saves a checkpoint and
-    /// exits with 4.
-    max_vram: Option<CacheSize> = None, "no limit" => MEMORY, in "bytes", "--max-vram SIZE";
-    /// Host-memory limit, as far as it can be foreseen: densification stops below it.
-    max_ram: Option<CacheSize> = None, "no limit" => MEMORY, in "bytes", "--max-ram SIZE";
-    /// Seed of all random numbers; the same seed gives the same bits.
+    /// Use every Nth view by name as a test view, instead of the dataset's split; 0: no test views.
+    test_every: Option<usize> = None, "the dataset's split, else every 8th" => Rule::COUNT, in "views", "--test-every N";
+    /// Memory for photographs on the device and on the host, such as 4G; the rest is kept on disk, which takes time but
+    /// changes no result.
+    cache: Option<CacheSize> = None, "a quarter of each memory" => MEMORY, in "bytes", "--cache SIZE";
+    /// Device memory limit, such as 4G; densification stops below it, and exceeding it saves and exits with code 4.
+    max_vram: Option<CacheSize> = None, "all" => MEMORY, in "bytes", "--max-vram SIZE";
+    /// Estimated host memory limit, such as 16G; densification stops below it.
+    max_ram: Option<CacheSize> = None, "all" => MEMORY, in "bytes", "--max-ram SIZE";
+    /// Random seed; the same seed gives the same bits.
     seed: u64 = 10 => Rule::COUNT, "--seed S";
-    /// Highest degree of the spherical harmonics.
+    /// Degree of the spherical harmonics.
     sh_degree: u32 = MAX_SH_DEGREE => Rule::Whole(0, MAX_SH_DEGREE as u64), "--sh-degree D";
-    /// Weight of 1 - SSIM; L1 has the rest of 1.
+    /// Weight of the loss 1 - SSIM; L1 has the remaining weight.
     ssim_weight: f64 = 0.2 => Rule::SHARE, "--ssim-weight W";
-    /// The largest number of Gaussians.
+    /// Maximum number of Gaussians.
     max_gaussians: usize = 1_000_000 => Rule::at_least(1), in "Gaussians", "--max-gaussians N";
     /// Background during training: black, or random, a new colour every step. Scores and renders use black.
     background: Background = Background::Random => Rule::OneOf(&["black", "random"]), "--background BACKGROUND";
-    /// Score the test views every N steps too: a line, and a row of evals.csv; 0: at the end only.
+    /// Also score the test views every N steps, to evals.csv; 0: at the end only.
     eval_every: u64 = 0 => Rule::COUNT, in "steps", "--eval-every N";
     /// Write a checkpoint and the model every N steps; 0: never.
     checkpoint_every: u64 = 1000 => Rule::COUNT, in "steps", "--checkpoint-every N";
-    /// Write a checkpoint whenever the last is this old, too; 0: never.
+    /// Also write a checkpoint when the last one is this old; 0: never.
     checkpoint_minutes: f64 = 10.0 => MINUTES, in "minutes", "--checkpoint-minutes MINUTES";
-    /// Save and stop after this time, with exit code 75; --resume goes on; 0: train to the end.
+    /// Save and stop after this time, with exit code 75, for --resume; 0: no limit.
     max_minutes: f64 = 0.0 => MINUTES, in "minutes", "--max-minutes MINUTES";
-    /// Log a checksum of every plane of the parameters to hashes.csv every N steps; 0: never.
+    /// Log checksums of the parameters to hashes.csv every N steps; 0: never.
     hash_every: u64 = 0 => Rule::COUNT, in "steps", "--hash-every N";
-    /// Write losses, rates, Gaussians, scores and a test view for `tensorboard --logdir RUN`.
+    /// Write logs for `tensorboard --logdir RUN`.
     tensorboard: bool = false => Rule::Flag, "--tensorboard";
-    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu.
+    /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu.
     device: String = String::new(), "the best" => Rule::Text("a device", |_| true), "--device DEVICE";
     /// The tile that a workgroup renders: width and height in pixels and, if several subgroups share it, their number.
     tile: Option<Tile> = None, "the fastest known on the device; recorded"
         => Rule::List(2, 3, &Rule::Whole(0, u32::MAX as u64));
-    /// Near plane, in units of the scene's extent: the distance of the cameras from their centre, rounded to a power of
+    /// Near plane, in units of the scene extent: the distance of the cameras from their centre, rounded to a power of
     /// two.
     near: f64 = 0.1 => Rule::from_to(1e-6, 1.0), "--near N";
     /// Random points to start from if the dataset has none.
@@ -158,9 +166,13 @@ sections {
 }
 
 /// A size of memory.
-const MEMORY: Rule = Rule::Text("a size of memory: bytes, or 512M, 4G, 1.5G", |text| {
-    text.parse::<CacheSize>().is_ok()
-});
+const MEMORY: Rule =
+    Rule::Text("a size of memory with its unit, such as 512M, 4G or 1.5G", |text| {
+        text.parse::<CacheSize>().is_ok()
+    });
+
+const WHITE_BALANCE: Rule =
+    Rule::Text(WhiteBalance::FORM, |text| text.parse::<WhiteBalance>().is_ok());
 
 const MINUTES: Rule = Rule::from_to(0.0, 1e9);
 
@@ -171,7 +183,7 @@ settings! {
 pub struct CheckConfig {
     /// Compare every pass of every Nth step with its CPU reference, and warn of differences; 0: never.
     every: u64 = 0 => Rule::COUNT, in "steps", "--check-every N";
-    /// Stop at a difference.
+    /// Stop if a checked step differs.
     stops: bool = false => Rule::Flag, "--check-stops";
 }
 }
@@ -181,7 +193,8 @@ settings! {
 /// Density control; [`Schedule`] has its steps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DensityConfig {
-    /// Densification: conserving, a split that preserves coverage, or paper, the clone and split of LITA-GS.
+    /// Densification: conserving splits a Gaussian into two that cover the same area; paper clones and splits as
+    /// LITA-GS.
     control: DensityControl = DensityControl::Conserving => Rule::OneOf(&["conserving", "paper"]), "--density NAME";
     /// Densify Gaussians whose mean screen-space gradient, in normalised device coordinates, has at least this norm.
     gradient_threshold: f64 = 4e-4 => Rule::POSITIVE;
@@ -249,8 +262,11 @@ impl TrainConfig {
             max_resolution: self.max_resolution,
             test_every: self.test_every,
             keep: CacheSize::on_host(self.cache, self.max_ram),
+            images: self.images.clone(),
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
+            mask_borders: self.mask_borders,
+            white_balance: self.white_balance.clone(),
             undistort: self.undistort,
             measured: if self.tone.full_resolution {
                 MeasuredSize::Own
@@ -289,7 +305,12 @@ impl TrainConfig {
     /// Moves the run to another copy of its dataset, with the paths inside its folder.
     pub(crate) fn move_dataset(&mut self, dataset: &Path) {
         let from = std::mem::replace(&mut self.dataset, dataset.to_owned());
-        let inside = [&mut self.reference, &mut self.model.depth_folder, &mut self.exposure.start];
+        let inside = [
+            &mut self.images,
+            &mut self.reference,
+            &mut self.model.depth_folder,
+            &mut self.exposure.start,
+        ];
         for folder in inside.into_iter().flatten() {
             if let Ok(place) = folder.strip_prefix(&from) {
                 *folder = dataset.join(place);
@@ -345,8 +366,8 @@ impl TrainConfig {
             frame.check_rows()?;
         }
         if self.exposure.learn == OnOff::On && self.model.tonemapper {
-            let rule = "off where the model has a tonemapper: a gain on targets does not describe the exposure of the \
-                        dark photographs";
+            let rule = "off with a tonemapper, which fits the dark photographs: a gain of the targets does not describe \
+                        their exposures";
             let (key, value) = ("exposure.learn".to_owned(), "on".to_owned());
             return Err(Error::Setting { key, value, rule: rule.to_owned() });
         }
@@ -371,7 +392,7 @@ mod tests {
         let mut config = TrainConfig::default();
         (config.exposure.learn, config.model.tonemapper) = (OnOff::On, true);
         let message = config.check().unwrap_err().to_string();
-        assert!(message.starts_with("exposure.learn is on; it must be off where"), "{message}");
+        assert!(message.starts_with("exposure.learn is on; it must be off with a tonemapper"), "{message}");
     }
 
     #[test]

@@ -13,6 +13,7 @@ mod noise;
 mod photograph;
 mod plan;
 mod sharpness;
+mod target_noise;
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -23,13 +24,15 @@ use serde::Serialize;
 
 use crate::camera::Camera;
 use crate::photographs::dataset::{self, Dataset, LoadOptions, View};
-use crate::photographs::image::{Image, MIDDLE_GREY, Mask, PictureFile, files};
+use crate::photographs::image::{ColourTally, Image, MIDDLE_GREY, Mask, PictureFile, files};
 use crate::photographs::tone::{Exposure, LuminanceHistogram, is_black};
+use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 use geometry::Shared;
 pub use noise::Noise;
 use photograph::PhotographStatistics;
 pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
+pub use target_noise::TargetNoise;
 
 /// A view is reported as blurred from this many times the median, and this many pixels more.
 const BLURRED: [f64; 2] = [1.6, 0.7];
@@ -65,6 +68,8 @@ pub struct ViewDiagnosis {
     pub code_values: usize,
     /// `None` if no part is flat and unclipped.
     pub noise: Option<Noise>,
+    /// As the tone curve shows it, with that of whole codes and of JPEG; none of a black or a tiny photograph.
+    pub noise_in_target: Option<TargetNoise>,
     /// The blur of the edges, as a standard deviation in pixels; `None` without edges.
     pub blur: Option<f64>,
     /// The standard deviation of log2 light over large regions, due to lamps and windows.
@@ -104,6 +109,8 @@ pub struct SceneDiagnosis {
     pub code_values: f64,
     /// Fitted to the patches of all views.
     pub noise: Option<Noise>,
+    /// The medians over the views.
+    pub noise_in_target: Option<TargetNoise>,
     /// The noise left in a target after averaging the views of a point, as a standard deviation of encoded values.
     pub target_noise: f64,
     /// The median over the views.
@@ -184,7 +191,7 @@ impl Diagnosis {
         let paths = views.iter().map(|(_, view)| path(view)).collect::<Result<Vec<_>>>()?;
         let shared = Shared::of(dataset, &views)?;
         let unknown = paths.iter().copied().filter(|file| !known.contains_key(&file.name));
-        known.extend(read(unknown.collect(), options)?);
+        known.extend(read(&dataset.root, &files, unknown.collect(), options)?);
         let photographs = views.iter().filter_map(|(_, view)| known.remove(&view.name));
         let photographs: Vec<Photograph> = photographs.collect();
         let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);
@@ -231,6 +238,8 @@ fn pixels(camera: &Camera) -> u64 {
 
 /// Reads and measures photographs; each with its name.
 fn read(
+    root: &Path,
+    all: &[dataset::Photograph],
     files: Vec<&dataset::Photograph>,
     options: &LoadOptions,
 ) -> Result<Vec<(String, Photograph)>> {
@@ -238,13 +247,19 @@ fn read(
         Image::size_of(&file.input).map(|(w, h)| u64::from(w) * u64::from(h))
     };
     let largest = files.iter().filter_map(|file| area(file).ok()).max().unwrap_or_default();
+    let colours = ColourTally::default();
+    let named = || all.iter().map(|file| (file.name.as_str(), file.input.as_path()));
+    let balance = options.white_balance.as_ref().filter(|_| !files.is_empty());
+    let gains = balance.map(|balance| balance.gains(root, named())).transpose()?;
     let mut photographs = vec![];
     for files in files.chunks(Image::decoded_at_once(largest)) {
-        let read = files
-            .par_iter()
-            .map(|file| Ok((file.name.clone(), Photograph::load(file, options.invert_masks)?)));
+        let read = files.par_iter().map(|file| {
+            let photograph = Photograph::load(file, options.invert_masks, gains, &colours)?;
+            Ok((file.name.clone(), photograph))
+        });
         photographs.extend(read.collect::<Result<Vec<_>>>()?);
     }
+    colours.say();
     Ok(photographs)
 }
 
@@ -253,28 +268,40 @@ struct Photograph {
     size: [u32; 2],
     measured: PhotographStatistics,
     histogram: LuminanceHistogram,
+    noise_in_target: Option<TargetNoise>,
 }
 
 impl Photograph {
-    fn load(file: &dataset::Photograph, invert_masks: bool) -> Result<Self> {
-        let (image, alpha) = PictureFile::open(&file.input)?.decode()?;
+    fn load(
+        file: &dataset::Photograph,
+        invert_masks: bool,
+        gains: Option<WhiteBalanceGains>,
+        colours: &ColourTally,
+    ) -> Result<Self> {
+        let (mut image, alpha) = PictureFile::open(&file.input)?.decode_counted(colours)?;
+        if let Some(gains) = gains {
+            gains.apply(&mut image);
+        }
         let decoded = (&image, alpha.as_ref());
-        let mask = Mask::over(&file.input, decoded, file.mask.as_deref(), invert_masks)?;
+        let mask = Mask::over(&file.input, decoded, file.mask.as_ref(), invert_masks)?;
         Ok(Self::of(&image, mask.as_ref()))
     }
 
     fn of(image: &Image, mask: Option<&Mask>) -> Self {
         let counted = mask.map(|mask| mask.counted(image));
         let counted = counted.as_deref().unwrap_or(&image.data);
+        let histogram = LuminanceHistogram::of(counted);
+        let exposure = Exposure::of([&histogram], None);
         Self {
             size: [image.width, image.height],
             measured: PhotographStatistics::of(image, counted),
-            histogram: LuminanceHistogram::of(counted),
+            noise_in_target: exposure.and_then(|own| target_noise::target_noise(image, &own)),
+            histogram,
         }
     }
 
     fn diagnosis(&self, name: &str, shared: &Shared, place: usize) -> ViewDiagnosis {
-        let Self { size, measured, histogram } = self;
+        let Self { size, measured, histogram, noise_in_target } = self;
         let [p10, p90] = measured.statistics.percentiles();
         ViewDiagnosis {
             name: name.to_owned(),
@@ -291,6 +318,7 @@ impl Photograph {
             zero_fraction: measured.zero_fraction,
             code_values: measured.code_values,
             noise: measured.noise,
+            noise_in_target: *noise_in_target,
             blur: measured.blur,
             unevenness: measured.unevenness,
             points: shared.points[place],
@@ -333,6 +361,9 @@ impl SceneDiagnosis {
             zero_fraction: mean(|view| view.zero_fraction),
             code_values: mean(|view| view.code_values as f64),
             noise,
+            noise_in_target: TargetNoise::median(
+                lit.iter().filter_map(|view| view.noise_in_target),
+            ),
             target_noise: noise.map_or(0.0, |noise| target_noise(noise, light, exposure, shared)),
             blur: geometry::median(lit.iter().filter_map(|view| view.blur).collect()),
             unevenness: mean(|view| view.unevenness),
@@ -381,7 +412,9 @@ fn without_pose(
     let mut names = vec![];
     for folder in folders {
         let photographs = files::photographs_in(folder)?;
-        let others = photographs.iter().filter(|path| !of_views.contains(path.as_path()));
+        let is_other =
+            |path: &&PathBuf| !of_views.contains(path.as_path()) && !dataset::is_mask(path);
+        let others = photographs.iter().filter(is_other);
         let stems = others.filter_map(|path| path.file_stem()?.to_str());
         names.extend(stems.filter(|name| !posed.contains(name)).map(str::to_owned));
     }

@@ -55,13 +55,7 @@ impl Views {
     ) -> Result<Gaussians> {
         let frame = config.frame.unwrap_or_default();
         let points = self.points(dataset, config, &frame);
-        let kept = &points[..points.len().min(config.max_gaussians)];
-        let fitting = config.render_settings().peak_gaussians(gpu);
-        if kept.len() > fitting {
-            let (of, device) = (kept.len(), &gpu.properties().name);
-            tracing::warn!("{fitting} of {of} points become Gaussians: {device} binds no more");
-        }
-        let kept = &kept[..kept.len().min(fitting)];
+        let kept = &sampled(points, config, gpu);
         // The position of each view of the dataset among those trained on.
         let mut places = vec![None; dataset.views.len()];
         self.photographs().for_each(|view| places[view.index] = Some(view.place));
@@ -188,9 +182,61 @@ fn scattered(count: usize) -> impl Iterator<Item = usize> {
     })
 }
 
+/// The points that begin as Gaussians: an even sample where they are more than there may be.
+fn sampled<'a>(points: Cow<'a, [Point]>, config: &TrainConfig, gpu: &Gpu) -> Cow<'a, [Point]> {
+    let fitting = config.render_settings().peak_gaussians(gpu);
+    let (of, count) = (points.len(), points.len().min(config.max_gaussians).min(fitting));
+    if count == of {
+        return points;
+    }
+    let limit = if count == config.max_gaussians {
+        "max_gaussians allows no more".to_owned()
+    } else {
+        format!("{} binds no more", gpu.properties().name)
+    };
+    tracing::warn!("{count} of {of} points, an even sample, begin as Gaussians: {limit}");
+    let seed = Stream::new(config.seed, streams::POINTS).bits(1);
+    even_sample(of, count, seed).into_iter().map(|index| points[index].clone()).collect()
+}
+
+/// `count` of the indices below `of`, ascending, spread evenly: one at random of each of `count` stretches of equal
+/// length. A scan lists neighbours in rows, and a fixed stride would meet the same place of each row.
+fn even_sample(of: usize, count: usize, seed: u64) -> Vec<usize> {
+    if count >= of {
+        return (0..of).collect();
+    }
+    let draws = Stream::new(seed, 0);
+    let begin = |stretch: usize| (stretch as u128 * of as u128 / count as u128) as usize;
+    let index = |stretch: usize| {
+        let (first, end) = (begin(stretch), begin(stretch + 1));
+        first + (draws.uniform(stretch as u64) * (end - first) as f64) as usize
+    };
+    (0..count).map(index).collect()
+}
+
 #[cfg(test)]
 mod tests {
-    use super::scattered;
+    use super::{even_sample, scattered};
+
+    #[test]
+    fn a_sample_is_even_and_follows_no_period_of_the_list() {
+        for (of, count) in [(60_000, 6000), (10, 9), (7, 7), (7, 12), (5, 1), (3, 0)] {
+            let sample = even_sample(of, count, 3);
+            assert_eq!(sample.len(), count.min(of));
+            assert!(
+                sample.windows(2).all(|two| two[0] < two[1]) && sample.iter().all(|&at| at < of)
+            );
+            for (stretch, &at) in sample.iter().enumerate() {
+                let expected = (stretch as f64 + 0.5) * of as f64 / count.min(of) as f64;
+                assert!((at as f64 - expected).abs() <= of as f64 / count.min(of) as f64);
+            }
+            assert_eq!(sample, even_sample(of, count, 3));
+        }
+        // Rows of ten: a stride of ten would meet one column.
+        let mut columns = [0; 10];
+        even_sample(10_000, 1000, 0).into_iter().for_each(|at| columns[at % 10] += 1);
+        assert!(columns.iter().all(|&count| count > 50), "{columns:?}");
+    }
 
     #[test]
     fn scattered_numbers_are_all_there_and_neighbours_far_apart() {

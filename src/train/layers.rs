@@ -13,7 +13,7 @@ use toml::{Table, Value};
 use super::settings::{SETTINGS, flat, number, setting, takes, unknown, value};
 use super::{TrainConfig, old_keys};
 use crate::base::input;
-use crate::base::settings::Setting;
+use crate::base::settings::{Rule, Setting};
 use crate::photographs::tone::{OF_CURVE, ToneCurve};
 use crate::{Error, Result};
 
@@ -104,6 +104,13 @@ impl SettingsLayer {
         // A device may be named 0.
         let is_text = setting(key).is_some_and(|row| row.rule.is_text());
         let value = value.filter(|value| !is_text || value.is_str());
+        let is_whole = setting(key).is_some_and(|row| matches!(row.rule, Rule::Whole(..)));
+        let is_flag = setting(key).is_some_and(|row| matches!(row.rule, Rule::Flag));
+        let value = match text {
+            "on" | "off" if is_flag => Some((text == "on").into()),
+            _ if is_whole => whole(text).map(Value::from).or(value),
+            _ => value,
+        };
         self.push(key, value.unwrap_or_else(|| Value::String(text.to_owned())), origin)
     }
 
@@ -313,6 +320,20 @@ pub fn values(config: &TrainConfig) -> Result<BTreeMap<String, Value>> {
     Ok(SettingsLayer::of(config)?.0.into_iter().map(|(key, value, _)| (key, value)).collect())
 }
 
+/// A whole number as people write large ones: 5000, 5k, 1e4, 1.5M.
+pub(crate) fn whole(text: &str) -> Option<i64> {
+    let factor = |letter| match letter {
+        'k' | 'K' => Some(1e3),
+        'm' | 'M' => Some(1e6),
+        _ => None,
+    };
+    let factor = text.chars().last().and_then(factor);
+    let digits = if factor.is_some() { &text[..text.len() - 1] } else { text };
+    let number = digits.parse::<f64>().ok()? * factor.unwrap_or(1.0);
+    // Beyond 2^53 not every whole number is a double.
+    (number.fract() == 0.0 && number.abs() < 9e15).then_some(number as i64)
+}
+
 /// The line of an offset in a text, for messages.
 fn line_at(text: &str, at: usize) -> String {
     format!(" (line {})", text[..at].matches('\n').count() + 1)
@@ -353,6 +374,7 @@ mod tests {
             "density.gradient_threshold = 1e-4",
             "downscale=4",
             "background=black",
+            "model.raw_colors=on",
             "device=0",
             "schedule.damping_steps=[1, 2]",
             "reference=pictures/high",
@@ -365,12 +387,24 @@ mod tests {
         expected.density.gradient_threshold = 1e-4;
         expected.downscale = 4.0;
         expected.background = Background::Black;
+        expected.model.raw_colors = true;
         expected.device = "0".to_owned();
         expected.schedule.damping_steps = [1, 2];
         expected.reference = Some("pictures/high".into());
         expected.steps = 4;
         assert_eq!(config, expected);
         assert_eq!(with(&[]).unwrap(), TrainConfig::default());
+    }
+
+    #[test]
+    fn a_whole_number_may_be_written_short() {
+        for (text, number) in [("5k", 5000), ("1e4", 10_000), ("1.5k", 1500), ("2M", 2_000_000)] {
+            assert_eq!(with(&[&format!("steps={text}")]).unwrap().steps, number, "{text}");
+        }
+        for text in ["1.5", "k", "5kk", "many", "1e-1", "nan"] {
+            assert!(with(&[&format!("steps={text}")]).is_err(), "{text}");
+        }
+        assert_eq!(with(&["seed=9007199254740993"]).unwrap().seed, 9_007_199_254_740_993);
     }
 
     #[test]
@@ -410,7 +444,7 @@ mod tests {
                 ["stop.every is 0; it must be a whole number, at least 1", "(line 4)"],
             ),
             ("steps = 3\nseed = \"x\"\n", ["seed is \"x\"", "(line 2)"]),
-            ("steps = \n", ["is no TOML", "(line 1)"]),
+            ("steps = \n", ["is not TOML", "(line 1)"]),
         ] {
             std::fs::write(&path, text).unwrap();
             let message = TrainConfig::load(&path).unwrap_err().to_string();
@@ -437,16 +471,16 @@ mod tests {
             "\nsteps = 9  # --set\n",
             "\nviews = 0  # preset fast\n",
             "\nseed = 10  # default\n",
-            "\n# Training steps, one view each: a whole number, at least 1, in steps\n",
+            "\n# Training steps (iterations), one view each: a whole number, at least 1, in steps\n",
         ] {
             assert!(text.contains(line), "no {line} in {text}");
         }
         assert_eq!(TrainConfig::from_toml(&text).unwrap(), config);
         let explained = settings.explained(&config).unwrap();
         assert!(
-            explained.contains("stop.views = 0  (preset fast)\n    The number of"),
+            explained.contains("stop.views = 0  (preset fast)\n    Hold out this many"),
             "{explained}"
         );
-        assert!(explained.contains("cache  (a quarter of the memory of each)\n"), "{explained}");
+        assert!(explained.contains("cache  (a quarter of each memory)\n"), "{explained}");
     }
 }

@@ -84,15 +84,15 @@ pub struct ModelConfig {
     structure: bool = false => Rule::Flag;
     /// A feature trained against a given depth map; not for views without one.
     depth: bool = false => Rule::Flag;
-    /// Colours are the plain SH sum of LITA-GS instead of max(SH + 0.5, 0), which viewers expect.
-    raw_colors: bool = false => Rule::Flag, "--raw-colors BOOL";
-    /// Train the networks on a random crop of at most N x N pixels a step; 0: on the whole view.
+    /// Colour is the SH sum alone, as in LITA-GS, instead of max(SH + 0.5, 0), as in viewers.
+    raw_colors: bool = false => Rule::Flag, "--raw-colors on|off";
+    /// Train the networks on random crops of at most N x N pixels; 0: on whole views.
     denoiser_crop: u32 = 0 => Rule::Whole(0, u32::MAX as u64), in "pixels", "--denoiser-crop N";
     /// The side of the boxes of the local depth term.
     depth_box: u32 = 128 => Rule::Whole(2, u32::MAX as u64), in "pixels";
-    /// A folder of depth maps, `NAME.*` or `depth_NAME.*`; larger is farther.
-    depth_folder: Option<PathBuf> = None, "`depth/` or `depth_maps/` of the dataset" => Rule::PATH, "--depth DIR";
-    /// The depth maps hold disparity: larger is nearer.
+    /// Folder of depth maps, `NAME.*` or `depth_NAME.*`, in which larger is farther.
+    depth_folder: Option<PathBuf> = None, "depth/ or depth_maps/ of the dataset" => Rule::PATH, "--depth DIR";
+    /// Depth maps hold disparity, in which larger is nearer.
     depth_is_disparity: bool = false => Rule::Flag, "--depth-is-disparity";
 }
 sections {

@@ -70,6 +70,15 @@ fn curves_are_drawn_with_the_statistics_of_a_dataset() {
 }
 
 #[test]
+fn a_plot_without_names_shows_six_curves_and_says_how_to_choose_others() {
+    let folder = tempfile::tempdir().unwrap();
+    let svg = folder.path().join("curves.svg");
+    let message = printed(&format!("--plot {}", svg.display()));
+    assert!(message.contains("6 curves; name curves to plot others"), "{message}");
+    assert_eq!(std::fs::read_to_string(svg).unwrap().matches("<polyline").count(), 6);
+}
+
+#[test]
 fn an_unknown_curve_is_misuse() {
     let error = parse("gama").unwrap_err();
     assert_eq!(error.exit_code(), 2);

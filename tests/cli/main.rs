@@ -108,7 +108,11 @@ fn a_run_directory_has_its_four_files_and_metrics_their_shape() {
         "spent",
         "ended",
     ];
-    assert_eq!(keys(&metrics), known);
+    assert_eq!(keys(&metrics), [&known[..], &["trained_with"]].concat());
+    for made_by in [&metrics["trained_with"], &json(run.join("done.json"))["trained_with"]] {
+        assert_eq!(made_by["nightsplat"], env!("CARGO_PKG_VERSION"));
+        assert!(!made_by["device"].as_str().unwrap().is_empty(), "{made_by}");
+    }
     assert_eq!(keys(&metrics[residual_transmittance]), ["mean", "views"]);
     assert_eq!(keys(&metrics[residual_transmittance]["views"]["008"]), ["mean", "q99"]);
     assert_eq!(keys(&metrics["mean"]), ["psnr", "psnr_channel_mean", "ssim"]);
@@ -127,6 +131,7 @@ fn a_run_directory_has_its_four_files_and_metrics_their_shape() {
     assert_eq!(log.lines().count(), 41);
     assert!(log.lines().nth(40).unwrap().starts_with("40,"));
     let config = fs::read_to_string(run.join("config.toml")).unwrap();
+    assert!(config.starts_with("# trained with {\"nightsplat\":"), "{config}");
     assert!(config.contains("seed = 3") && config.contains("curve = \"ap3\""), "{config}");
     assert!(
         fs::read(run.join("model.ply")).unwrap().starts_with(b"ply\nformat binary_little_endian")
@@ -191,13 +196,20 @@ fn eval_agrees_with_train_and_saves_what_it_scored() {
         assert!((scores.psnr - scored["psnr"].as_f64().unwrap()).abs() < 0.01, "{name}");
         assert!((scores.ssim - scored["ssim"].as_f64().unwrap()).abs() < 0.001, "{name}");
     }
+    let page = fixture.path("eval.html");
+    let table = succeed(&format!("eval {} --report {}", fixture.run(), page.display()));
+    assert!(table.contains("wrote ") && table.contains("eval.html"), "{table}");
+    let page = fs::read_to_string(page).unwrap();
+    for part in ["The worst view, 0", "error, times 5", "reference image<", ">loss<", "mean</td>"] {
+        assert!(page.contains(part), "no `{part}` in the page");
+    }
     let table = succeed(&format!("eval {}", fixture.run()));
     let lines: Vec<&str> = table.lines().collect();
-    assert_eq!(lines.len(), 4, "{table}");
+    assert!(lines.len() == 5 && lines[4].starts_with("next: nightsplat "), "{table}");
     assert!(lines[0].starts_with("view") && lines[0].contains("channel mean"), "{table}");
     let mean = format!("{:.2}", trained["mean"]["psnr"].as_f64().unwrap());
     assert!(lines[3].starts_with("mean") && lines[3].contains(&mean), "{table}");
-    assert!(lines.iter().all(|line| line.len() == lines[0].len()), "not aligned:\n{table}");
+    assert!(lines[..4].iter().all(|line| line.len() == lines[0].len()), "not aligned:\n{table}");
 }
 
 #[test]
@@ -228,7 +240,7 @@ fn eval_scores_lpips_where_it_is_given_the_weights() {
         let header = format!("{} ", table.lines().next().unwrap());
         assert!(header.contains(title) && table.contains(&format!("{mean:.4}")), "{table}");
     }
-    fs::write(&weights, "of nothing").unwrap();
+    fs::write(&weights, "no weights").unwrap();
     refused(&eval, 3, &["weights.safetensors", "safetensors"]);
     let without = format!("eval {} --lpips-range unit", fixture.run());
     refused(&without, 2, &["--lpips <WEIGHTS>"]);
@@ -249,7 +261,7 @@ fn a_set_without_references_and_photographs_of_test_views_scores_nothing() {
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!((&printed["mean"], keys(&printed["views"]).len()), (&Value::Null, 0));
     assert!(message.contains("no test view has a reference image or a photograph"), "{message}");
-    assert_eq!(succeed(&format!("eval {}", run.display())).lines().count(), 1);
+    assert_eq!(succeed(&format!("eval {}", run.display())).lines().count(), 2);
 }
 
 #[test]
@@ -322,7 +334,7 @@ fn tone_maps_a_folder_and_prints_its_statistics() {
 fn doctor_lists_the_devices_and_what_they_offer() {
     let report = succeed("doctor");
     assert!(report.contains("yes  timelineSemaphore") && report.contains("Vulkan 1."), "{report}");
-    assert!(report.contains("is used unless --device"), "{report}");
+    assert!(report.contains("ready: trains on ") && report.contains("colmap  "), "{report}");
 }
 
 #[test]
@@ -382,26 +394,64 @@ fn demo_touches_no_folder_of_somebody_else() {
 }
 
 #[test]
-fn demo_is_a_sweep_of_three_curves_that_goes_on() {
+fn demo_is_a_sweep_of_four_curves_that_continues_and_links_the_model() {
     let folder = tempfile::tempdir().unwrap();
     let demo = format!("demo --out {}", folder.path().display());
     let table = succeed(&demo);
-    for curve in ["linear", "ase", "ap3"] {
+    for curve in ["auto", "linear", "ase", "ap3"] {
         assert!(folder.path().join(format!("curve={curve}/model.ply")).is_file(), "{table}");
     }
     let page = fs::read_to_string(folder.path().join("index.html")).unwrap();
     assert!(page.contains("exposed") && page.contains("data:image/png"));
+    assert!(page.contains("<a href=\"curve=auto/model.html\">"));
+    assert!(folder.path().join("curve=auto/model.html").is_file());
     assert_eq!(succeed(&demo), table, "nothing is trained twice");
 }
 
+/// A reader that ends early, as `head` does.
 #[test]
-fn help_teaches_every_command_in_lines_that_fit() {
+fn a_closed_pipe_ends_a_command_quietly() {
+    let set = fixture().set();
+    for arguments in
+        [format!("tone apply {set} --json"), format!("diagnose {set}"), "doctor".to_owned()]
+    {
+        let mut command = common::command::command(&arguments);
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let output = command.stdout(writer).stderr(std::process::Stdio::piped()).output().unwrap();
+        let message = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && !message.contains("error"), "{arguments}: {message}");
+    }
+}
+
+#[test]
+fn completions_know_the_words_of_options() {
+    let script = succeed("completions bash");
+    for words in ["balanced", "ap3", "tonemapper", "lita"] {
+        assert!(script.contains(words), "no `{words}` in the completions");
+    }
+}
+
+#[test]
+fn man_pages_keep_the_lines_of_their_examples() {
+    let folder = tempfile::tempdir().unwrap();
+    succeed(&format!("man {}", folder.path().display()));
+    let page = fs::read_to_string(folder.path().join("nightsplat-train.1")).unwrap();
+    let (_, examples) = page.split_once(".SH EXAMPLES\n.nf\n").unwrap();
+    assert!(examples.lines().any(|line| line.contains("nightsplat train photos")), "{examples}");
+    assert!(examples.ends_with(".fi\n") && page.contains("ssim"), "{page}");
+}
+
+#[test]
+fn help_is_one_screen_for_each_command_and_help_all_has_every_option_in_lines_that_fit() {
     let commands = [
         "",
         "train",
         "diagnose",
+        "pose",
         "eval",
         "render",
+        "export",
         "tone",
         "tone list",
         "tone apply",
@@ -414,15 +464,17 @@ fn help_teaches_every_command_in_lines_that_fit() {
         "check",
     ];
     for command in commands {
-        let help = succeed(&format!("{command} --help"));
-        assert!(help.lines().all(|line| line.chars().count() < 100), "{help}");
+        let (short, all) =
+            (succeed(&format!("{command} -h")), succeed(&format!("{command} --help-all")));
+        assert!(all.lines().all(|line| line.chars().count() < 100), "{all}");
+        assert!(short.lines().count() <= if command.is_empty() { 60 } else { 40 }, "{short}");
     }
     let help = succeed("--help");
     assert!(
         commands.iter().all(|command| help.contains(command.split(' ').next().unwrap())),
         "{help}"
     );
-    // The first two columns are names; what is for developers stands below.
+    // The first two columns are names; those for developers follow below.
     let listed = help.lines().skip_while(|line| *line != "Commands:").skip(1);
     let listed = listed.take_while(|line| !line.is_empty());
     let names: Vec<&str> = listed
@@ -433,12 +485,20 @@ fn help_teaches_every_command_in_lines_that_fit() {
         names.len() <= 12 && names.contains(&"train") && !names.contains(&"synth"),
         "{names:?}"
     );
-    let train = succeed("train --help");
+    let (short, all) = (succeed("train -h"), succeed("train --help-all"));
+    assert_eq!(short, succeed("train --help"));
+    for part in ["--preset", "--max-vram", "Example:", "--help-all"] {
+        assert!(short.contains(part), "no `{part}` in {short}");
+    }
+    assert!(!short.contains("--ssim-weight"), "{short}");
+    for group in ["Photographs:", "Tone curve:", "Model:", "Logs and checks:"] {
+        assert!(all.contains(&format!("\n{group}\n")), "no `{group}` in {all}");
+    }
     for option in "--curve --gain --theta --steps --downscale --seed --sh-degree --ssim-weight --max-gaussians \
                    --background --reference --device --config --eval-every --out --overwrite --max-resolution --cache \
                    --test-every --tensorboard"
         .split_whitespace()
     {
-        assert!(train.contains(option), "{option}");
+        assert!(all.contains(option), "{option}");
     }
 }

@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use crate::common::command::{command, refused, succeed};
 
-/// Standard output and error of a short run of six steps that is scored behind the third.
+/// Standard output and error of a short run of six steps that is scored after the third.
 fn trained(more: &str) -> (String, String) {
     let folder = tempfile::tempdir().unwrap();
     let (set, out) = (folder.path().join("set"), folder.path().join("run"));
@@ -28,7 +28,9 @@ fn without_a_terminal_scores_on_the_way_are_lines() {
         assert!(stdout.contains("6 steps"), "{stdout}");
     }
     let (stdout, stderr) = trained("--progress none");
-    assert!(!stderr.contains("step 3") && stdout.contains("6 steps"), "{stderr}");
+    assert!(!stderr.contains("step ") && !stderr.contains("memory"), "{stderr}");
+    assert!(stdout.contains("6 steps") && !stdout.contains("views of"), "{stdout}");
+    assert!(stdout.contains("wrote ") && stdout.contains("next: nightsplat export "), "{stdout}");
 }
 
 #[test]

@@ -11,7 +11,7 @@ fn refuses_to_train(root: &Path, options: &str, code: i32, parts: &[&str]) {
     let run = root.join("run");
     refused(&format!("train {} --out {} {options}", root.display(), run.display()), code, parts);
     for name in ["metrics.json", "model.ply"] {
-        assert!(!run.join(name).exists(), "{name} was left behind");
+        assert!(!run.join(name).exists(), "{name} remains");
     }
 }
 
@@ -169,6 +169,58 @@ fn misuse_is_said_in_one_line_with_exit_code_2() {
 }
 
 #[test]
+fn options_of_other_trainers_get_a_hint() {
+    for (options, ours) in [
+        ("-s photos --out run", "use DATASET"),
+        ("--source_path photos --out run", "use DATASET"),
+        ("--data photos --out run", "use DATASET"),
+        ("photos -m run", "use --out DIR"),
+        ("photos --model_path run", "use --out DIR"),
+        ("photos --out run --resolution 4", "use --downscale F"),
+        ("photos --out run --max-num-iterations 7000", "use --steps N"),
+        ("photos --out run --format ply", "nightsplat export RUN --format"),
+        ("photos --out run --cap-max 1000", "use --max-gaussians N"),
+    ] {
+        refused(&format!("train {options}"), 2, &["there is no `-", ours]);
+    }
+    refused("bench --growth", 2, &["cargo run --release --example growth"]);
+}
+
+#[test]
+fn a_limit_of_memory_without_its_unit_is_refused() {
+    let set = fixture().set();
+    refuses_to_train(Path::new(&set), "--max-vram 4", 2, &["--max-vram", "4G or 1.5G"]);
+    refuses_to_train(Path::new(&set), "--set max_ram=100", 2, &["max_ram", "with its unit"]);
+}
+
+#[test]
+fn what_cannot_be_written_is_refused_before_anything_is_read() {
+    let file = fixture().path("set/low/000.png").display().to_string();
+    for command in [
+        "train /nonexistent/set --out OUT/run",
+        "sweep /nonexistent/set --curves all --out OUT/sweep",
+        "pose /nonexistent/photos --out OUT/set",
+        "render /nonexistent/run --split all --out OUT/pictures",
+        "export /nonexistent/run --format glb --out OUT/a.glb",
+        "diagnose /nonexistent/set --report OUT/a.html",
+        "eval /nonexistent/run --report OUT/a.html",
+        "tone apply /nonexistent/set --out OUT/toned",
+    ] {
+        refused(&command.replace("OUT", &file), 1, &["000.png/", "cannot be written"]);
+    }
+}
+
+#[test]
+fn a_number_of_steps_may_be_written_short() {
+    let folder = tempfile::tempdir().unwrap();
+    let train = format!("train {} --out {}", fixture().set(), folder.path().join("run").display());
+    for (steps, line) in [("1e4", "steps = 10000  (--steps)"), ("5k", "steps = 5000  (--steps)")] {
+        let (message, _) = run(&format!("{train} --explain --steps {steps}"), 0);
+        assert!(message.contains(line), "{message}");
+    }
+}
+
+#[test]
 fn a_configuration_with_an_unknown_key_names_it() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("config.toml");
@@ -197,7 +249,7 @@ fn every_setting_is_explained_with_who_says_it_and_nothing_is_trained() {
         "seed = 4  (--seed)\n",
         "stop.margin = 1.0  (--set)\n",
         "exposure.learn = \"off\"  (plan)\n",
-        "ssim_weight = 0.2  (default)\n    Weight of 1 - SSIM",
+        "ssim_weight = 0.2  (default)\n    Weight of the loss 1 - SSIM",
     ] {
         assert!(message.contains(line), "no {line} in {message}");
     }

@@ -1,8 +1,8 @@
-//! Hostile inputs: whole training steps, every pass against its CPU reference in f64, and what is to come of each.
+//! Hostile inputs: whole training steps, every pass against its CPU reference in f64, and the outcome of each.
 //!
-//! The table is [`cases::CASES`]: an input, what comes of it in words, and that in a form that is checked. A row fails
-//! where it is anything else. A few rows stand for all; the whole table, printed, is
-//! `cargo test --release --test cli whole_table -- --ignored --nocapture`.
+//! The table is [`cases::CASES`]: an input, its outcome in words, and the outcome in a form that is checked. A row
+//! fails where it is anything else. A few rows stand for all; the whole table, printed, is `cargo test --release
+//! --test cli whole_table -- --ignored --nocapture`.
 
 mod cases;
 mod hostile;
@@ -53,11 +53,8 @@ fn what_comes_of_another_hostile_input_is_what_the_table_says() {
 fn what_comes_of_the_whole_table_is_what_it_says() {
     let mut rows = vec![];
     let mut out = std::io::stdout();
-    writeln!(
-        out,
-        "input | view | Gaussians | error | of kernel | render | gradient | what comes of it"
-    )
-    .unwrap();
+    writeln!(out, "input | view | Gaussians | error | of kernel | render | gradient | outcome")
+        .unwrap();
     for case in CASES {
         let row = case.run(&gpu());
         writeln!(out, "{}", row.line()).unwrap();
@@ -73,7 +70,7 @@ fn every_input_of_the_table_is_named_once() {
     assert!(names.windows(2).all(|pair| pair[0] != pair[1]));
 }
 
-/// Beyond so many Gaussians times pixels the whole render is not compared in f64, which goes through all of them.
+/// Number of Gaussians times pixels beyond which the whole render is not compared in f64, which visits all of them.
 const MAX_FRAGMENTS: usize = 40_000_000;
 
 /// What came of a case.
@@ -91,7 +88,7 @@ struct Row {
     render_error: Option<f64>,
     /// The largest gradient; infinite where one is not finite.
     gradient: Option<f64>,
-    /// Where it is not what is to come of it.
+    /// The actual outcome, if it is not the expected one.
     problem: Option<String>,
 }
 
@@ -229,8 +226,8 @@ fn of_gaussians(gaussians: &Gaussians, wanted: &Range<usize>) -> Vec<f32> {
     own.copied().collect()
 }
 
-/// The largest difference between what the trainer shows and what the references do in f64, without tiles; none where that
-/// takes too long.
+/// The largest difference between what the trainer shows and what the references do in f64, without tiles; none where
+/// that takes too long.
 fn render_error(
     trainer: &mut Trainer,
     config: &TrainConfig,

@@ -101,8 +101,9 @@ fn a_finished_point_is_never_trained_twice_and_a_killed_one_is() {
     }
     assert!(!sweep.path("sweep.toml").exists(), "--dry-run writes nothing");
 
-    let (shown, _) = run(&sweep.arguments, 0);
+    let (shown, message) = run(&sweep.arguments, 0);
     assert!(shown.contains("PSNR, dB") && shown.contains("index.html"), "{shown}");
+    assert!(message.contains("1 of 4: curve=") && message.contains("4 of 4: curve="), "{message}");
     let leaderboard = sweep.leaderboard();
     let [csv, markdown, html] = &leaderboard;
     let lines: Vec<&str> = csv.lines().collect();
@@ -229,7 +230,8 @@ fn tables_and_all_curves_are_grids() {
     let gain = lines("--table gain --ssim-weight 0.3 --config /dev/null");
     assert_eq!(gain.len(), 9);
     // The options of `train` in its own order, then the point's.
-    let expected = "--config /dev/null --sh-degree 0 --ssim-weight 0.3 --curve ase --gain 0 --set tone.base_gain=1 --plan none --out";
+    let expected = "--config /dev/null --sh-degree 0 --ssim-weight 0.3 --curve ase --gain 0 --set \
+     tone.base_gain=1 --plan none --out";
     assert!(gain[0].contains(expected), "{}", gain[0]);
 }
 
@@ -320,7 +322,7 @@ fn presets_are_trained_by_their_plans_scored_on_the_way_and_compared() {
     assert!((whole - seconds[2]).abs() < 1e-3, "{whole} {way}");
     assert!(metrics["spent"]["device_bytes"].as_u64().unwrap() > 1000, "{metrics}");
     let html = sweep.read("costs.html");
-    assert!(html.contains("on the way") && html.contains("the difference to preset balanced"));
+    assert!(html.contains("during training") && html.contains("The difference to preset balanced"));
     for outside in ["http:", "https:", "<script", "<link", "@import", "url("] {
         assert!(!html.contains(outside), "{outside}");
     }
@@ -389,10 +391,12 @@ fn old_names_say_the_new_ones() {
 
 #[test]
 fn help_names_the_lists_and_fits_its_lines() {
-    let (help, _) = run("sweep --help", 0);
+    let (help, _) = run("sweep --help-all", 0);
     assert!(help.lines().all(|line| line.chars().count() < 100), "{help}");
-    for option in "--curves --alpha --beta --gain --theta --offset --grid --seeds --presets --json --table --jobs --dry-run --steps --set"
-        .split_whitespace()
+    for option in
+        "--curves --alpha --beta --gain --theta --offset --grid --seeds --presets --json --table \
+     --jobs --dry-run --steps --set"
+            .split_whitespace()
     {
         assert!(help.contains(option), "{option}");
     }

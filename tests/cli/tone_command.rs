@@ -22,6 +22,7 @@ fn args(input: &Path, out: PathBuf) -> ApplyArgs {
         colour: None,
         theta: None,
         scene_statistics: false,
+        white_balance: None,
         reference: None,
         invert_masks: false,
         json: false,
@@ -139,7 +140,7 @@ fn bad_input_is_named_in_one_line() {
     fails(args(&path("good.png"), dir.path().to_owned()), "is one of the photographs", 1);
     assert_eq!(std::fs::read(path("good.png")).unwrap(), before);
 
-    fails(args(&path("good.png"), path("broken.png")), "cannot be made", 1);
+    fails(args(&path("good.png"), path("broken.png")), "cannot be created", 1);
     fails(
         ApplyArgs { gain: Some(GainChoice::C(-1.0)), ..args(&path("good.png"), out.clone()) },
         "tone.gain_c",
@@ -307,7 +308,7 @@ fn values_that_are_no_numbers_are_counted_and_left_out_of_the_statistics() {
 
     exr::prelude::write_rgb_file(&path, 4, 4, |_, _| (f32::NAN, 0.0, 0.0)).unwrap();
     let error = apply(&args(&path, dir.path().join("out"))).unwrap_err().to_string();
-    assert!(error.contains("no pixel that is a number"), "{error}");
+    assert!(error.contains("no finite, unmasked pixel"), "{error}");
 }
 
 #[test]
@@ -385,7 +386,7 @@ fn the_automatic_curve_says_how_bright_and_why_and_lends_its_brightness() {
     let means: Vec<f64> = output.views.values().map(|view| view.after.mean_luminance).collect();
     assert!(means.iter().all(|mean| (0.43..0.55).contains(mean)), "{means:?}");
     let json = serde_json::to_value(apply(&automatic(&low)).unwrap()).unwrap();
-    for key in ["gain", "target", "mean", "lift", "weight", "spread", "share", "black"] {
+    for key in ["gain", "target", "mean", "brightening", "weight", "spread", "share", "black"] {
         assert!(json["exposure"][key].is_number(), "{key}");
     }
     assert!(json["views"]["a"]["gain"].is_number() && json["exposure"]["reason"].is_string());

@@ -6,6 +6,8 @@
 pub(crate) mod chain;
 #[cfg(feature = "cli")]
 pub(crate) mod command;
+#[cfg(feature = "cli")]
+pub(crate) mod log;
 pub(crate) mod lpips;
 pub(crate) mod place;
 pub(crate) mod safetensors;
@@ -26,8 +28,8 @@ pub(crate) fn own_gpu() -> Gpu {
     gpu_that_binds(gpu().properties().max_storage_buffer_range)
 }
 
-/// Runs a kernel on the device over host vectors named like its buffers, checks what it leaves against its reference, and
-/// gives back what it writes.
+/// Runs a kernel on the device over host vectors named like its buffers, checks what it leaves against its reference,
+/// and gives back what it writes.
 macro_rules! run_kernel {
     ($kernel:ident, $constants:expr, $params:expr, $threads:expr, [$($input:ident),*], [$($output:ident),+]) => {{
         // Before the buffers take the vectors' names.

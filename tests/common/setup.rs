@@ -100,7 +100,8 @@ impl Setup {
         }
     }
 
-    /// The point of the world that is seen at `pixel`, so deep in the view; behind the camera where a fisheye shows nothing.
+    /// The point of the world that is seen at `pixel`, so deep in the view; behind the camera where a fisheye shows
+    /// nothing.
     pub(crate) fn at_pixel(&self, pixel: DVec2, depth: f64) -> DVec3 {
         let in_view = self.camera.in_view(pixel, depth).unwrap_or(DVec3::NEG_Z * depth);
         let camera = self.camera();
@@ -176,7 +177,7 @@ impl Setup {
         rendered.download()
     }
 
-    /// The render with memory for so many intersections, whether they suffice or not, and the status.
+    /// The render with memory for this many intersections, whether they suffice or not, and the status.
     pub(crate) fn render_within(&self, capacity: u32) -> (Rendered<'_>, Status) {
         let mut rendered = Rendered::new(self);
         rendered.renderer.set_intersection_capacity(capacity).unwrap();
@@ -197,7 +198,7 @@ pub(crate) struct Rendered<'a> {
     pub(crate) transmittances: Vec<f32>,
 }
 
-/// What the backward pass leaves behind.
+/// What the backward pass leaves.
 #[derive(Clone, PartialEq, Debug)]
 pub(crate) struct Gradients {
     pub(crate) parameters: Vec<f32>,
@@ -270,7 +271,7 @@ impl<'a> Rendered<'a> {
     }
 }
 
-/// Features of so many channels, with the three of colour.
+/// Features of this many channels, with the three of colour.
 pub(crate) fn features(channels: usize) -> Features {
     let features = Features { depth: channels > 3, structure: channels > 4, ..Features::NONE };
     let features = if channels > 5 { Features::ALL } else { features };
@@ -278,7 +279,7 @@ pub(crate) fn features(channels: usize) -> Features {
     features
 }
 
-/// A tile of so many pixels that so many subgroups share.
+/// A tile of this size that this many subgroups share.
 pub(crate) fn tile_of((size, subgroups): ([u32; 2], u32)) -> Tile {
     Tile { size, subgroups }
 }

@@ -6,7 +6,7 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{StepReport, TrainConfig, Trainer};
 
-/// So many synthetic views of a size, loaded as by default.
+/// This many synthetic views of a size, loaded as by default.
 pub(crate) fn dataset(views: usize, [width, height]: [u32; 2]) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
     synthetic::write(

@@ -46,7 +46,7 @@ fn lend_and_take_back(extensions: &[&CStr]) {
     host.fill(&memory, 0x1234_5678);
     assert_eq!(host.read(&memory), vec![0x1234_5678; own.data.len()], "the device is not alive");
     host.free(memory);
-    // Objects that we left behind would be reported when the host destroys its device.
+    // Objects that we did not destroy would be reported when the host destroys its device.
     let messages = host.destroy();
     assert!(messages.is_empty(), "validation: {messages:#?}");
 }

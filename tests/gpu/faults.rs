@@ -1,5 +1,5 @@
-//! Memory that runs out and devices that are lost, at every place where that can be: nothing is lost that was saved, and no
-//! run says that it is done where it is not.
+//! Memory that runs out and devices that are lost, at every place where that can be: nothing is lost that was saved,
+//! and no run says that it is done where it is not.
 #![cfg(feature = "io")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 

@@ -18,7 +18,7 @@ fn relu_pipeline() -> Pipeline<relu_backward::Kernel> {
     gpu().pipeline(&relu_backward::Constants::default()).unwrap()
 }
 
-/// `count` ones, of which so many threads of `relu_backward` make zeros.
+/// `count` ones, of which this many threads of `relu_backward` make zeros.
 fn ones_and_zeros(count: usize, threads: Threads) -> Vec<f32> {
     let (gpu, pipeline) = (gpu(), relu_pipeline());
     let activations = gpu.zeros("activations", count).unwrap();
@@ -193,7 +193,7 @@ fn what_submits_by_itself_is_refused_within_a_recording_and_works_behind_it() {
         for error in refusals {
             let message = error.to_string();
             assert!(message.contains("`the recording`"), "{message}");
-            assert!(message.contains("before or behind"), "{message}");
+            assert!(message.contains("before or after"), "{message}");
         }
         pass.copy(&inner, &mut outer);
         Ok(())
@@ -201,7 +201,7 @@ fn what_submits_by_itself_is_refused_within_a_recording_and_works_behind_it() {
     .unwrap();
     assert_eq!(gpu.read(&outer).unwrap(), [1, 2, 3]);
     renderer.reserve(100, []).unwrap();
-    // A recording that fails leaves nothing behind either.
+    // A recording that fails leaves nothing either.
     gpu.run("fails", |_| Err(Error::Usage("enough".to_owned()))).unwrap_err();
     gpu.write(&mut inner, &[9; 3]).unwrap();
     assert_eq!(gpu.read(&inner).unwrap(), [9; 3]);

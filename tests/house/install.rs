@@ -76,3 +76,19 @@ fn the_package_has_what_it_is_built_from_and_little_else() {
         assert!(!files.lines().any(|file| file.starts_with(folder)), "{folder} is packaged");
     }
 }
+
+/// A file of the repository.
+fn file(name: &str) -> String {
+    fs::read_to_string(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(name)).unwrap()
+}
+
+#[test]
+fn archives_are_stripped_and_the_container_has_the_programs_of_pose_and_of_videos() {
+    assert!(file(".github/workflows/release.yml").contains("CARGO_PROFILE_RELEASE_STRIP: symbols"));
+    let container = file("Containerfile");
+    let (_, packages) = container.split_once("no-install-recommends \\\n").unwrap();
+    let packages = packages.lines().next().unwrap();
+    for program in ["colmap", "ffmpeg", "mesa-vulkan-drivers"] {
+        assert!(packages.split_whitespace().any(|package| package == program), "{packages}");
+    }
+}

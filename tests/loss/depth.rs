@@ -69,7 +69,7 @@ struct Chain {
     d_render: Vec<f32>,
 }
 
-/// Runs the kernels behind the boxes, or their references, on plane 1 of a render of two planes.
+/// Runs the kernels after the boxes, or their references, on plane 1 of a render of two planes.
 macro_rules! chain {
     ($run:ident, $size:expr, $regions:expr, $weights:expr, $images:expr, $chunk_size:expr $(, $threads:ident)?) => {{
         let (size, regions, chunk_size): (UVec2, Vec<[u32; 4]>, u32) = ($size, $regions, $chunk_size);

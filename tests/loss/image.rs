@@ -26,7 +26,7 @@ fn images([width, height]: [u32; 2]) -> [Vec<f32>; 2] {
     [render, target]
 }
 
-/// What one step of the loss leaves behind.
+/// What one step of the loss leaves.
 struct Outcome {
     l1: f32,
     ssim: f32,
@@ -64,8 +64,8 @@ fn evaluate_loss_region(
     Outcome { l1, ssim, d_render: gpu.read(&d_render).unwrap(), status: logged.status }
 }
 
-/// Holds the SSIM kernel to its reference, a lane taking so many columns, a subgroup so many rows, and loads and stores so
-/// many floats where rows begin at as many.
+/// Compares the SSIM kernel with its reference: `shape` is the columns of a lane, the rows of a subgroup, and the
+/// floats that loads and stores are aligned to.
 fn check_ssim(shape: [u32; 3], size: [u32; 2], loss_region: LossRegion) -> Vec<f32> {
     let ([columns, rows, alignment], [width, height]) = (shape, size);
     let [render, target] = images(size);

@@ -1,5 +1,5 @@
-//! Exposures: kernels against their references, gradients against central differences, the mean that stays the identity,
-//! and trainings on photographs that are not equally bright.
+//! Exposures: kernels against their references, gradients against central differences, the mean that stays the
+//! identity, and trainings on photographs that are not equally bright.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -183,7 +183,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     }
     assert!(gradients[..WIDTH].iter().chain(&gradients[2 * WIDTH..]).all(|&d| d == 0.0));
 
-    // Of the Gaussians: the chain behind the gradient that the exposure passes on, against differences of all of it.
+    // Of the Gaussians: the chain after the gradient that the exposure passes on, against differences of all of it.
     let mut downstream = Chain::new(&setup);
     downstream.d_render = d_render;
     let gradient = downstream.run(&parameters).gradient;
@@ -443,7 +443,7 @@ fn a_table_says_where_exposures_begin() {
         assert!((0..3).all(|c| gap(c) < 4e-6), "{again} is not {first}");
     }
 
-    std::fs::write(&path, "name,ev\nnobody,1\nelsewhere,2\n").unwrap();
+    std::fs::write(&path, "name,ev\nnoone,1\nelsewhere,2\n").unwrap();
     let error = Trainer::new(&gpu(), config, &dataset).unwrap_err().to_string();
-    assert!(error.contains("nobody, elsewhere") && error.contains("known.csv"), "{error}");
+    assert!(error.contains("noone, elsewhere") && error.contains("known.csv"), "{error}");
 }

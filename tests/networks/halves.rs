@@ -20,7 +20,7 @@ fn matrix() -> Option<CooperativeMatrix> {
     matrix
 }
 
-/// The bits of the largest magnitude of so many values from `offset` on.
+/// The bits of the largest magnitude of this many values from `offset` on.
 fn largest(values: &[f32], [offset, value_count]: [u32; 2]) -> Vec<u32> {
     let (chunk, values, largest) = (64, values.to_vec(), vec![0_u32]);
     run_kernel!(
@@ -141,8 +141,8 @@ fn weights_are_packed_for_both_ways() {
     }
 }
 
-/// The products of packed factors, and how far they are from those of the factors themselves: rounding the factors costs
-/// 2^-9 of the terms' magnitudes, and 2^-28 of the largest of each may vanish.
+/// The products of packed factors, and how far they are from those of the factors themselves: rounding the factors
+/// costs 2^-9 of the terms' magnitudes, and 2^-28 of the largest of each may vanish.
 fn check_product(
     matrix: CooperativeMatrix,
     transposed: bool,

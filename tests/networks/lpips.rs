@@ -1,4 +1,5 @@
-//! LPIPS against `PyTorch`'s, on weights that both make by a formula: `scripts/lpips-reference.py` prints what is expected.
+//! LPIPS against `PyTorch`'s, on weights that both make by a formula: `scripts/lpips-reference.py` prints what is
+//! expected.
 
 use std::process::Command;
 

@@ -4,9 +4,15 @@
 
 mod as_it_is;
 mod bad_input;
+mod colours;
+mod keys;
+mod layouts;
+mod models;
 mod photographs;
 #[cfg(feature = "cli")]
 mod pose;
+#[cfg(all(unix, feature = "cli"))]
+mod pose_cameras;
 #[cfg(all(feature = "cli", feature = "raw"))]
 mod raw;
 mod real;
@@ -307,6 +313,9 @@ fn a_list_of_test_names_decides_the_split() {
     photographs(folder.path(), "images", 0..9, 1.0);
     model(9).write_binary(&folder.path().join("sparse/0"));
     std::fs::write(folder.path().join("test.txt"), "v03.png\n\n v05 \r\nunknown.png\n").unwrap();
+    assert_eq!(names(&load(folder.path()), Split::Test), ["v03", "v05"]);
+    std::fs::rename(folder.path().join("test.txt"), folder.path().join("sparse/0/test.txt"))
+        .unwrap();
     assert_eq!(names(&load(folder.path()), Split::Test), ["v03", "v05"]);
 }
 

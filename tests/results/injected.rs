@@ -21,7 +21,7 @@ fn begun(arguments: &str) -> Child {
 fn wait_for_start(child: &mut Child) {
     let mut line = String::new();
     BufReader::new(child.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
-    assert!(line.contains("started") && line.contains("most_device"), "{line}");
+    assert!(line.contains("started") && line.contains("peak_device"), "{line}");
 }
 
 fn terminate(child: &Child) {

@@ -79,6 +79,7 @@ fn page(text: &str) -> String {
     Report {
         title: text.into(),
         intro: vec![text.into()],
+        links: vec![[text.into(), text.into()]],
         facts: vec![Facts { title: text.into(), rows: vec![[text.into(), text.into()]] }],
         tables: vec![table()],
         plots: vec![plot(text, text, &series)],
@@ -105,9 +106,9 @@ fn the_page_refers_to_nothing_outside_itself() {
 fn every_text_is_escaped() {
     let html = page("<b onload=\"x('&')\">");
     assert!(!html.contains("<b onload"));
-    // Title, heading, paragraph, a fact with its caption, two captions with alternative texts, row title, plot label, axes, legend
-    // and its title.
-    assert_eq!(html.matches("&lt;b onload=&quot;x(&#39;&amp;&#39;)&quot;&gt;").count(), 17);
+    // Title, heading, paragraph, a link with its address, a fact with its caption, two captions with alternative texts,
+    // row title, plot label, axes, legend and its title.
+    assert_eq!(html.matches("&lt;b onload=&quot;x(&#39;&amp;&#39;)&quot;&gt;").count(), 19);
 }
 
 #[test]
@@ -256,10 +257,11 @@ fn what_a_mean_is_of_is_drawn_as_a_line_from_least_to_greatest() {
 }
 
 #[test]
-fn pictures_come_first_on_a_page() {
+fn facts_come_before_images_and_these_before_numbers_and_plots() {
     let html = page("chair");
     let at = |part: &str| html.find(part).unwrap();
-    assert!(at("<img") < at("<table") && at("<table") < at("<polyline"));
+    assert!(at("<table class=\"facts\"") < at("<img") && at("<img") < at("<div class=\"table\""));
+    assert!(at("<div class=\"table\"") < at("<polyline"));
 }
 
 #[test]

@@ -100,7 +100,7 @@ fn scores_on_the_way_are_rows_and_a_resumed_run_has_each_once() {
 fn a_run_says_at_its_start_what_it_trains_and_why() {
     let folder = folder();
     let start = |out: &str, options: &str| succeed(&train(folder.path(), out, options));
-    let message = start("a", "--steps 1 --progress none");
+    let message = start("a", "--steps 1 --progress plain");
     for part in [
         "8 views of 48x32 to train on",
         "2 test views (as the transforms files say) scored against reference images",
@@ -110,20 +110,20 @@ fn a_run_says_at_its_start_what_it_trains_and_why() {
         assert!(message.contains(part), "no `{part}` in: {message}");
     }
     // Nothing is held out of eight views but one, and nothing of seven.
-    let message = start("d", "--progress none --preset balanced --set steps=30");
+    let message = start("d", "--progress plain --preset balanced --set steps=30");
     for part in [
-        "30 steps at most: the run settles for 10 and ends once 1 held-out view has converged",
-        "30 steps are too few to settle for 250 (a third of them at most)",
+        "at most 30 steps: training stops early once 1 held-out view has converged, after a cooldown of 10",
+        "30 steps are too few for a cooldown of 250 (at most a third)",
     ] {
         assert!(message.contains(part), "no `{part}` in: {message}");
     }
     assert!(message.contains("ended at step 30: all steps are done"), "{message}");
-    let message = start("e", "--progress none --preset balanced --set steps=3 --test-every 3");
+    let message = start("e", "--progress plain --preset balanced --set steps=3 --test-every 3");
     assert!(
-        message.contains("no early end: 6 training views are too few to hold one out"),
+        message.contains("no early stopping: 6 training views are too few to hold one out"),
         "{message}"
     );
-    let message = start("b", "--steps 1 --progress none --plan none --curve AP3 --test-every 5");
+    let message = start("b", "--steps 1 --progress plain --plan none --curve AP3 --test-every 5");
     assert!(message.contains("curve ap3: as asked for"), "{message}");
     assert!(message.contains("2 test views (every 5th by name, as asked for)"), "{message}");
     let message = start("c", "--steps 1 --progress json --curve none");
@@ -180,13 +180,16 @@ fn a_run_that_was_stopped_is_rendered_scored_and_made_longer_with_a_lower_cap() 
     assert_eq!(stopped_at(&path("run")), Some(10));
     let run_folder = path("run").display().to_string();
     let (printed, message) = run(&format!("eval {run_folder} --json"), 0);
-    assert!(message.contains("stopped at step 10 of 12"), "{message}");
+    assert!(message.contains("incomplete, at step 10 of 12"), "{message}");
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!(printed["steps"], 10);
     assert_eq!(printed["mean"], json(path("ten/metrics.json"))["mean"]);
     let shown = path("shown").display().to_string();
     let (_, message) = run(&format!("render {run_folder} --split test --out {shown}"), 0);
-    assert!(message.contains("stopped at step 10 of 12") && file_count(&shown) == 2, "{message}");
+    assert!(
+        message.contains("incomplete, at step 10 of 12") && file_count(&shown) == 2,
+        "{message}"
+    );
 
     succeed(&train(folder.path(), "run", &format!("--steps 12 --resume {options}")));
     assert!(model("run") == whole);
@@ -205,7 +208,7 @@ fn a_planned_run_is_made_longer_on_the_views_that_it_began_with() {
     let folder = tempfile::tempdir().unwrap();
     let set = folder.path().join("set").display().to_string();
     succeed(&format!("synth {set} --views 20 --width 32 --height 24"));
-    let short = "--set steps=6 --checkpoint-every 3 --progress none";
+    let short = "--set steps=6 --checkpoint-every 3 --progress plain";
     let message = succeed(&train(folder.path(), "run", short));
     assert!(message.contains("held-out view"), "{message}");
     let message = succeed(&train(folder.path(), "run", "--steps 9 --resume --progress none"));
@@ -226,7 +229,7 @@ fn a_model_is_written_with_every_checkpoint() {
     child.wait().unwrap();
     assert!(stopped_at(&out).unwrap() >= 5);
     let (_, message) = run(&format!("eval {}", out.display()), 0);
-    assert!(message.contains("stopped at step"), "{message}");
+    assert!(message.contains("incomplete, at step"), "{message}");
 }
 
 fn copy(from: &Path, to: &Path) {
@@ -254,11 +257,11 @@ fn a_run_is_opened_with_another_copy_of_its_dataset_and_what_differs_is_said() {
     let (printed, message) = run(&format!("eval {run_folder} --json --dataset {copied}"), 0);
     let printed: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!(printed, json(path("run/metrics.json")));
-    assert!(!message.contains("is not what"), "{message}");
+    assert!(!message.contains("differs from"), "{message}");
     fs::remove_file(path("copy/low/004.png")).unwrap();
     let arguments = format!("render {run_folder} --split test --out {shown} --dataset {copied}");
     let (_, message) = run(&arguments, 0);
-    assert!(message.contains("is not what") && message.contains("004,train,48,32"), "{message}");
+    assert!(message.contains("differs from") && message.contains("004,train,48,32"), "{message}");
 }
 
 /// The pictures of a path, as files.
@@ -284,7 +287,7 @@ fn a_camera_flies_and_the_pictures_become_a_video() {
         let [first, last] = [&files[0], &files[3]].map(|file| Image::load(file).unwrap());
         assert_eq!((first.width, first.height), (48, 32));
         assert!(first.data != last.data && first.data.iter().any(|&value| value > 0.1), "{way}");
-        // Whatever cannot show a moving PNG shows its first picture.
+        // Viewers without support for animation show the first frame.
         assert_eq!(Image::load(&video).unwrap(), first);
         let bytes = fs::read(&video).unwrap();
         let chunks = |name: &[u8]| bytes.windows(4).filter(|window| *window == name).count();
@@ -300,13 +303,20 @@ fn a_camera_flies_and_the_pictures_become_a_video() {
     let video =
         format!("{render} --path orbit --frames 2 --video {}/orbit.mp4", folder.path().display());
     let nowhere = [("PATH", "/nonexistent")];
-    let parts = ["orbit.mp4", "there is no ffmpeg", "ffmpeg -y", "-framerate 30", "%05d.png"];
+    let parts = ["orbit.mp4", "needs ffmpeg", "-framerate 30", "*.png"];
     refused_with(&video, &nowhere, 1, &parts);
     assert_eq!(file_count(&out), 2);
     if crate::common::command::exists("ffmpeg") {
         succeed(&video);
         assert!(fs::metadata(path("orbit.mp4")).unwrap().len() > 100);
+        let views = format!("{render} --split test --video {}/views.mp4", folder.path().display());
+        succeed(&views);
+        assert!(fs::metadata(path("views.mp4")).unwrap().len() > 100);
     }
+    // The views of a split are frames, too.
+    let views = format!("{render} --split test --video {}/views.png", folder.path().display());
+    assert!(succeed(&views).contains("views.png"));
+    assert!(fs::read(path("views.png")).unwrap().windows(4).any(|chunk| chunk == b"acTL"));
     refused(&render, 2, &["--split"]);
     refused(&format!("{render} --split all --path orbit"), 2, &["--path"]);
     refused(&format!("{render} --path orbit --format exr --video a.mp4"), 2, &["--video", "exr"]);

@@ -147,9 +147,9 @@ fn what_lies_beyond_a_binding_is_rendered() {
     let seen = Setup::new(500, [64, 48], shape, 5);
     let own = seen.gaussians();
     let mut all = Gaussians::zeros(hidden + seen.count, shape);
-    let behind_camera =
+    let out_of_view =
         seen.camera.view_from_world.inverse().transform_point3(DVec3::NEG_Z).as_vec3();
-    all.means_mut()[..hidden].fill(behind_camera);
+    all.means_mut()[..hidden].fill(out_of_view);
     let copies: [fn(&mut Gaussians, &Gaussians, usize); 6] = [
         |all, own, at| all.means_mut()[at..].copy_from_slice(own.means()),
         |all, own, at| all.quats_mut()[at..].copy_from_slice(own.quats()),

@@ -1,5 +1,5 @@
-//! The gradient of a camera, by `camera_backward` and `camera_gradient`: central differences of the f64 chain, the device
-//! against the chain, the same bits always.
+//! The gradient of a camera, by `camera_backward` and `camera_gradient`: central differences of the f64 chain, the
+//! device against the chain, the same bits always.
 
 use glam::{DMat3, DVec3};
 use nightsplat::camera::CameraModel;

@@ -174,7 +174,7 @@ fn every_pass_of_the_pseudo_gt_agrees_with_its_reference_for_every_curve() {
         let (done, report) = gpu.checked(|| -> nightsplat::Result<()> {
             let pseudo_gt = PseudoGt::new(&gpu, &settings)?;
             let image = gpu.buffer("image", &dark(47 * 33))?;
-            // Longer than the image: what lies beyond is nobody's.
+            // Longer than the image: what lies beyond is undefined.
             let curve = settings.parameters(&Statistics::of(&dark(47 * 33)));
             let parameters = gpu.buffer("tone", &[curve; 3])?;
             let mut target = gpu.zeros("target", image.len())?;
@@ -264,7 +264,7 @@ fn a_panic_ends_what_is_checked_and_takes_the_defect_along() {
     let work = || gpu.checked(|| with_defect(defect, || panic!("on purpose")));
     assert!(std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).is_err());
     assert!(!is_checked(&gpu));
-    assert_steps_agree("behind a panic", &config(&[]));
+    assert_steps_agree("after a panic", &config(&[]));
     assert!(!is_checked(&gpu));
 }
 

@@ -1,5 +1,5 @@
-//! How errors grow: blending with its layers, Adam with its steps, percentiles and means with their pixels; each against
-//! f64, with the bound that is promised.
+//! How errors grow: blending with its layers, Adam with its steps, percentiles and means with their pixels; each
+//! against f64, with the bound that is promised.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -25,12 +25,12 @@ use crate::common::{Random, widen};
 /// Numbers of a record of three channels: mean2d, conic, opacity, colour.
 const RECORD: usize = 9;
 
-/// Of so many layers that together leave a fiftieth of the light; no fainter than 1/255 anywhere in the view.
+/// Of this many layers that together leave a fiftieth of the light; no fainter than 1/255 anywhere in the view.
 fn opacity_of(count: usize) -> f64 {
     (1.0 - (-4.0 / count as f64).exp()).max(0.0055)
 }
 
-/// So many layers over a view of one tile, front to back.
+/// This many layers over a view of one tile, front to back.
 fn layers(count: usize) -> Setup {
     let mut setup = Setup::new(count, [16, 8], 0, 7);
     let mut random = Random::new(count as u64);
@@ -117,7 +117,7 @@ fn the_error_of_blending_and_its_backward_grows_no_faster_than_the_layers() {
     }
 }
 
-/// As training has them behind its schedules; of means, quats, log scales, raw opacities, dc, features, rest.
+/// As training has them after its schedules; of means, quats, log scales, raw opacities, dc, features, rest.
 const RATES: LearningRates = LearningRates([1.6e-6, 1e-3, 5e-4, 2.5e-3, 2.5e-3, 1e-3, 1.25e-4]);
 const LOG_SCALES: usize = 2;
 const COLUMNS: usize = 23;
@@ -200,7 +200,8 @@ struct PlaneError {
     error: f64,
     /// How far it moved.
     moved: f64,
-    /// The largest unit in the last place of what it was on the way, which is between where it begins and where it ends.
+    /// The largest unit in the last place of what it was on the way, which is between where it begins and where it
+    /// ends.
     unit: f64,
 }
 

@@ -7,8 +7,8 @@ fn opacity(raw: f32) -> f64 {
     1.0 / (1.0 + f64::from(-raw).exp())
 }
 
-/// Alpha of Gaussians without rotation, composited, seen along a direction in the plane of x and z: over the image's x in
-/// the plane and y across it.
+/// Alpha of Gaussians without rotation, composited, seen along a direction in the plane of x and z: over the image's x
+/// in the plane and y across it.
 fn alpha(shapes: &[Shape], angle: f64, [x, y]: [f64; 2]) -> f64 {
     let transmitted = |shape: &Shape| {
         let scales = shape.log_scales.to_array().map(|log| f64::from(log).exp());

@@ -215,7 +215,7 @@ fn growth_beyond_the_limit_goes_to_the_neediest() {
         report,
         DensifyReport { cloned: 2, pruned: 1, count: 11, refused: 7, ..Default::default() }
     );
-    // Gaussians 3 (rank 9) and 6 (rank 8) have their copies behind them.
+    // Gaussians 3 (rank 9) and 6 (rank 8) have their copies after them.
     let rows: Vec<_> = (0..11).map(|i| after.row(&after.parameters, i)[3..].to_vec()).collect();
     let twins: Vec<usize> = (0..10).filter(|&i| rows[i] == rows[i + 1]).collect();
     assert_eq!(twins, [2, 6]);

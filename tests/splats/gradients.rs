@@ -11,8 +11,8 @@ use crate::common::setup::{Gradients, Rendered, Setup, features, fisheye, tile_o
 
 const SIZE: [u32; 2] = [26, 19];
 
-/// Compares central differences with the chain's gradient, relative to the largest of each attribute, and the chain with
-/// the renderer.
+/// Compares central differences with the chain's gradient, relative to the largest of each attribute, and the chain
+/// with the renderer.
 fn check(setup: &Setup, name: &str) {
     let chain = Chain::new(setup);
     let (parameters, background) = (chain.parameters(), chain.background());
@@ -127,7 +127,7 @@ fn the_gradient_holds_where_one_part_of_a_tile_is_done_before_another() {
     for (channels, subgroups) in [(3, 2), (3, 4), (11, 4)] {
         let shape = Shape { sh_degree: 0, features: features(channels) };
         let mut setup = Setup::new(90, [32, 35], shape, 52);
-        // Of the uppermost part nothing is left behind the first ones; what lies below goes on for several batches.
+        // Of the uppermost part nothing shows after the first ones; what lies below goes on for several batches.
         for i in 0..12 {
             let mean = setup.at_pixel(DVec2::new(16.0, 2.0), 0.8 + 0.01 * i as f64);
             let log_scale = DVec3::new(0.5, 0.03, 0.03).map(f64::ln);

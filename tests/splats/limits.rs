@@ -1,5 +1,5 @@
-//! The passes of the renderer at what they can hold: counts that wrap around, slots without a tile, Gaussians that cover
-//! everything, crowds on one pixel, and tiles that suit no device.
+//! The passes of the renderer at what they can hold: counts that wrap around, slots without a tile, Gaussians that
+//! cover everything, crowds on one pixel, and tiles that suit no device.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -167,8 +167,8 @@ fn emit_wide(count: u32, size: UVec2, extra: u32) -> (Vec<u32>, Vec<UVec2>, u32)
 /// A record of four channels.
 type Record = [Vec3; 4];
 
-/// Sums the records of Gaussians with one feature, all in one place, whose slots are these: the gradients of the features
-/// are the sums of the last channel.
+/// Sums the records of Gaussians with one feature, all in one place, whose slots are these: the gradients of the
+/// features are the sums of the last channel.
 fn sums(intersection_ranges: Vec<UVec2>, gradient_records: &[Record]) -> Vec<f32> {
     let (count, shape) = (intersection_ranges.len(), Shape { sh_degree: 3, features: features(4) });
     let mut setup = Setup::new(count, [32, 32], shape, 1);
@@ -285,7 +285,7 @@ fn a_refused_view_names_a_longest_side_that_fits() {
     }
 }
 
-/// So many faint splats, one behind the other, on one pixel.
+/// This many faint splats, one after the other, on one pixel.
 fn splats_per_tile(count: usize) -> Setup {
     let mut setup = Setup::new(count, [16, 8], 0, 5);
     let size = setup.camera().size;

@@ -287,7 +287,7 @@ fn a_buffer_that_is_too_short_is_refused() {
 fn coefficients_in_halves_are_refused_where_a_buffer_is_too_short() {
     let gpu = gpu();
     let adam = Adam::new(&gpu).unwrap();
-    // Two Gaussians of 14 columns, and 9 coefficients behind them in 5 words.
+    // Two Gaussians of 14 columns, and 9 coefficients after them in 5 words.
     let fitting = [2 * (14 + 5), 2 * (14 + 9), 2 * (14 + 9)];
     for (short, fits) in
         [([0, 0, 0], true), ([1, 0, 0], false), ([0, 1, 0], false), ([0, 0, 1], false)]
@@ -321,7 +321,7 @@ fn the_first_value_that_is_not_finite_is_found_wherever_it_stands_and_none_where
     let gpu = gpu();
     let mut check = FiniteCheck::new(&gpu).unwrap();
     for count in [1, 3, 4, 255, 1024, 1025, 4097] {
-        // Extremes are finite; what lies behind the last value does not count.
+        // Extremes are finite; what lies after the last value does not count.
         let mut values: Vec<f32> =
             (0..count + 4).map(|i| [f32::MAX, -f32::MAX, 1e-45, -0.0][i % 4]).collect();
         values[count] = f32::NAN;

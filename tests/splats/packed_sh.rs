@@ -1,4 +1,5 @@
-//! Moments and SH coefficients in 16 bits: the kernels against their references, roundings that keep the mean, and runs.
+//! Moments and SH coefficients in 16 bits: the kernels against their references, roundings that keep the mean, and
+//! runs.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -229,8 +230,8 @@ fn a_render_of_halves_is_that_of_the_floats_they_stand_for() {
     }
 }
 
-/// The device is shared, and so is the peak of its memory: one test at a time. A checked render beside the start of a training
-/// also ended the process on lavapipe, in two runs of forty, for a reason that is not found yet.
+/// The device is shared, and so is the peak of its memory: one test at a time. A checked render beside the start of a
+/// training also ended the process on lavapipe, in two runs of forty, for a reason that is not found yet.
 fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)

@@ -447,7 +447,10 @@ mod ply_file {
         let header = std::str::from_utf8(&plain[..body]).unwrap();
         let header = header
             .replace("property float opacity", "property uchar tag\nproperty double weight\nproperty float opacity")
-            .replace("end_header", "comment by hand\nelement face 1\nproperty list uchar int vertex_indices\nend_header");
+            .replace(
+                "end_header",
+                "comment by hand\nelement face 1\nproperty list uchar int vertex_indices\nend_header",
+            );
         let mut extended = header.into_bytes();
         for vertex in plain[body..].chunks_exact(17 * 4) {
             extended.extend([&vertex[..9 * 4], &[9; 9], &vertex[9 * 4..]].concat());

@@ -175,7 +175,7 @@ fn holes_are_said_by_train_eval_and_diagnose() {
     assert!(mean > MAX_RESIDUAL_TRANSMITTANCE && q99 > mean, "{residual_transmittance}");
     assert_eq!(residual_transmittance["views"].as_object().unwrap().len(), 2);
     let table = succeed(&format!("eval {run}"));
-    for part in ["leftover", "99 %", &format!("{mean:.4}"), &format!("{q99:.4}")] {
+    for part in ["residual transmittance", "99 %", &format!("{mean:.4}"), &format!("{q99:.4}")] {
         assert!(table.contains(part), "no {part} in {table}");
     }
 

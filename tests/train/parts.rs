@@ -362,7 +362,7 @@ fn a_layer_that_the_model_lacks_is_named_with_those_it_has() {
     let with_denoiser = text.replace("denoiser = false", "denoiser = true");
     std::fs::write(&config, &with_denoiser).unwrap();
     refused(&format!("eval {at}"), 3, &["networks.safetensors"]);
-    let of_paper = with_denoiser.replace("form = \"identity\"", "form = \"paper\"");
+    let of_paper = with_denoiser.replace("variant = \"identity\"", "variant = \"paper\"");
     std::fs::write(&config, of_paper).unwrap();
     refused(&format!("eval {at}"), 2, &["no noise, which the denoiser takes"]);
 }
@@ -396,7 +396,7 @@ fn a_sweep_of_parts_trains_every_model_and_leaves_pages() {
     }
     assert!(table.contains("PSNR, dB of R_0") && table.contains("gain"), "{table}");
     let page = std::fs::read_to_string(out.join("index.html")).unwrap();
-    assert!(page.contains("the row of parts plain") && page.contains("data:image/png"));
+    assert!(page.contains("differences to parts plain") && page.contains("data:image/png"));
     let costs = std::fs::read_to_string(out.join("costs.html")).unwrap();
     assert!(costs.contains("device, MiB") && costs.contains("Gaussians"), "{costs}");
 }

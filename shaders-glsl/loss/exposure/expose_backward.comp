@@ -3,7 +3,7 @@
 #include "kernel.glsl"
 #include "exposure.glsl"
 
-//! The gradient behind `expose`: of the render, in place of that of the exposed one, and per chunk what that of the
+//! The gradient of `expose`: of the render, in place of that of the exposed one, and per chunk what that of the
 //! exposure is made of, the sums of d c and of d.
 //!
 //! A subgroup takes `CHUNK` values of one channel, in a fixed order: how a sum is parted is not the device's choice.
@@ -21,7 +21,7 @@ layout(push_constant) uniform Params {
 
 layout(binding = 0) readonly  buffer Exposures { float exposures[]; };  // (views, EXPOSURE_WIDTH)
 layout(binding = 1) readonly  buffer Render    { float render[]; };     // (3, H, W) and more, not clamped
-layout(binding = 2)           buffer DRender   { float d_render[]; };   // (3, H, W) and more: d, then that of the render
+layout(binding = 2)           buffer DRender { float d_render[]; };  // (3, H, W) and more: d, then that of the render
 layout(binding = 3) writeonly buffer Partials  { vec2 partials[]; };    // (3, chunks)
 
 void main() {

@@ -20,7 +20,7 @@ layout(push_constant) uniform Params {
 layout(binding = 0)           buffer Exposures { float exposures[]; };  // (views, EXPOSURE_WIDTH)
 layout(binding = 1) readonly  buffer Status    { uint status[]; };
 
-// A centred number is at most 2 BOUND; a float holds so many quanta, 2^24, exactly.
+// A centred number is at most 2 BOUND; a float holds this many quanta, 2^24, exactly.
 const float QUANTA = 2097152.0;
 const float BOUND = 4.0;
 

@@ -4,11 +4,11 @@
 #include "gaussian.glsl"
 #include "densify_action.glsl"
 
-//! Densify moments: one thread per Gaussian writes the moments of what comes of it to the new planes.
+//! Densify moments: one thread per Gaussian writes the moments of its children to the new planes.
 //!
 //! One that stays keeps its moments, a new one begins with zero: moments inherited in the proportion of the gradient
-//! were measured to cost 0.45 dB, because two halves need large steps to part. A dispatch goes from one batch of Gaussians
-//! to one batch of the new. Reference: `src/reference/densify_moments.rs`.
+//! were measured to cost 0.45 dB, because two halves need large steps to part. A dispatch goes from one batch of
+//! Gaussians to one batch of the new. Reference: `src/reference/densify_moments.rs`.
 
 layout(local_size_x = 64) in;
 

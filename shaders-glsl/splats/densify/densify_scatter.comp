@@ -6,7 +6,7 @@
 #include "densify_action.glsl"
 #include "random.glsl"
 
-//! Densify scatter: one thread per Gaussian writes the parameters of what comes of it to the new planes.
+//! Densify scatter: one thread per Gaussian writes the parameters of its children to the new planes.
 //!
 //! The paper's: a new one is at a position drawn from the normal distribution that its parent is (the clone too: the
 //! LITA-GS variant of Kerbl et al. 2023), after a split at 1/1.6 of its scale; draws depend on seed, step, Gaussian and

@@ -49,10 +49,10 @@ bool is_sound(uint i) {
     return true;
 }
 
-// An estimate of the mean squared change of a view where two halves take the place of a Gaussian, in units of the squared
-// contrast of what it covers: the share of the view that it covers, times the square of its opacity and of the relative
-// change of depth. Halves that move across the view show what the Gaussian showed; those that move along the ray are
-// magnified, and may pass what stands before the Gaussian.
+// An estimate of the mean squared change of a view where two halves take the place of a Gaussian, in units of the
+// squared contrast of what it covers: the share of the view that it covers, times the square of its opacity and of the
+// relative change of depth. Halves that move across the view show what the Gaussian showed; those that move along the
+// ray are magnified, and may pass what stands before the Gaussian.
 float view_change(vec3 mean, mat3 axes, float opacity, uint axis, Camera camera) {
     vec3 mean_in_view = camera.view_from_world * vec4(mean, 1.0);
     mat3 view_axes = mat3(camera.view_from_world) * axes;

@@ -7,9 +7,9 @@
 //! Adam over the planes of include/gaussian.glsl: beta 0.9 and 0.999, epsilon 1e-15.
 //!
 //! m = b1 m + (1 - b1) g, v = b2 v + (1 - b2) g^2, p -= rate / (1 - b1^t) m / (sqrt(v) / sqrt(1 - b2^t) + epsilon).
-//! A thread takes four floats in a row, of one plane or of two. A gradient that is not finite counts as zero, so that it
-//! poisons neither moment; log scales stay within bounds whose exp is finite. Nothing changes while status[0] is set.
-//! Moments are two floats, or both in one word. Kingma and Ba 2015. Reference: `src/reference/adam.rs`.
+//! A thread takes four floats in a row, of one plane or of two. A gradient that is not finite counts as zero, so that
+//! it poisons neither moment; log scales stay within bounds whose exp is finite. Nothing changes while status[0] is
+//! set. Moments are two floats, or both in one word. Kingma and Ba 2015. Reference: `src/reference/adam.rs`.
 
 layout(local_size_x = 256) in;
 
@@ -28,10 +28,11 @@ layout(binding = 0)           buffer Parameters    { vec4 parameters[]; };      
 layout(binding = 1) readonly  buffer Gradients     { vec4 gradients[]; };       // planes
 layout(binding = 2)           buffer FirstMoments  { vec4 first_moments[]; };   // planes; none with half moments
 layout(binding = 3)           buffer SecondMoments { vec4 second_moments[]; };  // as many
-layout(binding = 4)           buffer BothMoments   { vec4 both_moments[]; };    // planes of their bits; half moments alone
+layout(binding = 4)           buffer BothMoments { vec4 both_moments[]; };  // planes of their bits; half moments alone
 layout(binding = 5) readonly  buffer Status        { uint status[]; };
 
-// The largest scale leaves the determinant of a projected covariance finite at the near plane, (f / 0.2)^2 times its square.
+// The largest scale leaves the determinant of a projected covariance finite at the near plane, (f / 0.2)^2 times its
+// square.
 const float LOG_SCALE_MIN = -30.0;
 const float LOG_SCALE_MAX = 13.0;
 

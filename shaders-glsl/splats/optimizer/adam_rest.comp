@@ -22,7 +22,7 @@ layout(push_constant) uniform Params {
 
 layout(constant_id = 0) const bool HALF_MOMENTS = false;
 
-layout(binding = 0)           buffer Parameters    { uint parameters[]; };       // planes, halves behind first_column
+layout(binding = 0)           buffer Parameters    { uint parameters[]; };       // planes, halves after first_column
 layout(binding = 1) readonly  buffer Gradients     { float gradients[]; };       // planes
 layout(binding = 2)           buffer FirstMoments  { float first_moments[]; };   // planes; none with half moments
 layout(binding = 3)           buffer SecondMoments { float second_moments[]; };  // as many

@@ -9,12 +9,12 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 //! Blend backward: a tile's subgroups, most often one, record the gradient of every intersection in its slot.
 //!
-//! Walks front to back again, as the forward pass did, with the light still to come, L_i = sum_{k >= i} c_k alpha_k T_k +
-//! T background, which starts as the render itself: dC / dalpha_i = (c_i T_i - L_i) / (1 - alpha_i). Of both, the product
-//! with dL/dC is all that is needed: one number a pixel, however many channels. No atomics: a slot is written by the one
-//! tile it belongs to, and the sums over a tile's parts and over a Gaussian's slots come in a fixed order.
+//! Walks front to back again, as the forward pass did, with the light still to come, L_i = sum_{k >= i} c_k alpha_k T_k
+//! + T background, which starts as the render itself: dC / dalpha_i = (c_i T_i - L_i) / (1 - alpha_i). Of both, the
+//! product with dL/dC is all that is needed: one number a pixel, however many channels. No atomics: a slot is written
+//! by the one tile it belongs to, and the sums over a tile's parts and over a Gaussian's slots come in a fixed order.
 
-// So many channels, from the first, move and shape the splats; of the others only the colours learn.
+// This many channels, from the first, move and shape the splats; of the others only the colours learn.
 layout(constant_id = 8) const uint SHAPING_CHANNELS = 3;
 
 layout(push_constant, scalar) uniform Params { uvec2 size; uint tile_columns; };
@@ -100,7 +100,8 @@ void main() [[subgroup_uniform_control_flow]] {
                 vec3 conic = subgroupShuffle(mine.conic, j);
                 float opacity = subgroupShuffle(mine.opacity, j);
                 float splat_color[CHANNELS];
-                [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c / 3][c % 3], j);
+                [[unroll]] for (uint c = 0; c < CHANNELS; c++)
+                    splat_color[c] = subgroupShuffle(my_color[c / 3][c % 3], j);
                 // Moments of dL/dsigma over the pixels: what every gradient of the ellipse is made of.
                 float moment = 0.0;
                 vec2 moment_x_y = vec2(0.0);
@@ -180,7 +181,7 @@ void main() [[subgroup_uniform_control_flow]] {
                 gradient_records[RECORD_VECTORS * slot + k] = vec3(record[3 * k], record[3 * k + 1], record[3 * k + 2]);
         }
     }
-    // Behind a tile that is done every gradient is zero.
+    // After a tile that is done every gradient is zero.
     for (uint i = first + gl_LocalInvocationIndex; i < range.y; i += SUBGROUP_SIZE * SUBGROUPS_PER_TILE) {
         uint at = RECORD_VECTORS * sorted_intersections[i];
         [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) gradient_records[at + k] = vec3(0.0);

@@ -7,12 +7,12 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "tile.glsl"
 #include "status.glsl"
 
-//! Blend forward: a subgroup owns a tile or a part of one, finds the tile's run of the sorted intersections and composites
-//! it front to back.
+//! Blend forward: a subgroup owns a tile or a part of one, finds the tile's run of the sorted intersections and
+//! composites it front to back.
 //!
 //! C = sum_i c_i alpha_i T_i + T background, T_i = prod_{j < i} (1 - alpha_j). Each lane loads one splat of a batch and
-//! finds the groups of pixels that its ellipse meets; the batch is then broadcast splat by splat. The tile's state stays
-//! in registers: no shared memory, no barrier.
+//! finds the groups of pixels that its ellipse meets; the batch is then broadcast splat by splat. The tile's state
+//! stays in registers: no shared memory, no barrier.
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;
@@ -29,7 +29,7 @@ layout(binding = 4) readonly  buffer Colors     { vec3 colors[]; };      // (Gau
 layout(binding = 5) writeonly buffer Render     { float render[]; };  // (CHANNELS, H, W)
 layout(binding = 6) writeonly buffer Transmittances { float transmittances[]; };  // (H, W)
 layout(binding = 7) readonly  buffer Tiles      { uint sorted_tiles[]; };
-layout(binding = 8) writeonly buffer Ranges     { uvec2 tile_ranges[]; };  // (tiles) first intersection, one past the last
+layout(binding = 8) writeonly buffer Ranges { uvec2 tile_ranges[]; };  // (tiles) first intersection, one past the last
 layout(binding = 9)           buffer Status     { uint status[]; };
 
 #include "tile_run.glsl"
@@ -77,7 +77,8 @@ void main() [[subgroup_uniform_control_flow]] {
                 vec3 conic = subgroupShuffle(mine.conic, j);
                 float opacity = subgroupShuffle(mine.opacity, j);
                 float splat_color[CHANNELS];
-                [[unroll]] for (uint c = 0; c < CHANNELS; c++) splat_color[c] = subgroupShuffle(my_color[c / 3][c % 3], j);
+                [[unroll]] for (uint c = 0; c < CHANNELS; c++)
+                    splat_color[c] = subgroupShuffle(my_color[c / 3][c % 3], j);
 
                 [[unroll]] for (uint g = 0; g < GROUPS; g++) {
                     if ((groups >> g & 1) == 0) continue;

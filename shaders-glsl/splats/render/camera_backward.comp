@@ -9,8 +9,8 @@
 
 //! Camera backward: one lane per Gaussian, from the records of its slots to its share of the camera's gradient.
 //!
-//! Runs behind `project_backward`, whose gradient of the mean says what a shift of the view does. A turn of the view moves the
-//! mean, and turns the Gaussian against the Jacobian; colours depend on the camera's position alone.
+//! Runs after `project_backward`, whose gradient of the mean says what a shift of the view does. A turn of the view
+//! moves the mean, and turns the Gaussian against the Jacobian; colours depend on the camera's position alone.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -24,7 +24,8 @@ layout(push_constant, scalar) uniform Params {
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // planes
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer TileCounts { uint tile_counts[]; };
-layout(binding = 3) readonly  buffer IntersectionRanges    { uvec2 intersection_ranges[]; };     // first slot, one past the last
+// first intersection, one past the last
+layout(binding = 3) readonly  buffer IntersectionRanges    { uvec2 intersection_ranges[]; };
 layout(binding = 4) readonly  buffer GradientRecords    { vec3 gradient_records[]; };      // (slots, RECORD_VECTORS)
 layout(binding = 5) readonly  buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
 layout(binding = 6) readonly  buffer Cameras    { Camera cameras[]; };

@@ -17,7 +17,8 @@ layout(binding = 1) writeonly buffer Gradient { float gradient[]; };  // (CAMERA
 void main() {
     uint number = WORKGROUP_INDEX;
     float sum = 0.0;
-    for (uint i = gl_SubgroupInvocationID; i < gaussian_count; i += SUBGROUP_SIZE) sum += shares[CAMERA_WIDTH * i + number];
+    for (uint i = gl_SubgroupInvocationID; i < gaussian_count; i += SUBGROUP_SIZE)
+        sum += shares[CAMERA_WIDTH * i + number];
     sum = subgroup_sum(sum);
     if (subgroupElect()) gradient[number] = sum;
 }

@@ -23,8 +23,9 @@ layout(binding = 3) readonly  buffer Sums    { uint sums[]; };          // what 
 layout(binding = 4) readonly  buffer Splats  { ProjectedSplat splats[]; };
 layout(binding = 5) writeonly buffer Tiles   { uint tiles[]; };        // tile of each slot
 layout(binding = 6) writeonly buffer IntersectionIds   { uint intersection_ids[]; };        // 0, 1, 2, ...
-layout(binding = 7) writeonly buffer GaussianIds  { uint gaussian_ids[]; };       // Gaussian of each slot
-layout(binding = 8) writeonly buffer IntersectionRanges { uvec2 intersection_ranges[]; };      // by Gaussian: first slot, one past the last
+layout(binding = 7) writeonly buffer GaussianIds  { uint gaussian_ids[]; };       // of each intersection
+// first intersection of each Gaussian, one past the last
+layout(binding = 8) writeonly buffer IntersectionRanges { uvec2 intersection_ranges[]; };
 layout(binding = 9) readonly  buffer TileCounts { uint tile_counts[]; };  // by Gaussian
 
 const uint NO_TILE = 0xffffffffu;
@@ -59,8 +60,8 @@ void main() {
     bool is_shared = end - begin > SHARED_INTERSECTIONS;
     uvec4 sharing = subgroupBallot(is_shared);
 
-    // First every lane its own splat, then all together those that are shared, a row for each: in one loop, for a device
-    // that does not jump over branches pays for a second one even where nothing is shared.
+    // First every lane its own splat, then all together those that are shared, a row for each: in one loop, for a
+    // device that does not jump over branches pays for a second one even where nothing is shared.
     ProjectedSplat walked = splat;
     uint walked_id = id, slot = begin, walked_end = end, walked_rows = rows.y;
     uint row = is_shared ? rows.y : rows.x;

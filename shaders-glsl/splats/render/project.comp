@@ -9,7 +9,8 @@
 
 //! Project: one thread per Gaussian, world space to image plane.
 //!
-//! EWA: cov2d = U U^T + 0.3 I with U = J W R S, where J is the camera's Jacobian at the mean, so it is positive definite by construction, and its determinant is
+//! EWA: cov2d = U U^T + 0.3 I with U = J W R S, where J is the camera's Jacobian at the mean, so it is positive
+//! definite by construction, and its determinant is
 //! |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel. Colour is max(SH + 0.5, 0), what every viewer shows, or
 //! the bare SH sum of LITA-GS; features are taken as they are.
 //! A culled Gaussian gets the last depth key and covers no tile.
@@ -30,7 +31,7 @@ layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 as i
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // planes
 layout(binding = 1) writeonly buffer Splats     { ProjectedSplat splats[]; };
-layout(binding = 2) writeonly buffer Colors     { vec3 colors[]; };         // (gaussian_count, COLOR_VECTORS): CHANNELS, zeros
+layout(binding = 2) writeonly buffer Colors { vec3 colors[]; };  // (gaussian_count, COLOR_VECTORS): CHANNELS, zeros
 layout(binding = 3) writeonly buffer DepthKeys  { uint depth_keys[]; };
 layout(binding = 4) writeonly buffer Ids        { uint ids[]; };
 layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };

@@ -11,10 +11,10 @@
 
 //! Project backward: one lane per Gaussian, from the records of its slots to the gradients of its attributes.
 //!
-//! Sums the records, which gives the gradients of the splat, and reads the chain of `project` backwards; what it needs of
-//! the forward pass it computes again. Also keeps the statistics of density control: the norm of the screen-space gradient
-//! in normalised device units, damped near the camera. A gradient that is not finite raises a flag, so that neither this
-//! step nor those recorded behind it change a parameter.
+//! Sums the records, which gives the gradients of the splat, and reads the chain of `project` backwards; what it needs
+//! of the forward pass it computes again. Also keeps the statistics of density control: the norm of the screen-space
+//! gradient in normalised device units, damped near the camera. A gradient that is not finite raises a flag, so that
+//! neither this step nor later ones change a parameter.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -37,7 +37,8 @@ layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // pla
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer Colors     { vec3 colors[]; };       // (gaussian_count, COLOR_VECTORS)
 layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
-layout(binding = 4) readonly  buffer IntersectionRanges    { uvec2 intersection_ranges[]; };     // first slot, one past the last
+// first intersection, one past the last
+layout(binding = 4) readonly  buffer IntersectionRanges    { uvec2 intersection_ranges[]; };
 layout(binding = 5) readonly  buffer GradientRecords    { vec3 gradient_records[]; };      // (slots, RECORD_VECTORS)
 layout(binding = 6)           buffer Status     { uint status[]; };
 layout(binding = 7) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
@@ -180,7 +181,8 @@ void main() {
     uint bits = max(max(largest_bits(d_mean), largest_bits(d_quat.xyz)), largest_bits(d.log_scale));
     // No basis function is beyond 8.
     bits = max(max(bits, largest_bits(vec3(d_quat.w, d_raw_opacity, 0.0))), largest_bits(8.0 * d_color));
-    [[unroll]] for (uint k = 0; k < FEATURE_COUNT; k++) bits = max(bits, largest_bits(vec3(record[RECORD_HEAD + 3 + k])));
+    [[unroll]] for (uint k = 0; k < FEATURE_COUNT; k++)
+        bits = max(bits, largest_bits(vec3(record[RECORD_HEAD + 3 + k])));
     if (bits >= 0x7f800000u) {
         if ((status[0] & ~STATUS_GRADIENT) == 0) atomicOr(status[0], STATUS_GRADIENT);
         return;

@@ -7,8 +7,8 @@
 //! Radix sort, first kernel of a pass: where each partition's keys begin among those of their digit.
 //!
 //! One subgroup per partition of consecutive keys counts them by digit, in shared memory. The last of them to be done
-//! turns each digit's counts into exclusive prefix sums; where there are so many partitions that one subgroup would take
-//! long for that, `sort_spine` does, a subgroup for every digit.
+//! turns each digit's counts into exclusive prefix sums; where one subgroup would take long for the
+//! partitions, `sort_spine` does, with a subgroup for every digit.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

@@ -1,4 +1,4 @@
-//! The scene of the bench: deterministic, and as hard as a trained one.
+//! The synthetic scene of the bench, with the statistics of a trained one.
 
 use std::path::PathBuf;
 
@@ -26,21 +26,21 @@ pub struct BenchScene {
     pub low: Image,
 }
 
-/// The natural logarithm of a Gaussian's standard deviation in pixels: mean and deviation. With them 20 000 Gaussians
-/// have about 65 000 intersections at 512x384.
+/// Mean and deviation of the natural logarithm of a Gaussian's standard deviation in pixels. 20 000 Gaussians then have
+/// about 65 000 intersections at 512x384.
 const LOG_PIXELS: [f64; 2] = [0.545, 0.8];
 
 /// Random draws per Gaussian; each normal one takes two counters.
 const DRAWS: u64 = 32;
 
 impl BenchScene {
-    /// As many Gaussians in a view of these pixels.
+    /// `count` Gaussians in a view of `width` x `height` pixels.
     pub fn new(width: u32, height: u32, count: usize) -> Self {
         let camera = camera(width, height);
         Self { low: dark(width, height), gaussians: gaussians(&camera, count, 3), camera }
     }
 
-    /// One view, with a depth map and the Gaussians' means for points.
+    /// One view with a depth map; the points are the means of the Gaussians.
     fn dataset(&self) -> Dataset {
         let Camera { width, height, .. } = self.camera;
         let depth = (0..width * height).map(|i| (i / width) as f32 / height as f32);
@@ -52,15 +52,15 @@ impl BenchScene {
     }
 }
 
-/// The scene in training.
+/// Trainers of the scene.
 pub(super) struct Trainers {
-    /// Colour alone, with SH of degree 3.
+    /// Colour only, with SH of degree 3.
     pub(super) plain: Trainer,
     /// Every part, small enough for the references.
     pub(super) lita: Trainer,
-    /// The passes behind its first Gaussians and its targets, checked.
+    /// The checked passes of its initialisation and targets.
     pub(super) lita_begins: CheckReport,
-    /// Splats times tiles of the plain scene.
+    /// Number of splat-tile intersections of the plain scene.
     pub(super) intersections: u32,
 }
 
@@ -72,7 +72,7 @@ pub(super) fn trainers(gpu: &Gpu, scene: &BenchScene) -> Result<Trainers> {
     Ok(Trainers { plain, lita: lita?, lita_begins, intersections: intersections(gpu, scene)? })
 }
 
-/// A configuration whose steps all do the same work, behind those that the SH take to come into use.
+/// A configuration whose steps all do the same work once all SH degrees are in use.
 fn config() -> TrainConfig {
     let mut config = TrainConfig { tone: ToneSettings::new(ToneCurve::Ap3), ..TrainConfig::bare() };
     config.schedule.sh_degree_interval = 1;
@@ -82,7 +82,7 @@ fn config() -> TrainConfig {
     config
 }
 
-/// The plain model after the steps that bring all its coefficients into use.
+/// The plain model after the steps that enable all SH degrees.
 ///
 /// # Errors
 /// The device is out of memory or lost.
@@ -95,7 +95,7 @@ pub fn plain(gpu: &Gpu, scene: &BenchScene) -> Result<Trainer> {
     Ok(trainer)
 }
 
-/// Every part on a small scene, density control in every step.
+/// All parts on a small scene, with densification in every step.
 fn lita(gpu: &Gpu) -> Result<Trainer> {
     let mut config = config();
     config.model.follow_paper();
@@ -109,7 +109,7 @@ fn lita(gpu: &Gpu) -> Result<Trainer> {
     Trainer::new(gpu, config, &BenchScene::new(96, 72, 500).dataset())
 }
 
-/// How often a splat meets a tile.
+/// The number of splat-tile intersections.
 fn intersections(gpu: &Gpu, BenchScene { camera, gaussians, .. }: &BenchScene) -> Result<u32> {
     let mut renderer = Renderer::new(gpu, RenderSettings::default())?;
     renderer.reserve(gaussians.count, [camera])?;
@@ -131,7 +131,7 @@ pub fn camera(width: u32, height: u32) -> Camera {
     }
 }
 
-/// Spread over the camera's view, of the same sizes in pixels whatever its size.
+/// Gaussians spread over the camera's view, with sizes in pixels that do not depend on the resolution.
 pub fn gaussians(camera: &Camera, count: usize, shape: impl Into<Shape>) -> Gaussians {
     let stream = Stream::new(65, 0);
     let uniform = |gaussian: usize, draw: u64| stream.uniform(gaussian as u64 * DRAWS + draw);
@@ -158,7 +158,7 @@ pub fn gaussians(camera: &Camera, count: usize, shape: impl Into<Shape>) -> Gaus
     for (i, feature) in (0..).zip(gaussians.features_mut()) {
         *feature = Stream::new(65, 4).uniform(i) as f32;
     }
-    // A trained model's view dependence is faint.
+    // View dependence of a trained model is faint.
     for (i, coefficient) in (0..).zip(gaussians.rest_mut()) {
         let draw = |c: u64| 0.05 * Stream::new(65, 1).normal(3 * i + c) as f32;
         *coefficient = Vec3::from_array([0, 1, 2].map(draw));
@@ -166,7 +166,7 @@ pub fn gaussians(camera: &Camera, count: usize, shape: impl Into<Shape>) -> Gaus
     gaussians
 }
 
-/// Smooth and dark, with noise.
+/// A smooth, dark image with noise.
 pub fn dark(width: u32, height: u32) -> Image {
     let noise = Stream::new(65, 2);
     Image::from_fn(width, height, |x, y| {

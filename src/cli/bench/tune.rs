@@ -1,53 +1,53 @@
-//! `--tune`: the rasteriser with every tile that suits the device; the fastest are kept for it.
+//! `--tune`: times the rasteriser with every tile size that the device supports, and stores the fastest.
 
 use std::io::Write;
 
 use anyhow::Result;
 use serde_json::{Map, Value, json};
 
-use super::{Bench, median, scene, stages, table, total};
+use super::{Bench, finish, median, scene, stages, table, total};
 use crate::camera::Camera;
 use crate::gpu::{Buffer, Statistic, TUNE_VARIABLE, Tile, TunedTile};
 use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
 use crate::splats::scene::{DeviceGaussians, Features, Layout, MAX_SH_DEGREE, Shape};
 
-/// From the few pixels of a narrow subgroup to 32 rows of a wide one.
+/// From a few pixels for narrow subgroups to 512 for wide ones.
 const SIZES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8], [32, 16]];
-/// So many subgroups share a tile of as many pixels or more. On a processor one has it: there a barrier ends one loop over
-/// all lanes and begins another.
+/// Numbers of subgroups that share a tile, if it has `SHARED_PIXELS` or more. Processors use one: there, each barrier
+/// ends one loop over all lanes and begins another.
 const SUBGROUPS: [u32; 3] = [1, 2, 4];
 const SHARED_PIXELS: u32 = 256;
 
-/// Colour alone, and every feature: 3 and 11 channels.
+/// Colour only and all features: 3 and 11 channels.
 const FEATURES: [Features; 2] = [Features::NONE, Features::ALL];
 
-/// How far a render may be from that of the first tile: drivers may round each specialisation otherwise, and where a
-/// rounding decides whether a splat counts, by its faintest alpha.
+/// Allowed difference from the render with the first tile. Drivers may round each specialisation differently, which can
+/// decide whether a splat of minimal alpha counts.
 const LARGEST_DIFFERENCE: f32 = 0.01;
 const MEAN_DIFFERENCE: f64 = 1e-5;
 
-/// One image size and number of channels, with every tile.
+/// All tiles at one image size and number of channels.
 struct Case {
     channels: usize,
     size: [u32; 2],
     tiles: Vec<TileTiming>,
 }
 
-/// What one tile took.
+/// Measurements of one tile.
 struct TileTiming {
     tile: Tile,
     intersections: u32,
     /// Largest and mean difference from the render of the first tile.
     differences: (f32, f64),
-    /// Milliseconds of blending there and back, and of all passes of the rasteriser: all that the tile changes.
+    /// Milliseconds of forward and backward blending, and of the whole rasteriser.
     forward: f64,
     backward: f64,
     rasteriser: f64,
-    /// Of the blend kernels, forward and backward.
+    /// Statistics of the blend kernels, forward and backward.
     statistics: Option<[Vec<Statistic>; 2]>,
 }
 
-/// Measures every case, keeps the fastest tiles and prints.
+/// Measures every case, stores the fastest tiles and prints.
 ///
 /// # Errors
 /// The device gives no timestamps, is out of memory or lost, or the file cannot be written.
@@ -85,18 +85,19 @@ pub(super) fn run(
         writeln!(out, "{}", case.as_text(gaussians))?;
     }
     if !bench.gpu.properties().has_pipeline_statistics {
-        writeln!(out, "registers and spills: the driver does not tell them")?;
+        writeln!(out, "registers and spills: not reported by the driver")?;
     }
     let tile = |TunedTile { channels, tile }: &TunedTile| format!("{tile} at {channels} channels");
     let fastest = chosen.iter().map(tile).collect::<Vec<_>>().join(", ");
-    match file {
-        Some(file) => writeln!(out, "fastest: {fastest}; kept in {}", file.display())?,
-        None => writeln!(out, "fastest: {fastest}; not kept: {TUNE_VARIABLE} is off")?,
+    match &file {
+        Some(_) => writeln!(out, "fastest: {fastest}")?,
+        None => writeln!(out, "fastest: {fastest}; not stored, as {TUNE_VARIABLE} is off")?,
     }
-    Ok(())
+    let wrote = file.map(|file| file.display().to_string()).unwrap_or_default();
+    finish(&wrote, "nightsplat train photos --out run")
 }
 
-/// The tile whose times, each relative to the least of its size, have the least sum over the sizes.
+/// The tile with the least sum over sizes of its time relative to the fastest at that size.
 fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
     let cases = || cases.iter().filter(|case| case.channels == channels);
     let cost = |tile: Tile| {
@@ -111,7 +112,7 @@ fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
     Some(TunedTile { channels, tile })
 }
 
-/// A renderer for one tile, what it rendered and the passes it took so far.
+/// A renderer for one tile with its measurements so far.
 struct Candidate {
     renderer: Renderer,
     measured: TileTiming,
@@ -156,7 +157,7 @@ impl Case {
             candidates.push(Candidate { renderer, measured, times: vec![] });
         }
         let mut pass = Pass::new(bench, camera, on_device)?;
-        // Round by round, so that whatever else the device does meets every tile alike; the first does not count.
+        // Interleaved, so that other load affects all tiles alike; the first round is a warm-up.
         for round in 0..=bench.repeats {
             for candidate in &mut candidates {
                 let times = pass.profile(bench, &mut candidate.renderer)?;
@@ -168,7 +169,7 @@ impl Case {
         Ok(Self { channels: features.channels(), size: [width, height], tiles })
     }
 
-    /// What the fastest tile took.
+    /// The time of the fastest tile.
     fn least(&self) -> f64 {
         let agree = self.tiles.iter().filter(|measured| measured.agrees());
         agree.map(|measured| measured.rasteriser).fold(f64::INFINITY, f64::min)
@@ -190,7 +191,7 @@ impl Case {
         rows.extend(self.tiles.iter().map(|measured| {
             let TileTiming { tile, intersections, .. } = measured;
             let note = match measured.agrees() {
-                false => "renders otherwise",
+                false => "renders differently",
                 true if measured.rasteriser == self.least() => "fastest",
                 true => "",
             };
@@ -210,7 +211,7 @@ impl Case {
 
 const OPTIONS: RenderOptions = RenderOptions { sh_degree: MAX_SH_DEGREE, background: [0.0; 3] };
 
-/// All that a pass of the rasteriser reads and writes beside the memory of its renderer.
+/// The buffers of a pass of the rasteriser, apart from those of its renderer.
 struct Pass {
     camera: Camera,
     gaussians: DeviceGaussians,
@@ -238,7 +239,7 @@ impl Pass {
         })
     }
 
-    /// Milliseconds of blending forward and backward, and of all passes.
+    /// Milliseconds of forward and backward blending, and of all passes.
     fn profile(&mut self, bench: &Bench, renderer: &mut Renderer) -> crate::Result<[f64; 3]> {
         let Self { camera, gaussians, d_render, .. } = self;
         let times = bench.gpu.profile("tune", |pass| {
@@ -268,7 +269,7 @@ impl Candidate {
 }
 
 impl TileTiming {
-    /// Positive phrasing: a NaN does not agree.
+    /// Whether the render matches that of the first tile; phrased so that NaN does not.
     fn agrees(&self) -> bool {
         self.differences.0 <= LARGEST_DIFFERENCE && self.differences.1 <= MEAN_DIFFERENCE
     }
@@ -293,7 +294,7 @@ impl TileTiming {
         })
     }
 
-    /// A line with what the driver says of registers and spills.
+    /// A line with the registers and spills that the driver reports.
     fn registers(&self) -> Option<String> {
         let counts = |statistics: &Vec<Statistic>| {
             let is_meant = |told: &&Statistic| {
@@ -312,7 +313,7 @@ impl TileTiming {
 fn differences(render: &[f32], first: &[f32]) -> (f32, f64) {
     let scale = first.iter().fold(1.0f32, |scale, value| scale.max(value.abs()));
     let each = || render.iter().zip(first).map(|(a, b)| (a - b).abs() / scale);
-    // Of a NaN the sum tells.
+    // A NaN shows in the sum.
     let sum: f64 = each().map(f64::from).sum();
     (each().fold(0.0, f32::max), sum / first.len().max(1) as f64)
 }

@@ -1,31 +1,33 @@
-//! The frames of a clip that are worth a camera: of each window of time the sharpest.
+//! Extracts the sharpest frame of each time window of a clip.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
-use super::create;
 use super::tool::Tool;
+use crate::base::output::create_folder;
 use crate::photographs::image::Image;
 use crate::photographs::image::files::photographs_in;
 use crate::{Error, Result};
 
-/// Frames of a window, of which one stays.
+/// Frames per window.
 const CANDIDATES: usize = 4;
 
-/// Takes `fps` frames a second of a clip, as PNG files in `folder`.
+/// Extracts `fps` frames per second of a clip as PNG files in `folder`.
 ///
 /// # Errors
-/// [`Error::Input`] where ffmpeg fails or the clip has no picture.
+/// [`Error::Input`] if ffmpeg fails or the clip has no frame.
 pub(super) fn frames(
     ffmpeg: &Tool<'_>,
     clip: &Path,
     fps: f64,
     folder: &Path,
 ) -> Result<Vec<PathBuf>> {
-    create(folder)?;
-    let filter = format!("fps={}", fps * CANDIDATES as f64);
+    create_folder(folder)?;
+    let transfer = ffmpeg.probed(clip, "color_transfer");
+    let filters = filters(ffmpeg, clip, transfer.as_deref().unwrap_or_default())?;
+    let filter = format!("fps={}{filters}", fps * CANDIDATES as f64);
     let pattern = folder.join("frame_%06d.png");
     ffmpeg.run(
         "",
@@ -41,7 +43,13 @@ pub(super) fn frames(
     )?;
     let frames = photographs_in(folder)?;
     if frames.is_empty() {
-        return Err(Error::input(clip, "holds no frame that ffmpeg can decode"));
+        return Err(Error::input(clip, "contains no frame that ffmpeg can decode"));
+    }
+    if transfer.is_none() {
+        tracing::warn!(
+            "{}: ffprobe, which comes with ffmpeg, does not tell its colours; it is taken for SDR",
+            clip.display()
+        );
     }
     let sharpness = frames.par_iter().map(|frame| Ok(sharpness(&Image::load(frame)?)));
     let sharpness = sharpness.collect::<Result<Vec<f64>>>()?;
@@ -60,15 +68,47 @@ pub(super) fn frames(
     Ok(kept)
 }
 
-/// How much detail a frame has for its brightness: the mean absolute second difference over the mean. Of frames of
-/// one moment, noise is alike and motion is not.
+/// ffmpeg's filters that make sRGB of linear light above which nothing is white: HLG and PQ put that at 203 cd/m2 (BT.2408).
+/// What is brighter is clipped; a curve for it would change what is dark, too.
+const STANDARD_RANGE: &str = "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,tonemap=clip:desat=0,\
+                              zscale=t=iec61966-2-1:m=gbr:r=full,format=gbrp16le";
+
+/// The filters after `fps` for a clip of this transfer function: those above for high dynamic range. Frames of wide primaries
+/// say so themselves, and are converted where they are read.
+///
+/// # Errors
+/// [`Error::Input`] with the command to run where this ffmpeg has no such filters.
+fn filters(ffmpeg: &Tool<'_>, clip: &Path, transfer: &str) -> Result<String> {
+    let range = match transfer {
+        "arib-std-b67" => "HLG",
+        "smpte2084" => "PQ",
+        _ => return Ok(String::new()),
+    };
+    let has = |filter: &str| ffmpeg.helps_with(&["-hide_banner", "-filters"], filter);
+    if !has(" zscale ") || !has(" tonemap ") {
+        let path = clip.display();
+        let problem = format!(
+            "is HDR ({range}), and this ffmpeg has no filters zscale and tonemap; with one that has: ffmpeg -i {path} -vf \
+             {STANDARD_RANGE},format=yuv444p -color_primaries bt709 -color_trc iec61966-2-1 -crf 10 sdr.mp4"
+        );
+        return Err(Error::input(clip, problem));
+    }
+    tracing::warn!(
+        "{}: HDR ({range}) converted to sRGB; what is brighter than its white is clipped",
+        clip.display()
+    );
+    Ok(format!(",{STANDARD_RANGE}"))
+}
+
+/// Detail relative to brightness: mean absolute second difference over the mean. Frames of one moment share their
+/// noise, but not their motion blur.
 fn sharpness(frame: &Image) -> f64 {
     let (width, pixels) = (frame.width as usize, frame.pixel_count());
     let plane = &frame.data[pixels..2 * pixels];
     let (mut detail, mut light) = (0.0, f64::EPSILON);
     for row in plane.chunks_exact(width) {
         for near in row.windows(5) {
-            // Two pixels apart: neighbours differ by noise and by what the codec makes of it.
+            // At a distance of two pixels, since neighbours differ mostly by noise and compression.
             detail += f64::from((2.0 * near[2] - near[0] - near[4]).abs());
             light += f64::from(near[2]);
         }

@@ -1,49 +1,68 @@
-//! The photographs as COLMAP can see them: all lifted by one curve, under their own names.
+//! Brightened copies of the photographs for COLMAP, all by the same curve.
 
 use std::path::{Path, PathBuf};
 
-use super::create;
 use crate::Result;
 use crate::base::input;
+use crate::base::output::create_folder;
 use crate::cli::progress_bar;
 use crate::gpu::Gpu;
-use crate::photographs::image::files::{photographs_in, stem};
-use crate::photographs::image::{Image, exif_segment};
+use crate::photographs::image::files::stem;
+use crate::photographs::image::{ColourTally, Image, PictureFile, exif_segment};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 
 /// Lifts the photographs into `folder`, as stored, and returns the gain of the scene. A JPEG stays one and keeps its Exif,
-/// so that COLMAP finds the focal length; everything else becomes PNG.
+/// so that COLMAP finds the focal length; everything else becomes PNG. Those that do not decode are named and taken out of
+/// `photographs`.
 ///
 /// # Errors
-/// A photograph cannot be read, all are black, or the device is out of memory.
-pub(super) fn write(gpu: &Gpu, photographs: &[PathBuf], folder: &Path) -> Result<f64> {
-    create(folder)?;
-    // One curve for all: what two photographs show of one place stays alike.
+/// None decodes, all are black, or the device is out of memory.
+pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) -> Result<f64> {
+    create_folder(folder)?;
+    // The same curve for all, so that features keep matching.
     let settings = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
     let pseudo_gt = PseudoGt::new(gpu, &settings)?;
     let progress = progress_bar(2 * photographs.len());
-    let mut measured = vec![];
-    for path in photographs {
-        measured.push(MeasuredPhotograph::of(&Image::load(path)?.data));
+    let root = photographs.first().and_then(|path| path.parent()).unwrap_or(folder).to_owned();
+    let colours = ColourTally::default();
+    let (mut measured, mut undecoded) = (vec![], None);
+    photographs.retain(|path| {
         progress.inc(1);
+        match Image::load_counted(path, &colours) {
+            Ok(image) => measured.push(MeasuredPhotograph::of(&image.data)),
+            Err(error) => {
+                tracing::warn!("left out: {error}");
+                undecoded = Some(error);
+                return false;
+            }
+        }
+        true
+    });
+    if let (true, Some(error)) = (photographs.is_empty(), undecoded) {
+        return Err(error);
     }
-    let root = photographs.first().and_then(|path| path.parent()).unwrap_or(folder);
-    let scene = settings.scene(&measured).ok_or_else(|| all_black(root))?;
+    progress.suspend(|| colours.say());
+    let scene = settings.scene(&measured).ok_or_else(|| all_black(&root))?;
     for (path, measured) in photographs.iter().zip(&measured) {
-        let image =
-            pseudo_gt.tone_mapped(&Image::load(path)?, &settings.tone_mapping(&scene, measured))?;
-        let name = path.file_name().unwrap_or_default();
+        let (photograph, _) = PictureFile::open(path)?.decode()?;
+        let image = pseudo_gt.tone_mapped(&photograph, &settings.tone_mapping(&scene, measured))?;
+        let file = folder.join(name(path));
         if is_jpeg(path) {
-            image.save_jpeg(folder.join(name), exif_of(path)?.as_deref())?;
+            image.save_jpeg(file, exif_of(path)?.as_deref())?;
         } else {
-            let name = stem(&name.to_string_lossy()).to_owned() + ".png";
-            image.save_png8(folder.join(name))?;
+            image.save_png8(file)?;
         }
         progress.inc(1);
     }
     progress.finish_and_clear();
     Ok(scene.exposure.map_or(1.0, |exposure| exposure.gain))
+}
+
+/// The name that a photograph is lifted under.
+pub(super) fn name(photograph: &Path) -> String {
+    let name = photograph.file_name().unwrap_or_default().to_string_lossy();
+    if is_jpeg(photograph) { name.into_owned() } else { stem(&name).to_owned() + ".png" }
 }
 
 fn is_jpeg(path: &Path) -> bool {
@@ -54,12 +73,4 @@ fn is_jpeg(path: &Path) -> bool {
 fn exif_of(path: &Path) -> Result<Option<Vec<u8>>> {
     let bytes = input::bytes(path)?;
     Ok(exif_segment(&bytes))
-}
-
-/// Whether all photographs of a folder are of one size, and so of one camera.
-pub(super) fn are_of_one_size(folder: &Path) -> bool {
-    let sizes = photographs_in(folder).unwrap_or_default();
-    let mut sizes = sizes.iter().map(|path| Image::size_of(path).ok());
-    let first = sizes.next();
-    sizes.all(|size| Some(size) == first)
 }

@@ -1,21 +1,22 @@
-//! The user's programs: how to get them, what they are called with, and what they said.
+//! Runs external programs, logs their output, and tells how to install them.
 
 use std::ffi::OsStr;
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write};
 use std::path::Path;
 use std::process::{Command, Stdio};
+use std::time::Duration;
 
 use crate::{Error, Result};
 
-/// A program of the user's, whose output goes to a log.
+/// An external program whose output goes to a log.
 pub(super) struct Tool<'a> {
     path: &'a Path,
     name: &'static str,
     log: &'a Path,
 }
 
-/// The last lines of a program that failed, in its message.
+/// Lines of a failed program's output that its error quotes.
 const LAST_LINES: usize = 3;
 
 impl<'a> Tool<'a> {
@@ -23,15 +24,15 @@ impl<'a> Tool<'a> {
         Self { path, name, log }
     }
 
-    /// Another whose output goes to the same log.
+    /// Another program with the same log.
     pub(super) fn beside(&self, path: &'a Path, name: &'static str) -> Self {
         Self::new(path, name, self.log)
     }
 
-    /// The tool, once it is there.
+    /// Checks that the program runs.
     ///
     /// # Errors
-    /// [`Error::Usage`] says how to get it, and `besides`.
+    /// [`Error::Usage`] with how to install it, and `besides`.
     pub(super) fn found(self, besides: &str) -> Result<Self> {
         let started = Command::new(self.path).arg("-h").stdin(Stdio::null()).output();
         let Err(error) = started else { return Ok(self) };
@@ -47,7 +48,7 @@ impl<'a> Tool<'a> {
         )))
     }
 
-    /// Whether its help, of a command or of the whole, names something.
+    /// Whether the output of the arguments `help` contains `what`.
     pub(super) fn helps_with(&self, help: &[&str], what: &str) -> bool {
         let output = Command::new(self.path).args(help).stdin(Stdio::null()).output();
         output.is_ok_and(|output| {
@@ -56,11 +57,41 @@ impl<'a> Tool<'a> {
         })
     }
 
+    /// Whether the help of a command lists an option.
+    pub(super) fn has_option(&self, command: &str, option: &str) -> bool {
+        self.helps_with(&[command, "-h"], &format!("--{option} "))
+    }
+
+    /// What ffprobe, beside this ffmpeg, tells of the first video stream of a clip; `None` where it tells nothing.
+    pub(super) fn probed(&self, clip: &Path, entry: &str) -> Option<String> {
+        let name = self.path.file_name()?.to_str()?.replace("ffmpeg", "ffprobe");
+        let arguments =
+            ["-v", "error", "-select_streams", "v:0", "-of", "default=nokey=1:noprint_wrappers=1"];
+        let mut process = Command::new(self.path.with_file_name(name));
+        process.args(arguments).arg("-show_entries").arg(format!("stream={entry}")).arg(clip);
+        let output = process.stdin(Stdio::null()).output().ok()?;
+        let text = String::from_utf8(output.stdout).ok()?;
+        output.status.success().then(|| text.lines().next().unwrap_or_default().to_owned())
+    }
+
     /// Runs one of its commands to its end.
     ///
     /// # Errors
-    /// [`Error::Input`] with its last lines where it fails.
+    /// [`Error::Input`] with its last lines if it fails.
     pub(super) fn run(&self, command: &str, arguments: &[&OsStr]) -> Result<()> {
+        self.run_and_watch(command, arguments, |_| {})
+    }
+
+    /// The same; while it runs, `watch` sees what it has said, a few times a second.
+    ///
+    /// # Errors
+    /// As there.
+    pub(super) fn run_and_watch(
+        &self,
+        command: &str,
+        arguments: &[&OsStr],
+        mut watch: impl FnMut(&str),
+    ) -> Result<()> {
         let cannot = |error: std::io::Error| {
             Error::output(
                 self.log,
@@ -77,44 +108,55 @@ impl<'a> Tool<'a> {
         if !command.is_empty() {
             process.arg(command);
         }
-        // Its windows need no display.
+        // COLMAP without a display.
         process.args(arguments).env("QT_QPA_PLATFORM", "offscreen").stdin(Stdio::null());
-        let status = process.stdout(output(&log)?).stderr(output(&log)?).status();
-        let status =
-            status.map_err(|error| Error::input(self.path, format!("does not run: {error}")))?;
+        let unrunnable = |error| Error::input(self.path, format!("does not run: {error}"));
+        let started = process.stdout(output(&log)?).stderr(output(&log)?).spawn();
+        let mut child = started.map_err(unrunnable)?;
+        let printed = || {
+            let printed = std::fs::read(self.log).unwrap_or_default();
+            String::from_utf8_lossy(printed.get(begin..).unwrap_or_default()).into_owned()
+        };
+        let mut pause = Duration::from_millis(5);
+        let status = loop {
+            if let Some(status) = child.try_wait().map_err(unrunnable)? {
+                break status;
+            }
+            std::thread::sleep(pause);
+            pause = (2 * pause).min(Duration::from_millis(500));
+            watch(&printed());
+        };
         if status.success() {
             return Ok(());
         }
-        let printed = std::fs::read(self.log).unwrap_or_default();
-        let printed =
-            String::from_utf8_lossy(printed.get(begin..).unwrap_or_default()).into_owned();
+        let printed = printed();
         let lines: Vec<&str> =
             printed.lines().skip(1).map(str::trim).filter(|line| !line.is_empty()).collect();
         let last = lines[lines.len().saturating_sub(LAST_LINES)..].join(" | ");
-        let last = if last.is_empty() { "it said nothing".to_owned() } else { last };
+        let last = if last.is_empty() { "no output".to_owned() } else { last };
         Err(Error::input(self.path, format!("{command} ended with {status}: {last}")))
     }
 
-    /// Whether it said something, in any of its runs.
+    /// Whether the log contains `what`.
     pub(super) fn printed(&self, what: &str) -> bool {
         let printed = std::fs::read(self.log).unwrap_or_default();
         String::from_utf8_lossy(&printed).contains(what)
     }
 }
 
-/// Where a program comes from on each system.
-fn sources(name: &str) -> &'static str {
+/// How to install a program on each system.
+pub(in crate::cli) fn sources(name: &str) -> &'static str {
     match name {
         "colmap" => {
-            "Debian, Ubuntu: apt install colmap; Fedora: dnf install colmap; Arch: colmap of the AUR; macOS: brew install \
-             colmap; Windows and others: https://github.com/colmap/colmap/releases"
+            "Debian, Ubuntu: apt install colmap; Fedora: dnf install colmap; Arch: colmap of the AUR; macOS: \
+             brew install colmap; Windows and others: https://github.com/colmap/colmap/releases"
         }
         "glomap" => {
             "https://github.com/colmap/glomap/releases, or COLMAP 4.0 and later, which has it"
         }
         _ => {
-            "Debian, Ubuntu: apt install ffmpeg; Fedora: dnf install ffmpeg-free; Arch: pacman -S ffmpeg; macOS: brew \
-             install ffmpeg; Windows: winget install ffmpeg; others: https://ffmpeg.org/download.html"
+            "Debian, Ubuntu: apt install ffmpeg; Fedora: dnf install ffmpeg-free; Arch: pacman -S ffmpeg; \
+             macOS: brew install ffmpeg; Windows: winget install ffmpeg; others: https://ffmpeg.org/download.html"
         }
     }
 }

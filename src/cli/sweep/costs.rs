@@ -1,4 +1,4 @@
-//! What the points cost: time, energy and memory against their scores, and who is on the front.
+//! Costs of the points: time, energy and memory against scores, with Pareto fronts.
 
 use std::path::Path;
 
@@ -14,13 +14,13 @@ use crate::results::run::{Progress, energy_counters};
 /// The files of the costs.
 pub(super) const FILES: [&str; 2] = ["costs.csv", "costs.html"];
 
-/// Points on the way this much worse than the best are left out: they would flatten all others.
+/// Range of intermediate scores that is plotted, dB.
 const SHOWN_DECIBELS: f64 = 3.0;
 
-/// More rows than this are numbered in drawings, where their names would not fit.
+/// More rows than this are numbered in plots, where their names would not fit.
 const MAX_NAMES: usize = 8;
 
-/// A figure of a run: its column in CSV and JSON, its place in `metrics.json`, its heading, the digits and the unit shown.
+/// A quantity of a run: key in CSV and JSON, place in `metrics.json`, heading, digits and unit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Measure {
     key: &'static str,
@@ -61,7 +61,7 @@ const ALL: [Measure; 9] = [
     HOST,
 ];
 
-/// What is drawn: cost and gain.
+/// The plots: cost and score.
 const FRONTS: [(Measure, Measure); 8] = [
     (SECONDS, PSNR),
     (SECONDS, SSIM),
@@ -73,24 +73,23 @@ const FRONTS: [(Measure, Measure); 8] = [
     (HOST, PSNR),
 ];
 
-/// The fronts of PSNR that CSV and JSON name.
+/// The fronts in CSV and JSON.
 const NAMED_FRONTS: [(&str, Measure); 2] =
     [("on_front", SECONDS), ("on_processor_front", PROCESSOR)];
 
 impl Measure {
-    /// The mean as tables and drawings show it.
+    /// The mean in the displayed unit.
     fn shown(self, row: &Row) -> Option<f64> {
         Some(row.mean(self.place)? / self.unit)
     }
 }
 
-/// The indices of the points (cost, gain) that no other beats, the cheapest first: none is as cheap and as good but for one
-/// that is just the same, of which the first is taken.
+/// Indices of the Pareto-optimal points (cost, gain), cheapest first. Of equal points, the first is taken.
 fn front(points: &[(f64, f64)]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len())
         .filter(|&index| points[index].0.is_finite() && points[index].1.is_finite())
         .collect();
-    // Stable: of equals, the first stays first.
+    // Stable, so that of equal points the first stays first.
     order.sort_by(|&a, &b| {
         points[a].0.total_cmp(&points[b].0).then(points[b].1.total_cmp(&points[a].1))
     });
@@ -111,12 +110,12 @@ impl Rows {
     pub(super) fn save_costs(&self, folder: &Path, title: &str, notes: &[String]) -> Result<()> {
         let counters = energy_counters();
         let energy = if counters.is_empty() {
-            "No counter of energy can be read here.".to_owned()
+            "No energy counter is readable on this machine.".to_owned()
         } else {
-            format!("Energy is that of {}, idling included.", counters.join(", "))
+            format!("Energy is that of {}, including idle power.", counters.join(", "))
         };
-        let time = "Time is that of the steps, without loading and scoring. The dotted line is the front: the most that can \
-                    be had for this cost. A disc is a point on it, a ring one that is not.";
+        let time = "Time is that of the steps, without loading and scoring. The dotted line is the Pareto \
+         front: the best score for each cost. Discs are points on it, rings are not.";
         let mut intro = vec![format!("{time} {energy}")];
         let on_front = self.front_of(SECONDS, PSNR);
         let names = on_front.into_iter().map(|index| self.label(&self.rows[index], None));
@@ -143,13 +142,13 @@ impl Rows {
         front(&points.collect::<Vec<_>>())
     }
 
-    /// The measures that any row has.
+    /// The quantities that any row has.
     fn measures(&self) -> Vec<Measure> {
         let has = |of: &Measure| self.rows.iter().any(|row| row.mean(of.place).is_some());
         ALL.into_iter().filter(has).collect()
     }
 
-    /// Every row with every figure.
+    /// All rows with all quantities.
     pub(super) fn costs(&self) -> Table {
         let measures = self.measures();
         let is_score = |of: &Measure| [PSNR, SSIM].contains(of);
@@ -163,14 +162,14 @@ impl Rows {
             (format!("{}  {}", index + 1, self.label(row, None)), values)
         };
         Table {
-            title: "Every point".to_owned(),
+            title: "All points".to_owned(),
             label: "point".to_owned(),
             columns: measures.iter().map(column).collect(),
             rows: self.rows.iter().enumerate().map(row).collect(),
         }
     }
 
-    /// What each row gains and costs beside the baseline; none where there is no baseline, or it is not finished.
+    /// Differences to the baseline; `None` without a finished baseline.
     fn differences(&self) -> Option<Table> {
         let (base, name) = self.baseline().filter(|(row, _)| !row.metrics.is_empty())?;
         let measures = self.measures();
@@ -185,7 +184,7 @@ impl Rows {
             best: Best::Unmarked,
         };
         let table = Table {
-            title: format!("What each point gains and costs: the difference to {name}"),
+            title: format!("The difference to {name}"),
             label: "point".to_owned(),
             columns: measures.iter().map(column).collect(),
             rows: others.map(row).collect(),
@@ -198,7 +197,7 @@ impl Rows {
         fronts.chain(self.on_the_way()).collect()
     }
 
-    /// Where each row ended up; none where nobody knows the cost.
+    /// Final score against cost; `None` unless two rows have both.
     fn front_plot(&self, cost: Measure, gain: Measure) -> Option<String> {
         let point = |row: &Row| Some((cost.shown(row)?, gain.shown(row)?));
         let front = self.front_of(cost, gain);
@@ -210,10 +209,12 @@ impl Rows {
         let drawn: Vec<Trace> = self.rows.iter().enumerate().map(trace).collect();
         let steps: Vec<(f64, f64)> =
             front.iter().filter_map(|&index| point(&self.rows[index])).collect();
-        (!steps.is_empty()).then(|| traces(cost.name, gain.name, &drawn, &steps))
+        // A plot of a single point shows nothing.
+        let count = drawn.iter().filter(|trace| !trace.points.is_empty()).count();
+        (count > 1).then(|| traces(cost.name, gain.name, &drawn, &steps))
     }
 
-    /// How the best rows came to where they are; none where test views were scored at the end alone.
+    /// Score against time during training; `None` without intermediate scores.
     fn on_the_way(&self) -> Option<String> {
         let all = || self.rows.iter().flat_map(|row| &row.progress);
         let least = all().map(|one| one.psnr).fold(f64::NEG_INFINITY, f64::max) - SHOWN_DECIBELS;
@@ -223,12 +224,12 @@ impl Rows {
             Trace { points, ..self.trace(index) }
         };
         let drawn: Vec<Trace> = self.rows.iter().enumerate().take(MAX_NAMES).map(trace).collect();
-        let y_name = format!("{} on the way", PSNR.name);
+        let y_name = format!("{} during training", PSNR.name);
         let has_lines = drawn.iter().any(|trace| trace.points.len() > 1);
         has_lines.then(|| traces(SECONDS.name, &y_name, &drawn, &[]))
     }
 
-    /// What a row looks like in every drawing, without its points.
+    /// Name and colour of a row in every plot.
     fn trace(&self, index: usize) -> Trace {
         let (number, label) = (index + 1, self.label(&self.rows[index], None));
         let title = format!("{number}  {label}");
@@ -236,8 +237,8 @@ impl Rows {
         Trace { name, title, color: index, ..Trace::default() }
     }
 
-    /// A line per row: its settings, mean and standard deviation of every figure, and whether it is on the fronts of PSNR
-    /// against time on the wall and on the processors.
+    /// A line per row: settings, mean and standard deviation of every quantity, and whether it is on the fronts of PSNR
+    /// against wall time and processor time.
     fn costs_csv(&self) -> String {
         let mut header = self.keys.clone();
         header.push("runs".to_owned());
@@ -258,7 +259,7 @@ impl Rows {
         lines.map(|line| line + "\n").collect()
     }
 
-    /// Every figure as JSON, with the differences to the baseline.
+    /// All quantities as JSON, with the differences to the baseline.
     pub(super) fn json(&self, dataset: &Path, failures: &[Failure]) -> Value {
         let scores = self.scores.iter().map(|score| (score.clone(), place(score)));
         let costs = ALL.iter().map(|of| (of.key.to_owned(), of.place.to_owned()));
@@ -348,13 +349,13 @@ mod tests {
             "Gaussians",
             "device, MiB",
         ];
-        assert_eq!(names, expected, "what nothing has is no column");
+        assert_eq!(names, expected, "a quantity that no row has is no column");
         let values = [-2.0, 0.0, -15.0, -30.0, 0.0, 0.0, -1.0].map(Some).to_vec();
         assert_eq!(table.rows[1], ("balanced, steps 5".to_owned(), values));
         assert_eq!(table.rows[2], ("balanced, steps 9".to_owned(), vec![None; 7]));
         let mut lost = rows();
         lost.rows[0].metrics.clear();
-        assert!(lost.differences().is_none(), "there is nothing to differ from");
+        assert!(lost.differences().is_none(), "the baseline is not finished");
     }
 
     #[test]
@@ -365,7 +366,8 @@ mod tests {
         assert_eq!(
             lines[0],
             "preset,steps,runs,psnr,psnr_sd,ssim,ssim_sd,seconds,seconds_sd,processor_seconds,processor_seconds_sd,\
-             joules,joules_sd,steps,steps_sd,gaussians,gaussians_sd,device_bytes,device_bytes_sd,host_bytes,host_bytes_sd,\
+             joules,joules_sd,steps,steps_sd,gaussians,gaussians_sd,device_bytes,\
+             device_bytes_sd,host_bytes,host_bytes_sd,\
              on_front,on_processor_front"
         );
         assert!(

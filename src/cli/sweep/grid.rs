@@ -1,25 +1,25 @@
-//! The points of a sweep: every combination of the values of its axes, and the grids that have a name.
+//! The points of a sweep: all combinations of the values of its axes, and named grids.
 
 use super::point::{ADAPTIVE, ALL_PARTS, Axis, OFFSET, PARTS, PLAIN, PRESET, Point, all_curves};
 use crate::train::{Part, Preset};
 use crate::{Error, Result};
 
-/// The grids that have a name.
+/// The named grids.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(super) enum Grid {
-    /// The paper's: every curve
+    /// Every curve
     Leaderboard,
-    /// The paper's: AP3 with fixed black levels from 0 to 0.2, and the adaptive one
+    /// AP3 with fixed black levels from 0 to 0.2, and the adaptive one
     Offset,
-    /// The paper's: AP3 with alpha from 0.04 to 0.3, and linear
+    /// AP3 with alpha from 0.04 to 0.3, and linear
     Alpha,
-    /// The paper's: ASE with g0 from 1 to 4 at c = 0 and c from 1 to 4 at g0 = 1, and linear
+    /// ASE with g0 or c from 1 to 4, and linear
     Gain,
-    /// Colour alone, each part of LITA-GS alone beside it, and all of them
+    /// 3DGS, each part of LITA-GS added alone, and all parts
     Parts,
     /// The presets draft, fast, balanced and best
     Presets,
-    /// The preset balanced, and single changes of it that trade time for quality
+    /// The preset balanced, and single changes that trade time for quality
     Changes,
 }
 
@@ -27,7 +27,7 @@ pub(super) enum Grid {
 const CHANGES: [(&str, &[&str]); 8] = [
     ("steps", &["500", "1000"]),
     ("stop.gain", &["0.02", "0.1"]),
-    // Steps at a quarter and at half the size of the views; the schedule of `balanced` has 0 and 200.
+    // Steps at a quarter and at half resolution; `balanced` has 0 and 200.
     ("schedule.resolution_steps", &["[0,0]", "[0,1000]"]),
     ("schedule.initial_rate_factor", &["1"]),
     ("max_gaussians", &["2000", "4000"]),
@@ -36,21 +36,21 @@ const CHANGES: [(&str, &[&str]); 8] = [
     ("ssim_weight", &["0"]),
 ];
 
-/// Settings that change what is scored, or against what.
+/// Settings that change the scored images or their references.
 const FIXED: [(&str, &str); 3] = [
     (
         "downscale",
-        "changes what is scored; smaller views of the same scores are --grid schedule.resolution_steps=[0,1000]",
+        "changes the scored images; --grid schedule.resolution_steps=[0,1000] trains at lower resolution only",
     ),
-    ("dataset", "is one for all points"),
-    ("reference", "is what is scored against"),
+    ("dataset", "is common to all points"),
+    ("reference", "is what scores compare with"),
 ];
 
 impl Grid {
-    /// Axis and value of the point that the others are compared with.
+    /// Axis and value of the baseline.
     pub(super) fn baseline(self) -> Option<(&'static str, &'static str)> {
         match self {
-            // The paper's, where the library has it.
+            // The paper's baseline, if the library has it.
             Self::Leaderboard if all_curves().iter().any(|name| name == "softexp") => {
                 Some(("curve", "softexp"))
             }
@@ -99,11 +99,11 @@ impl Grid {
     }
 }
 
-/// The points of the axes, the first varying slowest; those of a grid with a name, where `given` replaces its axes of the
-/// same key and adds to the others.
+/// The points of the axes, the first varying slowest. `given` replaces axes of a named grid with the same key, and
+/// adds to the others.
 ///
 /// # Errors
-/// [`Error::Usage`] where there is no axis, one is given twice, or a fixed black level meets alpha or beta.
+/// [`Error::Usage`] without an axis, for an axis given twice, or for a fixed black level with alpha or beta.
 pub(super) fn points(given: &[Axis], table: Option<Grid>) -> Result<Vec<Point>> {
     for (index, axis) in given.iter().enumerate() {
         if given[..index].iter().any(|other| other.key == axis.key) {
@@ -124,7 +124,7 @@ pub(super) fn points(given: &[Axis], table: Option<Grid>) -> Result<Vec<Point>> 
     };
     let baseline = table.and_then(Grid::baseline).filter(|(key, _)| *key == "curve");
     if let Some((_, curve)) = baseline.filter(|(_, curve)| !has(curve)) {
-        // What shapes the other curves is nothing to the baseline.
+        // Constants of other curves do not concern the baseline.
         let of_others = ["curve", "alpha", "beta", "gain", "base_gain", OFFSET];
         let shared = given.iter().filter(|axis| !of_others.contains(&axis.key.as_str())).cloned();
         grids.push(std::iter::once(Axis::of("curve", &[curve])).chain(shared).collect());
@@ -149,7 +149,7 @@ fn check(grid: &[Axis]) -> Result<()> {
     }
     if has(OFFSET) && (has("alpha") || has("beta")) {
         let problem =
-            "--offset fixes the black level, which --alpha and --beta shape; give one or the other";
+            "--offset fixes the black level that --alpha and --beta compute; give one or the other";
         return Err(Error::Usage(problem.to_owned()));
     }
     Ok(())
@@ -225,7 +225,7 @@ mod tests {
         refused(&[], "empty");
         refused(&[("alpha", "")], "empty");
         refused(&[("alpha", "0.1,,0.2")], "empty");
-        refused(&[("seed", "1,2,1")], "1 is there twice");
+        refused(&[("seed", "1,2,1")], "1 is given twice");
         refused(&[("alpha", "0.1"), ("tone.alpha", "0.2")], "alpha is given twice");
         refused(&[("alpha", "0.1"), ("offset", "0.2")], "--offset");
         refused(&[("downscale", "2,4")], "resolution_steps");

@@ -1,4 +1,4 @@
-//! The leaderboard: a row per point, seeds averaged, the best first. Nothing in it depends on how long anything took.
+//! The leaderboard: a row per point, seeds averaged, the best first. It does not depend on training times.
 
 use std::path::Path;
 
@@ -21,20 +21,22 @@ use crate::results::report::{
 /// The files of a leaderboard.
 pub(super) const FILES: [&str; 3] = ["leaderboard.csv", "leaderboard.md", "index.html"];
 
-/// More lines than this in a plot are no longer told apart.
+/// Lines in a plot beyond which they cannot be told apart.
 const MAX_LINES: usize = 8;
 
-/// The best rows whose pictures are shown.
+/// Number of rows whose images are shown.
 const MAX_PICTURES: usize = 8;
 
-/// The page of a sweep.
+/// The leaderboard of a sweep.
 #[derive(Clone, Debug)]
 pub(super) struct Leaderboard<'a> {
     pub(super) rows: &'a Rows,
     pub(super) title: String,
-    /// The first paragraphs.
+    /// First paragraphs of the page.
     pub(super) intro: Vec<String>,
-    /// delta0 of the adaptive black level.
+    /// Links of the page: address and text.
+    pub(super) links: Vec<[String; 2]>,
+    /// Mean delta0 of the adaptive black level.
     pub(super) adaptive_offset: Option<f64>,
     pub(super) failures: &'a [Failure],
 }
@@ -51,7 +53,7 @@ impl Leaderboard<'_> {
         write_whole(&html, self.html(pictures).as_bytes())
     }
 
-    /// The rows with their scores and, where there is a baseline, how far they are from it.
+    /// The rows with their scores and the differences to the baseline, if there is one.
     pub(super) fn table(&self) -> Table {
         let Rows { keys, rows, scores, .. } = self.rows;
         let (mut columns, baseline) = (vec![], self.rows.baseline());
@@ -129,7 +131,7 @@ impl Leaderboard<'_> {
         text
     }
 
-    /// The first test view with a reference image as it came in, as the best rows show it, and as it should be.
+    /// The first test view with a reference image: photograph, reference, renders of the best rows.
     ///
     /// # Errors
     /// A model cannot be read, or the device is lost.
@@ -154,11 +156,13 @@ impl Leaderboard<'_> {
         let (dark, reference) = (view.loaded()?, view.loaded_reference()?);
         let mut pictures = vec![];
         if let Some(dark) = &dark {
-            // The least that a model must beat.
+            // A model must beat the score of the photograph itself.
             let own = reference.as_ref().and_then(|reference| Scores::of(dark, reference).ok());
             let scores = scored(own.map(|own| own.psnr), own.map(|own| own.ssim));
             pictures.push(picture("photograph", scores, dark));
         }
+        // Second, so that it stays in the row of the best renders.
+        pictures.extend(reference.map(|image| picture("reference", String::new(), &image)));
         for row in &self.rows.rows {
             let is_its = |run: &&Run| run.point.seedless() == row.point && run.metrics().is_some();
             let Some(run) = runs.iter().find(is_its) else { continue };
@@ -166,11 +170,10 @@ impl Leaderboard<'_> {
             let score = |name: &str| metrics["views"][&view.name][name].as_f64();
             let scores = scored(score("psnr"), score("ssim"));
             pictures.push(picture(&self.rows.label(row, None), scores, &run.render(gpu, view)?));
-            if pictures.len() > MAX_PICTURES {
+            if pictures.len() > 1 + MAX_PICTURES {
                 break;
             }
         }
-        pictures.extend(reference.map(|image| picture("reference", String::new(), &image)));
         Ok(Some(Comparison { title: format!("Test view {}", view.name), pictures }))
     }
 
@@ -178,6 +181,7 @@ impl Leaderboard<'_> {
         let report = Report {
             title: self.title.clone(),
             intro: self.notes(),
+            links: self.links.clone(),
             tables: vec![self.table()],
             plots: self.plots(),
             comparisons: pictures.into_iter().collect(),
@@ -190,10 +194,11 @@ impl Leaderboard<'_> {
     pub(super) fn notes(&self) -> Vec<String> {
         let mut notes = self.intro.clone();
         if let Some((_, name)) = self.rows.baseline() {
-            notes.push(format!("Gains are differences to the row of {name}."));
+            notes.push(format!("Gains are differences to {name}."));
         }
         if self.rows.rows.iter().any(Row::knows_references) {
-            notes.push("Rows with reference have targets that know references and are not comparable with the others.".to_owned());
+            notes.push("Rows marked \"with reference\" were trained on targets that know references; they do \
+             not compare with the others.".to_owned());
         }
         let mut against: Vec<&str> = self.rows.rows.iter().filter_map(Row::against).collect();
         against.sort_unstable();
@@ -210,10 +215,10 @@ impl Leaderboard<'_> {
         notes
     }
 
-    /// PSNR against every setting whose values are numbers; where there is none, a bar per row.
+    /// PSNR against every numeric setting; without one, a bar per row.
     fn plots(&self) -> Vec<String> {
         let psnr = column("psnr");
-        // The same line has the same number in every plot.
+        // A line keeps its colour in every plot.
         let mut lines = vec![];
         let numeric =
             self.rows.keys.iter().filter_map(|key| self.against(key, &psnr.name, &mut lines));
@@ -231,7 +236,7 @@ impl Leaderboard<'_> {
         vec![bars(&psnr.name, psnr.digits, &rows)]
     }
 
-    /// A line for every combination of the other settings; none where `key` is no number, or lines are too many.
+    /// A line for each combination of the other settings; `None` if `key` is not numeric, or there are too many lines.
     fn against(&self, key: &str, y_name: &str, known: &mut Vec<String>) -> Option<String> {
         let is_special = |value: &str| key == OFFSET && value == ADAPTIVE;
         let values = self.rows.rows.iter().filter_map(|row| row.point.value(key));
@@ -256,7 +261,7 @@ impl Leaderboard<'_> {
                     continue;
                 }
                 Some(value) => vec![(value.parse().ok()?, psnr)],
-                // What has no such setting is level.
+                // A row without this setting is a horizontal line.
                 None => vec![(low, psnr), (high, psnr)],
             };
             let spread = row.extremes("psnr").filter(|_| points.len() == 1);
@@ -272,7 +277,7 @@ impl Leaderboard<'_> {
                 }
             }
         }
-        // A lone point shows nothing of the setting.
+        // A single point shows no dependence.
         lines.retain(|line| line.points.len() > 1);
         for line in &mut lines {
             line.points.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -290,7 +295,7 @@ impl Leaderboard<'_> {
     }
 }
 
-/// How a score of `metrics.json` is shown.
+/// Heading and digits of a score of `metrics.json`.
 fn column(score: &str) -> Column {
     if let Some(measure) = Measure::all().find(|measure| measure.key() == score) {
         return Column { name: measure.title(), digits: 3, best: Best::Least };

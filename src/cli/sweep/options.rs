@@ -1,33 +1,30 @@
-//! The options of `train` as `sweep` takes them: checked like there, kept as text for the command lines of the points.
+//! The options of `train` in `sweep`: checked as in `train`, kept as text for the commands of the points.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use clap::builder::ValueParser;
 use clap::error::ErrorKind;
 use clap::parser::ValueSource;
 use clap::{Arg, ArgMatches, Args, Command, Error, FromArgMatches, ValueHint};
 
+use super::GRID;
 use crate::cli::train::TrainOptions;
 
-/// The options of `train` that take a list here: their name there, their name here, what the list holds.
+/// Options of `train` that take a list here: name in `train`, name here, help.
 const LISTS: [(&str, &str, &str); 5] = [
-    ("preset", "presets", "Presets, each with the plan that it makes for the photographs"),
-    ("curve", "curves", "Tone curves by name or file, or `all` [default: {tone.curve}]"),
-    (
-        "gain",
-        "gain",
-        "Values of c: how much a brighter photograph raises the curve's gain, or auto",
-    ),
-    ("theta", "theta", "Means that the linear curve aims at"),
-    ("seed", "seeds", "Seeds; scores are means over them, with their standard deviation"),
+    ("preset", "presets", "Presets, each with its plan for the photographs"),
+    ("curve", "curves", "Tone curves by name or file, or all [default: {tone.curve}]"),
+    ("gain", "gain", "Values of the gain constant c, or auto"),
+    ("theta", "theta", "Target means of the curve linear"),
+    ("seed", "seeds", "Seeds to average over"),
 ];
 
-/// What the command line says of the options of `train`.
+/// The options of `train` on the command line.
 #[derive(Clone, Debug)]
 pub(super) struct Options {
-    /// What every point is trained with, as arguments in the order of `train --help`.
+    /// Common arguments of all points, in the order of `train`.
     pub(super) shared: Vec<String>,
-    /// The option's name in `train` and the list that was given for it.
+    /// Option of `train` and its list.
     pub(super) lists: Vec<(&'static str, String)>,
 }
 
@@ -35,7 +32,7 @@ impl Args for Options {
     fn augment_args(command: Command) -> Command {
         LISTS.iter().fold(TrainOptions::augment_args(command), |command, &(option, name, help)| {
             command.mut_arg(option, |arg| {
-                let arg = arg.long(name).value_name("LIST").help(help).help_heading("The grid");
+                let arg = arg.long(name).value_name("LIST").help(help).help_heading(GRID);
                 let arg = if name == option { arg } else { arg.visible_alias(option) };
                 arg.value_parser(ValueParser::string())
             })
@@ -78,30 +75,27 @@ impl Options {
     fn push(&mut self, arg: &Arg, value: String) -> Result<(), Error> {
         let long = arg.get_long().unwrap_or_default();
         if !arg.get_action().takes_values() {
-            // A flag's raw value is whether it was given.
+            // The raw value of a flag is a boolean.
             self.shared.push(format!("--{long}"));
             return Ok(());
         }
         let is_path = arg.get_value_hint() == ValueHint::AnyPath;
-        let value = if is_path { text(&absolute(Path::new(&value))?)? } else { value };
+        let absolute = |path| {
+            super::absolute(path).map_err(|error| Error::raw(ErrorKind::ValueValidation, error))
+        };
+        let value = if is_path { absolute(Path::new(&value))? } else { value };
         self.shared.extend(pair(long, &value));
         Ok(())
     }
 }
 
-/// An option with its value, as arguments; a value that looks like an option itself is joined to it.
+/// An option and its value as arguments, joined if the value looks like an option.
 pub(super) fn pair(long: &str, value: &str) -> Vec<String> {
     if value.starts_with('-') {
         vec![format!("--{long}={value}")]
     } else {
         vec![format!("--{long}"), value.to_owned()]
     }
-}
-
-fn absolute(path: &Path) -> Result<PathBuf, Error> {
-    std::path::absolute(path).map_err(|error| {
-        Error::raw(ErrorKind::ValueValidation, format!("{}: {error}", path.display()))
-    })
 }
 
 fn text(value: &Path) -> Result<String, Error> {

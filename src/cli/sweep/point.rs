@@ -1,4 +1,4 @@
-//! A point of a sweep: what distinguishes one run from the others.
+//! A point of a sweep: the settings in which its run differs from the others.
 
 use std::path::Path;
 
@@ -7,22 +7,22 @@ use crate::photographs::tone::ToneCurve;
 use crate::train::Part;
 use crate::{Error, Result};
 
-/// The axis of presets, over which the other settings win.
+/// The axis of presets, which other settings override.
 pub(super) const PRESET: &str = "preset";
-/// The axis of the model's parts: [`PLAIN`], [`ALL_PARTS`], or parts by name.
+/// The axis of model parts: [`PLAIN`], [`ALL_PARTS`], or parts by name.
 pub(super) const PARTS: &str = "parts";
-/// On that axis: colour alone.
+/// On that axis: no part.
 pub(super) const PLAIN: &str = "plain";
 /// On that axis: every part.
 pub(super) const ALL_PARTS: &str = "all";
-/// The axis whose points are averaged.
+/// The axis that is averaged over.
 pub(super) const SEED: &str = "seed";
 /// The axis of fixed black levels.
 pub(super) const OFFSET: &str = "offset";
 /// On that axis: the black level of alpha and beta.
 pub(super) const ADAPTIVE: &str = "adaptive";
 
-/// The axes with a name of their own, in the order of a point's name, and the setting behind each.
+/// Short names of axes, in the order of a point's name, with their settings.
 const AXES: [(&str, &str); 10] = [
     (PRESET, PRESET),
     (PARTS, PARTS),
@@ -36,19 +36,19 @@ const AXES: [(&str, &str); 10] = [
     (SEED, SEED),
 ];
 
-/// A setting and the values it takes.
+/// A setting with a list of values.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Axis {
-    /// A name of [`AXES`], or the dotted path of any other setting.
+    /// A name of [`AXES`], or the key of any other setting.
     pub(super) key: String,
     pub(super) values: Vec<String>,
 }
 
 impl Axis {
-    /// The axis of a comma-separated list; commas within brackets and quotes separate nothing.
+    /// The axis of a comma-separated list; commas within brackets or quotes do not separate.
     ///
     /// # Errors
-    /// [`Error::Usage`] for a value that is empty or there twice.
+    /// [`Error::Usage`] for empty or duplicate values.
     pub(super) fn new(key: &str, list: &str) -> Result<Self> {
         let key = key.trim();
         let name = AXES.iter().find(|(_, setting)| *setting == key).map_or(key, |(name, _)| name);
@@ -64,7 +64,7 @@ impl Axis {
                     );
                 }
                 if axis.values.contains(&value) {
-                    return refused(format!("{value} is there twice"));
+                    return refused(format!("{value} is given twice"));
                 }
                 axis.values.push(value);
             }
@@ -79,7 +79,7 @@ impl Axis {
     /// The axis of `KEY=LIST`, as `--grid` takes it.
     ///
     /// # Errors
-    /// As [`Self::new`]; the list is missing.
+    /// As [`Self::new`], and if the list is missing.
     pub(super) fn parse(text: &str) -> Result<Self> {
         let (key, list) = text
             .split_once('=')
@@ -87,14 +87,14 @@ impl Axis {
         Self::new(key, list)
     }
 
-    /// Where its values stand in a point's name: those of [`AXES`] first, the seed last.
+    /// Sort key of axes in a point's name: those of [`AXES`] first, the seed last.
     pub(super) fn order(&self) -> (usize, &str) {
         let named = AXES.iter().position(|(name, _)| *name == self.key && *name != SEED);
         (named.unwrap_or(AXES.len() + usize::from(self.key == SEED)), &self.key)
     }
 }
 
-/// The parts of a list.
+/// Splits a list at commas outside of brackets and quotes.
 fn split(list: &str) -> Vec<String> {
     let (mut parts, mut depth, mut quote) = (vec![String::new()], 0, None);
     for character in list.chars() {
@@ -121,17 +121,17 @@ pub(super) fn all_curves() -> Vec<String> {
     ToneCurve::ALL.iter().map(|curve| curve.name().to_owned()).collect()
 }
 
-/// A curve as a point names it: a file from anywhere, any other by its name.
+/// The argument for a curve: an absolute path if it is a file, else its name.
 fn curve(name: &str) -> String {
     let is_file = name.contains(['.', '/']) && Path::new(name).is_file();
     let path = is_file.then(|| std::path::absolute(name).ok()).flatten();
     path.and_then(|path| path.to_str().map(str::to_owned)).unwrap_or_else(|| name.to_owned())
 }
 
-/// What distinguishes a run from the others.
+/// The settings of a point.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Point {
-    /// Axis and value, in the order of the name.
+    /// Axes and values, in the order of the name.
     pub(super) values: Vec<(String, String)>,
 }
 
@@ -140,14 +140,13 @@ impl Point {
         self.values.iter().find(|(own, _)| own == key).map(|(_, value)| value.as_str())
     }
 
-    /// The same without its seed.
+    /// The point without its seed.
     pub(super) fn seedless(&self) -> Self {
         let values = self.values.iter().filter(|(key, _)| key != SEED);
         Self { values: values.cloned().collect() }
     }
 
-    /// The name of its run directory, such as `curve=ap3,seed=10`: the same in every sweep that has the point, and no
-    /// other point's.
+    /// The unique name of its run directory, such as `curve=ap3,seed=10`, the same in every sweep.
     pub(super) fn name(&self) -> String {
         const LONGEST: usize = 120;
         let pairs: Vec<String> =
@@ -159,14 +158,14 @@ impl Point {
         if name == exact {
             return name;
         }
-        // FNV-1a tells apart what the replacements made alike.
+        // The FNV-1a hash keeps names unique after replacements.
         let hash = exact
             .bytes()
             .fold(0x811c_9dc5_u32, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193));
         format!("{name}-{hash:08x}")
     }
 
-    /// What it adds to the arguments of `train`.
+    /// Its arguments for `train`.
     pub(super) fn arguments(&self) -> Vec<String> {
         let set = |key: &str, value: &str| pair("set", &format!("{key}={value}"));
         let of = |(key, value): &(String, String)| match key.as_str() {

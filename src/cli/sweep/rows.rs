@@ -1,4 +1,4 @@
-//! The points of a sweep with what their finished runs came to: seeds together, the best PSNR first.
+//! The results of a sweep: points with seeds averaged, best PSNR first.
 
 use serde_json::Value;
 
@@ -7,34 +7,34 @@ use super::run::Run;
 use crate::results::eval::{AGAINST, WITH_REFERENCE};
 use crate::results::run::{Progress, load_progress};
 
-/// What a sweep found.
+/// The results of a sweep.
 #[derive(Clone, Debug)]
 pub(super) struct Rows {
-    /// The axes along which points differ, in the order of the names; never the seed.
+    /// The axes along which points differ, without the seed.
     pub(super) keys: Vec<String>,
-    /// The best PSNR first, points without a score last.
+    /// Best PSNR first, points without a score last.
     pub(super) rows: Vec<Row>,
     /// Names of the scores, as `metrics.json` has them below `mean`.
     pub(super) scores: Vec<String>,
-    /// Every seed.
+    /// All seeds.
     pub(super) seeds: Vec<String>,
-    /// Axis and value of the row that the others are compared with.
+    /// Axis and value of the baseline.
     baseline: Option<(&'static str, &'static str)>,
 }
 
-/// A point over its seeds.
+/// A point with all its seeds.
 #[derive(Clone, Debug)]
 pub(super) struct Row {
     /// The point without its seed.
     pub(super) point: Point,
-    /// `metrics.json` of every finished run.
+    /// `metrics.json` of each finished run.
     pub(super) metrics: Vec<Value>,
-    /// Scores on the way of the first run that finished.
+    /// Intermediate scores of the first finished run.
     pub(super) progress: Vec<Progress>,
 }
 
 impl Rows {
-    /// Reads what the finished ones of `runs` came to; a point without any has a row, too.
+    /// Reads the results of the finished `runs`; points without one have a row, too.
     pub(super) fn new(runs: &[Run], baseline: Option<(&'static str, &'static str)>) -> Self {
         let (mut rows, mut scores, mut seeds): (Vec<Row>, Vec<String>, Vec<String>) =
             Default::default();
@@ -68,7 +68,7 @@ impl Rows {
         seeds: Vec<String>,
         baseline: Option<(&'static str, &'static str)>,
     ) -> Self {
-        // Stable: equals keep the order of the grid.
+        // Stable, so that equal rows keep the order of the grid.
         let psnr = |row: &Row| row.score("psnr").unwrap_or(f64::NEG_INFINITY);
         rows.sort_by(|a, b| psnr(b).total_cmp(&psnr(a)));
         Self { keys: differing(&rows), rows, scores, seeds, baseline }
@@ -78,7 +78,7 @@ impl Rows {
         self.seeds.len() > 1
     }
 
-    /// What distinguishes the row, but for `except`.
+    /// The settings of a row as a label, without the axis `except`.
     pub(super) fn label(&self, row: &Row, except: Option<&str>) -> String {
         let speaks = |key: &str| {
             ["curve", PRESET, PARTS].contains(&key) || (except.is_none() && self.keys.len() == 1)
@@ -89,14 +89,14 @@ impl Rows {
         };
         let keys = self.keys.iter().filter(|key| Some(key.as_str()) != except);
         let words: Vec<String> = keys.filter_map(word).collect();
-        // What has no setting of its own is what the others change.
+        // A row without settings of its own is the one that others change.
         let whole = || row.point.values.last().map_or("all", |(_, value)| value).to_owned();
         let label = if words.is_empty() && except.is_none() { whole() } else { words.join(", ") };
         if row.knows_references() { format!("{label} (with reference)") } else { label }
     }
 
-    /// The row that others are compared with, and what it is called: of those with the value of the baseline the one with
-    /// the fewest settings. None where there are several such.
+    /// The baseline and its name: of the rows with its value, the one with the fewest settings. `None` if there are
+    /// several.
     pub(super) fn baseline(&self) -> Option<(&Row, String)> {
         let (key, value) = self.baseline?;
         let matching = || self.rows.iter().filter(|row| row.point.value(key) == Some(value));
@@ -108,12 +108,12 @@ impl Rows {
 }
 
 impl Row {
-    /// The mean over the finished runs of the number at `place` in `metrics.json`.
+    /// Mean over finished runs of the number at `place` in `metrics.json`.
     pub(super) fn mean(&self, place: &str) -> Option<f64> {
         mean(&self.values(place))
     }
 
-    /// The standard deviation of a sample of at least two.
+    /// Sample standard deviation; `None` for fewer than two runs.
     pub(super) fn deviation(&self, place: &str) -> Option<f64> {
         let values = self.values(place);
         let mean = mean(&values).filter(|_| values.len() > 1)?;
@@ -121,12 +121,12 @@ impl Row {
         Some((squares.sum::<f64>() / (values.len() - 1) as f64).sqrt())
     }
 
-    /// The mean of a score.
+    /// Mean of a score.
     pub(super) fn score(&self, name: &str) -> Option<f64> {
         self.mean(&place(name))
     }
 
-    /// The least and the greatest of a score of at least two runs.
+    /// Minimum and maximum of a score; `None` for fewer than two runs.
     pub(super) fn extremes(&self, name: &str) -> Option<[f64; 2]> {
         let values = self.values(&place(name));
         let least = values.iter().copied().min_by(f64::total_cmp)?;
@@ -134,18 +134,18 @@ impl Row {
         (values.len() > 1).then_some([least, greatest])
     }
 
-    /// Whether a run's targets knew references.
+    /// Whether the targets of a run know references.
     pub(super) fn knows_references(&self) -> bool {
         self.metrics.iter().any(|metrics| metrics.get(WITH_REFERENCE).is_some())
     }
 
-    /// What its scores are against, where that is no reference image.
+    /// What scores compare with, unless these are reference images.
     pub(super) fn against(&self) -> Option<&str> {
         self.metrics.iter().find_map(|metrics| metrics.get(AGAINST)?.as_str())
     }
 
     fn values(&self, place: &str) -> Vec<f64> {
-        // Without a denoiser what is scored is R_0.
+        // Without a denoiser, the scored image is R_0.
         let value = |metrics: &Value| {
             let found =
                 metrics.pointer(place).or_else(|| metrics.pointer(&place.replace("/r0", "")));
@@ -155,12 +155,12 @@ impl Row {
     }
 }
 
-/// Where a score stands in `metrics.json`.
+/// The place of a score in `metrics.json`.
 pub(super) fn place(score: &str) -> String {
     format!("/mean/{score}")
 }
 
-/// `psnr` of a score, `r0/psnr` of one of R_0.
+/// Names of scores: `psnr`, or `r0/psnr` for R_0.
 fn score_names(mean: &Value) -> Vec<String> {
     let names = |(name, value): (&String, &Value)| match value.as_object() {
         Some(inner) => inner.keys().map(|key| format!("{name}/{key}")).collect(),
@@ -169,10 +169,10 @@ fn score_names(mean: &Value) -> Vec<String> {
     mean.as_object().into_iter().flatten().flat_map(names).collect()
 }
 
-/// The axes along which the points differ; all of them where there is one point.
+/// The axes along which the points differ; all axes if there is one point.
 fn differing(rows: &[Row]) -> Vec<String> {
     let mut keys: Vec<&String> = vec![];
-    // The point with the most axes has them in order.
+    // The point with the most axes determines the order.
     let mut points: Vec<&Point> = rows.iter().map(|row| &row.point).collect();
     points.sort_by_key(|point| std::cmp::Reverse(point.values.len()));
     for (key, _) in points.iter().flat_map(|point| &point.values) {
@@ -191,7 +191,7 @@ fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
-/// A number of a CSV file, all of its digits; empty where there is none.
+/// A number for CSV with all digits; empty for `None`.
 pub(super) fn number(value: Option<f64>) -> String {
     value.map(|value| value.to_string()).unwrap_or_default()
 }

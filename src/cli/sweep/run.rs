@@ -1,4 +1,4 @@
-//! A run of a sweep: a `nightsplat train` process with a run directory of its own.
+//! A run of a sweep: a `nightsplat train` process with its run directory.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::point::{PRESET, Point};
+use crate::cli::quoted;
 use crate::cli::train::TrainArgs;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::View;
@@ -16,41 +17,31 @@ use crate::train::TrainConfig;
 use crate::train::diagnose::Plan;
 use crate::{Error, Result};
 
-/// A point with everything that training it takes.
+/// A point with the arguments of its training.
 #[derive(Clone, Debug)]
 pub(super) struct Run {
     pub(super) name: String,
     pub(super) point: Point,
     pub(super) folder: PathBuf,
-    /// Of `nightsplat`.
+    /// Arguments of `nightsplat`.
     pub(super) arguments: Vec<String>,
-    /// What these arguments come to, without a plan.
+    /// Configuration by these arguments, without a plan.
     pub(super) config: TrainConfig,
     args: TrainArgs,
 }
 
-/// What the points of a sweep have in common.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Common<'a> {
-    /// An absolute path.
-    pub(super) dataset: &'a str,
-    /// Options of `train`, as arguments.
-    pub(super) shared: &'a [String],
-    /// The absolute path of the folder with all run directories.
-    pub(super) out: &'a str,
-}
-
 impl Run {
-    /// The run of a point. One with a preset trains as `train --preset` does, by the plan that this makes for the photographs;
-    /// others differ by what their points say alone.
+    /// The run of a point with the options `shared`, in a folder of `out`; both paths are absolute. Points with a
+    /// preset train with its plan for the photographs, as `train --preset` does; others train without a plan, so that
+    /// they differ in nothing but their settings.
     ///
     /// # Errors
-    /// What `train` would say of these options, after the point's name.
-    pub(super) fn new(point: Point, common: Common<'_>) -> Result<Self> {
+    /// Those of `train` for these options, after the name of the point.
+    pub(super) fn new(point: Point, dataset: &str, shared: &[String], out: &Path) -> Result<Self> {
         let name = point.name();
-        let folder = Path::new(common.out).join(&name);
-        let mut arguments = vec!["train".to_owned(), common.dataset.to_owned()];
-        arguments.extend_from_slice(common.shared);
+        let folder = out.join(&name);
+        let mut arguments = vec!["train".to_owned(), dataset.to_owned()];
+        arguments.extend_from_slice(shared);
         arguments.extend(point.arguments());
         let end = ["--out".to_owned(), unicode(&folder)?, "--resume".to_owned()];
         let mut args: TrainArgs = parsed(&name, arguments.iter().chain(&end))?;
@@ -63,7 +54,7 @@ impl Run {
         Ok(Self { name, point, folder, arguments, config, args })
     }
 
-    /// Whether the run directory holds this run to its end.
+    /// Whether the run directory holds this run, finished.
     pub(super) fn is_finished(&self) -> Result<bool> {
         let path = self.folder.join("config.toml");
         if !path.exists() {
@@ -74,7 +65,7 @@ impl Run {
         let plan = plan.map(|path| Plan::read(&path)).transpose()?;
         let own = self.args.options.config(&self.args.dataset, plan.as_ref())?;
         let own = own.with_absolute_paths();
-        // A run records the tile and the frame that it took; where none is asked for, any is right.
+        // A run records its tile and frame; if none is required, any matches.
         let (tile, frame) = (own.tile.and(found.tile), own.frame.and(found.frame));
         let found = TrainConfig { tile, frame, ..found };
         if found != own {
@@ -85,13 +76,13 @@ impl Run {
         Ok(self.metrics().is_some())
     }
 
-    /// What `metrics.json` says, where the run is finished.
+    /// `metrics.json`, if the run is finished.
     pub(super) fn metrics(&self) -> Option<serde_json::Value> {
         let text = std::fs::read(self.folder.join("metrics.json")).ok()?;
         serde_json::from_slice(&text).ok()
     }
 
-    /// What the finished run makes of a view.
+    /// Renders a view with the model of the finished run.
     ///
     /// # Errors
     /// Its model cannot be read, or the device is lost.
@@ -104,7 +95,7 @@ impl Run {
         Ok(model_renderer.render(view)?.output().clone())
     }
 
-    /// The command as a shell takes it, which may be given any number of times.
+    /// The command for a shell; repeating it is safe.
     pub(super) fn command_line(&self) -> Result<String> {
         let program = std::env::current_exe()
             .map_err(|error| Error::input("nightsplat", format!("cannot be found: {error}")))?;
@@ -113,10 +104,10 @@ impl Run {
     }
 }
 
-/// What a command makes of its arguments, the first of which is its name.
+/// Parses the arguments of a command, its name first.
 ///
 /// # Errors
-/// What it says of them, after `what` they are for.
+/// Those of the parser, after the name `what`.
 pub(in crate::cli) fn parsed<A: Args>(
     what: &str,
     arguments: impl IntoIterator<Item: Into<OsString> + Clone>,
@@ -129,7 +120,7 @@ pub(in crate::cli) fn parsed<A: Args>(
     })
 }
 
-/// The first line in which two files differ.
+/// The first line of `found` that `wanted` lacks.
 pub(super) fn difference(found: &str, wanted: &str) -> String {
     let wanted: Vec<&str> = wanted.lines().collect();
     let is_new = |line: &&str| !wanted.contains(line);
@@ -137,7 +128,7 @@ pub(super) fn difference(found: &str, wanted: &str) -> String {
     line.to_owned()
 }
 
-/// The path as arguments have it, from everywhere.
+/// The absolute path as an argument.
 ///
 /// # Errors
 /// It is not Unicode.
@@ -151,27 +142,4 @@ pub(super) fn unicode(path: &Path) -> Result<String> {
     path.to_str().map(str::to_owned).ok_or_else(|| {
         Error::Usage(format!("{} is not Unicode; move it to a path that is", path.display()))
     })
-}
-
-/// A word that a POSIX shell reads back as it is.
-fn quoted(word: &str) -> String {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_./=,+:@%".contains(c);
-    if !word.is_empty() && word.chars().all(is_plain) {
-        return word.to_owned();
-    }
-    format!("'{}'", word.replace('\'', "'\\''"))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn words_are_quoted_where_a_shell_needs_it() {
-        assert_eq!(quoted("--set"), "--set");
-        assert_eq!(quoted("curve=ap3,seed=1"), "curve=ap3,seed=1");
-        assert_eq!(quoted("a b"), "'a b'");
-        assert_eq!(quoted("it's"), "'it'\\''s'");
-        assert_eq!(quoted(""), "''");
-    }
 }

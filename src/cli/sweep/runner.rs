@@ -1,9 +1,8 @@
-//! Trains the points that are left, each in a process of its own.
+//! Trains the unfinished points, each in a separate process.
 //!
-//! That process holds a lock on the file `lock` of its run directory, inherited as its standard input, until it ends:
-//! a sweep that is killed may leave a process at work, and the next one waits for it instead of writing beside it. Two
-//! sweeps in one folder share its points in the same way. A sweep that is asked to stop asks its processes, and waits
-//! until they have saved.
+//! The process holds a lock on the file `lock` of its run directory, inherited as standard input, until it ends. If a
+//! sweep is killed, its processes may continue; the next sweep waits for them. Two sweeps in the same folder share
+//! their points in the same way. A sweep that receives a signal passes it on, and waits for its processes to save.
 
 use std::fs::{File, TryLockError};
 use std::io::Write;
@@ -11,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use indicatif::ProgressBar;
 
@@ -20,19 +19,19 @@ use crate::cli::signals;
 use crate::results::run::Requests;
 use crate::{Error, Result, Stop};
 
-/// A point that did not finish, and why.
+/// A point that failed.
 #[derive(Clone, Debug)]
 pub(super) struct Failure {
     /// The point's name.
     pub(super) name: String,
-    /// What its process said last.
+    /// Last error of its process.
     pub(super) reason: String,
 }
 
-/// Trains every run that is not finished, `jobs` at once; what failed, in the order of `runs`.
+/// Trains `runs`, `jobs` at once, and returns the failures in their order.
 ///
 /// # Errors
-/// [`Error::BatchStopped`] where that was asked for, or the time of a run was up: `all` runs are to be in `folder`.
+/// [`Error::BatchStopped`] after a signal, or if the time of a run is up; `all` counts the runs of `folder`.
 pub(super) fn train(
     runs: &[&Run],
     jobs: usize,
@@ -42,6 +41,7 @@ pub(super) fn train(
     let requests = signals::requests()?;
     let time_up = AtomicBool::new(false);
     bar.enable_steady_tick(Duration::from_secs(1));
+    let begin = Instant::now();
     let (next, busy, failures) = (AtomicUsize::new(0), Mutex::new(vec![]), Mutex::new(vec![]));
     let finish = |index: usize, waits: bool| {
         let run: &Run = runs[index];
@@ -53,12 +53,17 @@ pub(super) fn train(
         };
         bar.set_message(run.name.clone());
         bar.inc(1);
-        match failure {
-            None => bar.suspend(|| tracing::info!("{}: finished", run.name)),
-            Some(reason) => {
-                bar.suspend(|| tracing::warn!("{} failed: {reason}", run.name));
-                locked(&failures).push((index, Failure { name: run.name.clone(), reason }));
-            }
+        if bar.is_hidden() {
+            let (done, of) = (bar.position(), runs.len());
+            let state = if failure.is_none() { "finished" } else { "failed" };
+            let seconds = begin.elapsed().as_secs_f64();
+            let line = format!("{done} of {of}: {} {state}, {seconds:.0} s", run.name);
+            // A closed standard error does not stop the sweep.
+            let _ = writeln!(std::io::stderr(), "{line}");
+        }
+        if let Some(reason) = failure {
+            bar.suspend(|| tracing::warn!("{} failed: {reason}", run.name));
+            locked(&failures).push((index, Failure { name: run.name.clone(), reason }));
         }
     };
     std::thread::scope(|scope| {
@@ -71,7 +76,7 @@ pub(super) fn train(
                     }
                     finish(index, false);
                 }
-                // What other processes are at comes last.
+                // Points of other processes come last.
                 loop {
                     let index = locked(&busy).pop();
                     let Some(index) = index.filter(|_| requests.stops().is_none()) else { break };
@@ -91,21 +96,21 @@ pub(super) fn train(
     Ok(failures.into_iter().map(|(_, failure)| failure).collect())
 }
 
-/// A list that stays usable where another thread panicked.
+/// Locks a list, even if another thread panicked.
 fn locked<T>(list: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     list.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
-/// How a run stands.
+/// The state of a run.
 enum Outcome {
     Finished,
-    /// Another process is at it.
+    /// Another process trains it.
     Busy,
-    /// It can go on from what it saved.
+    /// It stopped with a checkpoint.
     Saved,
 }
 
-/// Trains a run unless it is finished, or another process is at it and `waits` is false.
+/// Trains a run unless it is finished, or another process trains it and `waits` is false.
 fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
     let unusable =
         |error: std::io::Error| Error::output(&run.folder, format!("cannot be used: {error}"));
@@ -114,7 +119,7 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
     match lock.try_lock() {
         Err(TryLockError::WouldBlock) if waits => lock.lock().map_err(unusable)?,
         Err(TryLockError::WouldBlock) => return Ok(Outcome::Busy),
-        // A file system without locks: one sweep at a time is all that it can have.
+        // Without file locks, only one sweep at a time is safe.
         Err(TryLockError::Error(_)) | Ok(()) => {}
     }
     if run.is_finished()? {
@@ -129,7 +134,7 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
         .stdin(lock.try_clone().map_err(unusable)?)
         .stdout(output.try_clone().map_err(unusable)?)
         .stderr(output);
-    // A signal of the terminal is for us: what it asks of a process is asked once.
+    // Signals of the terminal reach this process only, which passes them on once.
     #[cfg(unix)]
     {
         use std::os::unix::process::CommandExt;
@@ -146,16 +151,16 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
     }
     let printed = std::fs::read(&log).unwrap_or_default();
     let reason = last_words(&String::from_utf8_lossy(&printed), status);
-    Err(Error::output(&run.folder, format!("{reason}; log.txt says more")))
+    Err(Error::output(&run.folder, format!("{reason}; see log.txt")))
 }
 
-/// This program; on Linux as it runs, even where another version has taken its file's place: all points are trained by one.
+/// This program; on Linux the running one, even if its file was replaced, so that all points use the same version.
 fn this_program() -> std::io::Result<PathBuf> {
     let running = Path::new("/proc/self/exe");
     if running.exists() { Ok(running.to_owned()) } else { std::env::current_exe() }
 }
 
-/// Waits for a process, which is asked to save and stop once we are.
+/// Waits for a process, passing on a request to stop.
 fn ended(child: &mut Child, requests: &Requests) -> std::io::Result<ExitStatus> {
     const POLL: Duration = Duration::from_millis(50);
     let mut is_told = false;
@@ -164,7 +169,7 @@ fn ended(child: &mut Child, requests: &Requests) -> std::io::Result<ExitStatus> 
             return Ok(status);
         }
         if requests.stops().is_some() && !std::mem::replace(&mut is_told, true) {
-            // The standard library only knows how to kill.
+            // The standard library cannot send SIGTERM.
             let kill = format!("kill -TERM {}", child.id());
             Command::new("sh").args(["-c", &kill]).status()?;
         }
@@ -172,7 +177,7 @@ fn ended(child: &mut Child, requests: &Requests) -> std::io::Result<ExitStatus> 
     }
 }
 
-/// The last error of a log; where it has none, how the process ended.
+/// The last error in a log, or else the exit status.
 fn last_words(log: &str, status: ExitStatus) -> String {
     let error = log.lines().rev().find_map(|line| line.strip_prefix("error: "));
     error.map_or_else(|| status.to_string(), str::to_owned)

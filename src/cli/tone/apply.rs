@@ -1,4 +1,4 @@
-//! `nightsplat tone apply`: measure photographs and apply a tone curve to them.
+//! `nightsplat tone apply`: measures photographs and applies a tone curve to them.
 
 mod page;
 mod photographs;
@@ -11,127 +11,138 @@ use serde::Serialize;
 
 use self::page::Page;
 use self::photographs::{Listed, listed};
-use crate::base::output::printable;
-use crate::cli::{ImageFormat, progress_bar, table};
+use crate::base::output::{check_writable, create_folder, printable};
+use crate::cli::{ImageFormat, finish, progress_bar, table, word, words};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
-use crate::photographs::image::{Image, Mask};
+use crate::photographs::image::{ColourTally, Image, Mask, Orientation};
 use crate::photographs::metrics::Scores;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
     CurveChoice, Exposure, GainChoice, MeasuredPhotograph, Profile, SceneTone, Statistics,
     ToneCurve, ToneSettings, all_black,
 };
+use crate::photographs::white_balance::WhiteBalance;
 use crate::results::eval;
 use crate::results::report::Distribution;
 use crate::{Error, Result};
 
-/// Apply a tone curve to a photograph, a folder of them or a dataset, and tell what that does.
+/// Apply a tone curve to photographs, and measure the effect.
 #[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, clap::Args)]
 pub struct ApplyArgs {
-    /// A photograph (PNG, JPEG, WebP, TIFF or EXR) or a folder of them, turned upright, or a dataset's, as stored and not undistorted
+    /// Photograph (PNG, JPEG, WebP, TIFF, EXR), folder of photographs, or dataset
+    ///
+    /// Photograph (PNG, JPEG, WebP, TIFF, EXR), folder of photographs, or dataset. Photographs are turned upright by
+    /// Exif; those of a dataset are taken as stored, and not undistorted.
     pub input: PathBuf,
-    /// The curve: a name that `nightsplat tone list` lists, or a .toml, .csv or .cube file
-    #[arg(long, value_name = "NAME|FILE", default_value_t = ToneSettings::default().curve.into())]
+    /// Tone curve: a name from `nightsplat tone list`, or a .toml, .csv or .cube file
+    #[arg(long, value_name = "NAME|FILE", value_parser = words::curves::<CurveChoice>())]
+    #[arg(default_value_t = ToneSettings::default().curve.into())]
     pub curve: CurveChoice,
-    /// A camera profile that `nightsplat tone fit --profile` made, in place of a curve; scores are labelled: they know its references
+    /// Camera profile from `nightsplat tone fit --profile`, in place of a curve; scores are marked as knowing its
+    /// references
     #[arg(long, value_name = "FILE", conflicts_with_all = ["curve", "gain", "brightness", "colour", "theta"])]
     pub profile: Option<PathBuf>,
-    /// The folder to write to, names are kept; made if it does not exist. Without it nothing is written
+    /// Folder for the results, under the same names [default: write nothing]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// c: how much a brighter photograph raises the gain, or auto: the gain that the photographs ask for, as the curve auto has it [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
+    /// Gain constant c of the curve, or auto to measure the gain, as the curve auto does [default: {tone.gain_c of
+    /// ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
     #[arg(long, value_name = "C|auto")]
     pub gain: Option<GainChoice>,
-    /// The mean luminance of the results, 0.1 to 0.9, where the gain is automatic [default: found between 0.44 and 0.54]
+    /// Mean luminance of the results, 0.1 to 0.9, with an automatic gain [default: chosen between 0.44 and 0.54]
     #[arg(long, value_name = "T")]
     pub brightness: Option<f64>,
-    /// lambda: how much of the curve auto keeps the ratios of the channels, 0 to 1 [default: a third for a dataset, else none]
+    /// Share of the curve auto that keeps the ratios of the channels, 0 to 1 [default: 1/3 for a dataset, else 0]
     #[arg(long, value_name = "L")]
     pub colour: Option<f64>,
-    /// The mean that linear scaling aims at [default: {tone.theta}]
+    /// Target mean of the curve linear [default: {tone.theta}]
     #[arg(long, value_name = "T")]
     pub theta: Option<f64>,
-    /// One curve for all: percentiles and means are averaged over the training photographs
+    /// Use the mean statistics of all training photographs for each
     #[arg(long)]
     pub scene_statistics: bool,
-    /// Normal-light photographs to score against: a folder with the same names, or a file for one photograph
+    /// White balance before anything is measured, as in `train`: R,G,B, kelvin, VIEW,x,y,w,h or VIEW,x1,y1,..,x4,y4
+    #[arg(long, value_name = "WHITE")]
+    pub white_balance: Option<WhiteBalance>,
+    /// References in normal light to score against: a folder with the same names, or a file
     #[arg(long, value_name = "DIR|FILE")]
     pub reference: Option<PathBuf>,
-    /// Masks (masks/NAME.png or masks/NAME.jpg.png beside the photographs) hide what is white, not what is black
+    /// Masks (masks/NAME.png or masks/NAME.jpg.png) hide white instead of black
     #[arg(long)]
     pub invert_masks: bool,
-    /// Print what was measured as JSON
+    /// Print JSON instead of a table
     #[arg(long)]
     pub json: bool,
-    /// Write a page with the measurements and the distributions of luminance
+    /// Write a page with measurements, histograms and images
     #[arg(long, value_name = "FILE.html")]
     pub report: Option<PathBuf>,
-    /// Further curves on the page
+    /// More curves for the page
     #[arg(long, value_name = "NAME|FILE,..", value_delimiter = ',', requires = "report")]
+    #[arg(value_parser = words::curves::<CurveChoice>())]
     pub compare: Vec<CurveChoice>,
-    /// The files to write: 8- or 16-bit PNG, or float EXR in linear light
+    /// Image format
     #[arg(long, value_enum, default_value_t)]
     pub format: ImageFormat,
-    /// The device: uuid:, pci: or index of `nightsplat doctor`, a part of its name, or cpu [default: the best]
+    /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the best]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 
-/// What is measured of a photograph or of what a curve made of it, on sRGB-encoded values.
+/// Statistics of the sRGB-encoded values of a photograph or of a result.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Measures {
-    /// The 10th percentile of the luminance.
+    /// 10th percentile of the luminance.
     pub p10: f64,
-    /// The 90th percentile of the luminance.
+    /// 90th percentile of the luminance.
     pub p90: f64,
-    /// p10 / p90; 1 where all is black.
+    /// p10 / p90; 1 for a black image.
     pub r: f64,
-    /// The mean of the luminance.
+    /// Mean luminance.
     pub mean_luminance: f64,
-    /// The mean over all channels.
+    /// Mean over all channels.
     pub mean: f64,
-    /// The fraction of the values, over all channels, that are 1 or more.
+    /// Fraction of values of all channels that are 1 or more.
     pub clipped_fraction: f64,
-    /// The skewness of the luminance.
+    /// Skewness of the luminance.
     pub skewness: f64,
 }
 
-/// What `tone apply` tells of a photograph, or of a scene as the mean over its views.
+/// Measurements of a photograph, or their means over a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ToneReport {
-    /// Of the photograph.
+    /// The photograph.
     #[serde(flatten)]
     pub before: Measures,
-    /// The black level that the settings' alpha and beta give this r; the paper's alpha where the curve has none.
+    /// Black level by the curve's alpha and beta, or by the paper's alpha if the curve has none.
     pub delta0: f64,
-    /// Pixels with a value that is NaN or infinite, which are black in the result, and hidden ones: they are in no measure.
+    /// Pixels that are masked, or not finite and thus black in the result; no statistic includes them.
     pub unusable_pixels: usize,
-    /// Of the result.
+    /// The result.
     pub after: Measures,
-    /// k of soft(x; k), whose brightness the result has, where the photographs give it; of a scene that of all together.
+    /// The k of soft(x; k) with the brightness of the result, if measured from the photographs.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gain: Option<f64>,
-    /// The result against the reference image.
+    /// Scores of the result against the reference.
     #[serde(flatten)]
     pub scores: Option<Scores>,
 }
 
-/// What `tone apply` tells.
+/// The output of `tone apply`.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ToneOutput {
-    /// The curve.
+    /// Settings of the curve.
     pub curve: ToneSettings,
-    /// What the results know of references, where they know any.
+    /// The references that the curve was fitted to, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub with_reference: Option<String>,
-    /// How bright the results are to be and why, where the photographs give it.
+    /// The measured exposure, if the gain is automatic.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exposure: Option<Exposure>,
-    /// Means: of measures over the training views, of scores over the test views; over all where nothing says which.
+    /// Means of statistics over training views and of scores over test views; without a split, over all.
     pub scene: ToneReport,
-    /// By name.
+    /// Measurements by view.
     pub views: BTreeMap<String, ToneReport>,
 }
 
@@ -166,20 +177,27 @@ impl Measures {
     }
 }
 
-/// Applies the curve and prints what was measured, as a table or as JSON.
+/// Applies the curve and prints the measurements.
 ///
 /// # Errors
 /// As [`apply`], or standard output cannot be written to.
-pub fn run(args: &ApplyArgs) -> Result<()> {
+pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
     let output = apply(args)?;
-    let text = if args.json {
-        let json = serde_json::to_string_pretty(&output);
-        json.map_err(|error| Error::output("standard output", error.to_string()))? + "\n"
-    } else {
-        text_table(&output)
+    if args.json {
+        return Ok(writeln!(std::io::stdout(), "{}", serde_json::to_string_pretty(&output)?)?);
+    }
+    write!(std::io::stdout(), "{}", text_table(&output))?;
+    let images =
+        args.out.as_ref().map(|out| format!("{} images to {}", output.views.len(), out.display()));
+    let wrote: Vec<String> = images
+        .into_iter()
+        .chain(args.report.iter().map(|page| page.display().to_string()))
+        .collect();
+    let next = match Dataset::is_at(&args.input) {
+        true => format!("nightsplat train {} --out run --curve {}", word(&args.input), args.curve),
+        false => format!("nightsplat pose {} --out scene", word(&args.input)),
     };
-    write!(std::io::stdout().lock(), "{text}")
-        .map_err(|error| Error::output("standard output", error.to_string()))
+    finish(&wrote.join(", "), &next)
 }
 
 fn text_table(output: &ToneOutput) -> String {
@@ -212,14 +230,13 @@ fn text_table(output: &ToneOutput) -> String {
     reason.unwrap_or_default() + &table::aligned(&rows) + &label
 }
 
-/// Maps every photograph and writes it to `args.out` under its own name.
-///
-/// A photograph of several that cannot be used is named in a warning and left out.
+/// Maps every photograph and writes it to `args.out` under its own name. Of several photographs, unusable ones are
+/// skipped with a warning.
 ///
 /// # Errors
-/// [`Error::Usage`] for settings that make no sense; [`Error::Input`] where there is nothing to map, two photographs
-/// would be written to one file, or a reference image is of another size; [`Error::Output`] where a file cannot be
-/// written or a photograph would be replaced; those of the device.
+/// [`Error::Usage`] for invalid settings; [`Error::Input`] if there is nothing to map, two photographs have the same
+/// name, or a reference has another size; [`Error::Output`] if a file cannot be written or a photograph would be
+/// replaced; those of the device.
 pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     let settings = match &args.profile {
         Some(file) => ToneSettings {
@@ -228,11 +245,9 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
         },
         None => settings(args, &args.curve)?,
     };
+    args.out.iter().chain(&args.report).try_for_each(|path| check_writable(path))?;
     let photographs = listed(args)?;
-    if let Some(out) = &args.out {
-        std::fs::create_dir_all(out)
-            .map_err(|error| Error::output(out, format!("cannot be made: {error}")))?;
-    }
+    args.out.iter().try_for_each(|out| create_folder(out))?;
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let mut set =
         CurveOnSet::new(&gpu, settings.clone(), &photographs, (&args.input, args.invert_masks))?;
@@ -255,7 +270,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
                 views.push((photograph, report));
             }
             Err(error @ Error::Input { .. }) if photographs.len() > 1 => {
-                progress.suspend(|| tracing::warn!("left out: {error}"));
+                progress.suspend(|| tracing::warn!("skipped: {error}"));
                 unusable = Some(error);
             }
             Err(error) => return Err(error),
@@ -263,6 +278,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
         progress.inc(1);
     }
     progress.finish_and_clear();
+    set.colours.say();
     let exposure = set.scene.exposure;
     let Some(mut scene) = scene(&views) else {
         let nothing = || Error::input(&args.input, "holds no photograph");
@@ -278,11 +294,11 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     Ok(output)
 }
 
-/// The settings of a curve under the options of the command line.
+/// The settings of a curve with the options of the command line.
 fn settings(args: &ApplyArgs, curve: &CurveChoice) -> Result<ToneSettings> {
     let mut settings = curve.settings()?;
     if *curve == ToneCurve::Auto.into() && !Dataset::is_at(&args.input) {
-        // The references of single pictures are paler than those of scenes.
+        // References of single photographs are less saturated than those of scenes.
         settings.colour = 0.0;
     }
     settings.theta = args.theta.unwrap_or(settings.theta);
@@ -296,16 +312,18 @@ fn settings(args: &ApplyArgs, curve: &CurveChoice) -> Result<ToneSettings> {
     Ok(settings)
 }
 
-/// A curve, and what the photographs of a set have in common for it.
+/// A curve with the statistics that it needs of the whole set.
 struct CurveOnSet {
     pseudo_gt: PseudoGt,
     scene: SceneTone,
-    /// Masks hide what is white.
+    /// Masks hide white.
     inverted: bool,
+    /// What was made of the colours of what is mapped.
+    colours: ColourTally,
 }
 
 impl CurveOnSet {
-    /// Measures the training photographs where the curve of one depends on the others.
+    /// Measures the training photographs if the curve depends on the whole set.
     fn new(
         gpu: &Gpu,
         settings: ToneSettings,
@@ -316,12 +334,13 @@ impl CurveOnSet {
         let mut measured = vec![];
         if settings.scene_statistics || settings.takes_exposure() {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
-                // What cannot be used is named where it would be mapped.
-                let Ok((photograph, gaps)) = loaded(listed, inverted) else { continue };
+                // Unusable photographs are reported when they are mapped.
+                let unsaid = ColourTally::default();
+                let Ok((photograph, gaps)) = loaded(listed, inverted, &unsaid) else { continue };
                 measured.push(MeasuredPhotograph::of(&without(&photograph, &gaps)));
             }
             if measured.is_empty() && settings.scene_statistics {
-                let problem = "--scene-statistics needs training photographs; there are none";
+                let problem = "--scene-statistics needs training photographs, and there are none";
                 return Err(Error::Usage(problem.to_owned()));
             }
         }
@@ -330,10 +349,10 @@ impl CurveOnSet {
             None if measured.is_empty() => SceneTone::default(),
             None => return Err(all_black(input)),
         };
-        Ok(Self { pseudo_gt, scene, inverted })
+        Ok(Self { pseudo_gt, scene, inverted, colours: ColourTally::default() })
     }
 
-    /// What was measured of a photograph, what the curve makes of it, and at which gain.
+    /// Statistics of a photograph, its mapped image and the gain.
     fn result(
         &mut self,
         photograph: &Image,
@@ -349,20 +368,17 @@ impl CurveOnSet {
     }
 }
 
-/// A photograph with those of its pixels that do not count.
-fn loaded(listed: &Listed, inverted: bool) -> Result<(Image, Vec<usize>)> {
-    let (photograph, gaps) = listed.load(inverted)?;
+/// A photograph and the indices of its unusable pixels.
+fn loaded(listed: &Listed, inverted: bool, colours: &ColourTally) -> Result<(Image, Vec<usize>)> {
+    let (photograph, gaps) = listed.load(inverted, colours)?;
     let (photograph, gaps) = listed.turned(photograph, gaps);
     if gaps.len() == photograph.pixel_count() {
-        return Err(Error::input(
-            &listed.input,
-            "has no pixel that is a number and not hidden; export it anew",
-        ));
+        return Err(Error::input(&listed.input, "has no finite, unmasked pixel; export it again"));
     }
     Ok((photograph, gaps))
 }
 
-/// A photograph, what was measured of it, and what the curve made of it.
+/// A photograph with its statistics and its mapped image.
 struct Mapped {
     photograph: Image,
     gaps: Vec<usize>,
@@ -373,8 +389,12 @@ struct Mapped {
 }
 
 fn mapped(set: &mut CurveOnSet, listed: &Listed) -> Result<Mapped> {
-    let (photograph, gaps) = loaded(listed, set.inverted)?;
-    let load = if listed.split.is_none() { Image::load_upright } else { Image::load };
+    let (photograph, gaps) = loaded(listed, set.inverted, &set.colours)?;
+    let load = |path: &PathBuf| {
+        let image = Image::load_counted(path, &set.colours)?;
+        let is_plain = listed.split.is_none();
+        Ok(if is_plain { image.turned(Orientation::of(path)) } else { image })
+    };
     let reference = listed.reference.as_ref().map(load).transpose()?;
     let (statistics, image, gain) = set.result(&photograph, &gaps)?;
     Ok(Mapped { photograph, gaps, statistics, image, gain, reference })
@@ -389,9 +409,9 @@ impl Mapped {
             if size(reference) != size(image) {
                 let path = listed.reference.as_deref().unwrap_or(&listed.input);
                 let (own, other) = (size(reference), size(image));
-                // A wrong folder, not a bad file: it stops the command.
+                // A wrong folder rather than a bad file: stop.
                 return Err(Error::Usage(format!(
-                    "{}: is {own} but {} is {other}; references must be of the photographs' size",
+                    "{}: is {own} but {} is {other}; references must have the size of the photographs",
                     path.display(),
                     listed.input.display()
                 )));
@@ -412,7 +432,7 @@ impl Mapped {
     }
 }
 
-/// The planes without some pixels, ascending.
+/// The planes without the pixels `gaps`, which are ascending.
 fn without<'a>(image: &'a Image, gaps: &[usize]) -> std::borrow::Cow<'a, [f32]> {
     if gaps.is_empty() {
         return (&image.data).into();
@@ -422,7 +442,7 @@ fn without<'a>(image: &'a Image, gaps: &[usize]) -> std::borrow::Cow<'a, [f32]> 
     (0..image.data.len()).filter(is_usable).map(|index| image.data[index]).collect()
 }
 
-/// The means over the views; none of nothing.
+/// Means over the views; `None` if empty.
 fn scene(views: &[(&Listed, ToneReport)]) -> Option<ToneReport> {
     let in_split = |split: Split| {
         let chosen: Vec<ToneReport> = views
@@ -430,7 +450,7 @@ fn scene(views: &[(&Listed, ToneReport)]) -> Option<ToneReport> {
             .filter(|(listed, _)| listed.split.is_none_or(|own| own == split))
             .map(|(_, report)| *report)
             .collect();
-        // A dataset whose photographs of one split are all absent or unusable.
+        // If a split has no usable photograph, take all.
         if chosen.is_empty() { views.iter().map(|(_, report)| *report).collect() } else { chosen }
     };
     let (training, test) = (in_split(Split::Train), in_split(Split::Test));
@@ -446,9 +466,4 @@ fn scene(views: &[(&Listed, ToneReport)]) -> Option<ToneReport> {
         gain: None,
         scores: Scores::mean(&scores),
     })
-}
-
-/// Whether two paths are one file.
-fn is_same_file(a: &Path, b: &Path) -> bool {
-    a.canonicalize().ok().zip(b.canonicalize().ok()).is_some_and(|(a, b)| a == b)
 }

@@ -1,4 +1,4 @@
-//! `nightsplat tone fit`: fit a tone curve to pairs of photographs.
+//! `nightsplat tone fit`: fits a tone curve to pairs of photographs.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -6,8 +6,9 @@ use std::path::PathBuf;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::base::output::write_whole;
+use crate::base::output::{check_writable, write_whole};
 use crate::cli::table::aligned;
+use crate::cli::{finish, word};
 use crate::photographs::fit::{
     Channels, Estimate, Fit, FitOptions, FitScene, HeldOut, Pair, Scores, Weighting,
     cross_validate, fit,
@@ -18,63 +19,63 @@ use crate::{Error, Result};
 mod plot;
 pub mod profile;
 
-/// Fit the constants of a tone curve, or a camera profile, to pairs of photographs, dark and in normal light
+/// Fit a tone curve, or a camera profile, to pairs of dark and normally lit photographs
 #[derive(Clone, Debug, clap::Args)]
 pub struct FitArgs {
-    /// Folders of pairs: each with `low` and `high` (or `normal`, or `images`) inside, files of the same names
+    /// Folders of pairs, each with low/ and high/ (or normal/ or images/), files of the same names
     #[arg(required = true)]
     pub pairs: Vec<PathBuf>,
-    /// The folder of the normal-light photographs; PAIRS is then that of the dark ones
+    /// Folder of the photographs in normal light; PAIRS is then that of the dark ones
     #[arg(long, value_name = "DIR")]
     pub normal: Option<PathBuf>,
-    /// The curve, by a name that `nightsplat tone list` lists, or `all`
+    /// Name of a curve from `nightsplat tone list`, or all
     #[arg(long, value_name = "NAME|all", default_value_t = FamilyChoice::One(ToneCurve::FittedCubic))]
     pub family: FamilyChoice,
-    /// Write the curve to a file that --curve takes, of several families the best; with --profile, the profile
+    /// Write the best curve, for --curve, or the profile
     #[arg(long, value_name = "FILE.toml")]
     pub out: Option<PathBuf>,
-    /// What is fitted: every channel's values, or the luminance
+    /// Fit the values of every channel, or luminance
     #[arg(long, value_enum, default_value_t)]
     pub channels: ChannelChoice,
-    /// What each photograph weighs: as much as it has pixels, or less the further it is from the curve
+    /// Weight of a photograph: its pixel count, or less with its distance from the curve
     #[arg(long, value_enum, default_value_t)]
     pub weigh: WeightingChoice,
-    /// Draw the fit to the family's own constants, as if they were N more photographs
+    /// Weight of the curve's default constants as a prior, in photographs
     #[arg(long, value_name = "N", default_value_t = FitOptions::default().prior)]
     pub prior: f64,
-    /// Residuals beyond D times their scale weigh less; inf for plain least squares
+    /// Huber threshold in units of the residuals' scale; inf for least squares
     #[arg(long, value_name = "D", default_value_t = FitOptions::default().huber)]
     pub huber: f64,
-    /// Columns of the histogram that is fitted to
+    /// Bins of the histogram that is fitted
     #[arg(long, value_name = "N", default_value_t = FitOptions::default().bins)]
     pub bins: usize,
-    /// Keep the curve at 1 or below, so that nothing clips
+    /// Keep the curve at or below 1, so that nothing clips
     #[arg(long)]
     pub bounded: bool,
-    /// Fit the black level (alpha) and the gain by brightness (c) as well, where a family has none of its own
+    /// Also fit black level (alpha) and gain (c), for curves without their own
     #[arg(long)]
     pub adapt: bool,
-    /// Score on pairs that were not fitted to: on every scene in turn, or on parts of one
+    /// Score on held-out pairs: each scene in turn, or folds of a single one
     #[arg(long)]
     pub cross_validate: bool,
-    /// The parts of a single scene; as many as pairs to leave out one at a time
+    /// Folds of a single scene
     #[arg(long, value_name = "N", default_value_t = 5)]
     pub folds: usize,
-    /// Draw the pairs and the curves
+    /// Plot pairs and curves as SVG
     #[arg(long, value_name = "FILE.svg")]
     pub plot: Option<PathBuf>,
-    /// Fit a camera profile in place of a curve (a 3x3 matrix, gain, bias and 16 segments a channel), which `--profile FILE` of `train` and `tone apply` takes
+    /// Fit a camera profile (3x3 matrix, gain, bias and 16 segments per channel), for --profile of train and tone apply
     #[arg(long, conflicts_with_all = ["family", "channels", "weigh", "prior", "bins", "bounded", "adapt", "plot"])]
     pub profile: bool,
-    /// Print JSON
+    /// Print JSON instead of text
     #[arg(long)]
     pub json: bool,
 }
 
-/// Which families are fitted.
+/// The families to fit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FamilyChoice {
-    /// Every family that has constants to fit.
+    /// Every family with constants.
     All,
     /// One.
     One(ToneCurve),
@@ -152,38 +153,38 @@ impl Fitted {
 ///
 /// # Errors
 /// As [`apply`], or standard output cannot be written to.
-pub fn run(args: &FitArgs) -> Result<()> {
+pub fn run(args: &FitArgs) -> anyhow::Result<()> {
+    args.out.iter().chain(&args.plot).try_for_each(|path| check_writable(path))?;
     let text = if args.profile {
         let fitted = profile::apply(args)?;
-        if args.json { json(&fitted)? } else { profile::told(&fitted) }
+        if args.json { serde_json::to_string_pretty(&fitted)? } else { profile::text(&fitted) }
     } else {
         let fitted = apply(args)?;
-        if args.json { json(&fitted)? } else { told(&fitted) }
+        if args.json { serde_json::to_string_pretty(&fitted)? } else { text(&fitted) }
     };
-    writeln!(std::io::stdout().lock(), "{}", text.trim_end())
-        .map_err(|error| Error::output("standard output", error.to_string()))
+    writeln!(std::io::stdout(), "{}", text.trim_end())?;
+    let option = if args.profile { "profile" } else { "curve" };
+    let next = match &args.out {
+        Some(out) => format!("nightsplat train photos --out run --{option} {}", word(out)),
+        None => format!("the same with --out {option}.toml, for --{option} of train"),
+    };
+    let wrote = args.out.iter().chain(&args.plot).map(|path| path.display().to_string());
+    if args.json { Ok(()) } else { finish(&wrote.collect::<Vec<_>>().join(", "), &next) }
 }
 
-fn json(fitted: &impl Serialize) -> Result<String> {
-    serde_json::to_string_pretty(fitted)
-        .map_err(|error| Error::output("standard output", error.to_string()))
-}
-
-/// Refuses two folders of dark photographs where one is named for those in normal light.
+/// Refuses --normal with several folders of dark photographs.
 fn check(args: &FitArgs) -> Result<()> {
     if args.normal.is_some() && args.pairs.len() > 1 {
-        return Err(Error::Usage(
-            "--normal goes with one folder of dark photographs, not with several".to_owned(),
-        ));
+        return Err(Error::Usage("--normal takes a single folder of dark photographs".to_owned()));
     }
     Ok(())
 }
 
-/// Fits every family that `args` names, best first, and writes the files that it asks for.
+/// Fits the families of `args`, best first, and writes the files.
 ///
 /// # Errors
-/// [`Error::Usage`] for options that make no sense; [`Error::Input`] for pairs that cannot be used; [`Error::Output`]
-/// where a file cannot be written.
+/// [`Error::Usage`] for invalid options; [`Error::Input`] for unusable pairs; [`Error::Output`] if a
+/// file cannot be written.
 pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
     check(args)?;
     let options = FitOptions {
@@ -232,7 +233,7 @@ pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
     Ok(fitted)
 }
 
-/// The curve with what is known of it in comments.
+/// The curve as TOML, with its scores in comments.
 fn toml(fitted: &Fitted) -> Result<String> {
     let Fitted { family, formula, fit, .. } = fitted;
     let settings = toml::to_string(&fit.settings.clone().rounded()).map_err(|error| {
@@ -258,16 +259,16 @@ fn with_error(constant: &Estimate) -> String {
     match (constant.standard_error, constant.at_bound) {
         (Some(error), _) => format!("{:.5} +- {error:.2e}", constant.value),
         (None, true) => format!("{:.5} (at its bound)", constant.value),
-        (None, false) => format!("{:.5} (not determined alone)", constant.value),
+        (None, false) => format!("{:.5} (not determined by the data)", constant.value),
     }
 }
 
-/// A table of the families, then the best in detail.
-fn told(fitted: &[Fitted]) -> String {
+/// A table of the families, then details of the best.
+fn text(fitted: &[Fitted]) -> String {
     let is_scored = fitted.iter().any(|fitted| fitted.held_out.is_some());
-    let mut header = vec!["family", "RMSE", "R2", "fitted dB", "own dB"];
+    let mut header = vec!["family", "RMSE", "R2", "fitted dB", "default dB"];
     if is_scored {
-        header.extend(["held out dB", "own dB"]);
+        header.extend(["held out dB", "default dB"]);
     }
     header.extend(["rises", "clips"]);
     let mut rows = vec![header.into_iter().map(str::to_owned).collect::<Vec<_>>()];
@@ -291,7 +292,7 @@ fn told(fitted: &[Fitted]) -> String {
     };
     let mut text = aligned(&rows);
     text += &format!(
-        "\nAP3 as it is: {:.2} dB on all pairs{}\n",
+        "\nAP3 with default constants: {:.2} dB on all pairs{}\n",
         fit.psnr.ap3,
         held_out.as_ref().map_or_else(String::new, |held_out| format!(
             ", {:.2} dB on held-out pairs",
@@ -307,11 +308,10 @@ fn told(fitted: &[Fitted]) -> String {
         "residuals: RMSE {:.4}, median {median:.4}, 95th percentile {high:.4}, robust loss {:.3e}{}\n",
         fit.rmse,
         fit.robust_loss,
-        fit.huber_delta
-            .map_or_else(String::new, |delta| format!(", weighing less beyond {delta:.4}"))
+        fit.huber_delta.map_or_else(String::new, |delta| format!(", Huber threshold {delta:.4}"))
     );
     text += &format!(
-        "{} values, worth {:.0} independent ones by how photographs differ; errors assume independent photographs\n",
+        "{} values, effectively {:.0} independent ones; errors assume independent photographs\n",
         fit.values, fit.effective_values
     );
     if let Some(held_out) = held_out {
@@ -321,7 +321,8 @@ fn told(fitted: &[Fitted]) -> String {
             let rmse = of(squared_error).map(|error| format!("{:.4}", error.sqrt()));
             [vec![name.to_owned(), pairs.to_string()], psnr.to_vec(), rmse.to_vec()].concat()
         };
-        let header = ["held out", "pairs", "fitted dB", "own dB", "AP3 dB", "RMSE", "own", "AP3"];
+        let header =
+            ["held out", "pairs", "fitted dB", "default dB", "AP3 dB", "RMSE", "own", "AP3"];
         let header = header.map(str::to_owned).to_vec();
         let folds = held_out.folds.iter();
         let pairs = folds.clone().map(|fold| fold.pairs).sum();

@@ -1,12 +1,12 @@
-//! `nightsplat tone list`: the table of tone curves, their values and their plots.
+//! `nightsplat tone list`: the tone curves, their values and plots.
 
 use std::io::Write;
 use std::path::PathBuf;
 
 use crate::base::output::write_whole;
-use crate::cli::table;
+use crate::cli::{finish, table, words};
 use crate::photographs::dataset::{Dataset, LoadOptions, Split};
-use crate::photographs::image::Image;
+use crate::photographs::image::{ColourTally, Image};
 use crate::photographs::tone::{
     CurveChoice, FAMILIES, Family, Statistics, ToneCurve, ToneSettings,
 };
@@ -16,16 +16,16 @@ use crate::{Error, Result};
 /// List the tone curves, print their values or plot them.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ListArgs {
-    /// Which: names, or .toml, .csv and .cube files [default: all of the table]
-    #[arg(value_name = "NAME|FILE")]
+    /// Names, or .toml, .csv and .cube files [default: all; six for --plot]
+    #[arg(value_name = "NAME|FILE", value_parser = words::curves::<CurveChoice>())]
     pub curves: Vec<CurveChoice>,
-    /// Draw them into an SVG file
+    /// Plot the curves as SVG
     #[arg(long, value_name = "FILE.svg")]
     pub plot: Option<PathBuf>,
-    /// Print their values
+    /// Print a table of values
     #[arg(long)]
     pub table: bool,
-    /// The values of t = x / p90 that --table prints
+    /// The t = x / p90 at which --table prints values
     #[arg(
         long,
         value_name = "T,..",
@@ -33,16 +33,26 @@ pub struct ListArgs {
         default_values_t = [0.05, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0]
     )]
     pub at: Vec<f64>,
-    /// A dataset: its mean statistics give the curves black level and gain, and are marked on the plot
+    /// Dataset whose mean statistics set black level and gain of the curves, and are marked on the plot
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
 }
 
-/// What there is to say of the automatic curve.
+/// The description of the automatic curve.
 const AUTO: &str = "0.075 + 0.925 ((1 - lambda) s(x) + lambda x s(Y) / Y), s(x) = 1 - exp(-k x)
     monotone, bounded; k from the luminance of all photographs, see the guide; drawn over t = k x";
 
-/// A curve with what it is called here.
+/// The curves of a plot without names.
+const PLOTTED: [ToneCurve; 6] = [
+    ToneCurve::Auto,
+    ToneCurve::Linear,
+    ToneCurve::Ase,
+    ToneCurve::Ap3,
+    ToneCurve::Gamma,
+    ToneCurve::Reinhard,
+];
+
+/// A curve with its name.
 struct Curve {
     name: String,
     settings: ToneSettings,
@@ -53,18 +63,21 @@ struct Curve {
 /// # Errors
 /// As [`text`], or standard output cannot be written to.
 pub fn run(args: &ListArgs) -> anyhow::Result<()> {
-    Ok(write!(std::io::stdout().lock(), "{}", text(args)?)?)
+    write!(std::io::stdout(), "{}", text(args)?)?;
+    finish("", "nightsplat tone apply photos --curve NAME --out toned")
 }
 
-/// What the command prints; the plot is written.
+/// Writes the plot and returns what the command prints.
 ///
 /// # Errors
-/// A file cannot be read or written, or a value of t makes no sense.
+/// A file cannot be read or written, or a t is negative.
 pub fn text(args: &ListArgs) -> Result<String> {
     if let Some(t) = args.at.iter().find(|&&t| t.is_nan() || t < 0.0) {
         return Err(Error::Usage(format!("--at {t}: t must be 0 or more")));
     }
-    let curves = chosen(&args.curves)?;
+    let plotted: Vec<CurveChoice> = PLOTTED.into_iter().map(CurveChoice::Named).collect();
+    let is_plain_plot = args.plot.is_some() && !args.table && args.curves.is_empty();
+    let curves = chosen(if is_plain_plot { &plotted } else { &args.curves })?;
     let scene = args.dataset.as_deref().map(scene_statistics).transpose()?;
     let mut text = String::new();
     if args.table {
@@ -73,7 +86,8 @@ pub fn text(args: &ListArgs) -> Result<String> {
     if let Some(path) = &args.plot {
         let svg = svg_file(&drawing(&curves, scene.as_ref()));
         write_whole(path, svg.as_bytes())?;
-        text += &format!("{}\n", path.display());
+        let others = if is_plain_plot { "; name curves to plot others" } else { "" };
+        text += &format!("wrote {}: {} curves{others}\n", path.display(), curves.len());
     }
     if !args.table && args.plot.is_none() {
         text = listing(&curves);
@@ -81,7 +95,7 @@ pub fn text(args: &ListArgs) -> Result<String> {
     Ok(text)
 }
 
-/// The automatic curve, then the table.
+/// The automatic curve, then those of the table.
 fn every_curve() -> impl Iterator<Item = ToneCurve> {
     std::iter::once(ToneCurve::Auto).chain(ToneCurve::ALL)
 }
@@ -94,15 +108,17 @@ fn chosen(choices: &[CurveChoice]) -> Result<Vec<Curve>> {
     choices.iter().map(curve).collect()
 }
 
-/// The means over the training photographs of a dataset, as stored.
+/// The mean statistics of a dataset's training photographs, as stored.
 fn scene_statistics(root: &std::path::Path) -> Result<Statistics> {
     let photographs = Dataset::photographs(root, &LoadOptions::default())?;
     let training = photographs.iter().filter(|photograph| photograph.split == Split::Train);
-    let statistics =
-        training.map(|photograph| Ok(Statistics::of(&Image::load(&photograph.input)?.data)));
+    let colours = ColourTally::default();
+    let statistics = training.map(|photograph| {
+        Ok(Statistics::of(&Image::load_counted(&photograph.input, &colours)?.data))
+    });
     let statistics = statistics.collect::<Result<Vec<_>>>()?;
-    Statistics::mean_of(&statistics)
-        .ok_or_else(|| Error::input(root, "has no training photograph to take statistics of"))
+    colours.say();
+    Statistics::mean_of(&statistics).ok_or_else(|| Error::input(root, "has no training photograph"))
 }
 
 fn listing(curves: &[Curve]) -> String {

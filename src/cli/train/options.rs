@@ -1,5 +1,6 @@
-//! The options of a training: those that set one setting are rows of the table of settings, the others are here.
+//! Options of a training. Those that set a single setting come from the table of settings; the others are defined here.
 
+use std::ops::Bound;
 use std::path::{Path, PathBuf};
 
 use clap::builder::ValueParser;
@@ -7,6 +8,7 @@ use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches, ValueHint}
 use toml::{Table, Value};
 
 use crate::base::settings::{Rule, Setting};
+use crate::cli::words::{self, Words};
 use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneSettings};
 use crate::train::diagnose::Plan;
 use crate::train::settings::SETTINGS;
@@ -15,7 +17,7 @@ use crate::train::{
 };
 use crate::{Error, Result};
 
-/// The options of a run; each wins over the configuration file.
+/// Options of a run; each overrides the configuration file.
 #[derive(Clone, Debug, Default, Args)]
 pub(crate) struct TrainOptions {
     #[command(flatten)]
@@ -24,44 +26,45 @@ pub(crate) struct TrainOptions {
     single: SingleSettings,
 }
 
-/// The options that are not one setting each.
+/// The options that set several settings.
 #[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, Default, Args)]
 struct SeveralSettings {
-    /// The tone curve: a name that `nightsplat tone list` lists, or a .toml, .csv or .cube file [default: {tone.curve}]
-    #[arg(long, value_name = "NAME|FILE")]
+    /// Tone curve: a name from `nightsplat tone list`, or a .toml, .csv or .cube file [default: {tone.curve}]
+    #[arg(long, value_name = "NAME|FILE", value_parser = words::curves::<CurveChoice>())]
     curve: Option<CurveChoice>,
-    /// A camera profile that `nightsplat tone fit --profile` made, in place of a curve; results are labelled: they know its references
+    /// Camera profile from `nightsplat tone fit --profile`, in place of a curve; scores are marked as knowing its
+    /// references
     #[arg(long, value_name = "FILE", conflicts_with_all = ["curve", "gain", "brightness", "colour", "theta"])]
     profile: Option<PathBuf>,
-    /// c: how much a brighter photograph raises the curve's gain, or auto: the gain that the photographs ask for, as the curve auto has it [default: {tone.gain_c of ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
+    /// Gain constant c of the curve, or auto to measure the gain, as the curve auto does [default: {tone.gain_c of
+    /// ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
     #[arg(long, value_name = "C|auto")]
     gain: Option<GainChoice>,
-    /// A TOML file with any of the settings of a run's config.toml
+    /// TOML file with settings, such as the config.toml of a run
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Any setting by its place in config.toml, such as tone.alpha=0.1; may be repeated, wins over all else
+    /// Set any key of config.toml, such as tone.alpha=0.1; repeatable, overrides everything else
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// plain: colour alone, as 3DGS; lita: every part of LITA-GS and L1 alone on R_0, which with a preset of the paper's is its model, else each begins as the identity [default: plain]
-    #[arg(long, help_heading = MODEL)]
+    /// plain: 3DGS; lita: all parts of LITA-GS, with L1 alone on R_0 [default: plain]
+    #[arg(long, value_parser = Words::<ModelName>::new(["plain", "lita"]))]
     model: Option<ModelName>,
-    /// Exactly these parts, parted by commas: denoiser, tonemapper, structure, depth
-    #[arg(long, value_name = "LIST", value_delimiter = ',', help_heading = MODEL)]
+    /// Parts of the model: any of denoiser, tonemapper, structure, depth
+    #[arg(long, value_name = "LIST", value_delimiter = ',', value_parser = words::parts())]
     parts: Option<Vec<Part>>,
-    /// draft, fast, balanced (the default) or best: time for quality; paper: the paper's curve and length; or the constants that the paper and its code state for a benchmark: lom, realx3d or mip360-varying; other options win
-    #[arg(long, value_name = "NAME", help_heading = MODEL)]
+    /// draft, fast, balanced or best: quality for time; paper: the paper's curve and length; lom, realx3d or
+    /// mip360-varying: the paper's benchmarks [default: balanced]
+    #[arg(long, value_name = "NAME", value_parser = words::presets())]
     preset: Option<Preset>,
 }
 
-const MODEL: &str = "Model";
-
-/// The options that set one setting each, as texts.
+/// The options that set a single setting, with their values as text.
 #[derive(Clone, Debug, Default)]
 struct SingleSettings(Vec<(&'static Setting, String)>);
 
 impl SingleSettings {
-    /// The rows with an option that [`SeveralSettings`] has not.
+    /// The rows with an option, without those of [`SeveralSettings`].
     fn rows() -> impl Iterator<Item = (&'static Setting, &'static str, Option<&'static str>)> {
         let rows =
             SETTINGS.iter().filter_map(|row| row.option().map(|(name, value)| (row, name, value)));
@@ -73,14 +76,17 @@ impl Args for SingleSettings {
     fn augment_args(command: Command) -> Command {
         Self::rows().fold(command, |command, (row, name, value)| {
             let arg = Arg::new(name).long(name).help(help(row));
-            // The name that other programs have for it.
+            // The name in other trainers.
             let arg = if name == "steps" { arg.visible_alias("iterations") } else { arg };
-            let arg = if row.key.starts_with("model.") { arg.help_heading(MODEL) } else { arg };
             let is_path = matches!(row.rule, Rule::Text("a path", _));
             let arg = if is_path { arg.value_hint(ValueHint::AnyPath) } else { arg };
-            command.arg(match value {
-                Some(value) => arg.value_name(value).value_parser(ValueParser::string()),
-                None => arg.action(ArgAction::SetTrue),
+            command.arg(match (value, row.rule) {
+                (Some(value), Rule::OneOf(words)) => {
+                    let words = words.iter().copied();
+                    arg.value_name(value).value_parser(Words::<String>::new(words))
+                }
+                (Some(value), _) => arg.value_name(value).value_parser(ValueParser::string()),
+                (None, _) => arg.action(ArgAction::SetTrue),
             })
         })
     }
@@ -108,7 +114,7 @@ impl FromArgMatches for SingleSettings {
     }
 }
 
-/// The help of an option: what its setting does, what it takes and what holds without it.
+/// The help of an option: effect, range and default of its setting.
 fn help(row: &Setting) -> String {
     let default = match row.absent {
         Some(absent) => absent.to_owned(),
@@ -116,7 +122,7 @@ fn help(row: &Setting) -> String {
         None => format!("{{{}}}", row.key),
     };
     let range = match row.rule {
-        Rule::Number(..) | Rule::Whole(1.., _) => format!(", {}", row.rule),
+        Rule::Number(_, Bound::Included(most)) if most < 1e6 => format!(", {}", row.rule),
         Rule::Whole(_, most) if most < u32::MAX.into() => format!(", {}", row.rule),
         _ => String::new(),
     };
@@ -124,19 +130,19 @@ fn help(row: &Setting) -> String {
 }
 
 impl TrainOptions {
-    /// Whether the command line has the option of a setting.
+    /// Whether the command line sets a setting.
     pub(in crate::cli) fn gives(&self, key: &str) -> bool {
         self.single.0.iter().any(|(row, _)| row.key == key)
     }
 
-    /// The same without the option of a setting.
+    /// These options without that of a setting.
     pub(in crate::cli) fn without(&self, key: &str) -> Self {
         let mut options = self.clone();
         options.single.0.retain(|(row, _)| row.key != key);
         options
     }
 
-    /// A line for each option that says something of what `config` has not.
+    /// A warning for each option without effect under `config`.
     pub(super) fn idle(&self, config: &TrainConfig) -> Vec<String> {
         let of_parts = |key: &str| -> &[Part] {
             match key {
@@ -154,38 +160,42 @@ impl TrainOptions {
             {
                 let names: Vec<&str> = parts.iter().map(|part| part.name()).collect();
                 lines.push(format!(
-                    "--{option} has no effect, as the model has no {}; --parts {} switches it on",
+                    "--{option} has no effect: the model has no {}; --parts {} adds it",
                     names.join(" and no "),
                     first.name()
                 ));
             }
         }
         if config.check.stops && config.check.every == 0 {
-            lines.push("--check-stops has no effect, as no step is checked; --check-every N says which are".to_owned());
+            lines.push(
+                "--check-stops has no effect: no step is checked; add --check-every N".to_owned(),
+            );
         }
         let stop = &config.stop;
         let gains = [("growth_gain", stop.growth_gain), ("degree_gain", stop.degree_gain)];
         let idle = gains.into_iter().filter(|(_, gain)| stop.views == 0 && *gain > 0.0);
         lines.extend(idle.map(|(gain, _)| {
-            format!("stop.{gain} has no effect, as no views are held out; --set stop.views=N keeps N of them from training")
+            format!(
+                "stop.{gain} has no effect: no views are held out; --set stop.views=N holds out N"
+            )
         }));
         lines
     }
 
-    /// Whether a diagnosis of the photographs is to decide what no option says.
+    /// Whether a diagnosis of the photographs chooses the settings that no option gives.
     pub(in crate::cli) fn wants_a_plan(&self) -> bool {
         let Self { several, .. } = self;
         several.config.is_none() && several.preset.is_none_or(Preset::is_planned)
     }
 
-    /// The configuration, with what a plan says of what no option says.
+    /// The configuration: options first, then the plan, then defaults.
     pub(crate) fn config(&self, dataset: &Path, plan: Option<&Plan>) -> Result<TrainConfig> {
         let config = self.requested(dataset)?.settings(plan)?.config()?;
         config.check()?;
         Ok(config)
     }
 
-    /// What the command line and its files say.
+    /// The settings that the command line and its files give.
     pub(crate) fn requested(&self, dataset: &Path) -> Result<RequestedSettings> {
         let several = &self.several;
         let mut requested =
@@ -216,7 +226,7 @@ impl TrainOptions {
             }
         }
         if self.gives("steps") {
-            // Whoever says how long a run is to be wants neither less nor views kept from it.
+            // An explicit length switches early stopping off, and with it the held-out views.
             options.push("stop.views", 0.into(), Origin::Option("--steps"))?;
         }
         Ok(requested)
@@ -271,7 +281,7 @@ impl SeveralSettings {
         if let Some(parts) = &self.parts {
             set_parts(parts, "--parts")?;
         }
-        // A benchmark has a weight of its own.
+        // Benchmarks state the weight themselves.
         if self.model == Some(ModelName::Lita) && !self.preset.is_some_and(Preset::is_benchmark) {
             options.push("ssim_weight", Value::Float(0.0), Origin::Option("--model"))?;
         }

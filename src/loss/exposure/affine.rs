@@ -1,11 +1,11 @@
-//! A gain and a bias for each channel.
+//! Gain and bias of each channel.
 
 use std::fmt;
 
 use crate::photographs::image::Image;
 use crate::{Error, Result};
 
-/// What a view's exposure makes of encoded values: gain times the value plus bias, per channel.
+/// The exposure of a view: encoded values times gain plus bias, per channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Affine {
     /// Of red, green and blue, above 0.
@@ -15,11 +15,11 @@ pub struct Affine {
 }
 
 impl Affine {
-    /// What leaves every value as it is.
+    /// The identity.
     pub const IDENTITY: Self = Self { gain: [1.0; 3], bias: [0.0; 3] };
 
-    /// The affine that brings `from` nearest to `to`, by the squared differences of each channel. A channel that is the
-    /// same everywhere in `from` only gets a bias.
+    /// The affine that maps `from` nearest to `to`, by least squares for each channel. A channel that is constant in
+    /// `from` gets a bias only.
     ///
     /// # Errors
     /// [`Error::Usage`] where the images differ in size or have no pixels.
@@ -54,7 +54,7 @@ impl Affine {
         Ok(affine)
     }
 
-    /// The image so exposed.
+    /// Applies it to an image.
     #[must_use]
     pub fn applied(&self, image: &Image) -> Image {
         let pixels = image.pixel_count();
@@ -65,7 +65,7 @@ impl Affine {
         Image { data: image.data.iter().enumerate().map(value).collect(), ..*image }
     }
 
-    /// The same exposures of another model, of which the mean of these is the identity.
+    /// The same exposures relative to their mean, so that the mean is the identity.
     pub fn about_their_mean(exposures: &[Self]) -> Vec<Self> {
         let mean = |of: &dyn Fn(&Self) -> f64| {
             exposures.iter().map(of).sum::<f64>() / exposures.len().max(1) as f64
@@ -79,7 +79,7 @@ impl Affine {
         exposures.iter().map(about).collect()
     }
 
-    /// What undoes it.
+    /// The inverse.
     #[must_use]
     pub fn inverse(&self) -> Self {
         let of = |c: usize| (1.0 / self.gain[c], -self.bias[c] / self.gain[c]);

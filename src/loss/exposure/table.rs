@@ -1,4 +1,4 @@
-//! `exposures.csv`: what is known or was learned of the exposure of each view.
+//! `exposures.csv`: the known or learned exposure of each view.
 //!
 //! ```text
 //! name,ev,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b
@@ -21,19 +21,19 @@ use crate::{Error, Result};
 const COLUMNS: [&str; 8] =
     ["name", "ev", "gain_r", "gain_g", "gain_b", "bias_r", "bias_g", "bias_b"];
 
-/// What a table knows of one view.
+/// A view's row.
 #[derive(Clone, Debug, PartialEq)]
 pub struct KnownExposure {
     /// The view's name.
     pub name: String,
-    /// The stops by which the photograph is brighter than it would be at EV 0, in linear light.
+    /// The stops by which the photograph is brighter than at EV 0, in linear light.
     pub ev: Option<f64>,
-    /// What the exposure makes of encoded values of the lifted view.
+    /// The exposure on encoded values of the target.
     pub affine: Option<Affine>,
 }
 
 impl Affine {
-    /// The stops that it is worth at middle grey: the mean over the channels.
+    /// The stops of the exposure at middle grey: the mean over the channels.
     pub fn stops(&self) -> f64 {
         let grey = f64::from(srgb_from_linear(MIDDLE_GREY));
         let stops = |c: usize| {
@@ -59,7 +59,7 @@ pub fn save(path: &Path, exposures: &[(String, Affine)]) -> Result<()> {
     write_whole(path, text.as_bytes())
 }
 
-/// Reads what is known of each view; a name may have the extension of its photograph.
+/// Reads the rows of a table; a name may have the extension of its photograph.
 ///
 /// # Errors
 /// The file cannot be read, has a column that there is not, a line that is no line of it, or a view twice.
@@ -87,7 +87,7 @@ pub fn load(path: &Path) -> Result<Vec<KnownExposure>> {
     Ok(known)
 }
 
-/// A line; a name may hold commas.
+/// Parses a line; a name may contain commas.
 fn parsed(columns: &[&str], line: &str) -> Result<KnownExposure, String> {
     let mut cells: Vec<&str> = line.rsplitn(columns.len(), ',').map(str::trim).collect();
     cells.reverse();

@@ -1,4 +1,4 @@
-//! What the denoiser keeps on the device: the maps of a stage, those of every stage where there is room, gradients.
+//! The memory of the denoiser: the maps of a stage, or of every stage where memory allows, and gradients.
 
 use glam::UVec2;
 
@@ -10,13 +10,13 @@ use super::DenoiserSettings;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 
-/// What decides how long the buffers are.
+/// What determines the lengths of the buffers.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct DenoiserExtent {
     pub(super) pixels: usize,
     /// Partial sums of the gradient of the inner convolution.
     partials: usize,
-    /// Of a map of features packed for matrices; 0 in single precision.
+    /// Size of a packed feature map; 0 in single precision.
     packed: usize,
 }
 
@@ -71,14 +71,15 @@ impl DenoiserExtent {
     }
 }
 
-/// What a stage's forward pass leaves to its backward pass.
+/// State of a stage between its forward and its backward pass.
 #[derive(Debug)]
 pub(super) struct Activations {
-    /// f of every repeat, each (C, H, W); where f is packed, of the first and by turns of those after it.
+    /// f of every repeat, each (C, H, W); where f is packed, that of the first, and two buffers that alternate for the
+    /// later ones.
     features: Vec<Buffer<f32>>,
     /// conv(f) of every repeat, repeats x (C, H, W).
     pub(super) convolved: Vec<Buffer<f32>>,
-    /// f of every repeat but the last, as matrices take it.
+    /// f of every repeat but the last, packed.
     pub(super) packed: Vec<PackedMap>,
     pub(super) norm: NormMemory,
     /// u, (3, H, W).
@@ -95,7 +96,7 @@ fn feature_maps(settings: DenoiserSettings) -> usize {
 }
 
 impl Activations {
-    /// f of a repeat; where f is packed, it is that of the first or of one of the last two that were written.
+    /// f of a repeat; where f is packed, that of the first or of one of the last two that were written.
     pub(super) fn features(&self, repeat: usize) -> &Buffer<f32> {
         &self.features[self.slot(repeat)]
     }
@@ -111,7 +112,7 @@ impl Activations {
         (&self.features[slot], &mut self.update)
     }
 
-    /// What a repeat reads, and all that it writes.
+    /// The input of a repeat, and all its outputs.
     pub(super) fn repeat(&mut self, repeat: usize) -> Repeat<'_> {
         let [from, to] = [repeat, repeat + 1].map(|repeat| self.slot(repeat));
         let (before, after) = self.features.split_at_mut(from.max(to));
@@ -156,7 +157,7 @@ impl Activations {
 pub(super) struct Repeat<'a> {
     /// f
     pub(super) shortcut: &'a Buffer<f32>,
-    /// f, as matrices take it.
+    /// f, packed.
     pub(super) packed: &'a mut PackedMap,
     /// conv(f)
     pub(super) convolved: &'a mut Buffer<f32>,
@@ -168,7 +169,7 @@ pub(super) struct Repeat<'a> {
 /// The activations of the stages before the last, as many as are kept.
 #[derive(Debug, Default)]
 pub(super) struct EarlierStages {
-    /// What they are long enough for.
+    /// The extent that they are allocated for.
     extent: DenoiserExtent,
     stages: Vec<Activations>,
 }
@@ -190,12 +191,13 @@ impl EarlierStages {
         u64::from(settings.stages - 1).saturating_mul(each)
     }
 
-    /// What they are long enough for.
+    /// The extent that they are allocated for.
     pub(super) fn extent(&self) -> DenoiserExtent {
         self.extent
     }
 
-    /// Those of stage `k` in a view of such an extent: its own where they are kept, else those that all stages share.
+    /// The activations of stage `k` in a view of this extent: its own where they are kept, else those that all stages
+    /// share.
     pub(super) fn of<'a>(
         &'a mut self,
         k: usize,
@@ -210,16 +212,16 @@ impl EarlierStages {
 /// The memory of one view.
 #[derive(Debug)]
 pub(super) struct DenoiserMemory {
-    /// Of the last stage, and of those before it that have none of their own.
+    /// Of the last stage, and of those before it without activations of their own.
     pub(super) activations: Activations,
     /// `R_1` to `R_K`, each (3, H, W).
     pub(super) denoised: Vec<Buffer<f32>>,
     pub(super) d_features: Buffer<f32>,
     pub(super) d_convolved: Buffer<f32>,
-    /// dL/d conv(f), as matrices take it.
+    /// dL/d conv(f), packed.
     pub(super) d_packed: PackedMap,
     pub(super) d_update: Buffer<f32>,
-    /// `dL/dR_k`, by turns, each (3, H, W).
+    /// `dL/dR_k`, alternating, each (3, H, W).
     pub(super) d_denoised: [Buffer<f32>; 2],
     pub(super) partials: Buffer<f32>,
 }

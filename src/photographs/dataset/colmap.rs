@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DQuat, DVec2, DVec3};
 
+use crate::base::tree;
 use crate::camera::{Distortion, Lens};
 use crate::{Error, Result};
 
@@ -32,26 +33,21 @@ pub(super) struct ModelPoint {
     pub(super) images: Vec<u32>,
 }
 
-/// Where COLMAP and its users put models below a dataset's root, most likely first; a folder may hold several in folders.
-const FOLDERS: [&str; 5] =
-    ["sparse", "colmap_sparse", "derived_colmap/sparse", "colmap/sparse", "colmap_text"];
-
-/// The models below `root` with what `needed` lists, of the first place that has any, by name.
-pub(super) fn find(root: &Path, needed: &[&str]) -> Vec<PathBuf> {
-    let mut models = FOLDERS.iter().map(|place| models_in(&root.join(place), needed));
-    models.find(|models| !models.is_empty()).unwrap_or_default()
-}
-
 /// The models in the folders of a place, or itself where they hold none.
 pub(super) fn models_in(place: &Path, needed: &[&str]) -> Vec<PathBuf> {
-    let complete = |folder: &PathBuf| needed.iter().all(|stem| file(folder, stem).is_some());
-    let entries = std::fs::read_dir(place).into_iter().flatten().flatten();
-    let mut models: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(complete).collect();
+    let folders = tree::entries(place).unwrap_or_default();
+    let mut models: Vec<PathBuf> =
+        folders.iter().filter_map(|folder| model_in(folder, needed)).collect();
     models.sort();
     if models.is_empty() {
-        models.extend(Some(place.to_owned()).filter(complete));
+        models.extend(model_in(place, needed));
     }
     models
+}
+
+/// A folder that is a model itself.
+pub(super) fn model_in(folder: &Path, needed: &[&str]) -> Option<PathBuf> {
+    needed.iter().all(|stem| file(folder, stem).is_some()).then(|| folder.to_owned())
 }
 
 /// The model that places the most photographs that exist, and how many each of several places; none of none.
@@ -103,8 +99,9 @@ enum Encoded {
 }
 
 fn file(folder: &Path, stem: &str) -> Option<Encoded> {
-    let path =
-        |extension| Some(folder.join(stem).with_extension(extension)).filter(|path| path.is_file());
+    let path = |extension| {
+        Some(folder.join(stem).with_extension(extension)).filter(|path| tree::is_file(path))
+    };
     path("bin").map(Encoded::Binary).or_else(|| path("txt").map(Encoded::Text))
 }
 
@@ -113,8 +110,8 @@ fn required(folder: &Path, stem: &str) -> Result<Encoded> {
         .ok_or_else(|| Error::input(folder, format!("has neither {stem}.bin nor {stem}.txt")))
 }
 
-/// Name and number of parameters by model id (colmap/src/colmap/sensor/models.h).
-const MODELS: [(&str, usize); 12] = [
+/// Name and number of parameters by model id (colmap/src/colmap/sensor/models.h), up to COLMAP 4.
+const MODELS: [(&str, usize); 18] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
     ("SIMPLE_RADIAL", 4),
@@ -127,10 +124,16 @@ const MODELS: [(&str, usize); 12] = [
     ("RADIAL_FISHEYE", 5),
     ("THIN_PRISM_FISHEYE", 12),
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
 ];
 
-/// Those of them that are undistorted on load.
-pub(super) const SUPPORTED: [&str; 9] = [
+/// Those of them that are rendered, or undistorted on load.
+pub(super) const SUPPORTED: [&str; 11] = [
     "SIMPLE_PINHOLE",
     "PINHOLE",
     "SIMPLE_RADIAL",
@@ -140,7 +143,20 @@ pub(super) const SUPPORTED: [&str; 9] = [
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
     "OPENCV_FISHEYE",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
 ];
+
+/// What to do about photographs of a model that is not supported.
+pub(super) fn remedy(model: &str) -> &'static str {
+    const PANORAMAS: [&str; 6] =
+        ["EQUIRECTANGULAR", "SPHERICAL", "PANORAMA", "PANO", "CYLINDRICAL", "OMNIDIRECTIONAL"];
+    if PANORAMAS.contains(&model.to_ascii_uppercase().as_str()) {
+        "cut the panoramas into the six faces of a cube (90 degrees each) and find the cameras of those"
+    } else {
+        "run COLMAP's image_undistorter and load its PINHOLE model"
+    }
+}
 
 /// A camera of a model by name; the error is what to tell the user.
 fn lens(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Lens, String> {
@@ -164,6 +180,8 @@ fn lens(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Lens
         ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => {
             ([f, f], [cx, cy], Distortion { k1, k2, ..fisheye })
         }
+        ("SIMPLE_FISHEYE", &[f, cx, cy]) => ([f, f], [cx, cy], fisheye),
+        ("FISHEYE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], fisheye),
         ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
             ([fx, fy], [cx, cy], Distortion { k1, k2, k3, k4, ..fisheye })
         }
@@ -174,9 +192,7 @@ fn lens(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Lens
             ));
         }
         _ => {
-            return Err(format!(
-                "has the unsupported model {model}; run COLMAP's image_undistorter and load its PINHOLE model"
-            ));
+            return Err(format!("has the unsupported model {model}; {}", remedy(model)));
         }
     };
     let [focal, principal_point] = [focal, principal_point].map(DVec2::from_array);

@@ -5,13 +5,15 @@ use std::path::PathBuf;
 use glam::DAffine3;
 
 use super::Split;
+use super::ply::Cloud;
 use crate::camera::Lens;
+use crate::photographs::image::MaskFile;
 
 /// One view as a listing describes it, before any pixel is read.
 #[derive(Clone, Debug)]
 pub(super) struct ListedView {
     pub(super) name: String,
-    /// Path as listed, relative to the root.
+    /// Path as listed, relative to the root; where the photograph was found elsewhere, that path.
     pub(super) listed: String,
     /// Path below the folder of all photographs.
     pub(super) below: String,
@@ -22,6 +24,10 @@ pub(super) struct ListedView {
     pub(super) lens: Lens,
     /// Rigid; the world is the listing's.
     pub(super) view_from_world: DAffine3,
+    /// The mask that the listing names.
+    pub(super) mask: Option<MaskFile>,
+    /// The depth map that the listing names.
+    pub(super) depth: Option<PathBuf>,
 }
 
 #[derive(Debug, Default)]
@@ -30,4 +36,6 @@ pub(super) struct Listing {
     pub(super) skipped: Vec<String>,
     /// What was chosen, and what lies there unused; a line each.
     pub(super) remarks: Vec<String>,
+    /// Points that the listing names.
+    pub(super) clouds: Vec<Cloud>,
 }

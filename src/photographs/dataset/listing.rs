@@ -3,28 +3,22 @@
 use std::collections::HashMap;
 use std::path::Path;
 
+use super::layout::{CAMERAS, Layout};
 use super::listed::{ListedView, Listing};
+use super::locate::{self, Wanted};
 use super::{colmap, names, transforms, unused};
 use crate::photographs::image::files::{self, Files};
 use crate::{Error, Result};
 
-/// The views by name, all different.
-pub(super) fn list(root: &Path, files: &Files) -> Result<Listing> {
-    if !root.is_dir() {
-        let problem = if root.is_file() {
-            "is a file, not a folder; of a clip `nightsplat pose` makes a dataset"
-        } else {
-            "is not a folder; name the dataset's folder"
-        };
-        return Err(Error::input(root, problem));
-    }
+/// The views by name, all different; their photographs are looked for in `images` where it is given.
+pub(super) fn list(layout: &Layout, images: Option<&Path>, files: &Files) -> Result<Listing> {
+    let root = layout.root.as_path();
     let mut listing = Listing::default();
-    let listings = transforms::find(root);
-    for (path, split) in &listings {
-        transforms::read(root, path, *split, files, &mut listing)?;
-    }
+    let listings = layout.listings();
     if listings.is_empty() {
-        list_colmap(root, files, &mut listing)?;
+        list_colmap(layout, images, files, &mut listing)?;
+    } else {
+        transforms::read((root, images), &listings, files, &mut listing)?;
     }
     if listing.frames.is_empty() {
         let first = listing.skipped.first().map_or("its listing is empty", String::as_str);
@@ -46,13 +40,20 @@ pub(super) fn warn(remarks: &[String]) {
     }
 }
 
-fn list_colmap(root: &Path, files: &Files, listing: &mut Listing) -> Result<()> {
-    let models = colmap::find(root, &["cameras", "images"]);
-    let file_of =
-        |name: &str| files.find(root, name).or_else(|| files.find(&root.join("images"), name));
-    let chosen = colmap::largest(&models, |name| file_of(&name.replace('\\', "/")).is_some())?;
-    let Some((folder, counts)) = chosen else {
-        return Err(Error::input(root, no_dataset(root)));
+fn list_colmap(
+    layout: &Layout,
+    images: Option<&Path>,
+    files: &Files,
+    listing: &mut Listing,
+) -> Result<()> {
+    let root = layout.root.as_path();
+    let models = layout.models(&CAMERAS);
+    let folders = [root.to_owned(), root.join("images")];
+    let exists = |name: &str| {
+        folders.iter().any(|folder| files.find(folder, &name.replace('\\', "/")).is_some())
+    };
+    let Some((folder, counts)) = colmap::largest(&models, exists)? else {
+        return Err(Error::input(root, layout.no_dataset()));
     };
     if counts.len() > 1 {
         let (taken, all) =
@@ -66,7 +67,14 @@ fn list_colmap(root: &Path, files: &Files, listing: &mut Listing) -> Result<()> 
         ));
     }
     let lenses = colmap::read_cameras(folder)?;
-    for image in colmap::read_images(folder)? {
+    let placed = colmap::read_images(folder)?;
+    let wanted = placed.iter().map(|image| Wanted {
+        path: image.name.replace('\\', "/"),
+        places: folders.to_vec(),
+        is_test: false,
+    });
+    let found = locate::photographs((root, images), wanted.collect(), files, listing);
+    for (image, found) in placed.into_iter().zip(found) {
         let name = image.name.replace('\\', "/");
         let lens = lenses.get(&image.camera).copied().ok_or_else(|| {
             Error::input(
@@ -78,26 +86,19 @@ fn list_colmap(root: &Path, files: &Files, listing: &mut Listing) -> Result<()> 
             listing.skipped.push(format!("{name}: its pose is not finite"));
             continue;
         };
-        let beside_root = files.find(root, &name);
-        let listed = if beside_root.is_some() { name.clone() } else { format!("images/{name}") };
-        let file = beside_root.or_else(|| files.find(&root.join("images"), &name));
-        let (name, below) = (files::stem(&name).to_owned(), name);
-        let split = None;
-        listing.frames.push(ListedView { name, listed, below, split, file, lens, view_from_world });
+        listing.frames.push(ListedView {
+            name: names::normalized(files::stem(&name)),
+            listed: found.listed,
+            below: found.below,
+            split: None,
+            file: found.file,
+            lens,
+            view_from_world,
+            mask: None,
+            depth: None,
+        });
     }
     Ok(())
-}
-
-/// What there is in place of a dataset, and the remedy.
-fn no_dataset(root: &Path) -> String {
-    let expected = "transforms_train.json, transforms.json or a COLMAP model in sparse/0";
-    match files::photographs_in(root).map_or(0, |photographs| photographs.len()) {
-        0 => format!("holds no dataset; expected {expected}"),
-        count => format!(
-            "holds no dataset but {count} photographs, whose poses are not known; find them with `nightsplat pose {} --out DATASET` (expected {expected})",
-            root.display()
-        ),
-    }
 }
 
 fn refuse_two_of_one_name(root: &Path, frames: &[ListedView]) -> Result<()> {

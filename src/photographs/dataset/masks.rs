@@ -1,18 +1,39 @@
-//! Masks of views: `masks/NAME.png`, or `masks/NAME.jpg.png` as COLMAP calls them, and the photographs' own alpha.
+//! Masks of views: the one that a listing names, `masks/NAME.png`, or `masks/NAME.jpg.png` as COLMAP calls them,
+//! `dynamic_mask_NAME.png` beside the photograph, and the photographs' own alpha.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use super::listed::ListedView;
+use crate::photographs::image::MaskFile;
 use crate::photographs::image::files::Files;
 
 /// Where masks lie below the root.
 const FOLDER: &str = "masks";
+/// How the names of masks begin that lie beside their photographs and mark what moves (instant-ngp).
+const MOVING: &str = "dynamic_mask_";
 
 /// The mask of a photograph.
-pub(super) fn find(root: &Path, frame: &ListedView, files: &Files) -> Option<PathBuf> {
+pub(super) fn find(root: &Path, frame: &ListedView, files: &Files) -> Option<MaskFile> {
+    if frame.mask.is_some() {
+        return frame.mask.clone();
+    }
     let folder = root.join(FOLDER);
     let file = frame.file.as_ref().and_then(|file| file.file_name()?.to_str());
     let names = [frame.below.clone(), frame.below.clone() + ".png"];
     let of_file = file.map(|file| format!("{file}.png"));
-    names.into_iter().chain(of_file).find_map(|name| files.find(&folder, &name))
+    let own = names.into_iter().chain(of_file).find_map(|name| files.find(&folder, &name));
+    own.map(MaskFile::shown).or_else(|| moving(frame, files))
+}
+
+/// The mask of what moves.
+fn moving(frame: &ListedView, files: &Files) -> Option<MaskFile> {
+    let file = frame.file.as_ref()?;
+    let name = file.file_name()?.to_str()?;
+    let path = files.find(file.parent()?, &format!("{MOVING}{name}"))?;
+    Some(MaskFile { path, is_inverted: true })
+}
+
+/// Whether a file is a mask that lies among photographs.
+pub(crate) fn is_beside(file: &Path) -> bool {
+    file.file_name().is_some_and(|name| name.to_string_lossy().starts_with(MOVING))
 }

@@ -4,6 +4,8 @@ use std::ops::Bound;
 use std::path::PathBuf;
 
 use crate::base::settings::Rule;
+use crate::base::tree;
+use crate::photographs::white_balance::WhiteBalance;
 use crate::{Error, Result};
 
 /// The factors by which photographs may shrink.
@@ -22,6 +24,8 @@ pub struct LoadOptions {
     /// Bytes that the decoded photographs to train on may take: where they take more, none is kept, and each is read anew
     /// whenever it is looked at; none: no limit.
     pub keep: Option<u64>,
+    /// The folder that holds the photographs by their listed names, in place of where the listing says they are.
+    pub images: Option<PathBuf>,
     /// A folder of reference images by name, in place of what is found beside the input.
     pub reference: Option<PathBuf>,
     /// Whether test views load their dark photograph too, where there is one.
@@ -30,6 +34,10 @@ pub struct LoadOptions {
     pub hold_out: usize,
     /// Masks hide what is white, not what is black.
     pub invert_masks: bool,
+    /// Black borders that photographs have in the same place, as undistorting leaves them, are masked.
+    pub mask_borders: bool,
+    /// Gains of the channels of the photographs; reference images stay as they are.
+    pub white_balance: Option<WhiteBalance>,
     /// At which size training photographs are measured while they are decoded, if they are not kept at that size.
     pub measured: MeasuredSize,
     /// Photographs of a fisheye are undistorted to a pinhole's, too, as those of every other lens are; without it the
@@ -69,10 +77,13 @@ impl Default for LoadOptions {
             max_resolution: 0,
             test_every: None,
             keep: None,
+            images: None,
             reference: None,
             load_low_test: true,
             hold_out: 0,
             invert_masks: false,
+            mask_borders: true,
+            white_balance: None,
             measured: MeasuredSize::default(),
             undistort: false,
             depth: DepthOptions::default(),
@@ -119,17 +130,16 @@ impl LoadOptions {
                 &"0, or 2 and more: else no view is left to train on",
             );
         }
-        match &self.reference {
-            Some(folder) if !folder.is_dir() => {
-                Err(Error::input(folder, "is not a folder of reference images"))
+        let folders = [
+            (&self.images, "photographs"),
+            (&self.reference, "reference images"),
+            (&self.depth.folder, "depth maps"),
+        ];
+        for (folder, of) in folders {
+            if let Some(folder) = folder.as_ref().filter(|folder| !tree::is_dir(folder)) {
+                return Err(Error::input(folder, format!("is not a folder of {of}")));
             }
-            _ => Ok(()),
-        }?;
-        match &self.depth.folder {
-            Some(folder) if !folder.is_dir() => {
-                Err(Error::input(folder, "is not a folder of depth maps"))
-            }
-            _ => Ok(()),
         }
+        Ok(())
     }
 }

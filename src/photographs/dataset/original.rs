@@ -13,6 +13,7 @@ use crate::base::hash::Hasher;
 use crate::camera::Lens;
 use crate::photographs::image::{Image, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
+use crate::photographs::white_balance::WhiteBalanceGains;
 
 /// A photograph that was shrunk on loading, or is not kept.
 #[derive(Clone, Debug)]
@@ -22,6 +23,8 @@ pub struct Original {
     lens: Lens,
     /// As [`super::LoadOptions::undistort`].
     undistort: bool,
+    /// White balance of a photograph.
+    pub(super) gains: Option<WhiteBalanceGains>,
     /// The statistics of the photograph, and of which size.
     pub(super) measured: Option<(MeasuredSize, MeasuredPhotograph)>,
     /// Of the pixels as they are loaded, where they are not kept.
@@ -32,7 +35,8 @@ pub struct Original {
 
 impl Original {
     pub(super) fn new(path: PathBuf, lens: Lens, undistort: bool) -> Self {
-        Self { path, lens, undistort, measured: None, checksum: None, stored: Arc::default() }
+        let stored = Arc::default();
+        Self { path, lens, undistort, gains: None, measured: None, checksum: None, stored }
     }
 
     /// Width and height, undistorted.
@@ -58,7 +62,10 @@ impl Original {
     pub(super) fn load_at(&self, size: (u32, u32)) -> Result<Image> {
         let Self { path, lens, undistort, .. } = self;
         let preparation = Preparation::new(lens, *undistort, size, &path.to_string_lossy())?;
-        let (image, _) = PictureFile::open(path)?.decode()?;
+        let (mut image, _) = PictureFile::open(path)?.decode()?;
+        if let Some(gains) = self.gains {
+            gains.apply(&mut image);
+        }
         let orientation = turn(path, (image.width, image.height), lens);
         preparation.loaded(image.turned(orientation), path)
     }

@@ -1,13 +1,16 @@
 //! From files to views: decode, check against the camera, undistort, shrink. Parallel over views.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use rayon::prelude::*;
 
 use super::allowance::Allowance;
+use super::borders::{self, Border};
+use super::dark_references;
 use super::depth::depth_map;
+use super::loaded::Loaded;
 use super::original::Original;
 use super::packed::Packed;
 use super::prepare::{Preparation, check_size, disagreement, pixel_count, turn};
@@ -16,8 +19,9 @@ use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
 use crate::camera::{Camera, Lens};
-use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
+use crate::photographs::image::{ColourTally, Image, Mask, Orientation, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
+use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 
 /// The shortest side that leaves something to train on, pixels.
@@ -33,7 +37,7 @@ pub(crate) type Look<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>) + Sync);
 pub(super) fn load(
     sources: Vec<Source>,
     options: &LoadOptions,
-    look: Option<Look<'_>>,
+    (look, gains): (Option<Look<'_>>, Option<WhiteBalanceGains>),
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
     let memory = Allowance::new(MAX_READ);
@@ -52,10 +56,23 @@ pub(super) fn load(
         }
     }
     let options = &resolved(&groups, options);
+    let borders = match options.mask_borders {
+        true => borders::find(groups.iter().flat_map(|(_, group)| group)),
+        false => BTreeMap::new(),
+    };
     let largest = groups.iter().map(|(lens, _)| pixel_count((lens.width, lens.height))).max();
     let at_once = Image::decoded_at_once(largest.unwrap_or_default());
     let originals = Allowance::new(bytes_for_originals(&groups, options));
-    let loading = Loading { options, at_once, look, originals: &originals };
+    let colours = [ColourTally::default(), ColourTally::of("reference image")];
+    let loading = Loading {
+        options,
+        at_once,
+        look,
+        gains,
+        originals: &originals,
+        borders: &borders,
+        colours: &colours,
+    };
     let mut loaded: Vec<Loaded> = vec![];
     while !groups.is_empty() {
         // What was read goes with its group.
@@ -63,7 +80,9 @@ pub(super) fn load(
         let now = now.into_par_iter().map(|(lens, group)| load_group(&lens, group, &loading));
         loaded.extend(now.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
+    colours.iter().for_each(ColourTally::say);
     loaded.sort_by(|a, b| a.name.cmp(&b.name));
+    dark_references::drop_from(&mut loaded, options);
     let mut views = Vec::with_capacity(loaded.len());
     for Loaded { view, problems, .. } in loaded {
         views.extend(view);
@@ -78,8 +97,14 @@ struct Loading<'a> {
     /// How many photographs are decoded side by side.
     at_once: usize,
     look: Option<Look<'a>>,
+    /// White balance of the photographs.
+    gains: Option<WhiteBalanceGains>,
     /// For photographs at their own size.
     originals: &'a Allowance,
+    /// Black borders of photographs by their size as stored.
+    borders: &'a BTreeMap<(u32, u32), Border>,
+    /// What was made of the colours of photographs and of reference images.
+    colours: &'a [ColourTally; 2],
 }
 
 /// Bytes that `keep` leaves for photographs at their own size, where a curve is applied to those: it needs the statistics
@@ -194,6 +219,13 @@ fn load_group(lens: &Lens, mut group: Vec<Source>, loading: &Loading<'_>) -> Res
     Ok(loaded)
 }
 
+/// The mean of an image, of some of its values.
+fn mean(image: &Image) -> f32 {
+    let some = image.data.iter().step_by(97);
+    let count = some.len().max(1) as f32;
+    some.sum::<f32>() / count
+}
+
 /// Loads the views of one lens.
 struct ViewLoader<'a> {
     preparation: Preparation<'a>,
@@ -202,13 +234,6 @@ struct ViewLoader<'a> {
     /// The pixels of `camera` that a fisheye does not see.
     unseen: Vec<usize>,
     loading: &'a Loading<'a>,
-}
-
-struct Loaded {
-    name: String,
-    /// `None`: a training view whose photograph does not decode.
-    view: Option<View>,
-    problems: Vec<String>,
 }
 
 /// A picture of a view.
@@ -222,7 +247,7 @@ struct Decoded {
 
 /// What memory holds of a photograph or reference image: its pixels as they are loaded, and its file where those are not
 /// all of it.
-type CachedImage = (Option<Image>, Option<Original>);
+type InMemory = (Option<Image>, Option<Original>);
 
 impl ViewLoader<'_> {
     fn load(&self, source: Source) -> Result<Loaded> {
@@ -231,12 +256,20 @@ impl ViewLoader<'_> {
             source;
         let (options, [read, read_reference]) = (loading.options, read);
         let mut problems = Vec::new();
-        let photograph = self.decode((input, read), &mut problems)?;
-        let reference = self.decode((reference, read_reference), &mut problems)?;
+        let [colours, reference_colours] = loading.colours;
+        let mut photograph = self.decode((input, read), colours, &mut problems)?;
+        if let (Some(gains), Some(photograph)) = (loading.gains, &mut photograph) {
+            gains.apply(&mut photograph.image);
+        }
+        let reference =
+            self.decode((reference, read_reference), reference_colours, &mut problems)?;
         let stored_mask = match photograph.as_ref().or(reference.as_ref()) {
             Some(Decoded { path, image, alpha, orientation }) => {
                 let decoded = (image, alpha.as_ref());
-                Mask::over(path, decoded, mask.as_deref(), options.invert_masks)?
+                let own = Mask::over(path, decoded, mask.as_ref(), options.invert_masks)?;
+                let size = (image.width, image.height);
+                let border = self.loading.borders.get(&size).map(|border| border.as_slice());
+                Mask::hiding_too(own, size, border.unwrap_or_default())
                     .map(|stored| (stored, path.clone(), *orientation))
             }
             None => None,
@@ -247,6 +280,11 @@ impl ViewLoader<'_> {
         let mask = stored_mask
             .map(|(stored, path, orientation)| preparation.mask(&stored, &path, orientation));
         let mask = Mask::hiding_too(mask.transpose()?.flatten(), preparation.size, unseen);
+        let brightness = [&photograph, &reference]
+            .map(|decoded| decoded.as_ref().map(|decoded| mean(&decoded.image)));
+        let reference_original = reference.as_ref().map(|decoded| {
+            Original::new(decoded.path.clone(), *preparation.lens, options.undistort)
+        });
         let is_hidden = mask.as_ref().is_some_and(Mask::hides_all);
         if is_hidden {
             problems.push(format!("{name}: no pixel is a number that its mask shows"));
@@ -268,7 +306,7 @@ impl ViewLoader<'_> {
         let view = View::new(&name, split, Camera { view_from_world, ..*camera }, image);
         let view = View { original, reference, reference_file, mask, depth, ..view };
         let view = (split == Split::Test || view.has_photograph()).then_some(view);
-        Ok(Loaded { name, view, problems })
+        Ok(Loaded { name, view, problems, brightness, reference: reference_original })
     }
 
     /// Decodes a file; `None`, and a problem, where that is no picture.
@@ -278,6 +316,7 @@ impl ViewLoader<'_> {
     fn decode(
         &self,
         (path, read): (Option<PathBuf>, Option<Arc<PictureFile>>),
+        colours: &ColourTally,
         problems: &mut Vec<String>,
     ) -> Result<Option<Decoded>> {
         let lens = self.preparation.lens;
@@ -287,7 +326,7 @@ impl ViewLoader<'_> {
         if let Ok(file) = &file {
             check_size(&path, file, lens)?;
         }
-        match file.and_then(PictureFile::decode) {
+        match file.and_then(|file| file.decode_counted(colours)) {
             Ok((image, alpha)) => {
                 let orientation = turn(&path, (image.width, image.height), lens);
                 Ok(Some(Decoded { path, image, alpha, orientation }))
@@ -305,7 +344,7 @@ impl ViewLoader<'_> {
         decoded: Decoded,
         mask: Option<&Mask>,
         is_training: bool,
-    ) -> Result<CachedImage> {
+    ) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
         let Decoded { path, image, orientation, .. } = decoded;
@@ -316,6 +355,7 @@ impl ViewLoader<'_> {
             return Ok((Some(whole), None));
         }
         let mut original = Original::new(path, *preparation.lens, options.undistort);
+        original.gains = loading.gains;
         let measured = |image: &Image| match mask {
             Some(mask) => MeasuredPhotograph::of(&mask.counted(image)),
             None => MeasuredPhotograph::of(&image.data),
@@ -343,7 +383,7 @@ impl ViewLoader<'_> {
         Ok((None, Some(original)))
     }
 
-    fn reference_image(&self, decoded: Decoded) -> Result<CachedImage> {
+    fn reference_image(&self, decoded: Decoded) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
         let Decoded { path, image, orientation, .. } = decoded;
         if loading.options.keep == Some(0) {

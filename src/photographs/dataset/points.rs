@@ -1,45 +1,159 @@
-//! The points of a dataset's COLMAP model, in the world of its views.
+//! The points of a dataset, in the world of its views.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use glam::DVec3;
+use glam::{DAffine3, DVec3};
 
+use super::layout::{CAMERAS, Layout};
+use super::ply::Cloud;
 use super::similarity::Similarity;
-use super::{Point, View, colmap, names};
+use super::{Point, View, colmap, names, ply};
 use crate::Result;
+use crate::base::tree;
+use crate::photographs::image::files::is_hidden;
 
 /// The largest camera-centre error, relative to the cameras' extent, at which two worlds count as the same.
 const MAX_WORLD_RESIDUAL: f64 = 0.01;
 
-/// The points of the dataset's COLMAP model, brought into the views' world.
-pub(super) fn points(root: &Path, views: &[View]) -> Result<Vec<Point>> {
+/// The points of the dataset, in the views' world: those of its COLMAP model, which know the photographs that see them;
+/// where it has none, those of a PLY file that the listing names or that lies beside it.
+pub(super) fn points(layout: &Layout, views: &[View], listed: &[Cloud]) -> Result<Vec<Point>> {
+    let of_model = of_model(layout, views)?;
+    if !of_model.is_empty() {
+        return Ok(of_model);
+    }
+    for cloud in listed.iter().cloned().chain(beside(&layout.root)) {
+        if let Some(points) = read(&cloud.file) {
+            return Ok(placed(&cloud, points, views));
+        }
+    }
+    let models = layout.models(&CAMERAS);
+    for folder in &models {
+        let Some(points) = beside(folder).find_map(|cloud| read(&cloud.file)) else { continue };
+        if let Some(to_views) = Shared::of(folder, views)?.to_views(folder) {
+            let point = |position| Point { position: to_views(position), views: vec![] };
+            return Ok(points.into_iter().map(point).collect());
+        }
+    }
+    warn_of_unread(layout, &models);
+    Ok(vec![])
+}
+
+/// Files of points beside a listing or in a model, by the names that tools give them.
+fn beside(folder: &Path) -> impl Iterator<Item = Cloud> + use<> {
+    const NAMES: [&str; 5] =
+        ["points3D.ply", "points3d.ply", "sparse_pc.ply", "point_cloud.ply", "pointcloud.ply"];
+    let files = NAMES.map(|name| folder.join(name)).into_iter();
+    files.filter(|file| tree::is_file(file)).map(|file| Cloud { file, applied: None })
+}
+
+/// Names the files of points that are not read where the dataset has none.
+fn warn_of_unread(layout: &Layout, models: &[PathBuf]) {
+    const ENDINGS: [&str; 6] = ["ply", "pcd", "las", "laz", "e57", "pts"];
+    let folders = [&layout.root].into_iter().chain(models);
+    let mut files: Vec<PathBuf> =
+        folders.flat_map(|folder| tree::entries(folder).unwrap_or_default()).collect();
+    files.retain(|file| {
+        let ending = file.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        ENDINGS.contains(&ending.as_str()) && !is_hidden(file)
+    });
+    files.sort();
+    if let Some(first) = files.first() {
+        tracing::warn!(
+            "{}: is not read; points come from a COLMAP model, from `ply_file_path` of a transforms.json or from points3D.ply",
+            first.display()
+        );
+    }
+}
+
+/// The points of a file; `None` and a warning where there are none.
+fn read(file: &Path) -> Option<Vec<DVec3>> {
+    match ply::points(file) {
+        Ok(points) if points.is_empty() => tracing::warn!("{}: holds no points", file.display()),
+        Ok(points) => {
+            tracing::info!("{}: {} points", file.display(), points.len());
+            return Some(points);
+        }
+        Err(problem) => tracing::warn!("{problem}"),
+    }
+    None
+}
+
+/// Points of a listing's world. Where the listing applied a transform to its cameras, it may have left it out of the points:
+/// of the two worlds the one that more photographs show counts.
+fn placed(cloud: &Cloud, points: Vec<DVec3>, views: &[View]) -> Vec<Point> {
+    /// Of a cloud seen from the wrong place about as much is seen; this much more is no chance.
+    const CLEARLY_MORE: f64 = 1.1;
+    let seen = |to_views: DAffine3| {
+        let step = points.len().div_ceil(1000);
+        let some: Vec<DVec3> =
+            points.iter().step_by(step).map(|point| to_views.transform_point3(*point)).collect();
+        let by_view =
+            |view: &View| some.iter().filter(|point| view.camera.sees(**point).is_some()).count();
+        views.iter().map(by_view).sum::<usize>() as f64
+    };
+    let as_stored = seen(DAffine3::IDENTITY);
+    let applied = cloud.applied.filter(|applied| seen(*applied) > CLEARLY_MORE * as_stored);
+    if applied.is_some() {
+        tracing::info!(
+            "{}: brought into the views' world by applied_transform",
+            cloud.file.display()
+        );
+    }
+    let to_views = applied.unwrap_or(DAffine3::IDENTITY);
+    let point = |position| Point { position: to_views.transform_point3(position), views: vec![] };
+    points.into_iter().map(point).collect()
+}
+
+/// The photographs that a model and the views share.
+struct Shared {
+    /// Image id, view, and the camera's position in either world.
+    images: Vec<(u32, u32, [DVec3; 2])>,
+}
+
+impl Shared {
+    fn of(folder: &Path, views: &[View]) -> Result<Self> {
+        let view_named = view_named(views);
+        let images = colmap::read_images(folder)?;
+        let shared = images.iter().filter_map(|image| {
+            let view = view_named(&image.name)?;
+            let own = image.view_from_world?.inverse().translation;
+            Some((image.id, view, [own, views[view as usize].camera.center()]))
+        });
+        Ok(Self { images: shared.collect() })
+    }
+
+    fn to_views(&self, folder: &Path) -> Option<Box<dyn Fn(DVec3) -> DVec3>> {
+        let pairs: Vec<_> = self.images.iter().map(|(.., [model, view])| (*model, *view)).collect();
+        same_world(folder, &pairs)
+    }
+}
+
+/// The view of a photograph that a model names.
+fn view_named(views: &[View]) -> impl Fn(&str) -> Option<u32> {
     let by_name: BTreeMap<&str, u32> =
         views.iter().zip(0..).map(|(view, index)| (view.name.as_str(), index)).collect();
-    let view_named = |image: &str| {
+    move |image| {
         let names = names::possible(&image.replace('\\', "/"));
         names.iter().find_map(|name| by_name.get(name.as_str()).copied())
-    };
-    let models = colmap::find(root, &["images", "points3D"]);
+    }
+}
+
+/// The points of the dataset's COLMAP model.
+fn of_model(layout: &Layout, views: &[View]) -> Result<Vec<Point>> {
+    let models = layout.models(&["images", "points3D"]);
+    let view_named = view_named(views);
     let Some((folder, _)) = colmap::largest(&models, |name| view_named(name).is_some())? else {
         return Ok(Vec::new());
     };
-    let images = colmap::read_images(folder)?;
     let points = colmap::read_points(folder)?;
-    let shared = images.iter().filter_map(|image| {
-        let view = view_named(&image.name)?;
-        Some((image.id, view, image.view_from_world?.inverse().translation))
-    });
-    let shared: Vec<(u32, u32, DVec3)> = shared.collect();
-    let pairs: Vec<_> = shared
-        .iter()
-        .map(|(_, view, center)| (*center, views[*view as usize].camera.center()))
-        .collect();
-    let Some(to_views) = same_world(folder, &pairs) else {
+    let shared = Shared::of(folder, views)?;
+    let Some(to_views) = shared.to_views(folder) else {
         return Ok(Vec::new());
     };
     let view_of: HashMap<u32, u32> =
-        shared.iter().map(|(image, view, _)| (*image, *view)).collect();
+        shared.images.iter().map(|(image, view, _)| (*image, *view)).collect();
     let point = |point: colmap::ModelPoint| {
         let seen_by: BTreeSet<u32> =
             point.images.iter().filter_map(|image| view_of.get(image).copied()).collect();

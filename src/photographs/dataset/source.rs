@@ -7,8 +7,9 @@ use glam::DAffine3;
 
 use super::Split;
 use super::allowance::Allowance;
+use crate::base::tree;
 use crate::camera::Lens;
-use crate::photographs::image::{Image, PictureFile};
+use crate::photographs::image::{Image, MaskFile, PictureFile};
 
 /// What a view is made of.
 #[derive(Clone, Debug)]
@@ -20,7 +21,7 @@ pub(super) struct Source {
     pub(super) view_from_world: DAffine3,
     pub(super) input: Option<PathBuf>,
     pub(super) reference: Option<PathBuf>,
-    pub(super) mask: Option<PathBuf>,
+    pub(super) mask: Option<MaskFile>,
     pub(super) depth: Option<PathBuf>,
     /// Photograph and reference image, where they are read already.
     pub(super) read: [Option<Arc<PictureFile>>; 2],
@@ -31,7 +32,8 @@ impl Source {
     pub(super) fn new(
         (name, split): (String, Split),
         (lens, view_from_world): (Lens, DAffine3),
-        [input, reference, mask, depth]: [Option<PathBuf>; 4],
+        [input, reference, depth]: [Option<PathBuf>; 3],
+        mask: Option<MaskFile>,
     ) -> Self {
         let read = [None, None];
         Self { name, split, lens, view_from_world, input, reference, mask, depth, read }
@@ -44,7 +46,7 @@ impl Source {
         let mut sizes = [None; 2];
         for ((path, read), size) in paths.into_iter().zip(&mut self.read).zip(&mut sizes) {
             let Some(path) = path else { continue };
-            let bytes = path.metadata().map_or(u64::MAX, |file| file.len());
+            let bytes = tree::metadata(path).map_or(u64::MAX, |(length, _)| length);
             if !memory.take(bytes) {
                 *size = Image::size_of(path).ok();
             } else if let Ok(file) = PictureFile::open(path) {

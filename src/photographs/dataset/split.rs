@@ -1,16 +1,22 @@
 //! Which views are held out.
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::listed::ListedView;
 use super::{LoadOptions, Split, names};
 use crate::Result;
-use crate::base::input;
+use crate::base::{input, tree};
 use crate::photographs::image::files::Files;
 
 /// Every eighth of the name-sorted views is held out where nothing else says which.
 pub(super) const TEST_EVERY: usize = 8;
+
+/// The list of test photographs, beside the photographs or in the model, as 3DGS has it.
+pub(super) fn test_list(root: &Path) -> Option<PathBuf> {
+    let places = ["test.txt", "sparse/0/test.txt"].map(|place| root.join(place));
+    places.into_iter().find(|path| tree::is_file(path))
+}
 
 /// Frames that the listing did not assign: by `test.txt` (a name a line), else every eighth. Sorted by name already. Where
 /// it is asked for, every so many instead, whatever else says; 0: none.
@@ -24,15 +30,15 @@ pub(super) fn split(
         split_anew(root, frames, every, files);
         return Ok(());
     }
-    let path = root.join("test.txt");
+    let list = test_list(root);
     let mut undecided: Vec<&mut ListedView> =
         frames.iter_mut().filter(|frame| frame.split.is_none()).collect();
-    if undecided.is_empty() || !path.is_file() {
+    let Some(path) = list.filter(|_| !undecided.is_empty()) else {
         for (index, frame) in undecided.into_iter().enumerate() {
             frame.split = Some(if index % TEST_EVERY == 0 { Split::Test } else { Split::Train });
         }
         return Ok(());
-    }
+    };
     let text = input::text(&path)?;
     let known: BTreeSet<String> = undecided.iter().map(|frame| frame.name.clone()).collect();
     let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
@@ -61,7 +67,7 @@ pub(super) fn log_split(root: &Path, frames: &[ListedView], options: &LoadOption
     let own = if frames.iter().any(|frame| frame.split.is_some()) {
         Some("its transforms files")
     } else {
-        Some("its test.txt").filter(|_| root.join("test.txt").is_file())
+        Some("its test.txt").filter(|_| test_list(root).is_some())
     };
     if let Some((own, every)) = own.zip(options.test_every) {
         tracing::warn!(

@@ -2,12 +2,14 @@
 
 use std::path::Path;
 
+use super::layout::Layout;
 use super::listed::Listing;
 use super::listing::list;
 use super::split::split;
-use super::{Dataset, LoadOptions, colmap, sources};
+use super::{Dataset, LoadOptions, sources};
 use crate::Result;
 use crate::base::hash::{self, Hasher};
+use crate::base::tree;
 use crate::photographs::image::files::Files;
 
 impl Dataset {
@@ -20,37 +22,44 @@ impl Dataset {
     pub(crate) fn stamp(root: &Path, options: &LoadOptions) -> Result<String> {
         options.check()?;
         let files = Files::default();
-        let Listing { mut frames, mut skipped, .. } = list(root, &files)?;
+        let layout = Layout::of(root)?;
+        let root = layout.root.as_path();
+        let Listing { mut frames, mut skipped, .. } =
+            list(&layout, options.images.as_deref(), &files)?;
         split(root, &mut frames, options.test_every, &files)?;
         let mut hasher = Hasher::default();
+        hasher.write(READING);
         for source in sources(root, &frames, options, &files, &mut skipped) {
             // Debug tells every two cameras apart.
             let view = format!("{} {:?} {:?}", source.name, source.split, source.lens);
             hasher.write(view.as_bytes());
             hasher.write_numbers(&source.view_from_world.to_cols_array());
-            for file in [&source.input, &source.reference, &source.mask, &source.depth] {
+            let mask = source.mask.map(|mask| mask.path);
+            for file in [&source.input, &source.reference, &mask, &source.depth] {
                 file.iter().for_each(|path| write_file(&mut hasher, path));
             }
         }
-        let folders = colmap::find(root, &["images", "points3D"]);
+        let folders = layout.models(&["images", "points3D"]);
         for folder in folders.iter().map(|folder| folder.as_path()).chain([root]) {
-            let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-            let mut paths: Vec<_> = entries.map(|entry| entry.path()).collect();
+            let mut paths = tree::entries(folder).unwrap_or_default();
             paths.sort();
             paths
                 .iter()
-                .filter(|path| path.is_file())
+                .filter(|path| tree::is_file(path))
                 .for_each(|path| write_file(&mut hasher, path));
         }
         Ok(hash::text(hasher.finish()))
     }
 }
 
+/// Of how files are read: another where the same file gives other pixels than before.
+const READING: &[u8] = b"in sRGB";
+
 fn write_file(hasher: &mut Hasher, path: &Path) {
     hasher.write(path.as_os_str().as_encoded_bytes());
-    let Ok(there) = path.metadata() else { return };
+    let Ok((length, changed)) = tree::metadata(path) else { return };
     // Debug tells every two times apart.
-    let changed = format!("{:?}", there.modified().ok());
-    hasher.write(&there.len().to_le_bytes());
+    let changed = format!("{changed:?}");
+    hasher.write(&length.to_le_bytes());
     hasher.write(changed.as_bytes());
 }

@@ -3,18 +3,25 @@
 //! `transform_matrix` is view to world in OpenGL axes (x right, y up, z back). Intrinsics stand at the top, in a frame,
 //! or both: the frame's win.
 
+mod intrinsics;
+mod keys;
+mod matrix;
+
 use std::path::{Path, PathBuf};
 
-use glam::{DAffine3, DMat3, DVec2, DVec3};
+use glam::{DAffine3, DMat3, DVec3};
 use serde::Deserialize;
+use serde_json::{Map, Value};
 
-use super::Split;
-use super::colmap::SUPPORTED;
+use self::intrinsics::Intrinsics;
+use self::keys::Unsupported;
+use self::matrix::Rows;
 use super::listed::{ListedView, Listing};
-use super::names::below_first;
-use crate::base::input;
-use crate::camera::{Distortion, Lens};
-use crate::photographs::image::Image;
+use super::locate::{self, Wanted};
+use super::ply::Cloud;
+use super::{Split, names};
+use crate::base::{input, tree};
+use crate::photographs::image::MaskFile;
 use crate::photographs::image::files::{Files, stem};
 use crate::{Error, Result};
 
@@ -23,59 +30,46 @@ struct Transforms {
     #[serde(flatten)]
     shared: Intrinsics,
     frames: Vec<ListedFrame>,
+    /// Held-out frames of the same form (ScanNet++).
+    #[serde(default)]
+    test_frames: Vec<ListedFrame>,
+    ply_file_path: Option<String>,
+    /// 3x4 rows: from the world of the original data to that of the frames (nerfstudio).
+    applied_transform: Option<Rows>,
+    #[serde(flatten)]
+    splits: StatedSplits,
+    #[serde(flatten)]
+    others: Map<String, Value>,
+}
+
+/// Names of files by split (nerfstudio).
+#[derive(Deserialize)]
+struct StatedSplits {
+    train_filenames: Option<Vec<String>>,
+    val_filenames: Option<Vec<String>>,
+    test_filenames: Option<Vec<String>>,
 }
 
 #[derive(Deserialize)]
 struct ListedFrame {
     file_path: String,
-    /// 4x4 or 3x4 rows; `None` stands for NaN.
-    transform_matrix: Vec<Vec<Option<f64>>>,
+    #[serde(deserialize_with = "matrix::rows")]
+    transform_matrix: Rows,
     #[serde(flatten)]
     own: Intrinsics,
-}
-
-#[derive(Clone, Default, Deserialize)]
-struct Intrinsics {
-    #[serde(default, deserialize_with = "number")]
-    w: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    h: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    fl_x: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    fl_y: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    camera_angle_x: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    cx: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    cy: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    k1: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    k2: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    k3: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    k4: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    p1: Option<f64>,
-    #[serde(default, deserialize_with = "number")]
-    p2: Option<f64>,
-    camera_model: Option<String>,
-    is_fisheye: Option<bool>,
-}
-
-/// A number that is there; null stands for NaN, which is not the same as leaving it out.
-fn number<'de, D: serde::Deserializer<'de>>(value: D) -> Result<Option<f64>, D::Error> {
-    Option::<f64>::deserialize(value).map(|number| number.or(Some(f64::NAN)))
+    mask_path: Option<String>,
+    #[serde(alias = "depth_path")]
+    depth_file_path: Option<String>,
+    split: Option<String>,
+    #[serde(flatten)]
+    others: Map<String, Value>,
 }
 
 /// The files that make up a listing below `root`, with the split each stands for; empty where there is none.
 ///
 /// `transforms_val.json` often repeats test views: it counts only where there is no test listing.
 pub(super) fn find(root: &Path) -> Vec<(PathBuf, Option<Split>)> {
-    let existing = |name: &str| Some(root.join(name)).filter(|path| path.is_file());
+    let existing = |name: &str| Some(root.join(name)).filter(|path| tree::is_file(path));
     let held_out = existing("transforms_test.json").or_else(|| existing("transforms_val.json"));
     match (existing("transforms_train.json"), held_out) {
         (Some(train), Some(test)) => vec![(train, Some(Split::Train)), (test, Some(Split::Test))],
@@ -84,47 +78,266 @@ pub(super) fn find(root: &Path) -> Vec<(PathBuf, Option<Split>)> {
     }
 }
 
-/// Reads one file's frames into the listing; a frame without a usable pose or size goes to `skipped`.
+/// One file of a listing, read but not looked at.
+struct Read<'a> {
+    path: &'a Path,
+    transforms: Transforms,
+}
+
+/// Reads the files of a listing; a frame without a usable pose or size goes to `skipped`.
+///
+/// # Errors
+/// [`Error::Input`] where a file is no listing, or a frame has intrinsics that are not supported.
 pub(super) fn read(
-    root: &Path,
-    path: &Path,
-    split: Option<Split>,
+    (root, images): (&Path, Option<&Path>),
+    listings: &[(PathBuf, Option<Split>)],
     files: &Files,
     listing: &mut Listing,
 ) -> Result<()> {
+    let mut frames = vec![];
+    let mut read = vec![];
+    for (path, split) in listings {
+        let mut transforms = parse(path)?;
+        let own = usable_frames(path, &mut transforms, *split, listing);
+        frames.extend(own.into_iter().map(|frame| (read.len(), frame)));
+        read.push(Read { path, transforms });
+    }
+    let wanted = frames.iter().map(|(_, frame)| Wanted {
+        is_test: frame.split == Some(Split::Test),
+        path: listed_path(&frame.listed.file_path),
+        places: vec![root.to_owned()],
+    });
+    let found = locate::photographs((root, images), wanted.collect(), files, listing);
+    for ((file, frame), found) in frames.into_iter().zip(found) {
+        let Read { path, transforms } = &read[file];
+        let listed = frame.listed;
+        let intrinsics = listed.own.over(&transforms.shared);
+        let Some(size) = intrinsics.size(found.file.as_deref()) else {
+            listing.skipped.push(format!(
+                "{}: neither w and h nor a readable file says how large it is",
+                found.listed
+            ));
+            continue;
+        };
+        let lens = intrinsics
+            .lens(size)
+            .map_err(|problem| Error::input(*path, format!("{}: {problem}", found.listed)))?;
+        let mask = listed.mask_path.map(|path| MaskFile::shown(listed_path(&path).into()));
+        listing.frames.push(ListedView {
+            name: names::normalized(stem(&found.listed)),
+            listed: found.listed,
+            below: found.below,
+            split: frame.split,
+            file: found.file,
+            lens,
+            view_from_world: frame.view_from_world,
+            mask,
+            depth: listed.depth_file_path.map(|path| listed_path(&path).into()),
+        });
+    }
+    locate::beside(root, files, listing);
+    for Read { path, transforms } in &read {
+        listing.clouds.extend(cloud(root, path, transforms, &mut listing.remarks));
+    }
+    Ok(())
+}
+
+fn parse(path: &Path) -> Result<Transforms> {
     let text = input::text(path)?;
-    let transforms: Transforms = serde_json::from_str(&nan_as_null(&text)).map_err(|error| {
+    serde_json::from_str(&nan_as_null(&text)).map_err(|error| {
         let remedy = if error.is_eof() {
             "it is cut short, copy it again"
         } else {
             "mend or export it anew"
         };
         Error::input(path, format!("is not a usable transforms file ({error}); {remedy}"))
-    })?;
-    for frame in transforms.frames {
-        let listed = frame.file_path.replace('\\', "/");
-        let listed = listed.trim_start_matches("./").to_owned();
-        let Some(view_from_world) = pose(&frame.transform_matrix) else {
-            listing.skipped.push(format!(
-                "{listed}: its transform_matrix is no finite rotation and translation"
-            ));
+    })
+}
+
+/// A path as listings are compared: with slashes, without what points to where it stands.
+fn listed_path(path: &str) -> String {
+    let path = path.replace('\\', "/");
+    path.trim_start_matches("./").to_owned()
+}
+
+/// A frame with its pose.
+struct TrainingFrame {
+    listed: ListedFrame,
+    split: Option<Split>,
+    view_from_world: DAffine3,
+}
+
+/// Takes the frames of a file that have a pose and are not marked to be left out.
+fn usable_frames(
+    path: &Path,
+    transforms: &mut Transforms,
+    split: Option<Split>,
+    listing: &mut Listing,
+) -> Vec<TrainingFrame> {
+    let mut unsupported = Unsupported::default();
+    unsupported.add(&transforms.others);
+    let held_out = std::mem::take(&mut transforms.test_frames);
+    let own = std::mem::take(&mut transforms.frames).into_iter();
+    let own_split = if held_out.is_empty() { split } else { Some(Split::Train) };
+    let all: Vec<(ListedFrame, Option<Split>)> = own
+        .map(|frame| (frame, own_split))
+        .chain(held_out.into_iter().map(|frame| (frame, Some(Split::Test))))
+        .collect();
+    let is_transposed =
+        matrix::are_transposed(all.iter().map(|(frame, _)| &frame.transform_matrix));
+    let mut mended = Mended { is_transposed, ..Mended::default() };
+    let (mut bad, mut unassigned) = (0, 0);
+    let mut frames = vec![];
+    for (listed, split) in all {
+        let name = listed_path(&listed.file_path);
+        if keys::is_marked_bad(&listed.others) {
+            bad += 1;
             continue;
-        };
-        let file = files.find(root, &listed);
-        let intrinsics = frame.own.over(&transforms.shared);
-        let Some(size) = intrinsics.size(file.as_deref()) else {
-            listing.skipped.push(format!(
-                "{listed}: neither w and h nor a readable file says how large it is"
-            ));
+        }
+        unsupported.add(&listed.others);
+        let stated = transforms.splits.of(&name, listed.split.as_deref());
+        if stated == Stated::Neither {
+            unassigned += 1;
             continue;
-        };
-        let lens = intrinsics
-            .lens(size)
-            .map_err(|problem| Error::input(path, format!("{listed}: {problem}")))?;
-        let (name, below) = (stem(&listed).to_owned(), below_first(&listed).to_owned());
-        listing.frames.push(ListedView { name, listed, below, split, file, lens, view_from_world });
+        }
+        match matrix::pose(&listed.transform_matrix, is_transposed) {
+            Err(problem) => listing.skipped.push(format!(
+                "{name}: its transform_matrix {problem}; export it right-handed, in OpenGL axes"
+            )),
+            Ok(pose) => {
+                mended.add(&pose);
+                let split = stated.split().or(split);
+                let view_from_world = pose.view_from_world;
+                frames.push(TrainingFrame { listed, split, view_from_world });
+            }
+        }
     }
-    Ok(())
+    let shown = path.display();
+    let mut say = |line: Option<String>| listing.remarks.extend(line);
+    say(unsupported.remark(path));
+    say(mended.remark(path));
+    say((bad > 0).then(|| format!("{shown}: {bad} frames are marked bad and left out")));
+    say((unassigned > 0).then(|| {
+        format!("{shown}: {unassigned} frames are in none of its lists of file names by split, and left out")
+    }));
+    frames
+}
+
+/// What was mended of the matrices of a file.
+#[derive(Default)]
+struct Mended {
+    is_transposed: bool,
+    scaled: usize,
+    scale: f64,
+    rounded: usize,
+}
+
+impl Mended {
+    fn add(&mut self, pose: &matrix::Pose) {
+        if pose.scale != 1.0 {
+            self.scaled += 1;
+            self.scale = pose.scale;
+        }
+        self.rounded += usize::from(pose.is_rounded);
+    }
+
+    fn remark(&self, path: &Path) -> Option<String> {
+        let mut parts = vec![];
+        if self.is_transposed {
+            parts.push("are transposed (the translation is their last row) and read so".to_owned());
+        }
+        if self.scaled > 0 {
+            parts.push(format!(
+                "hold a scale ({} of them, {:.4} the last), which is divided out",
+                self.scaled, self.scale
+            ));
+        }
+        if self.rounded > 0 {
+            parts.push(format!(
+                "are rounded ({} of them): the nearest rotation is taken",
+                self.rounded
+            ));
+        }
+        (!parts.is_empty())
+            .then(|| format!("{}: its matrices {}", path.display(), parts.join("; ")))
+    }
+}
+
+/// What a listing says of a frame's split.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Stated {
+    Nothing,
+    As(Split),
+    /// There are lists, and it is in none.
+    Neither,
+}
+
+impl Stated {
+    fn split(self) -> Option<Split> {
+        match self {
+            Self::As(split) => Some(split),
+            Self::Nothing | Self::Neither => None,
+        }
+    }
+}
+
+impl StatedSplits {
+    /// The split of a frame by its own key, else by the lists. As with files, a validation list counts only where there is no
+    /// test list.
+    fn of(&self, name: &str, own: Option<&str>) -> Stated {
+        match own {
+            Some("train") => return Stated::As(Split::Train),
+            Some("test" | "val" | "eval") => return Stated::As(Split::Test),
+            _ => {}
+        }
+        let filled =
+            |list: &Option<Vec<String>>| list.as_ref().is_some_and(|list| !list.is_empty());
+        let lists = [&self.train_filenames, &self.val_filenames, &self.test_filenames];
+        if !lists.into_iter().any(filled) {
+            return Stated::Nothing;
+        }
+        let held_out =
+            if filled(&self.test_filenames) { &self.test_filenames } else { &self.val_filenames };
+        let holds = |list: &Option<Vec<String>>| {
+            list.iter().flatten().any(|listed| listed_path(listed) == name)
+        };
+        let train_is_listed = filled(&self.train_filenames);
+        match (holds(&self.train_filenames), holds(held_out)) {
+            (_, true) => Stated::As(Split::Test),
+            (true, false) => Stated::As(Split::Train),
+            (false, false) if train_is_listed && filled(held_out) => Stated::Neither,
+            (false, false) if train_is_listed => Stated::As(Split::Test),
+            (false, false) => Stated::As(Split::Train),
+        }
+    }
+}
+
+/// The points that a listing names.
+fn cloud(
+    root: &Path,
+    path: &Path,
+    transforms: &Transforms,
+    remarks: &mut Vec<String>,
+) -> Option<Cloud> {
+    let named = listed_path(transforms.ply_file_path.as_ref()?);
+    let name = named.rsplit('/').next().unwrap_or(&named);
+    let places = [root.join(&named), path.with_file_name(name)];
+    let Some(file) = places.into_iter().find(|place| tree::is_file(place)) else {
+        remarks.push(format!("{}: {named}, its ply_file_path, is absent", path.display()));
+        return None;
+    };
+    let applied = transforms.applied_transform.as_ref().and_then(|rows| {
+        let row = |index: usize| -> Option<[f64; 4]> {
+            let row: Option<Vec<f64>> = rows.get(index)?.iter().copied().collect();
+            row?.try_into().ok()
+        };
+        let [x, y, z] = [row(0)?, row(1)?, row(2)?];
+        let matrix3 =
+            DMat3::from_cols_array(&[x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2]]);
+        let translation = DVec3::new(x[3], y[3], z[3]);
+        Some(DAffine3 { matrix3: matrix3.transpose(), translation })
+    });
+    Some(Cloud { file, applied })
 }
 
 /// Python writes NaN and Infinity bare, which JSON does not know; as null they are reported with their frame.
@@ -138,98 +351,4 @@ fn nan_as_null(text: &str) -> String {
         return text.to_owned();
     }
     text.split('"').enumerate().map(quoted).collect::<Vec<_>>().join("\"")
-}
-
-fn pose(rows: &[Vec<Option<f64>>]) -> Option<DAffine3> {
-    let row = |index: usize| -> Option<[f64; 4]> {
-        let values: Option<Vec<f64>> = rows.get(index)?.iter().copied().collect();
-        values?.try_into().ok()
-    };
-    let [x, y, z] = [row(0)?, row(1)?, row(2)?];
-    let rotation =
-        DMat3::from_cols_array(&[x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2]]).transpose();
-    let world_from_gl = DAffine3 { matrix3: rotation, translation: DVec3::new(x[3], y[3], z[3]) };
-    let off = rotation.transpose() * rotation - DMat3::IDENTITY;
-    // Positive phrasing: a NaN fails the test too.
-    let is_rotation =
-        off.to_cols_array().iter().all(|entry| entry.abs() < 1e-3) && rotation.determinant() > 0.0;
-    let opencv_from_gl = DAffine3::from_scale(DVec3::new(1.0, -1.0, -1.0));
-    (is_rotation && world_from_gl.is_finite()).then(|| opencv_from_gl * world_from_gl.inverse())
-}
-
-impl Intrinsics {
-    fn over(self, shared: &Self) -> Self {
-        let shared = shared.clone();
-        // One focal length's spelling in the frame overrides the other's at the top.
-        let own_focal = self.fl_x.is_some() || self.camera_angle_x.is_some();
-        let shared_focal = |value: Option<f64>| if own_focal { None } else { value };
-        Self {
-            w: self.w.or(shared.w),
-            h: self.h.or(shared.h),
-            fl_x: self.fl_x.or(shared_focal(shared.fl_x)),
-            fl_y: self.fl_y.or(shared_focal(shared.fl_y)),
-            camera_angle_x: self.camera_angle_x.or(shared_focal(shared.camera_angle_x)),
-            cx: self.cx.or(shared.cx),
-            cy: self.cy.or(shared.cy),
-            k1: self.k1.or(shared.k1),
-            k2: self.k2.or(shared.k2),
-            k3: self.k3.or(shared.k3),
-            k4: self.k4.or(shared.k4),
-            p1: self.p1.or(shared.p1),
-            p2: self.p2.or(shared.p2),
-            camera_model: self.camera_model.or(shared.camera_model),
-            is_fisheye: self.is_fisheye.or(shared.is_fisheye),
-        }
-    }
-
-    /// Width and height, pixels: as listed, else the file's.
-    fn size(&self, file: Option<&Path>) -> Option<DVec2> {
-        if let (Some(w), Some(h)) = (self.w, self.h) {
-            return Some(DVec2::new(w, h));
-        }
-        let (width, height) = Image::size_of(file?).ok()?;
-        Some(DVec2::new(f64::from(width), f64::from(height)))
-    }
-
-    fn lens(&self, size: DVec2) -> Result<Lens, String> {
-        let undistort = "run COLMAP's image_undistorter and export its PINHOLE model";
-        let model = self.camera_model.as_deref().unwrap_or("OPENCV");
-        if model != "PERSPECTIVE" && !SUPPORTED.contains(&model) {
-            return Err(format!("the camera model {model} is not supported; {undistort}"));
-        }
-        let is_fisheye = self.is_fisheye == Some(true) || model.ends_with("FISHEYE");
-        let nonzero = |value: Option<f64>| value.unwrap_or(0.0) != 0.0;
-        if !is_fisheye && nonzero(self.k4) {
-            // Of r^8 in some exports, in OpenCV's a denominator.
-            return Err(format!("k4 of a lens that is no fisheye is not supported; {undistort}"));
-        }
-        if is_fisheye && (nonzero(self.p1) || nonzero(self.p2)) {
-            return Err(format!("p1 and p2 of a fisheye are not supported; {undistort}"));
-        }
-        let from_angle = self.camera_angle_x.map(|angle| 0.5 * size.x / (0.5 * angle).tan());
-        let fl_x =
-            self.fl_x.or(from_angle).ok_or("there is neither fl_x nor camera_angle_x; add one")?;
-        let coefficient = |value: Option<f64>| value.unwrap_or(0.0);
-        let lens = Lens {
-            // A saturating cast: nonsense becomes a size that `problem` refuses.
-            width: size.x.round() as u32,
-            height: size.y.round() as u32,
-            focal: DVec2::new(fl_x, self.fl_y.unwrap_or(fl_x)),
-            principal_point: DVec2::new(
-                self.cx.unwrap_or(0.5 * size.x),
-                self.cy.unwrap_or(0.5 * size.y),
-            ),
-            distortion: Distortion {
-                k1: coefficient(self.k1),
-                k2: coefficient(self.k2),
-                k3: coefficient(self.k3),
-                k4: coefficient(self.k4),
-                p1: coefficient(self.p1),
-                p2: coefficient(self.p2),
-                is_fisheye,
-                ..Distortion::default()
-            },
-        };
-        lens.problem().map_or(Ok(lens), |problem| Err(format!("{problem}; mend the intrinsics")))
-    }
 }

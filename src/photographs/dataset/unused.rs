@@ -4,6 +4,8 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use super::listed::ListedView;
+use super::masks;
+use crate::base::tree;
 use crate::photographs::image::files::{photographs_in, unread_in};
 
 /// A line where most photographs have no pose, and one for each folder with pictures that are not read.
@@ -25,7 +27,8 @@ pub(super) fn remarks(root: &Path, frames: &[ListedView]) -> Vec<String> {
     };
     let photographs: Vec<PathBuf> =
         folders.iter().flat_map(|folder| photographs_in(folder).unwrap_or_default()).collect();
-    let without_pose: Vec<&PathBuf> = photographs.iter().filter(|file| !is_used(file)).collect();
+    let without_pose: Vec<&PathBuf> =
+        photographs.iter().filter(|file| !is_used(file) && !masks::is_beside(file)).collect();
     let mut remarks = vec![];
     let (count, of) = (without_pose.len(), photographs.len());
     if let Some(first) = without_pose.first().filter(|_| 2 * count > of) {
@@ -41,10 +44,10 @@ pub(super) fn remarks(root: &Path, frames: &[ListedView]) -> Vec<String> {
 
 fn add_folders_below(folder: &Path, folders: &mut BTreeSet<PathBuf>) {
     folders.insert(folder.to_owned());
-    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+    for path in tree::entries(folder).unwrap_or_default() {
         // A link may lead back up.
-        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
-            add_folders_below(&entry.path(), folders);
+        if tree::is_dir(&path) && !path.is_symlink() {
+            add_folders_below(&path, folders);
         }
     }
 }

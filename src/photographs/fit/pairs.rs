@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use super::Histogram;
-use crate::photographs::image::{Image, files};
+use crate::photographs::image::{ColourTally, Image, files};
 use crate::photographs::tone::Statistics;
 use crate::photographs::tone::{luminance, measurable};
 use crate::{Error, Result};
@@ -90,10 +90,13 @@ impl FitScene {
     /// differ.
     pub fn load(folder: &Path, normal: Option<&Path>) -> Result<Self> {
         let (files, dark) = files_of(folder, normal)?;
+        let colours = ColourTally::default();
         let load = |(dark, reference): &Files| {
-            Pair::new(dark, &Image::load(dark)?, &Image::load(reference)?)
+            let [image, bright] = [dark, reference].map(|path| Image::load_counted(path, &colours));
+            Pair::new(dark, &image?, &bright?)
         };
         let mut pairs = files.par_iter().map(load).collect::<Result<Vec<Pair>>>()?;
+        colours.say();
         pairs.retain(|pair| {
             if pair.is_black() {
                 tracing::warn!("left out: {} is black", pair.path.display());

@@ -20,7 +20,7 @@ use serde::Serialize;
 
 use super::pairs::{files_of, name_of};
 use crate::kernels::pseudo_gt::SEGMENTS;
-use crate::photographs::image::Image;
+use crate::photographs::image::{ColourTally, Image};
 use crate::photographs::tone::{Exposure, LuminanceHistogram, Profile, measurable, soft};
 use crate::{Error, Result};
 
@@ -88,10 +88,13 @@ impl ColourScene {
     pub fn load(folder: &Path, normal: Option<&Path>) -> Result<Self> {
         let (files, dark) = files_of(folder, normal)?;
         let share = (COLOURS / files.len()).max(1);
+        let colours = ColourTally::default();
         let load = |(dark, reference): &(PathBuf, PathBuf)| {
-            sampled(dark, &Image::load(dark)?, &Image::load(reference)?, share)
+            let [image, bright] = [dark, reference].map(|path| Image::load_counted(path, &colours));
+            sampled(dark, &image?, &bright?, share)
         };
         let photographs = files.par_iter().map(load).collect::<Result<Vec<_>>>()?;
+        colours.say();
         let Some(exposure) = Exposure::of(photographs.iter().map(|(_, y)| y), None) else {
             let problem = "every photograph is as good as black: a profile takes one pair at least";
             return Err(Error::input(dark, problem));

@@ -1,6 +1,5 @@
 //! Photographs from and to files: PNG, JPEG, WebP, TIFF and EXR in, PNG and EXR out.
 
-use std::fs::File;
 use std::io::{BufReader, Cursor};
 use std::path::{Path, PathBuf};
 
@@ -10,13 +9,15 @@ use ::image::{
     error::UnsupportedErrorKind,
 };
 
+use super::colour::{self, ColourTally};
+use super::decoded::{Decoded, Meaning};
 #[cfg(not(feature = "raw"))]
 use super::files::RAW_REMEDY;
 use super::files::{HEIC_REMEDY, is_raw};
 use super::source::{Source, not_an_image, reader};
-use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb, srgb_from_linear};
-use crate::base::input;
+use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb};
 use crate::base::output::write_whole;
+use crate::base::{input, tree};
 use crate::{Error, Result};
 
 /// The file of a picture, read whole.
@@ -47,44 +48,52 @@ impl PictureFile {
         size_of_reader(&self.path, reader.map_err(|error| unreadable(&self.path, &error))?)
     }
 
-    /// The photograph, and its alpha: that of a PNG, WebP or TIFF file, or 0 where a value of an EXR file is not finite, in all
-    /// three planes; none where the file hides nothing.
+    /// The photograph in sRGB, and its alpha: that of a PNG, WebP or TIFF file, or 0 where a value of an EXR file is not finite,
+    /// in all three planes; none where the file hides nothing.
     ///
     /// # Errors
     /// As [`Image::load`].
     pub(crate) fn decode(self) -> Result<(Image, Option<Image>)> {
-        decode(&self.path, self.bytes, from_linear)
+        self.decode_counted(&ColourTally::default())
+    }
+
+    /// The same; what was made of its colours is counted.
+    ///
+    /// # Errors
+    /// As [`Image::load`].
+    pub(crate) fn decode_counted(self, counters: &ColourTally) -> Result<(Image, Option<Image>)> {
+        let Decoded { image, alpha, conversion } = decode(&self.path, self.bytes, Meaning::Colour)?;
+        counters.add(conversion);
+        Ok((image, alpha))
     }
 }
 
-/// The encoded value of a value of an EXR file that is a colour.
-fn from_linear(linear: f32) -> Option<f32> {
-    (linear >= 0.0).then(|| srgb_from_linear(linear))
-}
-
-fn decode(
-    path: &Path,
-    bytes: Vec<u8>,
-    from_exr_value: exr_file::FromExrValue,
-) -> Result<(Image, Option<Image>)> {
+fn decode(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Decoded> {
     budget::check(path, &bytes)?;
     if bytes.starts_with(&exr_file::MAGIC) {
-        return exr_file::load(path, bytes, from_exr_value);
+        return exr_file::load(path, bytes, meaning);
     }
-    if bytes.starts_with(&jpeg::MAGIC)
-        && let Some(image) = jpeg::load(path, &bytes)?
-    {
-        return Ok((image, None));
+    let is_jpeg = bytes.starts_with(&jpeg::MAGIC);
+    let by_libjpeg = if is_jpeg { jpeg::load(path, &bytes)? } else { None };
+    let (mut image, alpha) = match by_libjpeg {
+        Some(image) => (image, None),
+        None => {
+            refuse_heic(path, &bytes)?;
+            if is_raw(path) {
+                return Ok(Decoded::as_stored(load_raw(path, bytes)?, None));
+            }
+            let reader = reader(Cursor::new(bytes.as_slice()));
+            let decoded = reader.map_err(ImageError::from).and_then(ImageReader::decode);
+            let decoded = decoded.map_err(|error| undecodable(path, &error))?;
+            let alpha = alpha_of(&decoded);
+            (from_decoded(decoded), alpha)
+        }
+    };
+    if meaning == Meaning::Number {
+        return Ok(Decoded::as_stored(image, alpha));
     }
-    refuse_heic(path, &bytes)?;
-    if is_raw(path) {
-        return Ok((load_raw(path, bytes)?, None));
-    }
-    let reader = reader(Cursor::new(bytes));
-    let decoded = reader.map_err(ImageError::from).and_then(ImageReader::decode);
-    let decoded = decoded.map_err(|error| undecodable(path, &error))?;
-    let alpha = alpha_of(&decoded);
-    Ok((from_decoded(decoded), alpha))
+    let conversion = colour::convert(&mut image, &bytes);
+    Ok(Decoded { image, alpha, conversion })
 }
 
 /// The alpha of a decoded picture in all three planes; none of one that hides nothing.
@@ -123,7 +132,7 @@ pub(crate) mod openings {
 fn file_reader(path: &Path) -> Result<ImageReader<Box<dyn Source>>> {
     #[cfg(test)]
     openings::count(path);
-    let opened = File::open(path).and_then(|file| reader(BufReader::new(file)));
+    let opened = tree::open(path).and_then(|file| reader(BufReader::new(file)));
     opened.map_err(|error| unreadable(path, &error))
 }
 
@@ -143,9 +152,11 @@ fn size_of_reader(path: &Path, reader: ImageReader<Box<dyn Source + '_>>) -> Res
 }
 
 impl Image {
-    /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file as it is stored (`Image::load_upright` turns it);
-    /// the content decides, not the file's name.
+    /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file as it is stored, not turned; the content
+    /// decides, not the file's name.
     ///
+    /// Colours become sRGB by the file's ICC profile, the chunks of a PNG, the chromaticities of an EXR or Exif; a profile that
+    /// cannot be used is named in a warning, and the values count as sRGB. What sRGB does not hold is clipped.
     /// Alpha is dropped, grey is repeated, camera RAW (feature `raw`) is linear light. Of an EXR file the first layer's R, G and B
     /// (or Y) are taken as linear light; values that are negative or not finite become 0, with a warning that counts them
     /// ([`super::Mask::load`] hides the pixels of the latter).
@@ -153,18 +164,30 @@ impl Image {
     /// # Errors
     /// [`Error::Input`] names the file when it cannot be read, is cut short or is of another format.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
-        let file = PictureFile::open(path.as_ref())?;
-        Ok(file.decode()?.0)
+        let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
+        let Decoded { image, conversion, .. } = decode(&path, bytes, Meaning::Colour)?;
+        if let Some(problem) = conversion.unknown {
+            tracing::warn!("{}: {problem} is not used; the colours count as sRGB", path.display());
+        }
+        Ok(image)
     }
 
-    /// The same for numbers that are no colour, such as depth: EXR values are taken as they are, also negative ones.
+    /// The same for many photographs: what was made of their colours is counted, and not said.
+    ///
+    /// # Errors
+    /// As [`Image::load`].
+    pub(crate) fn load_counted(path: &Path, counters: &ColourTally) -> Result<Self> {
+        Ok(PictureFile::open(path)?.decode_counted(counters)?.0)
+    }
+
+    /// The same for numbers that are no colour, such as depth: they are taken as they are stored, also negative ones of EXR.
     ///
     /// # Errors
     /// As [`Image::load`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
         let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
-        Ok(decode(&path, bytes, Some)?.0)
+        Ok(decode(&path, bytes, Meaning::Number)?.image)
     }
 
     /// Width and height of an image file, from its header alone.

@@ -1,20 +1,37 @@
 //! What a camera writes of its exposure.
 
-use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
 use ::exif::{Exif, In, Reader, Tag, Value};
 
+use crate::base::tree;
+
 /// The stops of a photograph's exposure, log2(t S / N^2) of its exposure time t in seconds, ISO speed S and f-number N: of
 /// two photographs of one thing that of one more stop shows twice the linear light. None where the file does not say all
 /// three.
 pub fn exposure_value(path: &Path) -> Option<f64> {
-    let file = File::open(path).ok()?;
+    let file = tree::open(path).ok()?;
     let exif = Reader::new().read_from_container(&mut BufReader::new(file)).ok()?;
     let number = |tag| positive(&exif, tag);
     let (time, aperture) = (number(Tag::ExposureTime)?, number(Tag::FNumber)?);
     Some((time * number(Tag::PhotographicSensitivity)? / aperture.powi(2)).log2())
+}
+
+/// Camera, lens and focal length as a file names them, where it names any: of a phone with several lenses the numbers alone
+/// differ.
+#[cfg(feature = "cli")]
+pub(crate) fn lens_name(path: &Path) -> Option<String> {
+    let file = tree::open(path).ok()?;
+    let exif = Reader::new().read_from_container(&mut BufReader::new(file)).ok()?;
+    let tags =
+        [Tag::Make, Tag::Model, Tag::LensModel, Tag::FocalLength, Tag::FocalLengthIn35mmFilm];
+    let shown = tags.map(|tag| {
+        let field = exif.get_field(tag, In::PRIMARY)?;
+        Some(field.display_value().to_string())
+    });
+    let named: Vec<String> = shown.into_iter().flatten().collect();
+    (!named.is_empty()).then(|| named.join(", "))
 }
 
 /// The first number of a tag, where it is above 0 and finite.

@@ -5,32 +5,38 @@ use std::path::Path;
 
 use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableImage};
 
-use super::Image;
+use super::colour::{self, Chromaticities, Conversion};
+use super::decoded::{Decoded, Meaning};
 use super::source::{Source, not_an_image};
+use super::{Image, srgb_from_linear};
 use crate::base::output::write_whole;
 use crate::{Error, Result};
 
 /// What an EXR file begins with.
 pub(super) const MAGIC: [u8; 4] = [0x76, 0x2F, 0x31, 0x01];
 
-/// What a finite value of an EXR file means; none where it makes no sense.
-pub(super) type FromExrValue = fn(f32) -> Option<f32>;
-
-/// The first layer's R, G and B (or Y), each value through `from_exr_value`, and where not all values of a pixel are finite.
-/// Values that mean nothing become 0, with a warning that counts them.
+/// The first layer's R, G and B (or Y), and where not all values of a pixel are finite. Colours are encoded as sRGB; those that
+/// are negative or not finite become 0, with a warning that counts them.
 ///
 /// # Errors
 /// [`Error::Input`] names the file when it is damaged or has no such channels.
-pub(super) fn load(
-    path: &Path,
-    bytes: Vec<u8>,
-    from_exr_value: FromExrValue,
-) -> Result<(Image, Option<Image>)> {
-    let mut image = decoded(path, bytes)?;
-    let finite = finite_part(&image);
+pub(super) fn load(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Decoded> {
+    let (mut image, chromaticities) = decoded(path, bytes)?;
+    let alpha = finite_part(&image);
+    let conversion = match chromaticities {
+        Some(chromaticities) if meaning == Meaning::Colour => {
+            colour::convert_linear(&mut image, chromaticities)
+        }
+        _ => Conversion::default(),
+    };
     let mut replaced = 0_usize;
     for value in &mut image.data {
-        let usable = Some(*value).filter(|value| value.is_finite()).and_then(from_exr_value);
+        let usable = match meaning {
+            Meaning::Colour => {
+                (*value >= 0.0 && value.is_finite()).then(|| srgb_from_linear(*value))
+            }
+            Meaning::Number => value.is_finite().then_some(*value),
+        };
         replaced += usize::from(usable.is_none());
         *value = usable.unwrap_or(0.0);
     }
@@ -40,7 +46,7 @@ pub(super) fn load(
             path.display()
         );
     }
-    Ok((image, finite))
+    Ok(Decoded { image, alpha, conversion })
 }
 
 /// 1 where all values of a pixel are finite, 0 elsewhere, in all three planes; none where all are.
@@ -54,8 +60,8 @@ fn finite_part(Image { width, height, data }: &Image) -> Option<Image> {
     Some(Image { width: *width, height: *height, data: shown.repeat(3) })
 }
 
-/// The first layer's R, G and B (or Y), as they are.
-fn decoded(path: &Path, bytes: Vec<u8>) -> Result<Image> {
+/// The first layer's R, G and B (or Y), as they are, and the chromaticities of its primaries.
+fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>)> {
     let bytes: Box<dyn Source> = Box::new(Cursor::new(bytes));
     let image = exr::prelude::read()
         .no_deep_data()
@@ -65,6 +71,9 @@ fn decoded(path: &Path, bytes: Vec<u8>) -> Result<Image> {
         .all_attributes()
         .from_buffered(bytes)
         .map_err(|error| not_an_image(path, &error))?;
+    let chromaticities = image.attributes.chromaticities.map(|of| {
+        [of.white, of.red, of.green, of.blue].map(|place| [place.0, place.1].map(f64::from))
+    });
     let layer = image.layer_data;
     let pixels = layer.size.width() * layer.size.height();
     let channel = |name: &str| layer.channel_data.list.iter().find(|channel| channel.name.eq(name));
@@ -82,7 +91,7 @@ fn decoded(path: &Path, bytes: Vec<u8>) -> Result<Image> {
         data.extend(channel.sample_data.values_as_f32());
     }
     let (width, height) = (layer.size.width() as u32, layer.size.height() as u32);
-    Ok(Image { width, height, data })
+    Ok((Image { width, height, data }, chromaticities))
 }
 
 /// Writes R, G and B as 32-bit floats, each value through `to_exr_value`.

@@ -4,6 +4,9 @@ use std::cell::RefCell;
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
+use unicode_normalization::UnicodeNormalization;
+
+use crate::base::tree;
 use crate::{Error, Result};
 
 /// Endings of the files that [`super::Image::load`] reads.
@@ -85,33 +88,48 @@ pub(crate) struct Files {
 }
 
 impl Files {
-    /// The file at `folder/listed`; where there is none, the one there that differs by its extension only.
+    /// The file at `folder/listed`; where there is none, the one there that differs by its extension only, or by how Unicode
+    /// composes its letters. What a path of an archive leads to outside it is not found.
     pub(crate) fn find(&self, folder: &Path, listed: &str) -> Option<PathBuf> {
         let exact = folder.join(listed);
-        if exact.is_file() {
+        if tree::archive_of(folder).is_some_and(|archive| !exact.starts_with(archive)) {
+            return None;
+        }
+        if tree::is_file(&exact) {
             return Some(exact);
         }
         let parent = exact.parent()?.to_owned();
         let mut folders = self.folders.borrow_mut();
         let by_stem = folders.entry(parent).or_insert_with_key(|parent| by_stem(parent));
-        by_stem.get(stem(listed)).cloned()
+        by_stem.get(&normalized(stem(listed))).cloned()
     }
+}
+
+/// A name as names are compared: of the ways in which Unicode writes a letter, the composed one.
+pub(crate) fn normalized(name: &str) -> String {
+    if name.is_ascii() { name.to_owned() } else { name.nfc().collect() }
 }
 
 fn by_stem(folder: &Path) -> BTreeMap<String, PathBuf> {
     let paths = files_in(folder).unwrap_or_default().into_iter();
-    let named = |path: PathBuf| Some((stem(path.file_name()?.to_str()?).to_owned(), path));
+    let named = |path: PathBuf| Some((normalized(stem(path.file_name()?.to_str()?)), path));
     // Of two files with one stem the first by name, whatever order the disk lists them in.
     paths.rev().filter_map(named).collect()
 }
 
-/// Every file of a folder, sorted.
+/// Every file of a folder, sorted, but those that begin with a dot: a Mac leaves `._NAME.JPG` beside every photograph on the
+/// disks of others.
 fn files_in(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
-    let entries = std::fs::read_dir(folder)?.map(|entry| entry.map(|entry| entry.path()));
-    let mut paths = entries.collect::<std::io::Result<Vec<PathBuf>>>()?;
-    paths.retain(|path| path.is_file());
+    let mut paths = tree::entries(folder)?;
+    paths.retain(|path| !is_hidden(path) && tree::is_file(path));
     paths.sort();
     Ok(paths)
+}
+
+/// Whether a file or folder begins with a dot, or is what a Mac adds to an archive.
+pub(crate) fn is_hidden(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    name.starts_with('.') || name == "__MACOSX"
 }
 
 fn is_one_of(endings: &[&str], ending: &str) -> bool {

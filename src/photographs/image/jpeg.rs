@@ -30,43 +30,63 @@ pub(super) fn load(path: &Path, bytes: &[u8]) -> Result<Option<Image>> {
     })
 }
 
-/// The Exif segment of a JPEG file, marker and length before it, said to be stored upright; none where it has none.
-pub fn exif_segment(bytes: &[u8]) -> Option<Vec<u8>> {
-    const EXIF: u8 = 0xE1;
-    let mut at = MAGIC.len();
-    loop {
-        let head = bytes.get(at..at + 4)?;
-        let length = usize::from(u16::from_be_bytes([head[2], head[3]]));
+/// The segments of a JPEG file before its coded data: marker, and what follows the length.
+pub(super) fn segments(bytes: &[u8]) -> impl Iterator<Item = (u8, &[u8])> {
+    let mut rest = bytes.get(MAGIC.len()..).unwrap_or_default();
+    std::iter::from_fn(move || {
+        // Any number of 0xFF may stand before a marker.
+        while rest.starts_with(&[0xFF, 0xFF]) {
+            rest = &rest[1..];
+        }
+        let [0xFF, marker @ 0xC0..=0xFE, high, low, ..] = *rest else { return None };
         // What comes before the picture has a length; what does not is the picture.
-        if head[0] != 0xFF || !(0xC0..=0xFE).contains(&head[1]) || head[1] == 0xDA || length < 2 {
+        let length = usize::from(u16::from_be_bytes([high, low]));
+        if marker == 0xDA || length < 2 {
             return None;
         }
-        let segment = bytes.get(at..at + 2 + length)?;
-        if head[1] == EXIF && segment.get(4..10) == Some(b"Exif\0\0") {
-            let mut segment = segment.to_vec();
-            set_upright(&mut segment[10..]);
-            return Some(segment);
-        }
-        at += 2 + length;
-    }
+        let (segment, after) = rest.split_at_checked(2 + length)?;
+        rest = after;
+        Some((marker, &segment[4..]))
+    })
 }
 
-/// Sets the orientation that the first directory of Exif data names to 1, as stored.
-fn set_upright(tiff: &mut [u8]) -> Option<()> {
+/// The Exif segment of a JPEG file, marker and length before it, said to be stored upright and in sRGB; none where it has none.
+pub fn exif_segment(bytes: &[u8]) -> Option<Vec<u8>> {
+    const EXIF: u8 = 0xE1;
+    const HEAD: &[u8] = b"Exif\0\0";
+    let mut of_exif = segments(bytes).filter(|&(marker, _)| marker == EXIF);
+    let (_, found) = of_exif.find(|(_, segment)| segment.starts_with(HEAD))?;
+    let mut tiff = found[HEAD.len()..].to_vec();
+    set_stored_as_seen(&mut tiff);
+    let length = (2 + found.len() as u16).to_be_bytes();
+    Some([&[0xFF, EXIF], &length[..], HEAD, &tiff].concat())
+}
+
+/// Sets the orientation and the colour space of Exif data to 1: as stored, and sRGB.
+fn set_stored_as_seen(tiff: &mut [u8]) -> Option<()> {
     const ORIENTATION: u16 = 0x0112;
+    const EXIF_DIRECTORY: u16 = 0x8769;
+    const COLOR_SPACE: u16 = 0xA001;
     let is_little = tiff.starts_with(b"II");
-    let short = |bytes: &[u8]| -> Option<u16> {
-        let pair = bytes.get(..2)?.try_into().ok()?;
+    let short = |tiff: &[u8], at: usize| -> Option<u16> {
+        let pair = tiff.get(at..at + 2)?.try_into().ok()?;
         Some(if is_little { u16::from_le_bytes(pair) } else { u16::from_be_bytes(pair) })
     };
-    let word: [u8; 4] = tiff.get(4..8)?.try_into().ok()?;
-    let first =
-        if is_little { u32::from_le_bytes(word) } else { u32::from_be_bytes(word) } as usize;
-    for entry in 0..usize::from(short(tiff.get(first..)?)?) {
-        let at = first + 2 + 12 * entry;
-        if short(tiff.get(at..)?)? == ORIENTATION {
-            let upright = if is_little { [1, 0] } else { [0, 1] };
-            tiff.get_mut(at + 8..at + 10)?.copy_from_slice(&upright);
+    let word = |tiff: &[u8], at: usize| -> Option<usize> {
+        let word = tiff.get(at..at + 4)?.try_into().ok()?;
+        Some(if is_little { u32::from_le_bytes(word) } else { u32::from_be_bytes(word) } as usize)
+    };
+    let one = if is_little { [1, 0] } else { [0, 1] };
+    let mut directories = vec![word(tiff, 4)?];
+    // The second is that of the photograph; none is entered twice.
+    while let Some(first) = directories.pop() {
+        for entry in 0..usize::from(short(tiff, first)?) {
+            let at = first + 2 + 12 * entry;
+            match short(tiff, at)? {
+                ORIENTATION | COLOR_SPACE => tiff.get_mut(at + 8..at + 10)?.copy_from_slice(&one),
+                EXIF_DIRECTORY if first == word(tiff, 4)? => directories.extend(word(tiff, at + 8)),
+                _ => {}
+            }
         }
     }
     Some(())

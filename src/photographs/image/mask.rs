@@ -1,7 +1,7 @@
 //! Which pixels of a photograph count: numbers that its alpha channel and its mask show.
 
 use std::borrow::Cow;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::Image;
 use super::{Orientation, codec::PictureFile};
@@ -17,6 +17,21 @@ pub struct Mask {
     pub height: u32,
     /// `(height, width)`, not all 1.
     pub weights: Vec<f32>,
+}
+
+/// The file of a mask, and its sense.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct MaskFile {
+    pub(crate) path: PathBuf,
+    /// It marks what is hidden, not what counts.
+    pub(crate) is_inverted: bool,
+}
+
+impl MaskFile {
+    /// A mask whose white pixels count.
+    pub(crate) fn shown(path: PathBuf) -> Self {
+        Self { path, is_inverted: false }
+    }
 }
 
 impl Mask {
@@ -40,7 +55,8 @@ impl Mask {
     /// [`Error::Input`] names a file that cannot be read, or a mask of another shape than its photograph.
     pub fn load(photograph: &Path, file: Option<&Path>, inverted: bool) -> Result<Option<Self>> {
         let (image, alpha) = PictureFile::open(photograph)?.decode()?;
-        Self::over(photograph, (&image, alpha.as_ref()), file, inverted)
+        let file = file.map(|path| MaskFile::shown(path.to_owned()));
+        Self::over(photograph, (&image, alpha.as_ref()), file.as_ref(), inverted)
     }
 
     /// The same of a photograph that is decoded, with its alpha.
@@ -50,11 +66,14 @@ impl Mask {
     pub(crate) fn over(
         photograph: &Path,
         (image, alpha): (&Image, Option<&Image>),
-        file: Option<&Path>,
+        file: Option<&MaskFile>,
         inverted: bool,
     ) -> Result<Option<Self>> {
-        let Some(file) = file else { return Ok(alpha.and_then(Self::of_plane)) };
-        let mut mask = Image::load(file)?;
+        let Some(MaskFile { path: file, is_inverted }) = file else {
+            return Ok(alpha.and_then(Self::of_plane));
+        };
+        let inverted = inverted != *is_inverted;
+        let mut mask = Image::load_as_stored(file)?;
         let size = (image.width, image.height);
         let (own, upright) = ((mask.width, mask.height), Orientation::of(photograph).size(size));
         let is_of_shape = |(width, height): (u32, u32)| {

@@ -1,6 +1,5 @@
 //! How a photograph is turned: cameras store what the sensor saw, and say in Exif which way is up.
 
-use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
@@ -8,7 +7,7 @@ use ::exif::{In, Reader, Tag};
 use rayon::prelude::*;
 
 use super::Image;
-use crate::Result;
+use crate::base::tree;
 
 /// The orientation of Exif, 1 to 8: where the first row and column of what is stored lie in what is seen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -21,7 +20,7 @@ impl Orientation {
     /// What a file says; upright where it says nothing.
     pub fn of(path: &Path) -> Self {
         let tagged = || {
-            let file = File::open(path).ok()?;
+            let file = tree::open(path).ok()?;
             let exif = Reader::new().read_from_container(&mut BufReader::new(file)).ok()?;
             let value = exif.get_field(Tag::Orientation, In::PRIMARY)?.value.get_uint(0)?;
             u8::try_from(value).ok().filter(|value| (1..=8).contains(value))
@@ -50,17 +49,8 @@ impl Orientation {
 }
 
 impl Image {
-    /// As [`Image::load`], turned upright as the file's Exif says.
-    ///
-    /// # Errors
-    /// As there.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn load_upright(path: impl AsRef<Path>) -> Result<Self> {
-        let path = path.as_ref();
-        Ok(Self::load(path)?.turned(Orientation::of(path)))
-    }
-
     /// The image as it is seen.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn turned(self, orientation: Orientation) -> Self {
         if orientation == Orientation::UPRIGHT {
             return self;

@@ -86,7 +86,7 @@ impl ToneSettings {
         curve => Rule::Text("a curve that `nightsplat tone list` lists", |name| name.parse::<ToneCurve>().is_ok()), "--curve NAME|FILE";
         /// c: how much a brighter photograph raises the curve's gain.
         gain_c, "the curve's" => Rule::from_to(0.0, MOST), "--gain C|auto";
-        /// theta: the mean over all channels that the linear curve aims at, before clipping.
+        /// Target mean of the curve linear over all channels, before clipping.
         theta => Rule::above(0.0, MOST), "--theta T";
         /// alpha: the highest black level.
         alpha, "the curve's" => Rule::SHARE;
@@ -98,9 +98,9 @@ impl ToneSettings {
         scene_statistics => Rule::Flag;
         /// The gain is the one that the photographs ask for, and c and g0 have no say. The curve auto has no other.
         auto_gain, "the curve's" => Rule::Flag;
-        /// The mean luminance of the targets where the gain is automatic.
-        brightness, "found between 0.44 and 0.54" => Rule::from_to(0.1, 0.9), "--brightness T";
-        /// lambda: how much of the curve auto keeps the ratios of the channels.
+        /// Mean luminance of the targets, with an automatic gain.
+        brightness, "chosen between 0.44 and 0.54" => Rule::from_to(0.1, 0.9), "--brightness T";
+        /// Share of the curve auto that keeps the ratios of the channels.
         colour => Rule::SHARE, "--colour L";
         /// A photograph is lifted at its own size and shrunk after that.
         full_resolution, "as auto_gain" => Rule::Flag;

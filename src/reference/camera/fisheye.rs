@@ -48,7 +48,8 @@ impl Fisheye {
         };
         let factor = 1.0 + sum(&|_| 1.0, 1);
         let ratio = if sine > 0.0 { t / sine } else { 1.0 };
-        // t / sin t = 1 + t^2 / 6 + 7 t^4 / 360 + 31 t^6 / 15120 + ..., whose derivative near the axis cancels in closed form.
+        // t / sin t = 1 + t^2 / 6 + 7 t^4 / 360 + 31 t^6 / 15120 + ..., whose derivative near the axis cancels in
+        // closed form.
         let d_ratio = if t < 0.02 {
             t / 3.0 + 7.0 / 90.0 * power(3) + 31.0 / 2520.0 * power(5)
         } else {

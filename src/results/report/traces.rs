@@ -135,7 +135,8 @@ impl Labels {
 
     /// The left end of the base line of a name beside (x, y), where nothing else stands if there is such a place.
     fn place(&mut self, x: f64, y: f64, name: &str, ends_line: bool) -> (f64, f64) {
-        let width = 7.4 * name.chars().count() as f64;
+        // A semibold letter of the page's font at most.
+        let width = 8.4 * name.chars().count() as f64;
         // A line comes from the left; a front leaves to the right.
         let mut order = [x + 8.0, x - 8.0 - width];
         if !ends_line {

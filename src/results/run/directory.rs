@@ -34,6 +34,7 @@ use super::lock::RunLock;
 pub use super::progress::Progress;
 use super::tensorboard::EventFile;
 use crate::base::output::{csv_field, write_whole};
+use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, Split, View};
@@ -217,8 +218,14 @@ impl RunDirectory {
     ///
     /// # Errors
     /// The disk is full or gone.
-    pub(super) fn save_config(&self, config: &TrainConfig, settings: &Settings) -> Result<()> {
+    pub(super) fn save_config(
+        &self,
+        config: &TrainConfig,
+        settings: &Settings,
+        gpu: &Gpu,
+    ) -> Result<()> {
         let text = settings.written(&config.clone().with_absolute_paths())?;
+        let text = format!("# trained with {}\n{text}", trained_with(gpu));
         write_whole(&self.path.join("config.toml"), text.as_bytes())
     }
 

@@ -5,8 +5,9 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::files::DONE;
+use super::files::{DONE, trained_with};
 use crate::base::output::write_whole;
+use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, Fingerprint};
 use crate::train::{Ended, TrainConfig};
 use crate::{Error, Result};
@@ -25,6 +26,9 @@ struct Done {
     /// How it ended; older files do not say.
     #[serde(default)]
     ended: Option<Ended>,
+    /// Version and device; older files have none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    trained_with: Option<serde_json::Value>,
 }
 
 /// Writes the sign, after everything else.
@@ -33,6 +37,7 @@ pub(super) fn save(
     config: &TrainConfig,
     (dataset, stamp): (&Fingerprint, Option<String>),
     ended: &Ended,
+    gpu: &Gpu,
 ) -> Result<()> {
     let done = Done {
         configuration: config.checksum()?,
@@ -40,6 +45,7 @@ pub(super) fn save(
         stamp,
         steps: ended.step,
         ended: Some(*ended),
+        trained_with: Some(trained_with(gpu)),
     };
     let text =
         serde_json::to_string_pretty(&done).map_err(|error| Error::Usage(error.to_string()))?;

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use crate::Error;
+use crate::gpu::Gpu;
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
 pub(super) const FILES: [&str; 14] = [
@@ -52,6 +53,9 @@ pub(crate) const SPENT: &str = "spent";
 /// How the run ended, in `metrics.json`.
 pub(crate) const ENDED: &str = "ended";
 
+/// Version of nightsplat and device of the run, in `metrics.json` and `done.json`.
+pub(crate) const TRAINED_WITH: &str = "trained_with";
+
 /// The last scores of the held-out views and their spread, in `metrics.json`.
 pub(crate) const HELD_OUT_CURVE: &str = "held_out";
 
@@ -69,6 +73,16 @@ pub(super) const CHECKPOINT: &str = "checkpoint.safetensors";
 
 /// The one before.
 pub(super) const CHECKPOINT_BEFORE: &str = "checkpoint.before.safetensors";
+
+/// The value of [`TRAINED_WITH`].
+pub(super) fn trained_with(gpu: &Gpu) -> serde_json::Value {
+    let properties = gpu.properties();
+    serde_json::json!({
+        "nightsplat": env!("CARGO_PKG_VERSION"),
+        "device": properties.name,
+        "driver": properties.driver,
+    })
+}
 
 /// The error of a file of the run that cannot be written.
 pub(super) fn unwritable(path: &Path, error: &std::io::Error) -> Error {

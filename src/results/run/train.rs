@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use super::directory::Progress;
-use super::files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE};
+use super::files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE, TRAINED_WITH, trained_with};
 use super::meter::{ResourceMeter, ResourceUsage};
 use super::tensorboard::EventFile;
 use super::{Event, Requests, RunDirectory, RunSummary, done, generations, load};
@@ -123,11 +123,12 @@ pub fn train_in(
         eval::add_exposure(&mut metrics, &scored);
     }
     metrics[ENDED] = serde_json::json!(ended);
+    metrics[TRAINED_WITH] = trained_with(gpu);
     if let Some(curve) = held_out_curve(&trainer) {
         metrics[HELD_OUT_CURVE] = curve;
     }
     directory.save_metrics(&metrics)?;
-    done::save(out, config, (trainer.fingerprint(), stamp), &ended)?;
+    done::save(out, config, (trainer.fingerprint(), stamp), &ended, gpu)?;
     let trained = RunSummary { trainer, ended, scored, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
@@ -173,7 +174,7 @@ fn begin(
     config.spool.get_or_insert_with(|| out.to_owned());
     let config = &config;
     let explain = |directory: &RunDirectory| match session.settings {
-        Some(settings) => directory.save_config(config, settings),
+        Some(settings) => directory.save_config(config, settings, gpu),
         None => Ok(()),
     };
     let mut trainer = match checkpoint {

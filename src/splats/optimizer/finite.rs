@@ -1,21 +1,21 @@
-//! Whether what is learned is still numbers.
+//! Detection of non-finite parameters.
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Slice, Threads};
 use crate::kernels::first_not_finite;
 use crate::{Error, Result};
 
-/// Looks for NaN and infinity on the device, for a small part of what a step takes.
+/// Finds NaN and infinity on the device, in a small fraction of a step's time.
 #[derive(Debug)]
 pub struct FiniteCheck {
     pipeline: Pipeline<first_not_finite::Kernel>,
-    /// The least index; [`NONE`] where there is none.
+    /// The lowest index; [`NONE`] if all are finite.
     first: Buffer<u32>,
 }
 
 const NONE: u32 = u32::MAX;
 
 impl FiniteCheck {
-    /// The kernel on this device.
+    /// Builds the kernel.
     ///
     /// # Errors
     /// The device refuses the pipeline.

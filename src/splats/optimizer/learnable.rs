@@ -1,25 +1,25 @@
-//! What is learned beside the Gaussians.
+//! Parameters beside the Gaussians.
 
 use super::{Adam, AdamBuffers, LearningRates};
 use crate::Result;
 use crate::gpu::{Buffer, Recorder};
 use crate::splats::attributes::PlaneCounts;
 
-/// Numbers that Adam trains at one rate and that a checkpoint keeps, such as the parameters of a network.
+/// Parameters that Adam trains at one learning rate and a checkpoint stores, such as those of a network.
 pub trait Learnable {
-    /// What its tensors are called in a checkpoint: `NAME.parameters`, `NAME.first_moments`, `NAME.second_moments`.
+    /// The prefix of its tensors in a checkpoint: `NAME.parameters`, `NAME.first_moments`, `NAME.second_moments`.
     fn name(&self) -> &'static str;
 
     /// Adam's learning rate at a step, counted from 1.
     fn learning_rate(&self, step: u64) -> f64;
 
-    /// What is learned, with the gradients of the step and what Adam keeps.
+    /// The parameters, with the gradients of the step and Adam's moments.
     fn buffers(&mut self) -> AdamBuffers<'_>;
 }
 
 impl Adam {
-    /// Records step number `step`, from 1, of all that is learned, at `rate` times its own rate; nothing changes while
-    /// `status` is set.
+    /// Records step number `step`, from 1, of all parameters, at `rate` times its own learning rate; nothing changes
+    /// while `status` is nonzero.
     ///
     /// # Errors
     /// As [`Adam::record`].

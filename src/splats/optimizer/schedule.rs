@@ -1,4 +1,4 @@
-//! What changes with the step: learning rates, SH degree, gradient damping, density control.
+//! Schedules by step: learning rates, SH degree, gradient damping, density control.
 
 use std::collections::BTreeMap;
 use std::ops::{Index, IndexMut};
@@ -15,7 +15,7 @@ use crate::splats::attributes::{ATTRIBUTES, Attribute};
 pub struct LearningRates(pub [f64; ATTRIBUTES.len()]);
 
 impl LearningRates {
-    /// One rate for every column.
+    /// The same rate for every attribute.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) const fn uniform(rate: f64) -> Self {
         Self([rate; ATTRIBUTES.len()])
@@ -27,7 +27,7 @@ impl LearningRates {
     }
 }
 
-/// Those of the table.
+/// The initial rates of the table.
 impl Default for LearningRates {
     fn default() -> Self {
         Self(ATTRIBUTES.each_ref().map(|spec| spec.learning_rate))
@@ -70,43 +70,43 @@ impl<'de> Deserialize<'de> for LearningRates {
 
 settings! {
 "schedule."
-/// The schedules as functions of the step, counted from 1. The defaults are those of 3DGS (Kerbl et al. 2023) but for
-/// density control, which begins early, for the first steps, which see small views, and for the last, which settle.
+/// The schedules as functions of the step, counted from 1. The defaults are those of 3DGS (Kerbl et al. 2023), except
+/// for density control, which starts early, for the first steps, which see small views, and for the cooldown.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Schedule {
-    /// The rate of the means at the end of its decay, for a scene of extent 1.
+    /// The learning rate of the means at the end of its decay, for a scene of extent 1.
     final_means_rate: f64 = 1.6e-6 => Rule::above(0.0, MAX_RATE);
-    /// The steps over which the rate of the means decays exponentially.
+    /// Steps over which the learning rate of the means decays exponentially.
     means_rate_steps: u64 = 30_000 => Rule::COUNT, in "steps";
-    /// All rates but the opacity's begin at this many times themselves, and fall to themselves exponentially.
+    /// All learning rates but the opacity's start at this multiple and decay exponentially to 1.
     initial_rate_factor: f64 = 4.0 => Rule::from_to(1e-3, 1e3);
-    /// The steps over which the boost fades.
+    /// Steps over which that multiple decays.
     initial_rate_steps: u64 = 600 => Rule::COUNT, in "steps";
-    /// The SH degree in use grows by one each time this many steps are done, from 0.
+    /// The SH degree in use grows by one after each interval of this many steps, from 0.
     sh_degree_interval: u64 = 1_000 => Rule::COUNT, in "steps";
     /// Density control acts after this step.
     densify_after: u64 = 50 => Rule::COUNT;
     /// Density control acts before this step.
     densify_before: u64 = 3_000 => Rule::COUNT;
-    /// The steps from one round of density control to the next.
+    /// Steps from one round of density control to the next.
     densify_interval: u64 = 100 => Rule::COUNT, in "steps";
-    /// The last steps of a run, a third of it at most, in which the model settles: there is no density control, and all
-    /// learning rates decay exponentially.
+    /// The cooldown: the last steps of a run, at most a third of it, without density control and with exponentially
+    /// decaying learning rates.
     cooldown_steps: u64 = 250 => Rule::COUNT, in "steps";
-    /// The part of themselves to which the rates decay as the model settles.
+    /// The factor on the learning rates at the end of the cooldown.
     cooldown_rate: f64 = 0.05 => Rule::above(0.0, 1.0);
-    /// Views are a quarter of their width and height before the first of these steps, half before the second.
+    /// Views have a quarter of their width and height before the first of these steps, half before the second.
     resolution_steps: [u64; 2] = [0, 200] => Rule::List(2, 2, &Rule::COUNT), in "steps";
     /// The weight of the near-camera damping is 1 before the first of these steps, 1/2 before the second, then 0.
     damping_steps: [u64; 2] = [4_000, 7_000] => Rule::List(2, 2, &Rule::COUNT), in "steps";
 }
 sections {
-    /// The rates at the start; that of the means for a scene of extent 1.
+    /// Initial learning rates; that of the means for a scene of extent 1.
     initial_rates: LearningRates;
 }
 }
 
-/// No rate of use is near it, and a step of it overflows nothing.
+/// No useful rate is near it, and a step with it cannot overflow.
 const MAX_RATE: f64 = 100.0;
 
 impl LearningRates {
@@ -139,7 +139,7 @@ impl Schedule {
             .try_for_each(|(row, rate)| row.check(rate))
     }
 
-    /// Density control acts between steps 500 and 5 000, every 200 steps, and every step sees whole views (LITA-GS).
+    /// Density control acts between steps 500 and 5 000, every 200 steps, and every step has full resolution (LITA-GS).
     #[cfg(test)]
     pub(crate) fn paper() -> Self {
         Self {
@@ -154,7 +154,8 @@ impl Schedule {
         }
     }
 
-    /// The rates of `step` in a scene of `extent`: the means' decay log-linearly, the others stay.
+    /// The learning rates of `step` in a scene of `extent`: that of the means decays log-linearly, the others are
+    /// constant.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn learning_rates(&self, step: u64, extent: f64) -> LearningRates {
         let done = (step as f64 / self.means_rate_steps.max(1) as f64).min(1.0);
@@ -171,27 +172,27 @@ impl Schedule {
         rates
     }
 
-    /// The SH degree that `step` trains, at most `max`.
+    /// The SH degree in use in `step`, at most `max`.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn sh_degree(&self, step: u64, max: u32) -> u32 {
         let degree = step / self.sh_degree_interval.max(1);
         degree.min(u64::from(max)) as u32
     }
 
-    /// Whether density control acts at the end of `step`.
+    /// Whether a round of density control follows `step`.
     pub(crate) fn densifies_at(&self, step: u64) -> bool {
         step > self.densify_after
             && step < self.densify_before
             && step.is_multiple_of(self.densify_interval.max(1))
     }
 
-    /// The step behind which density control acts first, if it ever does.
+    /// The step that the first round of density control follows, if there is one.
     pub(crate) fn first_round(&self) -> u64 {
         let interval = self.densify_interval.max(1);
         (self.densify_after / interval).saturating_add(1).saturating_mul(interval)
     }
 
-    /// What learning rates are multiplied by after this share of the settling phase.
+    /// The factor on the learning rates after this fraction of the cooldown.
     pub(crate) fn cooldown_factor(&self, done: f64) -> f64 {
         self.cooldown_rate.powf(done.clamp(0.0, 1.0))
     }
@@ -205,13 +206,12 @@ impl Schedule {
         }
     }
 
-    /// How many levels of resolution the steps use.
+    /// The number of resolution levels.
     pub(crate) fn resolution_levels(&self) -> usize {
         1 + self.resolution_level(1)
     }
 
-    /// The number of rounds of density control from the end of `step` on, one there included, where none comes after
-    /// step `last`.
+    /// The number of rounds of density control from the end of `step` on, that one included, up to step `last`.
     pub(crate) fn rounds_left(&self, step: u64, last: u64) -> u64 {
         let interval = self.densify_interval.max(1);
         self.densify_before.saturating_sub(1).min(last).saturating_sub(step) / interval + 1

@@ -1,4 +1,4 @@
-//! The memory of one view: what the passes of a render hand each other.
+//! The memory of one view: intermediate buffers of a render.
 
 use glam::{UVec2, Vec3};
 
@@ -10,29 +10,29 @@ use crate::kernels::status::{
 };
 use crate::kernels::{self, ProjectedSplat};
 
-/// The first guess of how many tiles a Gaussian meets; a view that needs more makes the memory grow.
+/// The first estimate of tiles per Gaussian; a view that needs more grows the memory.
 const TILES_PER_GAUSSIAN: u32 = 6;
 
-/// How many depth ranks one subgroup counts the tiles of. Small: `emit` sums up what precedes a rank within them.
+/// Depth ranks whose tiles one subgroup counts. Small, because `emit` sums the counts before a rank within them.
 pub(super) const RANKS_PER_PARTITION: u32 = 256;
 
-/// What the status words say.
+/// The decoded status words.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Status {
     /// More intersections than memory was reserved for.
     pub overflowed: bool,
     /// A loss term is NaN or infinite.
     pub not_finite: bool,
-    /// A gradient of a Gaussian is, and nothing before it was.
+    /// A gradient of a Gaussian is NaN or infinite, and no earlier flag was set.
     pub gradient_not_finite: bool,
-    /// The most intersections that a render had since the status was cleared.
+    /// The most intersections of a render since the status was cleared.
     pub intersections: u32,
-    /// The most splats of one tile, where the device cannot follow so many; else 0.
+    /// The most splats of one tile where they exceed the device's limit; else 0.
     pub splats_per_tile: u32,
 }
 
 impl Status {
-    /// Reads the words that [`super::Renderer::status`] holds.
+    /// Decodes the words that [`super::Renderer::status`] holds.
     pub fn from_words(words: &[u32]) -> Self {
         let word = |i: usize| words.get(i).copied().unwrap_or_default();
         Self {
@@ -45,14 +45,14 @@ impl Status {
     }
 }
 
-/// What the passes hand each other; buffers by what their length follows. Public for tests alone.
+/// The intermediate buffers, grouped by what determines their length. Public for tests only.
 #[derive(Debug)]
 #[allow(missing_docs, reason = "each is declared in the kernels that write and read it")]
 pub struct RenderBuffers {
     /// Values per pixel.
     channels: usize,
     // Gaussians
-    /// `[0]`: how many are rendered
+    /// `[0]`: the number of rendered Gaussians
     pub gaussian_counts: Buffer<u32>,
     pub splats: Buffer<ProjectedSplat>,
     pub colors: Buffer<Vec3>,
@@ -72,7 +72,7 @@ pub struct RenderBuffers {
     pub render: Buffer<f32>,
     pub transmittances: Buffer<f32>,
     pub tile_ranges: Buffer<UVec2>,
-    /// The camera of a view whose camera lies nowhere else on the device.
+    /// The camera of a view without a camera in another buffer.
     pub camera: Buffer<kernels::Camera>,
     // single numbers
     pub counts: Buffer<u32>,
@@ -82,7 +82,7 @@ pub struct RenderBuffers {
 }
 
 impl RenderBuffers {
-    /// Room for nothing but the single numbers.
+    /// Empty but for the single numbers.
     pub(super) fn new(gpu: &Gpu, channels: usize) -> Result<Self> {
         Ok(Self {
             channels,
@@ -109,7 +109,8 @@ impl RenderBuffers {
         })
     }
 
-    /// Lengths only grow: to `capacity` where they do not suffice for `count` Gaussians; intersections begin with a guess.
+    /// Lengths only grow: to `capacity` where they do not suffice for `count` Gaussians; intersections start with an
+    /// estimate.
     pub(super) fn reserve(
         &mut self,
         gpu: &Gpu,
@@ -147,7 +148,7 @@ impl RenderBuffers {
     pub(super) fn set_intersection_capacity(&mut self, gpu: &Gpu, capacity: u32) -> Result<()> {
         let capacity = capacity as usize;
         if capacity != self.tiles.len() {
-            // What was there goes first: the two together may be more than there is.
+            // The old buffer is freed first: both together may exceed the memory.
             for numbers in [&mut self.tiles, &mut self.intersection_ids, &mut self.gaussian_ids] {
                 *numbers = gpu.uninit("intersections", 0)?;
             }
@@ -162,14 +163,14 @@ impl RenderBuffers {
         Ok(())
     }
 
-    /// What each Gaussian takes, in bytes.
+    /// Bytes per Gaussian.
     pub(super) fn bytes_per_gaussian(&self) -> usize {
         let color = color_vectors(self.channels) * size_of::<Vec3>();
         let numbers = 4 * size_of::<f32>() + size_of::<UVec2>();
         size_of::<ProjectedSplat>() + color + numbers
     }
 
-    /// What each intersection takes, in bytes.
+    /// Bytes per intersection.
     pub(super) fn bytes_per_intersection(&self) -> usize {
         3 * size_of::<u32>() + self.record_vectors() * size_of::<Vec3>()
     }
@@ -179,7 +180,7 @@ impl RenderBuffers {
         (RECORD_HEAD as usize + self.channels).div_ceil(3)
     }
 
-    /// How many intersections' records one binding holds.
+    /// The number of intersections whose records fit one binding.
     pub(super) fn max_intersections(&self, gpu: &Gpu) -> u32 {
         let record = (self.record_vectors() * size_of::<Vec3>()) as u64;
         (gpu.properties().max_storage_buffer_range / record).min(u32::MAX.into()) as u32
@@ -217,7 +218,7 @@ mod tests {
         assert_eq!((flags(read(0)), read(0).intersections), ([false; 4], 5));
     }
 
-    /// The device counts what it allocates; rows of sixteen bytes, and numbers for whole partitions, are the rest.
+    /// Counted against allocations; the difference is padding to rows of sixteen bytes and to whole partitions.
     #[cfg(feature = "io")]
     #[test]
     fn gaussians_and_intersections_take_the_bytes_that_are_foreseen() {

@@ -1,4 +1,4 @@
-//! Cameras on the device: kernels find theirs by its index in a buffer.
+//! Cameras on the device: kernels index a buffer of them.
 
 use super::Renderer;
 use crate::Result;
@@ -8,11 +8,11 @@ use crate::kernels::camera::CAMERA_WIDTH;
 use crate::kernels::{self, camera_backward, camera_gradient};
 use crate::splats::scene::GaussianSlice;
 
-/// What is rendered: a patch of what a camera sees, and where on the device the camera is.
+/// What is rendered: a camera or a patch of it, and the camera's index on the device.
 #[derive(Clone, Copy, Debug)]
 pub struct Viewpoint<'a> {
     pub(super) patch: Patch,
-    /// The buffer and the index; none: the camera goes into the command buffer, and from there to the renderer.
+    /// The buffer and the index; `None`: the camera is uploaded through the command buffer.
     pub(super) on_device: Option<(&'a Buffer<kernels::Camera>, u32)>,
 }
 
@@ -28,7 +28,7 @@ impl From<&Camera> for Viewpoint<'_> {
     }
 }
 
-/// Views that are rendered again and again, with their cameras in one buffer.
+/// Views that are rendered repeatedly, with their cameras in one buffer.
 #[derive(Debug)]
 pub struct Viewpoints {
     patches: Vec<Patch>,
@@ -45,16 +45,16 @@ impl Viewpoints {
         Ok(Self { cameras: gpu.buffer("cameras", &cameras)?, patches })
     }
 
-    /// One of them, by the place it was given at.
+    /// The view at `index`, in the order of the upload.
     ///
     /// # Panics
-    /// There is none at this place.
+    /// The index is out of range.
     pub fn get(&self, index: usize) -> Viewpoint<'_> {
         Viewpoint { patch: self.patches[index], on_device: Some((&self.cameras, index as u32)) }
     }
 }
 
-/// What the gradient of a camera takes. Nothing learns a camera yet.
+/// Kernels and memory for the gradient of a camera. No camera is learned yet.
 #[cfg(feature = "testing")]
 #[derive(Debug)]
 pub struct CameraGradient {
@@ -67,11 +67,11 @@ pub struct CameraGradient {
 
 #[cfg(feature = "testing")]
 impl CameraGradient {
-    /// Numbers of the gradient: of a shift of the view, world units, and of a turn about the camera, radians, (x, y, z) each in
-    /// the view; of focal lengths, principal point and the four coefficients of a fisheye.
+    /// Components of the gradient: a translation of the view, world units; a rotation about the camera, radians, (x, y,
+    /// z) each in view space; focal lengths, principal point and the four coefficients of a fisheye.
     pub const WIDTH: usize = CAMERA_WIDTH as usize;
 
-    /// The kernels for a camera model, and memory for so many Gaussians.
+    /// Builds the kernels for a camera model, and allocates for `capacity` Gaussians.
     ///
     /// # Errors
     /// The driver refuses a kernel, or the device is out of memory.
@@ -93,12 +93,13 @@ impl CameraGradient {
         })
     }
 
-    /// Records the gradient of a viewpoint's camera ([`CameraGradient::WIDTH`]), behind the [`Renderer::backward`] of the same,
-    /// which has left `gradients` of the parameters. The camera is moved in its view: a point p of it becomes p + shift + turn x p.
+    /// Records the gradient of a viewpoint's camera ([`CameraGradient::WIDTH`]), after the [`Renderer::backward`] of
+    /// the same viewpoint, whose parameter gradients it reads. The camera is moved in view space: a point p becomes p +
+    /// translation + rotation x p.
     ///
     /// # Errors
-    /// The viewpoint is of another camera model, there are more Gaussians than there is memory for, or others than the renderer's, or a pass exceeds what the device
-    /// launches.
+    /// The viewpoint is of another camera model, the Gaussians exceed the memory or are not those of the renderer, or a
+    /// pass exceeds what the device can launch.
     pub fn record<'a>(
         &mut self,
         pass: &mut Recorder<'_>,

@@ -1,4 +1,4 @@
-//! Room for Gaussians, views and intersections, and what it takes.
+//! Capacity for Gaussians, views and intersections, and its memory.
 
 use glam::UVec2;
 
@@ -8,7 +8,7 @@ use crate::camera::Camera;
 use crate::{Error, Result};
 
 impl Renderer {
-    /// Makes room for `gaussian_count` Gaussians and the images of `cameras`, or their patches.
+    /// Reserves memory for `gaussian_count` Gaussians and the images of `cameras`, or their patches.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -27,7 +27,7 @@ impl Renderer {
     /// The same for images of these sizes; where `gaussian_count` Gaussians need more memory, for `capacity` of them.
     ///
     /// # Errors
-    /// The device is out of memory, or cannot follow so many tiles.
+    /// The device is out of memory, or the tiles exceed its limit.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn reserve_sizes(
         &mut self,
@@ -47,10 +47,10 @@ impl Renderer {
         self.frame.reserve(&self.gpu, gaussian_count, capacity, pixels, tiles)
     }
 
-    /// Makes room for `intersections`, and half as many again where the device can bind them; what room there is stays.
+    /// Grows the memory to `intersections`, and half as many again where the device can bind them; never shrinks.
     ///
     /// # Errors
-    /// The device is out of memory, or cannot bind so many.
+    /// The device is out of memory, or cannot bind that many.
     pub fn grow(&mut self, intersections: u32) -> Result<()> {
         let headroom =
             intersections.saturating_add(intersections / 2).min(self.max_intersections());
@@ -58,36 +58,36 @@ impl Renderer {
         self.set_intersection_capacity(capacity.max(self.frame.intersection_capacity()))
     }
 
-    /// The most intersections of a view whose records the device can bind at once.
+    /// The most intersections of a view whose gradient records the device can bind at once.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn max_intersections(&self) -> u32 {
         self.frame.max_intersections(&self.gpu)
     }
 
-    /// What each Gaussian takes beside its own numbers, in bytes.
+    /// Bytes per Gaussian beside its parameters.
     pub(crate) fn bytes_per_gaussian(&self) -> usize {
         self.frame.bytes_per_gaussian() + self.depth_sort.bytes_per_item()
     }
 
-    /// What the buffers take that follow the numbers of Gaussians and intersections, those of the sorts left out, which come
-    /// with the first render; in bytes.
+    /// The bytes of the buffers whose size follows the numbers of Gaussians and intersections, except for those of the
+    /// sorts, which are allocated with the first render.
     pub(crate) fn reserved_bytes(&self) -> usize {
         let frame = &self.frame;
         frame.splats.len() * frame.bytes_per_gaussian()
             + frame.tiles.len() * frame.bytes_per_intersection()
     }
 
-    /// What each intersection of a view takes, in bytes.
+    /// Bytes per intersection of a view.
     pub(crate) fn bytes_per_intersection(&self) -> usize {
         self.frame.bytes_per_intersection() + self.tile_sort.bytes_per_item()
     }
 
-    /// How many intersections there is room for.
+    /// The intersections that memory is reserved for.
     pub(crate) fn intersection_capacity(&self) -> u32 {
         self.frame.intersection_capacity()
     }
 
-    /// Makes room for exactly so many intersections.
+    /// Sets the capacity to exactly `intersections`.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -116,7 +116,7 @@ mod tests {
     use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
     use crate::splats::scene::Gaussians;
 
-    /// With the sorts, whose memory comes with the first render.
+    /// With the sorts, whose memory is allocated with the first render.
     #[test]
     fn a_render_takes_the_bytes_that_are_foreseen() {
         let gpu = Gpu::new(&DeviceChoice::Best).unwrap();

@@ -1,4 +1,4 @@
-//! Renders to the host: as much at once as the device takes, patch by patch where that is less than the view.
+//! Renders to the host: the whole view if the device can, else patch by patch.
 
 use glam::UVec2;
 
@@ -9,13 +9,13 @@ use crate::photographs::image::Image;
 use crate::splats::scene::GaussianSlice;
 
 impl Renderer {
-    /// What a view is rendered in: all of it where the device takes that at once, else patches that it takes.
+    /// The patches in which a view is rendered: the whole view where the device can, else patches that fit.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn patches(&self, camera: &Camera) -> Vec<Patch> {
         self.patches_with_margin(camera, 0, |_| true)
     }
 
-    /// The same where around each patch as many pixels of its neighbours are rendered, and the whole suits others, too.
+    /// The same with a margin of neighbouring pixels around each patch; the whole view must satisfy `fits` too.
     pub(crate) fn patches_with_margin(
         &self,
         camera: &Camera,
@@ -31,11 +31,11 @@ impl Renderer {
         })
     }
 
-    /// Renders to the host; grows the memory as the view demands.
+    /// Renders to the host; grows the memory as the view needs.
     ///
     /// # Errors
-    /// The Gaussians do not suit the settings, they or the image exceed what was reserved, or the device is out of memory or
-    /// lost.
+    /// The Gaussians do not match the settings, they or the image exceed what was reserved, or the device is out of
+    /// memory or lost.
     pub fn render_image<'a>(
         &mut self,
         gaussians: impl Into<GaussianSlice<'a>>,
@@ -48,8 +48,8 @@ impl Renderer {
         Ok(Image { width, height, data })
     }
 
-    /// Renders every channel to the host, (channels, H, W), patch by patch where the device takes no more at once; grows the
-    /// memory as the view demands.
+    /// Renders all channels to the host, (channels, H, W), patch by patch where the device cannot at once; grows the
+    /// memory as the view needs.
     ///
     /// # Errors
     /// As [`Renderer::render_image`].
@@ -64,7 +64,7 @@ impl Renderer {
         Ok(planes)
     }
 
-    /// As [`Renderer::render_channels`], and behind the channels how much of the background shows, (channels + 1, H, W).
+    /// As [`Renderer::render_channels`], with the transmittance as the last channel, (channels + 1, H, W).
     ///
     /// # Errors
     /// As [`Renderer::render_image`].
@@ -97,7 +97,7 @@ impl Renderer {
         Ok(data)
     }
 
-    /// How many intersections the Gaussians have in a patch, whether there is room for them or not.
+    /// The number of intersections of a patch, whether it exceeds the capacity or not.
     ///
     /// # Errors
     /// The image exceeds what was reserved, or the device is lost.
@@ -110,7 +110,7 @@ impl Renderer {
         Ok(self.try_render(gaussians, patch, &options)?.intersections)
     }
 
-    /// Renders once, and says how that went; no flag is left.
+    /// Renders once and returns the status; all flags are cleared.
     fn try_render(
         &mut self,
         gaussians: GaussianSlice<'_>,
@@ -128,8 +128,8 @@ impl Renderer {
         Ok(Status::from_words(&words))
     }
 
-    /// Every channel of one patch, and behind them its [`Renderer::transmittances`], (channels + 1, h, w); where the device
-    /// cannot follow all intersections of it, half by half.
+    /// All channels of one patch, then its [`Renderer::transmittances`], (channels + 1, h, w); in two halves where the
+    /// device cannot bind all its intersections.
     ///
     /// # Errors
     /// As [`Renderer::render_image`].

@@ -1,4 +1,4 @@
-//! How far kernels get on a device that ends loops after so many turns.
+//! Limits of kernels on a device that ends loops after a number of iterations.
 
 use glam::{UVec2, Vec3};
 
@@ -8,21 +8,22 @@ use crate::gpu::{Gpu, Properties, Tile};
 use crate::kernels::ProjectedSplat;
 use crate::{Error, Result};
 
-/// How many splats the blending kernels take in one turn of their inner loop. A device that ends loops after so many turns
-/// follows a hundred thousand splats on a tile with two; one and four were measured slower there.
+/// The splats that the blending kernels process per iteration of their inner loop. With two, a device with an iteration
+/// limit can process a hundred thousand splats on a tile; one and four were measured to be slower there.
 pub(super) fn splats_per_turn(gpu: &Gpu) -> u32 {
     if gpu.properties().max_loop_iterations < u32::MAX { 2 } else { 1 }
 }
 
 impl RenderSettings {
-    /// Whether a view of this size is rendered and trained on at once: this device can, and nobody asked for less.
+    /// Whether a view of this size is rendered and trained on at once: the device can, and the settings ask for no
+    /// less.
     pub(crate) fn takes_at_once(&self, gpu: &Gpu, size: UVec2) -> bool {
         let pixels = u64::from(size.x) * u64::from(size.y);
         self.patch_pixels.is_none_or(|most| pixels <= most) && self.suits(gpu, size)
     }
 
-    /// The most Gaussians that this device can render and train: some passes read the splat and the colour of any of them,
-    /// which one binding has to hold. What else there is of them is bound in [`Batches`](crate::splats::batches::Batches).
+    /// The most Gaussians that this device can render and train: some passes read splat and colour of any Gaussian,
+    /// which one binding has to hold. Other planes are bound in [`Batches`](crate::splats::batches::Batches).
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn peak_gaussians(&self, gpu: &Gpu) -> usize {
         let color = color_vectors(self.channels()) * size_of::<Vec3>();
@@ -30,11 +31,11 @@ impl RenderSettings {
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
     }
 
-    /// The tile for views of these sizes: that of [`RenderSettings::tile_on`], twice and more as high where nothing names a
-    /// tile and the device could not follow so many of them.
+    /// The tile for views of these sizes: that of [`RenderSettings::tile_on`], or a multiple of its height where the
+    /// settings name none and a view would have too many tiles.
     ///
     /// # Errors
-    /// As there.
+    /// As [`RenderSettings::tile_on`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn tile_for(
         &self,
@@ -64,7 +65,8 @@ impl RenderSettings {
     /// Refuses a view that this device cannot render and train on, from its size alone.
     ///
     /// # Errors
-    /// [`Error::Usage`] names the view, the limit, and the longest side that it leaves; the tile does not suit the device.
+    /// [`Error::Usage`] names the view, the limit, and the longest side that it leaves; the tile does not suit the
+    /// device.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn check_size(
         &self,
@@ -97,19 +99,19 @@ impl RenderSettings {
     }
 }
 
-/// Turns of a kernel's loops beside those that are counted.
+/// Iterations of a kernel's loops beside those that are counted.
 const SOME_TURNS: u32 = 64;
 
-/// How many tiles a view may have: where every Gaussian of a subgroup covers all of them, `project_backward` makes as
-/// many turns as there are tiles, its lanes taking turns at each; `emit` makes fewer.
+/// The most tiles of a view: where every Gaussian of a subgroup covers all of them, `project_backward` makes as many
+/// iterations as there are tiles, its lanes taking turns at each; `emit` makes fewer.
 pub(super) fn max_tiles(gpu: &Gpu) -> usize {
     let Properties { max_loop_iterations, subgroup_size, .. } = *gpu.properties();
     let turns_of_owners = 2 * subgroup_size;
     (max_loop_iterations - SOME_TURNS - turns_of_owners) as usize
 }
 
-/// How many splats of a tile the blending kernels get through: of a subgroup of splats they make one turn of the
-/// outer loop and the turns of the inner one; some more find the run, and end a loop.
+/// The most splats of a tile that the blending kernels can process: for a subgroup of splats they make one iteration of
+/// the outer loop and the iterations of the inner one; some more find the run and end a loop.
 pub(super) fn longest_run(gpu: &Gpu) -> u32 {
     let properties = gpu.properties();
     let lanes = properties.subgroup_size;

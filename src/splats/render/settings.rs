@@ -1,30 +1,30 @@
-//! What a renderer is made for, and the tile that suits a device.
+//! The settings of a renderer, and the tile that suits a device.
 
 use crate::gpu::{Gpu, Tile};
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{Features, Shape};
 use crate::{Error, Result};
 
-/// What a renderer is specialised for.
+/// Specialization of a renderer.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RenderSettings {
-    /// Gaussians nearer than this are not seen, in world units.
+    /// The near plane, in world units.
     pub near: f32,
     /// The largest alpha of a splat on a pixel; below 1.
     pub max_alpha: f32,
-    /// What the Gaussians are made of.
+    /// The attributes of the Gaussians.
     pub shape: Shape,
-    /// Colours are the bare SH sum, which can be negative, as in LITA-GS, instead of max(SH + 0.5, 0).
+    /// Colours are the raw SH sum, which can be negative, as in LITA-GS, instead of max(SH + 0.5, 0).
     pub raw_colors: bool,
-    /// How SH coefficients above degree 0 are stored: [`Gaussians::upload`](crate::splats::scene::Gaussians::upload) leaves 32 bits,
-    /// a training that is told to 16.
+    /// The storage format of the SH coefficients above degree 0: 32 bits after
+    /// [`Gaussians::upload`](crate::splats::scene::Gaussians::upload), 16 in training if the configuration says so.
     pub rest: StorageFormat,
-    /// The gradient of noise and illumination moves and shapes no Gaussian; that of depth and structure, which are there for
-    /// it, does.
+    /// Stop-gradient: the noise and illumination channels do not affect means, scales, rotations and opacities; depth
+    /// and structure, which exist to do so, do.
     pub detach_geometry: bool,
-    /// The tile that a workgroup owns; none: what is fastest on the device.
+    /// The tile of a workgroup; `None`: the fastest on the device.
     pub tile: Option<Tile>,
-    /// The most pixels that are rendered at once; none: as many as the device can bind.
+    /// The most pixels that are rendered at once; `None`: as many as the device can bind.
     pub patch_pixels: Option<u64>,
 }
 
@@ -43,16 +43,16 @@ impl Default for RenderSettings {
     }
 }
 
-/// The tile of a GPU, as in 3DGS, and that of a processor, whose subgroups are narrow: measured on lavapipe.
+/// The tile of a GPU, as in 3DGS, and that of a CPU, whose subgroups are narrow: measured on lavapipe.
 const GPU_TILE: [u32; 2] = [16, 16];
 const CPU_TILE: [u32; 2] = [16, 8];
-/// More channels than these take a smaller tile on a processor: its state no longer fits the registers of larger ones.
+/// More channels than these take a smaller tile on a CPU, whose registers no longer hold the state of a larger one.
 const CPU_TILE_CHANNELS: usize = 5;
 const CPU_SMALL_TILE: [u32; 2] = [8, 8];
 
 impl RenderSettings {
     /// The tile on this device, in pixels: that of these settings, else the one that was measured to be the fastest
-    /// there (`Gpu::tuned_tile`), else what such devices are known to like.
+    /// (`Gpu::tuned_tile`), else the default for such devices.
     ///
     /// # Errors
     /// A subgroup's part has no whole number of rows of lanes, or more than 32.
@@ -83,7 +83,7 @@ impl RenderSettings {
         self.shape.features.channels()
     }
 
-    /// How many of them, from the first, move and shape the Gaussians.
+    /// The leading channels whose gradients reach the geometry.
     pub(super) fn shaping_channels(&self) -> u32 {
         let Features { noise, illumination, .. } = self.shape.features;
         let observing =

@@ -1,4 +1,4 @@
-//! Gaussians on the device: how they lie there, and what owns and lends them.
+//! Gaussians on the device: their layout, and their owned and borrowed forms.
 
 use glam::DVec3;
 
@@ -9,56 +9,56 @@ use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::Batches;
 use crate::splats::packed_sh::{PackedSh, StorageFormat};
 
-/// How Gaussians lie on the device: as planes (include/gaussian.glsl), in batches where one binding does not hold them.
+/// The layout of Gaussians on the device: planes (include/gaussian.glsl), in batches where they exceed one binding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Layout {
     /// The number of Gaussians.
     pub count: usize,
-    /// How many there is memory for.
+    /// The number that memory is allocated for.
     pub capacity: usize,
-    /// What they are made of.
+    /// Their attributes.
     pub shape: Shape,
-    /// How SH coefficients above degree 0 are stored.
+    /// The storage format of SH coefficients above degree 0.
     pub sh_rest: StorageFormat,
 }
 
 impl Layout {
-    /// Of `count` Gaussians, with memory for no more.
+    /// The layout of `count` Gaussians, without headroom.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn new(count: usize, shape: impl Into<Shape>, sh_rest: StorageFormat) -> Self {
         Self { count, capacity: count, shape: shape.into(), sh_rest }
     }
 
-    /// What planes of one float for each parameter are made of, as gradients and moments are.
+    /// The dimensions of planes with one float per parameter, such as gradients and moments.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn floats(&self) -> PlaneCounts {
         let features = self.shape.features.width();
         PlaneCounts { gaussians: self.count, columns: width(self.shape), features }
     }
 
-    /// Words of each Gaussian's parameters.
+    /// Words per Gaussian.
     pub(crate) fn words(&self) -> usize {
         self.sh_rest.words(self.floats())
     }
 
-    /// How planes of one float for each parameter lie in a buffer.
+    /// The batches of planes with one float per parameter.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn batches(&self, gpu: &Gpu) -> Batches {
         Batches::new(gpu, self.floats())
     }
 
-    /// How the parameters do.
+    /// The batches of the parameters.
     pub(crate) fn parameter_batches(&self, gpu: &Gpu) -> Batches {
         self.batches(gpu).with_columns(self.words())
     }
 }
 
-/// Gaussians on the device, which owns their parameters: what a [`Renderer`](crate::splats::render::Renderer) draws.
+/// Gaussians that own their parameters on the device: what a [`Renderer`](crate::splats::render::Renderer) renders.
 #[derive(Debug)]
 pub struct DeviceGaussians {
-    /// How the parameters lie in their buffer.
+    /// The layout of the parameters.
     pub layout: Layout,
-    /// `capacity * words()` words or more, as the layout says.
+    /// `capacity * words()` words or more, in that layout.
     pub parameters: Buffer<f32>,
     /// The world position that their positions are relative to.
     pub origin: DVec3,
@@ -67,9 +67,9 @@ pub struct DeviceGaussians {
 /// Gaussians on the device, borrowed for passes that read them.
 #[derive(Clone, Copy, Debug)]
 pub struct GaussianSlice<'a> {
-    /// How the parameters lie.
+    /// The layout of the parameters.
     pub layout: Layout,
-    /// `count * words()` words or more, as the layout says.
+    /// `count * words()` words or more, in that layout.
     pub parameters: Slice<'a, f32>,
 }
 
@@ -80,7 +80,7 @@ impl<'a> From<&'a DeviceGaussians> for GaussianSlice<'a> {
 }
 
 impl DeviceGaussians {
-    /// Memory for Gaussians whose parameters are undefined.
+    /// Allocates Gaussians with uninitialised parameters.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -91,7 +91,7 @@ impl DeviceGaussians {
         Ok(Self { layout, parameters, origin: DVec3::ZERO })
     }
 
-    /// To be drawn.
+    /// Borrows them for rendering.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn slice(&self) -> GaussianSlice<'_> {
         GaussianSlice { layout: self.layout, parameters: self.parameters.slice() }
@@ -145,7 +145,7 @@ impl Gaussians {
         self.upload_as(gpu, StorageFormat::Single)
     }
 
-    /// A copy on the device, SH coefficients above degree 0 as `sh_rest` says.
+    /// A copy on the device, SH coefficients above degree 0 in the format `sh_rest`.
     ///
     /// # Errors
     /// The device is out of memory or lost.

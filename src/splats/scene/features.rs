@@ -1,34 +1,34 @@
-//! What a Gaussian can carry beside its colour: numbers that the rasteriser blends as it blends colour.
+//! Features: values beside colour that the rasteriser blends as it blends colour.
 
 use std::ops::Range;
 
 /// The render's channels before the features: RGB.
 pub const COLOR_CHANNELS: usize = 3;
 
-/// Something that a part of the model learns per Gaussian (LITA-GS). None depends on the viewing direction, none has
-/// an activation.
+/// A value per Gaussian that a part of the model learns (LITA-GS), independent of the viewing direction and without an
+/// activation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Feature {
     /// A free scalar that the depth loss shapes; not the distance to the camera.
     Depth,
     /// Edge strength, compared with the colour invariant of the target.
     Structure,
-    /// RGB: what the denoiser begins with.
+    /// RGB: the input of the denoiser.
     Noise,
-    /// RGB: what takes the denoised render back to the dark photograph.
+    /// RGB: the factor from the denoised render to the dark photograph.
     Illumination,
 }
 
-/// All that is to know about one feature.
+/// The description of a feature.
 #[derive(Debug)]
 pub struct FeatureSpec {
-    /// Which feature this row describes.
+    /// The feature of this row.
     pub feature: Feature,
     /// The name on the command line and in errors.
     pub name: &'static str,
     /// Channels.
     pub width: usize,
-    /// What its PLY properties begin with (`f_NAME_0` and on, as LITA-GS writes them).
+    /// The prefix of its PLY properties (`f_NAME_0` and on, as LITA-GS writes them).
     pub ply_name: &'static str,
 }
 
@@ -45,27 +45,27 @@ pub const FEATURES: [FeatureSpec; 4] = [
     },
 ];
 
-/// The features that the Gaussians of a scene have.
+/// The features of a scene's Gaussians.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Features {
     /// A free scalar that the depth loss shapes; not the distance to the camera.
     pub depth: bool,
     /// Edge strength, compared with the colour invariant of the target.
     pub structure: bool,
-    /// RGB: what the denoiser begins with.
+    /// RGB: the input of the denoiser.
     pub noise: bool,
-    /// RGB: what takes the denoised render back to the dark photograph.
+    /// RGB: the factor from the denoised render to the dark photograph.
     pub illumination: bool,
 }
 
 impl Features {
-    /// None: the model of 3DGS.
+    /// No features: the model of 3DGS.
     pub const NONE: Self =
         Self { depth: false, structure: false, noise: false, illumination: false };
-    /// Every one.
+    /// All features.
     pub const ALL: Self = Self { depth: true, structure: true, noise: true, illumination: true };
 
-    /// Whether the feature is there.
+    /// Whether the feature is present.
     pub(crate) const fn has(self, feature: Feature) -> bool {
         match feature {
             Feature::Depth => self.depth,
@@ -75,7 +75,7 @@ impl Features {
         }
     }
 
-    /// The rows of [`FEATURES`] that are there.
+    /// The rows of [`FEATURES`] that are present.
     pub(crate) fn specs(self) -> impl Iterator<Item = &'static FeatureSpec> {
         FEATURES.iter().filter(move |spec| self.has(spec.feature))
     }
@@ -92,7 +92,7 @@ impl Features {
         COLOR_CHANNELS + self.width()
     }
 
-    /// The channels of a render that show the feature; none where the scene does not have it.
+    /// The channels of a render with the feature; `None` where the scene does not have it.
     pub(crate) fn channels_of(self, feature: Feature) -> Option<Range<usize>> {
         let mut begin = COLOR_CHANNELS;
         for spec in self.specs() {

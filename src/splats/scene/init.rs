@@ -1,4 +1,4 @@
-//! The Gaussians that training begins with.
+//! Initialization of the Gaussians.
 
 use std::borrow::Borrow;
 use std::ops::Bound::Excluded;
@@ -18,29 +18,29 @@ use crate::{Error, Result};
 
 settings! {
 "start."
-/// What the first Gaussians look like; the points say where they are and in which colour.
+/// The initialization of the Gaussians; points give positions and colours.
 ///
-/// The defaults are denser and smaller than 3DGS begins, which scores higher after as many steps, in less time, since what is
-/// opaque hides what lies behind it (docs/benchmarks.md). Still denser ones score higher yet, but lose more when they are split.
-/// Discs score as round ones do, with more Gaussians.
+/// The defaults are denser and smaller than those of 3DGS. They score higher after the same steps in less time, since
+/// opaque Gaussians hide those behind a surface (docs/benchmarks.md). Even denser ones score higher yet, but lose more
+/// when they are split. Discs score as round ones do, with more Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Initialization {
-    /// The opacity of each first Gaussian.
+    /// Initial opacity.
     opacity: f64 = 0.2 => Rule::Number(Excluded(0.0), Excluded(1.0));
     /// Standard deviation in units of the root mean squared distance to the three nearest points.
     scale: f64 = 0.8 => Rule::from_to(1e-3, 1e3);
-    /// The min_axis_ratio axis of a disc in units of its longest: neighbours that lie on a surface make discs along it. 1: all are
-    /// round.
+    /// The least axis of a disc in units of its longest: where neighbouring points lie on a surface, Gaussians are
+    /// discs along it. 1: all are isotropic.
     min_axis_ratio: f64 = 1.0 => Rule::from_to(1e-3, 1.0);
 }
 }
 
 impl Initialization {
-    /// 3DGS's, and the paper's.
+    /// The initialization of 3DGS and of the paper.
     #[cfg(feature = "testing")]
     pub const PAPER: Self = Self { opacity: 0.1, scale: 1.0, min_axis_ratio: 1.0 };
 
-    /// Refuses values that make no Gaussian, naming the field.
+    /// Refuses invalid values, naming the field.
     ///
     /// # Errors
     /// [`Error::Usage`].
@@ -52,22 +52,24 @@ impl Initialization {
 /// The least mean squared distance to the neighbours, world units squared (3DGS).
 const MIN_SQUARED_DISTANCE: f64 = 1e-7;
 
-/// A point that no track says the views of is looked for in no more.
+/// The most views that are searched for a point without a track.
 pub const MAX_VIEWS: usize = 64;
 
-/// The standard deviation of a Gaussian that has no neighbour at all, world units.
+/// The standard deviation of a Gaussian without neighbours, world units.
 const LONE_SCALE: f64 = 0.01;
 
 impl Gaussians {
     /// One Gaussian per point, in the points' order.
     ///
-    /// SH degree 0 is such that the colour is `colors[i]` (sRGB-encoded, [0, 1]), nothing above it. Scales are those of `start`
-    /// times the root of the mean squared distance to the three nearest other positions (3DGS); coincident points count as one
-    /// position, so duplicates do not shrink to nothing. With fewer than four positions the mean goes over those there are; a
-    /// single position has the standard deviation 0.01. Features are uniform in [0, 1), drawn from `seed` (LITA-GS).
+    /// SH of degree 0 gives the colour `colors[i]` (sRGB-encoded, [0, 1]); higher degrees are zero. Scales are
+    /// `start.scale` times the root of the mean squared distance to the three nearest other positions (3DGS);
+    /// coincident points count as one position, so that duplicates do not shrink to nothing. With fewer than four
+    /// positions the mean is over those that exist; a single position has the standard deviation 0.01. Features are
+    /// uniform in [0, 1), drawn from `seed` (LITA-GS).
     ///
     /// # Errors
-    /// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or `Initialization::check` refuses.
+    /// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or `Initialization::check`
+    /// refuses.
     pub fn from_points(
         positions: &[DVec3],
         colors: &[Vec3],
@@ -114,18 +116,18 @@ impl Gaussians {
     }
 }
 
-/// Standard deviations along axes of its own, world units.
+/// Standard deviations along the principal axes, world units.
 #[derive(Clone, Copy)]
 struct Ellipsoid {
     rotation: DQuat,
     scales: DVec3,
 }
 
-/// What each point's Gaussian covers.
+/// The ellipsoid of each point.
 fn ellipsoids(positions: &[DVec3], start: &Initialization) -> Vec<Ellipsoid> {
     // The nearest position is the point itself.
     const NEAREST: usize = 1 + 3;
-    /// So many tell the direction of a surface.
+    /// The neighbours from which the direction of a surface is estimated.
     const AROUND: usize = 1 + 8;
     // Adding zero turns -0 into 0, so that equal coordinates have equal bits.
     let key = |position: &DVec3| (*position + 0.0).to_array().map(f64::to_bits);
@@ -152,15 +154,15 @@ fn ellipsoids(positions: &[DVec3], start: &Initialization) -> Vec<Ellipsoid> {
         }
         let (rotation, spread) = spread(others.iter().map(|(_, other)| *other - *position));
         let axes = spread.map(|axis| axis.max(start.min_axis_ratio));
-        // The area of the disc, the product of its two longer axes, stays that of the round one.
+        // The area of the disc, the product of its two longer axes, is that of the isotropic Gaussian.
         let area = axes.element_product() / axes.min_element();
         Ellipsoid { rotation, scales: axes * (scale / area.sqrt()) }
     };
     positions.par_iter().map(ellipsoid).collect()
 }
 
-/// The principal axes of directions, and how far they spread along each: 1 along the one they spread along most. Each
-/// direction counts alike, however long.
+/// The principal axes of directions, and the spread along each, relative to the largest. All directions weigh the same,
+/// whatever their length.
 fn spread(directions: impl Iterator<Item = DVec3>) -> (DQuat, DVec3) {
     let mut moments = Matrix3::zeros();
     for direction in directions.filter_map(DVec3::try_normalize) {
@@ -175,12 +177,12 @@ fn spread(directions: impl Iterator<Item = DVec3>) -> (DQuat, DVec3) {
     (DQuat::from_mat3(&axes).normalize(), spread.max(DVec3::ZERO).map(f64::sqrt))
 }
 
-/// `count` random positions inside what the cameras see, for captures without points; none without cameras.
+/// `count` random positions within the views of the cameras, for captures without points; empty without cameras.
 ///
-/// Each lies at a uniform place of a random camera's image, at a depth that is log-uniform between half the
-/// capture's radius and five times it (radius: the greatest distance of a camera from the cameras' mean; 1 where all
-/// cameras are in one place). A position that a second camera sees is preferred: its depth can be learned. No more than
-/// [`MAX_VIEWS`] cameras are asked, so that the time is proportional to `count`.
+/// Each is at a uniform position of a random camera's image, at a depth that is log-uniform between half the capture's
+/// radius and five times it (radius: the greatest distance of a camera from the cameras' mean; 1 where all cameras
+/// coincide). Positions that a second camera sees are preferred, since their depth can be learned. At most
+/// [`MAX_VIEWS`] cameras are tried, so that the time is proportional to `count`.
 pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
     const TRIES: u64 = 16;
     const DRAWS_PER_TRY: u64 = 4;
@@ -200,11 +202,11 @@ pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
                 uniform(2) * f64::from(camera.height),
             );
             let depth = near * (far / near).powf(uniform(3));
-            // Where a fisheye shows nothing, straight ahead.
+            // Outside of a fisheye's image circle, straight ahead.
             let in_view = camera.in_view(pixel, depth).unwrap_or(DVec3::Z * depth);
             (place, camera.view_from_world.inverse().transform_point3(in_view))
         };
-        // Views that follow each other show the same: the second camera is found among the first ones most often.
+        // Consecutive views overlap: the second camera is most often found among the first ones tried.
         let seen_twice = |(place, position): &(usize, DVec3)| {
             let (before, from) = cameras.split_at(*place);
             let seen = from.iter().chain(before.iter().rev()).take(MAX_VIEWS);
@@ -222,19 +224,20 @@ fn radius(cameras: &[Camera]) -> f64 {
     let centers: Vec<DVec3> = cameras.iter().map(Camera::center).collect();
     let mean = centers.iter().sum::<DVec3>() / centers.len() as f64;
     let radius = centers.iter().map(|center| center.distance(mean)).fold(0.0, f64::max);
-    // Below this the spread is the rounding of one place's coordinates.
+    // Below this the spread is rounding error of one position's coordinates.
     let least = 1e-9 * mean.length().max(1.0);
     if radius > least { radius } else { 1.0 }
 }
 
-/// The colour of each point: the mean of what the training views that see it show in their targets, RGB.
+/// The colour of each point: the mean of the targets of the training views that see it, RGB.
 ///
-/// A point is seen by the training views of its track; without any, by the training views that it lies inside of, of
-/// [`MAX_VIEWS`] that cover the scene (`Camera::covering`). A point that none of them sees gets the mean grey of the targets. `target` gives the target of a view (an index
-/// into `views`), or nothing where there is none; it is asked once per training view, in order, so it may compute.
+/// A point is seen by the training views of its track; without a track, by the training views that it projects into, of
+/// [`MAX_VIEWS`] that cover the scene (`Camera::covering`). A point that none of them sees gets the mean grey of the
+/// targets. `target` returns the target of a view (an index into `views`), or `None`; it is called once per training
+/// view, in order, so it may compute.
 ///
-/// The time is proportional to the pixels of the views and the length of all tracks; a point without a track counts as one of
-/// [`MAX_VIEWS`] views.
+/// The time is proportional to the pixels of the views and the length of all tracks; a point without a track counts as
+/// one of [`MAX_VIEWS`] views.
 ///
 /// # Errors
 /// Those of `target`.
@@ -264,20 +267,20 @@ pub fn colors_from_views<I: Borrow<Image>>(
     Ok(colors.into_iter().map(|color| color.value().unwrap_or(grey)).collect())
 }
 
-/// Where a view shows a point, in pixels; none where the point lies outside of it or its pixels are hidden.
+/// The pixel of a view that shows a point; `None` where the point is outside of it or its pixel is masked.
 fn shown(view: &View, point: &Point) -> Option<DVec2> {
     let pixel = view.camera.sees(point.position)?;
     let is_hidden = view.mask.as_ref().is_some_and(|mask| mask.hides_around(pixel));
     (!is_hidden).then_some(pixel)
 }
 
-/// Which points a view may give their colour to.
+/// The points that a view may colour.
 struct Candidates {
-    /// Of each view the points whose track has it, ascending.
+    /// For each view the points whose track has it, ascending.
     of_view: Vec<Vec<u32>>,
     /// The points that no training view of their track shows.
     untracked: Vec<u32>,
-    /// Whether each view is one that these are looked for in.
+    /// Whether each view is searched for these.
     covers: Vec<bool>,
 }
 
@@ -319,7 +322,7 @@ impl Candidates {
         own
     }
 
-    /// The points that a view is asked for: those with a track, and those without.
+    /// The points of a view: those with a track, and those without.
     fn of_view(&self, view: usize) -> [&[u32]; 2] {
         [&self.of_view[view], if self.covers[view] { &self.untracked } else { &[] }]
     }
@@ -348,7 +351,8 @@ fn mean_grey(values: &[f32]) -> Vec3 {
     Vec3::splat((sum / values.len().max(1) as f64) as f32)
 }
 
-/// The image's value at a place in pixels (pixel centres at +0.5), RGB; beyond the outermost centres the edge goes on.
+/// The bilinearly interpolated image at a position in pixels (pixel centres at +0.5), RGB; clamped to the outermost
+/// centres.
 fn bilinear(image: &Image, pixel: DVec2) -> Vec3 {
     let (width, height) = (image.width as usize, image.height as usize);
     let axis = |place: f64, size: usize| {

@@ -1,26 +1,26 @@
-//! The nearest of many positions, exactly.
+//! Exact nearest neighbours.
 
 use std::ops::Range;
 
 use glam::DVec3;
 
-/// A balanced k-d tree without nodes: the middle position of every range splits the others along the axis that they
-/// spread widest on, those before it not beyond it, those behind it not below it.
+/// A balanced k-d tree without nodes: the median of every range splits the others along the axis of their largest
+/// extent; those before it are not above it, those after it not below it.
 pub(super) struct Neighbours {
     positions: Vec<DVec3>,
-    /// Along which axis each position splits its range.
+    /// The axis along which each position splits its range.
     axes: Vec<usize>,
 }
 
 impl Neighbours {
-    /// Every position is finite.
+    /// All positions must be finite.
     pub(super) fn new(mut positions: Vec<DVec3>) -> Self {
         let mut axes = vec![0; positions.len()];
         split(&mut positions, &mut axes);
         Self { positions, axes }
     }
 
-    /// The nearest positions to `place` with their squared distances, by these; infinity where there are no more.
+    /// The nearest positions to `place`, sorted by squared distance; infinity where there are no more.
     pub(super) fn nearest<const COUNT: usize>(&self, place: DVec3) -> [(f64, DVec3); COUNT] {
         let mut found = [(f64::INFINITY, DVec3::INFINITY); COUNT];
         self.search(0..self.positions.len(), place, &mut found);
@@ -74,7 +74,7 @@ mod tests {
     fn the_nearest_are_those_that_a_search_through_all_finds() {
         let draws = Stream::new(7, 0);
         for count in [0, 1, 2, 3, 7, 64, 1000] {
-            // On a grid many are equally far, and many share a coordinate with what splits them.
+            // On a grid many are equidistant, and many share a coordinate with the one that splits them.
             for grid in [1e-9, 0.25] {
                 let axis = |draw: u64| (4.0 * draws.uniform(draw) / grid).round() * grid;
                 let position = |i: u64| DVec3::from_array([0, 1, 2].map(|k| axis(3 * i + k)));

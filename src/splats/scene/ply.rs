@@ -1,10 +1,10 @@
-//! Gaussians as a PLY file in the INRIA layout that every splat viewer opens.
+//! Gaussians as a PLY file in the INRIA layout, which splat viewers open.
 //!
 //! Binary little-endian, one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`.
-//! Positions far from the world's origin are relative to another one, which a comment names: `world = position + X Y Z`.
-//! Features, where the scene has any, stand between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`,
-//! which viewers skip. Normals are zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid,
-//! scales are logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
+//! Positions far from the world's origin are relative to another one, which a comment gives: `world = position + X Y
+//! Z`. Features, where the scene has any, are between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2
+//! f_illu_0..2`, which viewers skip. Normals are zero; `f_rest_*` is channel-major (all of red, then green, then blue);
+//! opacity is before the sigmoid, scales are logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
 
 use std::collections::HashMap;
 use std::fs;
@@ -21,10 +21,10 @@ use crate::splats::attributes::{
 };
 use crate::{Error, Result};
 
-/// How the comment begins that names the origin of the positions.
+/// The prefix of the comment with the origin of the positions.
 const ORIGIN: &str = "world = position + ";
 
-/// A property of the file: its name, the attribute and the component of it that it holds.
+/// A property of the file: its name, and the attribute and component that it holds.
 struct Property {
     name: String,
     attribute: Attribute,
@@ -39,7 +39,7 @@ impl Property {
     }
 }
 
-/// Every property but the normals, which follow the means, in the order of the file.
+/// All properties but the normals, which follow the means, in file order.
 fn properties(shape: Shape) -> Vec<Property> {
     let mut specs: Vec<&AttributeSpec> = ATTRIBUTES.iter().collect();
     specs.sort_by_key(|spec| spec.ply_place);
@@ -66,17 +66,17 @@ fn properties(shape: Shape) -> Vec<Property> {
 }
 
 impl Gaussians {
-    /// Reads a model: a PLY in the INRIA layout, from whichever trainer, told by its content and not by its name.
+    /// Reads a model: a PLY in the INRIA layout, of any trainer, recognised by its content, not by its name.
     ///
     /// # Errors
-    /// [`Error::Input`] where the file is missing, of another format, cut short, longer than its header says, or where a
-    /// needed property is missing or not finite.
+    /// [`Error::Input`] where the file is missing, of another format, truncated, longer than its header says, or where
+    /// a required property is missing or not finite.
     pub fn open(path: impl AsRef<Path>) -> Result<Self> {
         load(path)
     }
 }
 
-/// Writes `gaussians` to `path`; the file appears under its name only once it is complete.
+/// Writes `gaussians` to `path` atomically.
 ///
 /// # Errors
 /// [`Error::Output`] where the file cannot be written.
@@ -84,7 +84,7 @@ pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
     save_with_comments(gaussians, path, &[""; 0])
 }
 
-/// As [`save`], with lines of the header that readers skip.
+/// As [`save`], with comments in the header.
 ///
 /// # Errors
 /// As there.
@@ -137,11 +137,11 @@ fn write(gaussians: &Gaussians, path: &Path, comments: &[impl AsRef<str>]) -> st
     if file.metadata()?.is_file() { file.sync_all() } else { Ok(()) }
 }
 
-/// Reads Gaussians from a binary little-endian PLY; properties that are not ours are skipped.
+/// Reads Gaussians from a binary little-endian PLY; unknown properties are skipped.
 ///
 /// # Errors
-/// [`Error::Input`] where the file is missing, of another format, cut short, longer than its header says, or where a
-/// needed property is missing or not finite.
+/// [`Error::Input`] where the file is missing, of another format, truncated, longer than its header says, or where a
+/// required property is missing or not finite.
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
     let bytes = input::bytes(path)?;
@@ -168,7 +168,7 @@ fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
         ));
     }
 
-    // Before there is memory for them: a vertex that lacks everything takes no byte of the file, however many there are.
+    // Before allocation: vertices without properties take no bytes of the file, however many there are.
     let shape = header.shape()?;
     let offset_of = |property: Property| Ok((header.offset(&property.name)?, property));
     let properties =
@@ -207,7 +207,7 @@ fn parse_origin(numbers: &str) -> Result<DVec3, String> {
     }
 }
 
-/// What the header says about the vertices.
+/// The vertices according to the header.
 struct Header {
     /// Bytes before the first vertex.
     length: usize,
@@ -217,7 +217,7 @@ struct Header {
     stride: usize,
     /// Byte offset in the vertex and type of each property.
     properties: HashMap<String, (usize, String)>,
-    /// Whether elements follow the vertices.
+    /// Whether other elements follow the vertices.
     more_elements: bool,
     /// The world position that the positions are relative to.
     origin: DVec3,
@@ -310,7 +310,7 @@ impl Header {
         Ok(Shape { sh_degree: self.sh_degree()?, features: self.features() })
     }
 
-    /// The features whose first property is there.
+    /// The features whose first property is present.
     fn features(&self) -> Features {
         let has = |feature: Feature| {
             let name = FEATURES[feature as usize].ply_name;
@@ -324,7 +324,7 @@ impl Header {
         }
     }
 
-    /// The degree whose `f_rest_*` properties are all there.
+    /// The degree whose `f_rest_*` properties are all present.
     fn sh_degree(&self) -> Result<u32, String> {
         let found = self.properties.keys().filter(|name| name.starts_with("f_rest_")).count();
         let degree = (0..=MAX_SH_DEGREE).find(|&degree| 3 * rest_coefficients(degree) == found);

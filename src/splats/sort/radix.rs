@@ -1,4 +1,4 @@
-//! The radix sort: least significant digit first, up to 8 bits a pass.
+//! The radix sort: least significant digit first, up to 8 bits per pass.
 
 use super::{Count, common_len};
 use crate::Result;
@@ -21,15 +21,15 @@ pub struct RadixSort {
     scratch: Scratch,
 }
 
-/// One subgroup makes the prefix sums of so many partitions in less time than a pass of its own costs. A processor has
-/// no other lanes that would do it at the same time.
+/// Up to this number of partitions, one subgroup scans them faster than a pass of its own would. A CPU has no idle
+/// lanes that would do so at the same time.
 const FOLDED_PARTITIONS_ON_A_GPU: u32 = 16;
 const FOLDED_PARTITIONS_ON_A_CPU: u32 = 1024;
 
-/// What a sort needs beside the pairs themselves.
+/// Scratch memory of a sort.
 #[derive(Debug)]
 struct Scratch {
-    /// Each pass writes the pairs here, then these and the caller's buffers change places.
+    /// Each pass writes the pairs here; then these and the caller's buffers are swapped.
     keys: Buffer<u32>,
     values: Buffer<u32>,
     /// (partitions, digits)
@@ -39,12 +39,12 @@ struct Scratch {
 }
 
 impl RadixSort {
-    /// What its scratch memory takes for each pair, in bytes.
+    /// Its size in bytes per pair.
     pub(crate) fn bytes_per_item(&self) -> usize {
         2 * size_of::<u32>() + (size_of::<u32>() << MAX_DIGIT_BITS) / self.partition_size as usize
     }
 
-    /// A sort with scratch memory for buffers of `capacity` pairs; buffers of another length have it made anew.
+    /// A sort with scratch memory for `capacity` pairs, reallocated for buffers of another length.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -68,10 +68,10 @@ impl RadixSort {
         })
     }
 
-    /// Records the sort of the first `count` pairs by the lowest `bits` bits of their keys (32 at most); pairs of equal
-    /// bits keep their order. Afterwards `keys` and `values` hold the result, whatever the number of passes, because
-    /// they change places with the sort's own memory: what lay beyond the count is lost. A count beyond the buffers'
-    /// common length is clamped to it.
+    /// Records the sort of the first `count` pairs by the lowest `bits` bits of their keys (32 at most); it is stable.
+    /// Afterwards `keys` and `values` hold the result, whatever the number of passes, because they are swapped with the
+    /// scratch memory: their elements beyond the count are lost. A count beyond the buffers' common length is clamped
+    /// to it.
     ///
     /// # Errors
     /// The buffers' lengths differ, the count's index is outside its buffer, or the device is out of memory.
@@ -96,7 +96,7 @@ impl RadixSort {
         Ok(())
     }
 
-    /// Orders the pairs by one digit, from `keys` and `values` into the scratch.
+    /// Sorts the pairs by one digit, from `keys` and `values` into the scratch memory.
     fn record_pass(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -171,8 +171,8 @@ impl Scratch {
     }
 }
 
-/// The lowest bit and the width of each pass's digit. As few passes as possible, and digits as equal as possible: two
-/// digits of 5 bits need an eighth of the counters that 8 and 2 bits do.
+/// The lowest bit and the width of each pass's digit. As few passes as possible, of widths as equal as possible: two
+/// digits of 5 bits need an eighth of the counters of 8 and 2 bits.
 fn digits(bits: u32) -> impl Iterator<Item = (u32, u32)> {
     let bits = bits.min(u32::BITS);
     let passes = bits.div_ceil(MAX_DIGIT_BITS);

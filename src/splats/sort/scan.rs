@@ -1,4 +1,4 @@
-//! The exclusive scan: where each item's output begins, from how much output it has.
+//! The exclusive scan: the offset of each item's output, from the sizes of the outputs.
 
 use super::{Count, common_len};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -19,7 +19,7 @@ pub struct Scan {
 }
 
 impl Scan {
-    /// A scan with scratch memory for `capacity` values; longer buffers let it grow.
+    /// A scan with scratch memory for `capacity` values; it grows with the buffers.
     ///
     /// # Errors
     /// The device is out of memory or lost.

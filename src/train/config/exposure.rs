@@ -37,10 +37,10 @@ settings! {
 /// Gain and bias of each channel of each training view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExposureConfig {
-    /// Learn gain and bias of each channel of each training view, for photographs of differing brightness.
+    /// Learn gain and bias of each channel of each training view, for photographs of different exposure.
     learn: OnOff = OnOff::Off => Rule::OneOf(&["on", "off"]), "--exposure on|off";
-    /// Initial exposures, as a table of `name,ev` or `name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b`.
-    start: Option<PathBuf> = None, "exposures.csv of the dataset" => Rule::PATH, "--exposures FILE";
+    /// Initial exposures as CSV: `name,ev` or `name,gain_r,gain_g,gain_b,bias_r,bias_g,bias_b`.
+    start: Option<PathBuf> = None, "the dataset's exposures.csv" => Rule::PATH, "--exposures FILE";
 }
 sections {
     /// Adam's learning rate.

@@ -10,12 +10,12 @@ use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::render::RenderSettings;
 use nightsplat::splats::scene::Gaussians;
 
-/// An input, and what is to come of it.
+/// An input and its expected outcome.
 #[derive(Debug)]
 pub(super) struct Case {
     /// The input.
     pub(super) name: &'static str,
-    /// What is to come of it, in words.
+    /// Expected outcome in words.
     pub(super) outcome: &'static str,
     /// What it takes.
     pub(super) effort: Effort,
@@ -36,7 +36,7 @@ pub(super) enum Effort {
     Unchecked,
 }
 
-/// What is to come of a case. Whatever it is, loss, gradients and parameters are finite.
+/// Expected outcome of a case. In every case, loss, gradients and parameters are finite.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Expect {
     /// The Gaussians that it is about learn.
@@ -104,7 +104,7 @@ fn all_at_once() -> Result<Hostile> {
     }))
 }
 
-/// So many at one place: the same ones, or colours and opacities of their own.
+/// Many Gaussians at one position, identical or with different colours and opacities.
 fn coincident(count: usize) -> Result<Hostile> {
     let stream = Stream::new(14, 1);
     Ok(Hostile::gaussians(count, SIZE, |gaussians, i| {
@@ -114,7 +114,7 @@ fn coincident(count: usize) -> Result<Hostile> {
     }))
 }
 
-/// So many faint ones on a pixel of an image of one tile, one behind the other.
+/// Many faint Gaussians on a pixel of an image of one tile, in a row along the axis.
 fn splats_per_tile(count: usize) -> Result<Hostile> {
     let mut own = Hostile::gaussians(count, [16, 8], |gaussians, i| {
         let depth = 1.0 + 4.0 * i as f32 / 100_000.0;
@@ -206,9 +206,12 @@ use Expect::{Learns, NoTrace, Refusal, Trains};
 
 /// Every input.
 pub(super) const CASES: &[Case] = &[
-    case("scales 1e-20", "a dot as wide as the dilation; Adam lifts them to e^-30", Trains, |_| {
-        scales([-20.0; 3])
-    }),
+    case(
+        "scales 1e-20",
+        "a dot as wide as the dilation; Adam raises them to e^-30",
+        Trains,
+        |_| scales([-20.0; 3]),
+    ),
     case("scales 1e-20, 1, 1e-20", "a needle as wide as the dilation", Learns, |_| {
         scales([-20.0, 0.0, -20.0])
     }),
@@ -244,7 +247,7 @@ pub(super) const CASES: &[Case] = &[
     })),
     case("quaternion 1e38", "as of unit length", Learns, |_| quat([1e38, 2e38, -1e38, 3e37])),
     case("mean on the near plane", "culled: no trace", NoTrace, |_| mean(0.0, 0.0, 0.2)),
-    case("mean 1e-6 behind the near plane", "seen", Learns, |_| {
+    case("mean 1e-6 beyond the near plane", "seen", Learns, |_| {
         mean(0.01, 0.0, 0.200_001).map(at_once)
     }),
     case("mean behind the camera", "culled: no trace", NoTrace, |_| mean(0.1, 0.1, -3.0)),
@@ -264,13 +267,13 @@ pub(super) const CASES: &[Case] = &[
     large(case("one over 16 000 tiles", "covers the view", Learns, |_| wide())),
     case(
         "2000 on one pixel",
-        "blended; those behind a full pixel have no gradient",
+        "blended; those after a saturated pixel have no gradient",
         Learns,
         |_| splats_per_tile(2000),
     ),
     large(case(
         "100 000 on one pixel",
-        "blended; those behind a full pixel have no gradient",
+        "blended; those after a saturated pixel have no gradient",
         Learns,
         |_| splats_per_tile(100_000),
     )),
@@ -305,16 +308,11 @@ pub(super) const CASES: &[Case] = &[
     quick(case("photograph black: p90 = 0", "trains towards a target of black", Trains, |_| {
         Ok(Hostile::photograph(|_, _| [0.0; 3]))
     })),
-    case(
-        "photograph black, curve auto",
-        "refused: nothing to lift",
-        Refusal("as good as black"),
-        |_| {
-            let mut own = Hostile::photograph(|_, _| [0.0; 3]);
-            own.config.tone = ToneSettings::new(ToneCurve::Auto);
-            Ok(own)
-        },
-    ),
+    case("photograph black, curve auto", "refused: all black", Refusal("as good as black"), |_| {
+        let mut own = Hostile::photograph(|_, _| [0.0; 3]);
+        own.config.tone = ToneSettings::new(ToneCurve::Auto);
+        Ok(own)
+    }),
     case("photograph of one value: p10 = p90", "trains", Trains, |_| {
         Ok(Hostile::photograph(|_, _| [0.05; 3]))
     }),

@@ -46,8 +46,8 @@ fn config() -> TrainConfig {
 }
 
 impl Hostile {
-    /// `count` Gaussians in the middle of a view of such a size, at depth 3 and some pixels wide, and neighbours behind
-    /// them.
+    /// `count` Gaussians in the middle of a view of this size, at depth 3 and some pixels wide, and farther
+    /// neighbours.
     pub(super) fn gaussians(
         count: usize,
         size: [u32; 2],
@@ -112,8 +112,8 @@ impl Hostile {
         own
     }
 
-    /// Photographs in EXR files, as the loader takes them; `value` of linear light, column and row. The first Gaussians are
-    /// the dataset's own.
+    /// Photographs in EXR files, as the loader takes them; `value` of linear light, column and row. The first
+    /// Gaussians are the dataset's own.
     pub(super) fn exr(value: impl Fn(f32, u32, u32) -> f32) -> Result<Self> {
         let config = config();
         let files = tempfile::tempdir()

@@ -175,7 +175,7 @@ fn a_photograph_is_turned_where_its_camera_saw_it_upright_and_stays_where_it_did
                 assert_eq!(columns, [false, true], "orientation {orientation} is turned");
             }
             let lone = root.join("images/v03.jpg");
-            let upright = Image::load_upright(&lone).unwrap();
+            let upright = Image::load(&lone).unwrap().turned(Orientation::of(&lone));
             assert_eq!((upright.width, upright.height), Orientation::of(&lone).size(stored));
         }
         jpeg(&root.join("images/v03.jpg"), (36, 40), orientation);

@@ -15,19 +15,25 @@ use crate::common::{not_run, shared};
 
 /// A program that does as the real one's command line asks, by a few lines of shell for each of its commands.
 #[cfg(unix)]
-fn stub(folder: &Path, cases: &str) -> PathBuf {
-    use std::os::unix::fs::PermissionsExt;
+pub(super) fn stub(folder: &Path, cases: &str) -> PathBuf {
     let path = folder.join("colmap-stub");
-    let script = format!(
-        "#!/bin/sh\ncommand=$1; shift\n[ \"$1\" = -h ] && exit 0\nwhile [ $# -gt 0 ]; do\n case $1 in\n  --image_path) images=$2;;\n  --output_path) output=$2;;\n esac\n shift\ndone\ncase $command in\n{cases}\nesac\n"
+    let lines = format!(
+        "command=$1; shift\nif [ \"$1\" = -h ]; then\n [ $command = mapper ] && echo '  --Mapper.init_min_tri_angle arg (=16)'\n exit 0\nfi\nwhile [ $# -gt 0 ]; do\n case $1 in\n  --image_path) images=$2;;\n  --output_path) output=$2;;\n  --image_list_path) list=$2;;\n  --Mapper.init_min_tri_angle) angle=$2;;\n esac\n shift\ndone\ncase $command in\n{cases}\nesac\n"
     );
-    fs::write(&path, script).unwrap();
-    fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
+    script(&path, &lines);
     path
 }
 
+/// A program of these lines of shell.
+#[cfg(unix)]
+fn script(path: &Path, lines: &str) {
+    use std::os::unix::fs::PermissionsExt;
+    fs::write(path, format!("#!/bin/sh\n{lines}\n")).unwrap();
+    fs::set_permissions(path, fs::Permissions::from_mode(0o755)).unwrap();
+}
+
 /// Photographs with some detail, dark, `photos/v00.png` to `v08.png`.
-fn photographed(root: &Path) -> PathBuf {
+pub(super) fn photographed(root: &Path) -> PathBuf {
     let photos = root.join("photos");
     fs::create_dir_all(&photos).unwrap();
     for index in 0..9 {
@@ -73,7 +79,7 @@ fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
         "{stdout}"
     );
     for stage in
-        ["9 photographs lifted", "features extracted", "features matched", "cameras placed"]
+        ["9 photographs brightened", "features extracted", "features matched", "cameras placed"]
     {
         assert!(stderr.contains(stage), "no `{stage}` in: {stderr}");
     }
@@ -99,7 +105,7 @@ fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
     refused(&format!("{arguments} --overwrite"), 1, &["exists already; choose another folder"]);
 }
 
-/// One photograph in nine has no camera, so all are compared once more.
+/// One photograph in nine has no camera, so all are matched again.
 #[cfg(unix)]
 #[test]
 fn a_second_comparison_that_fails_costs_nothing_of_the_first() {
@@ -114,7 +120,7 @@ fn a_second_comparison_that_fails_costs_nothing_of_the_first() {
         format!("pose {} --out {} --colmap {}", photos.display(), out.display(), colmap.display());
     let (stdout, stderr) = run(&arguments, 0);
     assert!(stdout.contains("8 of 9 photographs"), "{stdout}");
-    assert!(stderr.contains("are those of the first comparison"), "{stderr}");
+    assert!(stderr.contains("using the cameras of the first attempt"), "{stderr}");
 }
 
 #[cfg(unix)]
@@ -175,7 +181,7 @@ fn colmap_that_fails_or_finds_too_little_is_told_in_a_line_and_leaves_nothing() 
         ),
         (
             "exhaustive_matcher) kill -9 $$;;",
-            &["exhaustive_matcher ended with signal: 9", "it said nothing"],
+            &["exhaustive_matcher ended with signal: 9", "no output"],
         ),
         (two.as_str(), &["no cameras for these 9 photographs", "scene.colmap.log"]),
         (
@@ -253,7 +259,7 @@ fn what_keeps_pose_from_beginning_is_told_in_a_line() {
     refused(&train, 3, &["9 photographs", "nightsplat pose", "--out DATASET"]);
     refused(&pose(&root.join("absent"), "--colmap true"), 3, &["absent", "cannot be read"]);
     fs::create_dir(root.join("empty")).unwrap();
-    refused(&pose(&root.join("empty"), "--colmap true"), 3, &["holds 0 photographs"]);
+    refused(&pose(&root.join("empty"), "--colmap true"), 3, &["contains 0 photographs"]);
     refused(&pose(&photos, "--colmap true --fps 0"), 2, &["--fps"]);
     fs::write(root.join("clip.mp4"), "no clip").unwrap();
     let clip = root.join("clip.mp4");
@@ -264,11 +270,7 @@ fn what_keeps_pose_from_beginning_is_told_in_a_line() {
     );
     refused(&pose(&clip, "--colmap true --ffmpeg false"), 3, &["false", "ended with"]);
     fs::copy(photos.join("v01.png"), photos.join("v00.webp")).unwrap();
-    refused(
-        &pose(&photos, "--colmap true"),
-        3,
-        &["v00.png and v00.webp are two photographs of one name"],
-    );
+    refused(&pose(&photos, "--colmap true"), 3, &["v00.png and v00.webp have the same name"]);
     fs::remove_file(photos.join("v00.webp")).unwrap();
     for index in 0..9 {
         photograph(&photos.join(name(index)).with_extension("png"), SIZE, 0.0);
@@ -319,7 +321,7 @@ fn of_a_clip_the_sharpest_frame_of_each_window_is_taken() {
         colmap.display()
     );
     let (_, stderr) = run(&arguments, 3);
-    assert!(stderr.contains("4 photographs lifted"), "{stderr}");
+    assert!(stderr.contains("4 photographs brightened"), "{stderr}");
     let mut seen: Vec<String> = fs::read_dir(root.join("seen"))
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
@@ -330,6 +332,107 @@ fn of_a_clip_the_sharpest_frame_of_each_window_is_taken() {
         ["frame_000003.png", "frame_000007.png", "frame_000011.png", "frame_000015.png"]
     );
     nothing_is_left(&out);
+}
+
+/// A clip of one dark picture, made by ffmpeg with these filters and options; `None` where this ffmpeg cannot.
+#[cfg(unix)]
+fn clip_of(root: &Path, name: &str, filters: &str, options: &[&str]) -> Option<PathBuf> {
+    dark_picture(1).save_png8(root.join("source.png")).unwrap();
+    let clip = root.join(name);
+    let made = Command::new("ffmpeg")
+        .args([
+            "-v",
+            "error",
+            "-loop",
+            "1",
+            "-framerate",
+            "8",
+            "-i",
+            "source.png",
+            "-frames:v",
+            "4",
+        ])
+        .args(["-vf", filters, "-c:v", "ffv1"])
+        .args(options)
+        .arg(&clip)
+        .current_dir(root)
+        .stdin(Stdio::null())
+        .output()
+        .unwrap();
+    made.status.success().then_some(clip)
+}
+
+#[cfg(unix)]
+#[test]
+fn a_clip_of_high_dynamic_range_or_wide_primaries_gives_the_frames_of_a_plain_one() {
+    if !is_installed("ffmpeg") || !is_installed("ffprobe") {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let colmap = stub(root, &format!("mapper) cp -r $images {}/seen; exit 1;;", root.display()));
+    let seen = |clip: &Path| {
+        let out = root.join("scene");
+        let arguments = format!(
+            "pose {} --out {} --colmap {} --fps 2",
+            clip.display(),
+            out.display(),
+            colmap.display()
+        );
+        let (_, stderr) = run(&arguments, 3);
+        let frame = fs::read_dir(root.join("seen")).unwrap().next().unwrap().unwrap().path();
+        let frame = Image::load(frame);
+        fs::remove_dir_all(root.join("seen")).unwrap();
+        nothing_is_left(&out);
+        (frame.unwrap(), stderr)
+    };
+    let plain = clip_of(root, "plain.mkv", "null", &[]).unwrap();
+    let (expected, message) = seen(&plain);
+    assert!(!message.contains("HDR") && !message.contains("converted to sRGB"), "{message}");
+    for (transfer, part) in
+        [("arib-std-b67", "HDR (HLG)"), ("smpte2084", "HDR (PQ)"), ("bt709", "Rec. 2020")]
+    {
+        let filters = format!(
+            "zscale=pin=bt709:tin={}:min=gbr:p=bt2020:t={transfer}:m=bt2020nc:r=tv:npl=203,format=yuv444p12le",
+            if transfer == "bt709" { "bt709" } else { "iec61966-2-1" }
+        );
+        let tags =
+            ["-color_primaries", "bt2020", "-color_trc", transfer, "-colorspace", "bt2020nc"];
+        let Some(clip) = clip_of(root, "wide.mkv", &filters, &tags) else {
+            not_run(format_args!("this ffmpeg has no zscale"));
+            return;
+        };
+        let (frame, message) = seen(&clip);
+        assert!(message.contains(part), "{message}");
+        let differences = frame.data.iter().zip(&expected.data).map(|(a, b)| (a - b).abs());
+        let mean = differences.sum::<f32>() / frame.data.len() as f32;
+        assert!(mean < 0.01, "{transfer}: {mean}");
+        fs::remove_file(clip).unwrap();
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn an_ffmpeg_without_the_filters_for_a_wide_range_names_the_command() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    dark_picture(1).save_png8(root.join("source.png")).unwrap();
+    let copy = format!("for last; do :; done; cp {}/source.png $(printf $last 1)", root.display());
+    script(&root.join("ffmpeg"), &copy);
+    script(&root.join("ffprobe"), "echo arib-std-b67");
+    fs::write(root.join("clip.mov"), "a clip").unwrap();
+    let [clip, out, ffmpeg] = ["clip.mov", "scene", "ffmpeg"].map(|name| root.join(name));
+    let arguments = format!(
+        "pose {} --out {} --colmap true --ffmpeg {}",
+        clip.display(),
+        out.display(),
+        ffmpeg.display()
+    );
+    let parts = ["clip.mov: is HDR (HLG)", "zscale=t=linear", "sdr.mp4"];
+    refused(&arguments, 3, &parts);
+    script(&root.join("ffprobe"), "exit 1");
+    let (_, message) = run(&arguments, 3);
+    assert!(message.contains("ffprobe") && message.contains("taken for SDR"), "{message}");
 }
 
 #[test]

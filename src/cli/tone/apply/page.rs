@@ -1,4 +1,4 @@
-//! The page of `tone apply`: measurements, distributions of luminance, pictures side by side.
+//! The page of `tone apply`: measurements, histograms of luminance, images side by side.
 
 use std::path::Path;
 
@@ -14,13 +14,13 @@ use crate::results::report::{
     Best, Column, Comparison, Distribution, Picture, Report, Table, distributions,
 };
 
-/// The widest picture on the page, pixels.
+/// Maximum width of an image, pixels.
 const PICTURE_WIDTH: u32 = 480;
 
-/// What the page gathers while photographs are mapped.
+/// The contents of the page, gathered while photographs are mapped.
 pub(super) struct Page {
     curve: String,
-    /// Where some photographs have a reference image, only those are drawn, so that like is compared with like.
+    /// Only photographs with a reference are drawn, if there are any, so that the histograms compare.
     only_referenced: bool,
     input: Distribution,
     result: Distribution,
@@ -55,7 +55,7 @@ impl Page {
         })
     }
 
-    /// Adds a photograph and its result; the first one's pictures are shown.
+    /// Adds a photograph and its result; the images of the first are shown.
     pub(super) fn add(
         &mut self,
         listed: &Listed,
@@ -89,16 +89,13 @@ impl Page {
         let mut drawn = vec![self.input, self.result];
         drawn.extend(self.compared.into_iter().map(|(_, distribution)| distribution));
         let mut intro = vec![format!(
-            "The curve {} on {} photographs, and how their luminance is distributed before and after.",
+            "The curve {} on {} photographs: luminance before and after.",
             self.curve,
             output.views.len()
         )];
         if self.only_referenced {
             drawn.push(self.reference);
-            intro.push(
-                "Distributions and pictures are those of the photographs with a reference image."
-                    .to_owned(),
-            );
+            intro.push("Histograms and images show photographs with a reference only.".to_owned());
         }
         intro.extend(output.with_reference.as_deref().map(eval::with_reference));
         let report = Report {
@@ -115,14 +112,7 @@ impl Page {
 
 fn picture(caption: &str, scores: Option<Scores>, image: &Image) -> Picture {
     let scores = scores.map(|Scores { psnr, ssim, .. }| format!("{psnr:.2} dB, SSIM {ssim:.3}"));
-    let width = image.width.min(PICTURE_WIDTH);
-    let height =
-        (u64::from(image.height) * u64::from(width) / u64::from(image.width.max(1))) as u32;
-    Picture {
-        caption: caption.to_owned(),
-        scores: scores.unwrap_or_default(),
-        image: image.resized(width, height),
-    }
+    Picture::shrunk(caption, scores.unwrap_or_default(), image, PICTURE_WIDTH)
 }
 
 fn table(output: &ToneOutput) -> Table {
@@ -145,7 +135,7 @@ fn table(output: &ToneOutput) -> Table {
         (name, values)
     });
     Table {
-        title: "Per photograph, and the means of the scene".to_owned(),
+        title: "Per photograph, and means of the scene".to_owned(),
         label: "photograph".to_owned(),
         columns: vec![
             column("p10", 4),

@@ -1,13 +1,16 @@
-//! Which photographs `tone apply` reads, and where each goes.
+//! The photographs that `tone apply` reads, and the files that it writes.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use super::{ApplyArgs, is_same_file};
+use super::ApplyArgs;
+use crate::base::output::is_same_file;
+use crate::base::tree;
 use crate::cli::ImageFormat;
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
-use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
+use crate::photographs::image::{ColourTally, Image, Mask, MaskFile, Orientation, PictureFile};
+use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -16,26 +19,33 @@ pub(super) struct Listed {
     pub(super) name: String,
     pub(super) input: PathBuf,
     pub(super) reference: Option<PathBuf>,
-    /// Of a dataset's view.
+    /// The split, in a dataset.
     pub(super) split: Option<Split>,
     /// Its mask.
-    pub(super) mask: Option<PathBuf>,
+    pub(super) mask: Option<MaskFile>,
     /// The file to write.
     pub(super) target: Option<PathBuf>,
+    pub(super) gains: Option<WhiteBalanceGains>,
 }
 
 impl Listed {
-    /// The photograph as it is stored, with its pixels that do not count: those that are no numbers, and what alpha or mask
-    /// hides.
-    pub(super) fn load(&self, inverted: bool) -> Result<(Image, Vec<usize>)> {
-        let (image, alpha) = PictureFile::open(&self.input)?.decode()?;
+    /// The photograph as stored, with the indices of pixels that are not finite or hidden by alpha or mask.
+    pub(super) fn load(
+        &self,
+        inverted: bool,
+        colours: &ColourTally,
+    ) -> Result<(Image, Vec<usize>)> {
+        let (mut image, alpha) = PictureFile::open(&self.input)?.decode_counted(colours)?;
+        if let Some(gains) = self.gains {
+            gains.apply(&mut image);
+        }
         let decoded = (&image, alpha.as_ref());
-        let mask = Mask::over(&self.input, decoded, self.mask.as_deref(), inverted)?;
+        let mask = Mask::over(&self.input, decoded, self.mask.as_ref(), inverted)?;
         let hidden = mask.as_ref().map(Mask::hidden).unwrap_or_default();
         Ok((image, hidden))
     }
 
-    /// Turned upright, as its pixels that do not count are, unless cameras may say how it is stored.
+    /// Image and indices turned upright by Exif; photographs of a dataset stay as stored, as their cameras assume.
     pub(super) fn turned(&self, image: Image, gaps: Vec<usize>) -> (Image, Vec<usize>) {
         let orientation = match self.split {
             None => Orientation::of(&self.input),
@@ -54,13 +64,13 @@ impl Listed {
     }
 }
 
-/// The photographs of the input: itself, those of a folder by name, or a dataset's.
+/// The photographs of the input: a file, those of a folder by name, or those of a dataset.
 pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
     let input = &args.input;
     let unreadable =
         |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));
-    let is_folder = std::fs::metadata(input).map_err(unreadable)?.is_dir();
-    let mut photographs = if !is_folder {
+    std::fs::metadata(input).map_err(unreadable)?;
+    let mut photographs = if !tree::is_dir(input) {
         vec![plain(input, args.reference.as_deref())?]
     } else if Dataset::is_at(input) {
         let options = LoadOptions { reference: args.reference.clone(), ..LoadOptions::default() };
@@ -71,6 +81,7 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
             mask,
             split: Some(split),
             target: None,
+            gains: None,
         };
         Dataset::photographs(input, &options)?.into_iter().map(of_view).collect()
     } else {
@@ -81,15 +92,19 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
         files.iter().map(|file| plain(file, args.reference.as_deref())).collect::<Result<_>>()?
     };
     if photographs.is_empty() {
-        return Err(Error::input(input, "holds no PNG, JPEG, WebP, TIFF or EXR image"));
+        return Err(Error::input(input, "contains no PNG, JPEG, WebP, TIFF or EXR image"));
     }
+    let named = || photographs.iter().map(|one| (one.name.as_str(), one.input.as_path()));
+    let balance = args.white_balance.as_ref();
+    let gains = balance.map(|balance| balance.gains(input, named())).transpose()?;
+    photographs.iter_mut().for_each(|photograph| photograph.gains = gains);
     if let Some(out) = &args.out {
         set_targets(&mut photographs, out, args.format)?;
     }
     Ok(photographs)
 }
 
-/// A photograph that belongs to no dataset.
+/// A photograph outside of a dataset.
 fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
     let stem = input.file_stem().unwrap_or_default();
     let reference = match reference {
@@ -97,18 +112,19 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
             photographs_in(folder)?.into_iter().find(|file| file.file_stem() == Some(stem))
         }
         Some(file) if file.is_file() => Some(file.to_owned()),
-        Some(absent) => return Err(Error::input(absent, "is neither a folder nor a file")),
+        Some(absent) => return Err(Error::input(absent, "does not exist")),
         None => None,
     };
     let name = stem.to_string_lossy().into_owned();
     let masks = input.with_file_name("masks");
     let file = input.file_name().unwrap_or_default().to_string_lossy();
     let candidates = [format!("{name}.png"), format!("{file}.png")].map(|mask| masks.join(mask));
-    let mask = candidates.into_iter().find(|mask| mask.is_file());
-    Ok(Listed { name, input: input.to_owned(), reference, split: None, mask, target: None })
+    let mask = candidates.into_iter().find(|mask| mask.is_file()).map(MaskFile::shown);
+    let input = input.to_owned();
+    Ok(Listed { name, input, reference, split: None, mask, target: None, gains: None })
 }
 
-/// The file that each is written to, all different and none of them a photograph.
+/// Sets the file that each is written to, refusing duplicates and photographs.
 fn set_targets(photographs: &mut [Listed], out: &Path, format: ImageFormat) -> Result<()> {
     let extension = format.extension();
     let mut sources: Vec<PathBuf> = vec![];
@@ -120,8 +136,10 @@ fn set_targets(photographs: &mut [Listed], out: &Path, format: ImageFormat) -> R
     for listed in photographs {
         let target = out.join(format!("{}.{extension}", listed.name));
         if let Some(other) = seen.insert(listed.name.clone(), listed.input.clone()) {
-            let problem =
-                format!("would be written to the same file as {}; rename one", other.display());
+            let problem = format!(
+                "would be written to the same file as {}; rename one of them",
+                other.display()
+            );
             return Err(Error::input(&listed.input, problem));
         }
         if target.exists() && sources.iter().any(|source| is_same_file(source, &target)) {

@@ -1,32 +1,20 @@
-//! The pairs and the curves as an SVG file that stands alone.
+//! Plot of the pairs and the curves as an SVG file.
 
 use super::Fitted;
 use crate::photographs::fit::{Channels, FitOptions, Histogram, Pair};
 use crate::photographs::tone::{Statistics, ToneCurve, ToneSettings};
-use crate::results::report::{Series, plot};
+use crate::results::report::{Series, plot, svg_file};
 
-/// The t up to which curves are drawn holds this share of all pixels.
+/// Share of the pixels that the t axis covers.
 const SHARE: f64 = 0.995;
-/// Points of a curve.
+/// Points per curve.
 const POINTS: usize = 200;
-/// Columns of the pairs' own lines.
+/// Bins of the measured lines.
 const BINS: usize = 64;
-/// Below this share of the pixels, a column's mean says little.
+/// Bins with a smaller share of the pixels are left out as too noisy.
 const MIN_COLUMN: f64 = 1e-4;
-/// What the page's style would say.
-const COLORS: [(&str, &str); 8] = [
-    ("--text", "#23211e"),
-    ("--quiet", "#6f6a63"),
-    ("--line", "#ddd8d0"),
-    ("--series-0", "#c2571a"),
-    ("--series-1", "#2f6fb3"),
-    ("--series-2", "#0f8a6d"),
-    ("--series-3", "#8a4fb0"),
-    ("--series-4", "#a08010"),
-];
-
-/// The reference against t: the pairs' mean and one standard deviation to either side, the fitted curve, and AP3 as it is. Curves that adapt
-/// are drawn for a photograph with the mean statistics.
+/// Reference against t: mean and standard deviation of the pairs, the fitted curve, and AP3 with its defaults.
+/// Adaptive curves are drawn for the mean statistics.
 pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> String {
     let histograms = pairs.iter().flat_map(|pair| {
         let factor = 1.0 / f64::from(pair.statistics.p90);
@@ -73,13 +61,5 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
         line("mean - 1 sd", -1.0),
         line("mean + 1 sd", 1.0),
     ];
-    let mut svg = plot("t = x / p90", "reference", &series);
-    for (name, color) in COLORS {
-        svg = svg.replace(&format!("var({name})"), color);
-    }
-    svg.replacen(
-        "<svg ",
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" style=\"background:#fbfaf8\" font-family=\"system-ui, sans-serif\" ",
-        1,
-    ) + "\n"
+    svg_file(&plot("t = x / p90", "reference", &series))
 }

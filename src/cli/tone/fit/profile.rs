@@ -1,4 +1,4 @@
-//! `nightsplat tone fit --profile`: a camera profile in place of a curve.
+//! `nightsplat tone fit --profile`: fits a camera profile in place of a curve.
 
 use serde::Serialize;
 
@@ -15,18 +15,18 @@ use crate::photographs::tone::Profile;
 /// A fitted profile.
 #[derive(Clone, Debug, Serialize)]
 pub struct FittedProfile {
-    /// The profile of all pairs.
+    /// Profile fitted to all pairs.
     pub profile: Profile,
-    /// On these pairs.
+    /// Scores on these pairs.
     pub scores: ProfileScores,
-    /// On pairs that others were fitted to.
+    /// Scores on held-out pairs.
     pub held_out: Option<Vec<ProfileFold>>,
 }
 
-/// Fits a profile to every pair that `args` names, and writes it where they say.
+/// Fits a profile to the pairs of `args`, and writes it.
 ///
 /// # Errors
-/// [`crate::Error::Input`] for pairs that cannot be used; [`crate::Error::Output`] where the file cannot be written.
+/// [`crate::Error::Input`] for unusable pairs; [`crate::Error::Output`] if the file cannot be written.
 pub fn apply(args: &FitArgs) -> Result<FittedProfile> {
     super::check(args)?;
     let scenes = args.pairs.iter().map(|folder| ColourScene::load(folder, args.normal.as_deref()));
@@ -45,7 +45,7 @@ pub fn apply(args: &FitArgs) -> Result<FittedProfile> {
     Ok(fitted)
 }
 
-/// The profile with what it is in comments; the numbers have the digits that 8-bit references determine.
+/// The profile as TOML, with its scores in comments, to the precision of 8-bit references.
 fn toml(fitted: &FittedProfile) -> String {
     let FittedProfile { profile, scores, .. } = fitted;
     let row = |row: &[f64]| {
@@ -62,10 +62,10 @@ fn toml(fitted: &FittedProfile) -> String {
     let matrix = rows(&matrix.each_ref().map(<[f64; 3]>::as_slice));
     let segments = rows(&segments.each_ref().map(Vec::as_slice));
     format!(
-        "# A camera profile: {:.2} dB on the pairs it was fitted to, the automatic curve {:.2} dB.\n\
-         # Scores of what it makes know these references.\n\
+        "# Camera profile: {:.2} dB on the pairs it was fitted to; the curve auto has {:.2} dB.\n\
+         # Scores of its results know these references.\n\
          reference = {name}\npairs = {pairs}\n\n\
-         # v = 1 - exp(-k x), u = gain (matrix v) + bias; rows and numbers are those of red, green and blue.\n\
+         # v = 1 - exp(-k x), u = gain (matrix v) + bias; rows and values are red, green and blue.\n\
          matrix = {matrix}\ngain = {}\nbias = {}\n\n\
          # The values at u = 0, 1/16, .. 1.\nsegments = {segments}\n",
         scores.profile,
@@ -75,8 +75,8 @@ fn toml(fitted: &FittedProfile) -> String {
     )
 }
 
-/// What was found, for people.
-pub(super) fn told(fitted: &FittedProfile) -> String {
+/// The results as text.
+pub(super) fn text(fitted: &FittedProfile) -> String {
     let FittedProfile { profile, scores, held_out } = fitted;
     let row = |name: &str, pairs: usize, ProfileScores { profile, auto }: &ProfileScores| {
         [name.to_owned(), pairs.to_string(), format!("{profile:.2}"), format!("{auto:.2}")].to_vec()

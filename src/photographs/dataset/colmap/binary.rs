@@ -5,7 +5,7 @@ use std::path::Path;
 
 use glam::DVec3;
 
-use super::{MODELS, ModelImage, ModelPoint, lens, pose};
+use super::{MODELS, ModelImage, ModelPoint, lens, pose, remedy};
 use crate::base::input;
 use crate::camera::Lens;
 use crate::{Error, Result};
@@ -18,7 +18,8 @@ pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, Lens>> {
         let (width, height) = (reader.u64()?, reader.u64()?);
         let known = MODELS.get(model as usize);
         let (name, parameters) = known.ok_or_else(|| {
-            Error::input(path, format!("camera {id} has the unknown model {model}"))
+            let problem = format!("camera {id} has the unknown model {model}; {}", remedy(""));
+            Error::input(path, problem)
         })?;
         let parameters = (0..*parameters).map(|_| reader.f64()).collect::<Result<Vec<f64>>>()?;
         let lens = lens(name, width, height, &parameters);

@@ -16,7 +16,7 @@ pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, Lens>> {
     let camera = |(number, line)| {
         let mut fields = Fields::new(path, number, line);
         let (id, model): (u32, String) = (fields.next("camera id")?, fields.next("model")?);
-        let (width, height) = (fields.next("width")?, fields.next("height")?);
+        let (width, height) = (fields.side("width")?, fields.side("height")?);
         let parameters = fields.rest("parameter")?;
         let lens = lens(&model, width, height, &parameters);
         Ok((id, lens.map_err(|problem| Error::input(path, format!("camera {id} {problem}")))?))
@@ -26,7 +26,7 @@ pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, Lens>> {
 
 pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
     let text = input::text(path)?;
-    let mut lines = lines(&text);
+    let mut lines = lines(&text).peekable();
     let mut images = Vec::new();
     while let Some((number, line)) = lines.next() {
         if line.is_empty() {
@@ -50,10 +50,23 @@ pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
             name,
             view_from_world: pose([w, x, y, z], [tx, ty, tz]),
         });
-        // The keypoints' line, empty where there are none; the points' tracks say the same.
-        lines.next();
+        // The keypoints' line, empty where there are none; the points' tracks say the same. Scripts leave it out.
+        lines.next_if(|(_, line)| !is_image(line));
     }
     Ok(images)
+}
+
+/// Whether a line is an image's and not one of keypoints, which are three numbers each.
+fn is_image(line: &str) -> bool {
+    let fields: Vec<&str> = line.split_whitespace().collect();
+    let are_numbers = |fields: &[&str]| fields.iter().all(|field| field.parse::<f64>().is_ok());
+    let are_keypoints = fields.len().is_multiple_of(3) && are_numbers(&fields);
+    let is_whole = |field: &str| field.parse::<u32>().is_ok();
+    !are_keypoints
+        && fields.len() >= 10
+        && is_whole(fields[0])
+        && are_numbers(&fields[1..8])
+        && is_whole(fields[8])
 }
 
 pub(super) fn points(path: &Path) -> Result<BTreeMap<u64, ModelPoint>> {
@@ -99,6 +112,13 @@ impl<'a> Fields<'a> {
         let (field, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
         self.line = rest;
         field.parse().map_err(|_| self.error(what))
+    }
+
+    /// A number of pixels; tools write 500.0 too.
+    fn side(&mut self, what: &str) -> Result<u64> {
+        let pixels: f64 = self.next(what)?;
+        let is_whole = pixels.fract() == 0.0 && (0.0..=u64::MAX as f64).contains(&pixels);
+        if is_whole { Ok(pixels as u64) } else { Err(self.error(what)) }
     }
 
     fn rest<T: FromStr>(&mut self, what: &str) -> Result<Vec<T>> {

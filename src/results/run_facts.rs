@@ -1,43 +1,43 @@
-//! What a run begins with: what is said of it before the first step.
+//! Summary of a run, printed before its first step.
 
 use serde::Serialize;
 
+use super::eval::ScoreReference;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, Split};
 use crate::photographs::tone::ToneCurve;
-use crate::results::eval::ScoreReference;
 use crate::train::TrainConfig;
 use crate::train::diagnose::Plan;
 
-/// Device, views, split, points and curve.
+/// Dataset, device, views, split, points and curve of a run.
 #[derive(Clone, Debug, Serialize)]
-pub(super) struct Facts {
+pub(crate) struct RunFacts {
     dataset: String,
     device: String,
     /// Width and height of the first training view, pixels.
     size: [u32; 2],
     train_views: usize,
     test_views: usize,
-    /// Views that are held out to tell when the run has converged.
+    /// Views held out for early stopping.
     held_out_views: usize,
-    /// The most steps that the run takes.
+    /// Maximum number of steps.
     steps: u64,
-    /// The last steps, in which the model settles.
+    /// Length of the cooldown, steps.
     effective_cooldown_steps: u64,
-    /// What a run that was to end early, or to settle for longer, does instead.
+    /// Requests on the length of the run that cannot be met.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     notes: Vec<String>,
-    /// What says which views are test views.
+    /// The rule that selects the test views.
     split: String,
     points: usize,
     curve: String,
     why: String,
-    /// What the test views are scored against.
+    /// The images that test views are scored against.
     against: &'static str,
 }
 
-impl Facts {
-    pub(super) fn of(
+impl RunFacts {
+    pub(crate) fn of(
         gpu: &Gpu,
         config: &TrainConfig,
         plan: Option<&Plan>,
@@ -73,13 +73,16 @@ impl Facts {
         }
     }
 
-    pub(super) fn text(&self) -> String {
+    pub(crate) fn text(&self) -> String {
         let Self { dataset, device, size: [width, height], train_views, points, .. } = self;
         let length = match (self.held_out_views, self.effective_cooldown_steps) {
             (0, 0) => format!("{} steps", self.steps),
-            (0, settling) => format!("{} steps, of which the last {settling} settle", self.steps),
+            (0, settling) => {
+                format!("{} steps, of which the last {settling} are the cooldown", self.steps)
+            }
             (views, settling) => format!(
-                "{} steps at most: the run settles for {settling} and ends once {views} held-out view{} converged",
+                "at most {} steps: training stops early once {views} held-out view{} converged, after a \
+                 cooldown of {settling}",
                 self.steps,
                 if views == 1 { " has" } else { "s have" }
             ),
@@ -97,18 +100,17 @@ impl Facts {
     }
 }
 
-/// A line for each thing that was asked of the length of a run and cannot be.
+/// A line for each request on the length of the run that cannot be met.
 fn notes(config: &TrainConfig, dataset: &Dataset) -> Vec<String> {
     let (steps, asked) = (config.steps, config.schedule.cooldown_steps);
     let views = dataset.views.iter().filter(|view| view.is_for_training()).count();
     let is_held_out = dataset.views.iter().any(|view| view.split == Split::HeldOut);
     let none = (config.stop.views > 0 && !is_held_out).then(|| {
         format!(
-            "no early end: {views} training views are too few to hold one out (one of eight is)"
+            "no early stopping: {views} training views are too few to hold one out (one in eight)"
         )
     });
-    let short = (config.effective_cooldown_steps() < asked).then(|| {
-        format!("{steps} steps are too few to settle for {asked} (a third of them at most)")
-    });
+    let short = (config.effective_cooldown_steps() < asked)
+        .then(|| format!("{steps} steps are too few for a cooldown of {asked} (at most a third)"));
     none.into_iter().chain(short).collect()
 }

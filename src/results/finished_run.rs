@@ -1,4 +1,4 @@
-//! A run, finished or stopped, or a model file, opened to be rendered: what `eval` and `render` begin with.
+//! A run, finished or interrupted, or a model file, opened for rendering by `eval`, `render` and others.
 
 use std::path::Path;
 
@@ -11,22 +11,22 @@ use crate::splats::scene::{Gaussians, ply};
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
-/// The model of a run, with the views it was trained and is scored on.
-pub(super) struct FinishedRun {
-    pub(super) gpu: Gpu,
-    pub(super) config: TrainConfig,
-    pub(super) dataset: Dataset,
-    pub(super) gaussian_count: usize,
-    pub(super) model_renderer: ModelRenderer,
+/// The model of a run with its dataset.
+pub(crate) struct FinishedRun {
+    pub(crate) gpu: Gpu,
+    pub(crate) config: TrainConfig,
+    pub(crate) dataset: Dataset,
+    pub(crate) gaussian_count: usize,
+    pub(crate) model_renderer: ModelRenderer,
 }
 
 impl FinishedRun {
-    /// Loads configuration, model and dataset; dataset and device are the run's where nothing else is named. Says where the
-    /// run was stopped on its way, and how another dataset differs.
+    /// Loads configuration, model and dataset; dataset and device default to the run's. Warns where the run is
+    /// incomplete or the dataset has changed.
     ///
     /// # Errors
     /// The folder holds no run with a model, its dataset is gone, or there is no such device.
-    pub(super) fn open(
+    pub(crate) fn open(
         folder: &Path,
         dataset: Option<&Path>,
         device: Option<&DeviceChoice>,
@@ -34,11 +34,11 @@ impl FinishedRun {
         Self::open_with(folder, dataset, device, |_| {})
     }
 
-    /// The same with something in the configuration changed.
+    /// As [`Self::open`], with a change of the configuration.
     ///
     /// # Errors
-    /// As there.
-    pub(super) fn open_with(
+    /// As [`Self::open`].
+    pub(crate) fn open_with(
         folder: &Path,
         dataset: Option<&Path>,
         device: Option<&DeviceChoice>,
@@ -56,21 +56,21 @@ impl FinishedRun {
         let gaussians = run::load_model(folder, raw_colors)?;
         if !config.dataset.is_dir() {
             let problem = format!(
-                "names the dataset {}, which is not there; name it with --dataset, or correct `dataset` in this file",
+                "names the dataset {}, which does not exist; pass --dataset, or correct `dataset` in this file",
                 config.dataset.display()
             );
             return Err(Error::input(folder.join("config.toml"), problem));
         }
         if let Some(step) = run::stopped_at(folder) {
             let steps = config.steps;
-            tracing::warn!("{}: stopped at step {step} of {steps}", folder.display());
+            tracing::warn!("{}: incomplete, at step {step} of {steps}", folder.display());
         }
         let device = device.map_or_else(|| config.device.parse(), |choice| Ok(choice.clone()))?;
         let gpu = Gpu::new(&device)?;
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
         if let Some(difference) = run::other_views(folder, &dataset) {
             let root = dataset.root.display();
-            tracing::warn!("{root}: is not what {} was trained on: {difference}", folder.display());
+            tracing::warn!("{root} differs from the dataset of {}: {difference}", folder.display());
         }
         Ok(Self {
             dataset,
@@ -86,7 +86,7 @@ impl FinishedRun {
         })
     }
 
-    /// The same of a model without a run, which says nothing of how it was trained.
+    /// Opens a model file, which holds no settings of its training.
     fn open_model(
         path: &Path,
         dataset: Option<&Path>,
@@ -102,32 +102,31 @@ impl FinishedRun {
     }
 }
 
-/// What to say of a model file where its photographs are needed and not named.
-pub(super) fn needs_photographs(path: &Path) -> Error {
-    Error::input(path, "is a model without a run; name its photographs with --dataset")
+/// The error for a model file without the photographs that a command needs.
+pub(crate) fn needs_photographs(path: &Path) -> Error {
+    Error::input(path, "is a model file without a run; pass its photographs with --dataset")
 }
 
 /// Whether a path names a model file in place of a run.
-pub(super) fn is_model(path: &Path) -> bool {
+pub(crate) fn is_model(path: &Path) -> bool {
     path.is_file() || (!path.is_dir() && path.extension().is_some_and(|name| name == "ply"))
 }
 
-/// A model file's Gaussians, with the settings that they are shown by, which are the defaults; says that their training is
-/// unknown.
+/// Loads the Gaussians of a model file, with default settings to render them; warns that its training is unknown.
 ///
 /// # Errors
-/// The file is no model.
-pub(super) fn load_model(path: &Path, dataset: Option<&Path>) -> Result<(Gaussians, TrainConfig)> {
+/// The file is not a model.
+pub(crate) fn load_model(path: &Path, dataset: Option<&Path>) -> Result<(Gaussians, TrainConfig)> {
     let gaussians = ply::load(path)?;
     let config = TrainConfig {
         dataset: dataset.unwrap_or(Path::new("")).to_owned(),
         sh_degree: gaussians.shape.sh_degree,
-        // Without references, photographs are what there is to compare with.
+        // Without references, the photographs are compared with.
         tone: ToneSettings::new(ToneCurve::None),
         ..TrainConfig::default()
     };
     tracing::warn!(
-        "{}: its training is unknown; it is shown with the default near plane",
+        "{}: the settings of its training are unknown; rendering with the default near plane",
         path.display()
     );
     Ok((gaussians, config))

@@ -1,0 +1,265 @@
+//! Files and folders by path, on the disk or in a ZIP archive that stands in the path: `scan.zip/images/1.png`.
+//!
+//! An archive is read in place: nothing of it is written, so that no name in it can lead anywhere.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::fs::File;
+use std::io::{self, Cursor, Read, Seek};
+use std::path::{Component, Path, PathBuf};
+use std::sync::{Arc, LazyLock, Mutex, PoisonError};
+use std::time::SystemTime;
+
+use zip::ZipArchive;
+
+/// The most that an entry of an archive may expand to, bytes.
+const MOST_OF_ENTRY: u64 = 1 << 31;
+/// The most that all of them may, bytes.
+const MOST_OF_ALL: u64 = 1 << 37;
+
+/// What is read, on disk or in memory.
+pub(crate) trait Source: Read + Seek + Send {}
+impl<T: Read + Seek + Send> Source for T {}
+
+/// Whether a path is a file's.
+pub(crate) fn is_file(path: &Path) -> bool {
+    match archived(path) {
+        Some((archive, entry)) => archive.entries.contains_key(&entry),
+        None => path.is_file(),
+    }
+}
+
+/// Whether a path is a folder's; an archive is one.
+pub(crate) fn is_dir(path: &Path) -> bool {
+    match archived(path) {
+        Some((archive, entry)) => archive.folders.contains_key(&entry),
+        None => path.is_dir(),
+    }
+}
+
+/// The paths of what is in a folder, in any order.
+///
+/// # Errors
+/// It cannot be read.
+pub(crate) fn entries(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    match archived(folder) {
+        Some((archive, entry)) => {
+            let names = archive.folders.get(&entry).ok_or(io::ErrorKind::NotFound)?;
+            Ok(names.iter().map(|name| folder.join(name)).collect())
+        }
+        None => std::fs::read_dir(folder)?.map(|entry| entry.map(|entry| entry.path())).collect(),
+    }
+}
+
+/// The length of a file, and when it was changed.
+pub(crate) fn metadata(path: &Path) -> io::Result<(u64, Option<SystemTime>)> {
+    match archived(path) {
+        Some((archive, entry)) => {
+            let (_, length) = archive.entries.get(&entry).ok_or(io::ErrorKind::NotFound)?;
+            Ok((*length, archive.changed))
+        }
+        None => path.metadata().map(|there| (there.len(), there.modified().ok())),
+    }
+}
+
+/// Opens a file.
+///
+/// # Errors
+/// It cannot be read.
+pub(crate) fn open(path: &Path) -> io::Result<Box<dyn Source>> {
+    match archived(path) {
+        Some((archive, entry)) => Ok(Box::new(Cursor::new(archive.read(&entry)?))),
+        None => Ok(Box::new(File::open(path)?)),
+    }
+}
+
+/// The bytes of a file of an archive; `None` of one on disk.
+pub(super) fn archived_bytes(path: &Path) -> Option<io::Result<Vec<u8>>> {
+    archived(path).map(|(archive, entry)| archive.read(&entry))
+}
+
+/// The archive that a path leads into or to.
+pub(crate) fn archive_of(path: &Path) -> Option<&Path> {
+    let is_archive = |path: &&Path| {
+        path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("zip")) && path.is_file()
+    };
+    path.ancestors().find(is_archive)
+}
+
+/// Why a path that names an archive is none.
+///
+/// # Errors
+/// The archive is damaged, or expands to too much.
+pub(crate) fn check(path: &Path) -> io::Result<()> {
+    archive_of(path)
+        .map_or(Ok(()), |path| Archive::open(path, [MOST_OF_ENTRY, MOST_OF_ALL]).map(drop))
+}
+
+/// An archive's folders and files by path with slashes; the root is "".
+struct Archive {
+    zip: Mutex<ZipArchive<File>>,
+    /// Place and length.
+    entries: HashMap<String, (usize, u64)>,
+    folders: BTreeMap<String, BTreeSet<String>>,
+    changed: Option<SystemTime>,
+}
+
+impl Archive {
+    fn open(path: &Path, [of_entry, of_all]: [u64; 2]) -> io::Result<Self> {
+        let file = File::open(path)?;
+        let changed = file.metadata()?.modified().ok();
+        let mut zip = ZipArchive::new(file).map_err(io::Error::other)?;
+        let mut entries = HashMap::new();
+        let mut folders = BTreeMap::from([(String::new(), BTreeSet::new())]);
+        let mut expanded = 0_u64;
+        for place in 0..zip.len() {
+            let entry = zip.by_index_raw(place).map_err(io::Error::other)?;
+            // Names that lead out of the archive are none of its files.
+            let Some(name) = entry.enclosed_name().and_then(|name| slashed(&name)) else {
+                continue;
+            };
+            expanded = expanded.saturating_add(entry.size());
+            if entry.size() > of_entry || expanded > of_all {
+                return Err(io::Error::other(format!(
+                    "it expands to more than is read of an archive ({} GiB a file, {} GiB in all): expand it yourself",
+                    of_entry >> 30,
+                    of_all >> 30
+                )));
+            }
+            let is_folder = entry.is_dir();
+            let mut child = name.as_str();
+            while let Some((folder, own)) =
+                child.rsplit_once('/').or(Some(("", child))).filter(|_| !child.is_empty())
+            {
+                folders
+                    .entry(folder.to_owned())
+                    .or_insert_with(BTreeSet::new)
+                    .insert(own.to_owned());
+                child = folder;
+            }
+            if is_folder {
+                folders.entry(name).or_default();
+            } else {
+                entries.insert(name, (place, entry.size()));
+            }
+        }
+        Ok(Self { zip: Mutex::new(zip), entries, folders, changed })
+    }
+
+    /// An entry as it was before it was compressed.
+    fn read(&self, entry: &str) -> io::Result<Vec<u8>> {
+        let &(place, length) = self.entries.get(entry).ok_or(io::ErrorKind::NotFound)?;
+        let mut zip = self.zip.lock().unwrap_or_else(PoisonError::into_inner);
+        let entry = zip.by_index(place).map_err(io::Error::other)?;
+        let mut bytes = vec![];
+        // It may expand to more than it says.
+        entry.take(length).read_to_end(&mut bytes)?;
+        Ok(bytes)
+    }
+}
+
+/// A path within an archive with slashes; `None` where it leads out.
+fn slashed(path: &Path) -> Option<String> {
+    let mut parts = vec![];
+    for part in path.components() {
+        match part {
+            Component::Normal(part) => parts.push(part.to_str()?),
+            Component::CurDir => {}
+            Component::ParentDir => drop(parts.pop()?),
+            Component::RootDir | Component::Prefix(_) => return None,
+        }
+    }
+    Some(parts.join("/"))
+}
+
+/// The archive of a path, opened once and again when it changes, and what the path is in it.
+fn archived(path: &Path) -> Option<(Arc<Archive>, String)> {
+    static OPENED: LazyLock<Mutex<HashMap<PathBuf, Arc<Archive>>>> = LazyLock::new(Mutex::default);
+    let at = archive_of(path)?;
+    let entry = slashed(path.strip_prefix(at).ok()?)?;
+    let changed = at.metadata().ok()?.modified().ok();
+    let mut opened = OPENED.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(archive) = opened.get(at).filter(|archive| archive.changed == changed) {
+        return Some((archive.clone(), entry));
+    }
+    let archive = Arc::new(Archive::open(at, [MOST_OF_ENTRY, MOST_OF_ALL]).ok()?);
+    opened.insert(at.to_owned(), archive.clone());
+    Some((archive, entry))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use zip::CompressionMethod;
+    use zip::write::{SimpleFileOptions, ZipWriter};
+
+    use super::*;
+
+    fn archive(folder: &Path, files: &[(&str, &[u8])]) -> PathBuf {
+        let path = folder.join("set.zip");
+        let mut zip = ZipWriter::new(File::create(&path).unwrap());
+        let packed = SimpleFileOptions::default().compression_method(CompressionMethod::Deflated);
+        for (name, bytes) in files {
+            zip.start_file(*name, packed).unwrap();
+            zip.write_all(bytes).unwrap();
+        }
+        zip.finish().unwrap();
+        path
+    }
+
+    #[test]
+    fn an_archive_is_a_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        let zip = archive(folder.path(), &[("a/b/1.txt", b"one"), ("2.txt", &[7; 4000])]);
+        assert!(is_dir(&zip) && is_dir(&zip.join("a")) && is_dir(&zip.join("a/b")));
+        assert!(!is_dir(&zip.join("c")) && !is_dir(&zip.join("2.txt")) && !is_file(&zip));
+        assert!(is_file(&zip.join("2.txt")) && is_file(&zip.join("a/./b/../b/1.txt")));
+        let mut names = entries(&zip).unwrap();
+        names.sort();
+        assert_eq!(names, [zip.join("2.txt"), zip.join("a")]);
+        assert_eq!(metadata(&zip.join("2.txt")).unwrap().0, 4000);
+        assert_eq!(archived_bytes(&zip.join("2.txt")).unwrap().unwrap(), [7; 4000]);
+        let mut text = String::new();
+        open(&zip.join("a/b/1.txt")).unwrap().read_to_string(&mut text).unwrap();
+        assert_eq!(text, "one");
+        assert!(open(&zip.join("a/absent")).is_err() && entries(&zip.join("c")).is_err());
+    }
+
+    #[test]
+    fn no_path_leads_out_of_an_archive() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("secret"), "s").unwrap();
+        let zip = archive(folder.path(), &[("../secret", b"x"), ("/etc/x", b"x"), ("a", b"y")]);
+        assert_eq!(entries(&zip).unwrap().len(), 2, "a and etc");
+        assert!(!is_file(&zip.join("../secret")) || !is_file(&zip.join("a/../../secret")));
+        assert_eq!(slashed(Path::new("a/../../b")), None);
+    }
+
+    #[test]
+    fn an_archive_that_expands_to_too_much_is_refused_by_what_it_declares() {
+        let folder = tempfile::tempdir().unwrap();
+        let zip = archive(folder.path(), &[("a", &[0; 60_000]), ("b", &[0; 60_000])]);
+        assert!(Archive::open(&zip, [60_000, 120_000]).is_ok());
+        for limits in [[59_999, 1 << 20], [60_000, 119_999]] {
+            let error = Archive::open(&zip, limits).err().unwrap().to_string();
+            assert!(error.contains("expand it yourself"), "{error}");
+        }
+    }
+
+    #[test]
+    fn an_archive_that_was_written_again_is_read_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let zip = archive(folder.path(), &[("a", b"old")]);
+        assert!(is_file(&zip.join("a")));
+        archive(folder.path(), &[("b", b"new")]);
+        File::options()
+            .append(true)
+            .open(&zip)
+            .unwrap()
+            .set_modified(SystemTime::UNIX_EPOCH)
+            .unwrap();
+        assert!(is_file(&zip.join("b")) && !is_file(&zip.join("a")));
+        std::fs::write(&zip, "no archive").unwrap();
+        assert!(check(&zip).is_err());
+    }
+}

@@ -1,0 +1,55 @@
+//! Values of options that are words: listed in completions and man pages, and parsed by their type.
+
+use std::ffi::OsStr;
+use std::fmt::Display;
+use std::marker::PhantomData;
+use std::str::FromStr;
+
+use clap::builder::{PossibleValue, StringValueParser, TypedValueParser};
+use clap::{Arg, Command, Error};
+
+use crate::photographs::tone::ToneCurve;
+use crate::train::{Part, Preset};
+
+/// Parses a `T`, of which some values have names. Others may exist, such as files.
+#[derive(Clone, Debug)]
+pub(super) struct Words<T>(Vec<&'static str>, PhantomData<fn() -> T>);
+
+impl<T> Words<T> {
+    pub(super) fn new(names: impl IntoIterator<Item = &'static str>) -> Self {
+        Self(names.into_iter().collect(), PhantomData)
+    }
+}
+
+/// The names of all curves.
+pub(super) fn curves<T>() -> Words<T> {
+    Words::new(std::iter::once(ToneCurve::Auto).chain(ToneCurve::ALL).map(ToneCurve::name))
+}
+
+/// The names of all presets.
+pub(super) fn presets() -> Words<Preset> {
+    Words::new(Preset::ALL.map(Preset::name))
+}
+
+/// The names of all parts of the model.
+pub(super) fn parts() -> Words<Part> {
+    Words::new(Part::ALL.map(Part::name))
+}
+
+impl<T> TypedValueParser for Words<T>
+where
+    T: FromStr<Err: Display> + Clone + Send + Sync + 'static,
+{
+    type Value = T;
+
+    fn parse_ref(&self, command: &Command, arg: Option<&Arg>, text: &OsStr) -> Result<T, Error> {
+        let parser = StringValueParser::new();
+        parser
+            .try_map(|text| text.parse::<T>().map_err(|error| error.to_string()))
+            .parse_ref(command, arg, text)
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        Some(Box::new(self.0.iter().map(|name| PossibleValue::new(*name))))
+    }
+}

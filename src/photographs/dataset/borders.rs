@@ -1,0 +1,261 @@
+//! Black borders and corners that belong to no scene: what undistorting leaves where the lens saw nothing, and bars.
+//!
+//! Such black touches the border, lies in the same place in all views and ends abruptly; the black of a dark scene does not.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use super::Split;
+use super::source::Source;
+use crate::photographs::image::{Image, PictureFile};
+
+/// The pixels of photographs of one size that show nothing, as indices into a plane, ascending.
+pub(super) type Border = Arc<Vec<usize>>;
+
+/// Black is at most this, encoded: what JPEG makes of 0 within a block of it.
+const BLACK: f32 = 1.5 / 255.0;
+/// What is brighter than this shows something.
+const SOMETHING: f32 = 4.0 / 255.0;
+/// How many photographs of a size are looked at, and how many are needed.
+const LOOKED_AT: usize = 12;
+const NEEDED: usize = 3;
+/// The part of the photographs that is black in the same place.
+const MAX_VIEWS: f64 = 0.9;
+/// The least part of a photograph that matters.
+const LEAST_AREA: f64 = 0.002;
+/// The part of its outline at which black must end abruptly.
+const LEAST_ABRUPT: f64 = 0.5;
+/// What JPEG makes of black in a block that shows something as well is below this.
+const DIM: f32 = 8.0 / 255.0;
+/// A block of JPEG, pixels: so far around black what is dim in most views is black.
+const BLOCK: usize = 8;
+/// How far interpolation carries black into what shows something, pixels.
+const REACH: usize = 2;
+
+/// Finds the borders by size, width and height.
+pub(super) fn find<'a>(sources: impl Iterator<Item = &'a Source>) -> BTreeMap<(u32, u32), Border> {
+    let mut by_size: BTreeMap<(u32, u32), Vec<&Source>> = BTreeMap::new();
+    // Who has masks has masked what shows nothing.
+    for source in sources.filter(|source| source.split == Split::Train && source.mask.is_none()) {
+        let size = source.read[0].as_ref().and_then(|file| file.size().ok());
+        let size = size.or_else(|| Image::size_of(source.input.as_deref()?).ok());
+        by_size.entry(size.unwrap_or_default()).or_default().push(source);
+    }
+    by_size.retain(|_, sources| sources.len() >= NEEDED);
+    let found = by_size.into_iter().filter_map(|(size, sources)| {
+        let step = sources.len().div_ceil(LOOKED_AT);
+        let images = sources.iter().step_by(step).filter_map(|source| decoded(source));
+        let border = border(images, size)?;
+        let (width, height) = size;
+        tracing::warn!(
+            "{:.1} % of the photographs of {width}x{height} is black in the same place at the border, as undistorting leaves \
+             it where the lens saw nothing: masked (mask_borders = false trains on it)",
+            100.0 * border.len() as f64 / f64::from(width) / f64::from(height)
+        );
+        Some((size, Arc::new(border)))
+    });
+    found.collect()
+}
+
+/// A photograph as it is stored; what its alpha hides is not black.
+fn decoded(source: &Source) -> Option<Image> {
+    let file = match &source.read[0] {
+        Some(read) => PictureFile::clone(read),
+        None => PictureFile::open(source.input.as_deref()?).ok()?,
+    };
+    let (mut image, alpha) = file.decode().ok()?;
+    if let Some(alpha) = alpha {
+        for (value, alpha) in image.data.iter_mut().zip(alpha.data) {
+            *value = if alpha < 1.0 { 1.0 } else { *value };
+        }
+    }
+    Some(image)
+}
+
+/// The black border that images of one size have in common.
+fn border(images: impl Iterator<Item = Image>, (width, height): (u32, u32)) -> Option<Vec<usize>> {
+    let plane = Plane { width: width as usize, height: height as usize };
+    let least = (LEAST_AREA * plane.len() as f64).ceil().max(1.0) as usize;
+    let mut counts = vec![0_u16; plane.len()];
+    let mut brightness = vec![];
+    for image in images {
+        if image.pixel_count() != plane.len() {
+            return None;
+        }
+        let values = brightest(&image);
+        let black = plane.black_from_border(&values);
+        // What all views have the first has.
+        if black.len() < least {
+            return None;
+        }
+        black.iter().for_each(|&pixel| counts[pixel] += 1);
+        brightness.push(values);
+    }
+    let views = brightness.len();
+    if views < NEEDED {
+        return None;
+    }
+    let most = (MAX_VIEWS * views as f64).ceil() as u16;
+    let is_common = |pixel: usize| counts[pixel] >= most;
+    let common: Vec<usize> = (0..plane.len()).filter(|&pixel| is_common(pixel)).collect();
+    if common.len() < least || common.len() == plane.len() {
+        return None;
+    }
+    // Where black ends, what lies a block farther shows something in most views.
+    let (mut outline, mut abrupt) = (0, 0);
+    for &pixel in &common {
+        for (next, beyond) in plane.outward(pixel, BLOCK + 2 * REACH) {
+            if !is_common(next) {
+                outline += views;
+                abrupt += brightness.iter().filter(|values| values[beyond] > SOMETHING).count();
+            }
+        }
+    }
+    let is_abrupt = abrupt as f64 >= LEAST_ABRUPT * f64::from(outline.max(1) as u32);
+    let is_dim = |pixel: usize| {
+        let dim = brightness.iter().filter(|values| values[pixel] <= DIM).count();
+        dim >= usize::from(most)
+    };
+    is_abrupt.then(|| plane.dilated(&plane.grown(common, is_dim)))
+}
+
+/// The largest channel of every pixel.
+fn brightest(image: &Image) -> Vec<f32> {
+    let pixels = image.pixel_count();
+    let (red, rest) = image.data.split_at(pixels);
+    let (green, blue) = rest.split_at(pixels);
+    red.iter().zip(green).zip(blue).map(|((r, g), b)| r.max(*g).max(*b)).collect()
+}
+
+/// Pixels of an image by their index.
+struct Plane {
+    width: usize,
+    height: usize,
+}
+
+impl Plane {
+    fn len(&self) -> usize {
+        self.width * self.height
+    }
+
+    /// The neighbours of a pixel, each with the pixel `reach` away in its direction, within the image.
+    fn outward(&self, pixel: usize, reach: usize) -> impl Iterator<Item = (usize, usize)> + use<> {
+        let (width, height) = (self.width, self.height);
+        let (x, y) = (pixel % width, pixel / width);
+        let row = move |at: usize| y * width + at;
+        let column = move |at: usize| at * width + x;
+        let left = (x > 0).then(|| (row(x - 1), row(x.saturating_sub(reach))));
+        let right = (x + 1 < width).then(|| (row(x + 1), row((x + reach).min(width - 1))));
+        let above = (y > 0).then(|| (column(y - 1), column(y.saturating_sub(reach))));
+        let below = (y + 1 < height).then(|| (column(y + 1), column((y + reach).min(height - 1))));
+        [left, right, above, below].into_iter().flatten()
+    }
+
+    /// The black pixels that are connected to the border by black ones.
+    fn black_from_border(&self, values: &[f32]) -> Vec<usize> {
+        let mut is_reached = vec![false; self.len()];
+        let is_edge = |pixel: usize| {
+            let (x, y) = (pixel % self.width, pixel / self.width);
+            x == 0 || y == 0 || x + 1 == self.width || y + 1 == self.height
+        };
+        let mut open: Vec<usize> =
+            (0..self.len()).filter(|&pixel| is_edge(pixel) && values[pixel] <= BLACK).collect();
+        open.iter().for_each(|&pixel| is_reached[pixel] = true);
+        let mut black = vec![];
+        while let Some(pixel) = open.pop() {
+            black.push(pixel);
+            for (next, _) in self.outward(pixel, 1) {
+                if !is_reached[next] && values[next] <= BLACK {
+                    is_reached[next] = true;
+                    open.push(next);
+                }
+            }
+        }
+        black
+    }
+
+    /// Pixels with those of a kind that are connected to them, within a block.
+    fn grown(&self, mut pixels: Vec<usize>, is_of_kind: impl Fn(usize) -> bool) -> Vec<usize> {
+        let mut is_reached = vec![false; self.len()];
+        pixels.iter().for_each(|&pixel| is_reached[pixel] = true);
+        let mut begin = 0;
+        for _ in 0..BLOCK {
+            let end = pixels.len();
+            for place in begin..end {
+                for (next, _) in self.outward(pixels[place], 1) {
+                    if !is_reached[next] && is_of_kind(next) {
+                        is_reached[next] = true;
+                        pixels.push(next);
+                    }
+                }
+            }
+            begin = end;
+        }
+        pixels
+    }
+
+    /// Pixels and those that interpolation mixes them into, ascending.
+    fn dilated(&self, pixels: &[usize]) -> Vec<usize> {
+        let mut is_hidden = vec![false; self.len()];
+        for &pixel in pixels {
+            let (x, y) = (pixel % self.width, pixel / self.width);
+            for row in y.saturating_sub(REACH)..(y + REACH + 1).min(self.height) {
+                let begin = row * self.width;
+                let columns = x.saturating_sub(REACH)..(x + REACH + 1).min(self.width);
+                is_hidden[begin + columns.start..begin + columns.end].fill(true);
+            }
+        }
+        (0..self.len()).filter(|&pixel| is_hidden[pixel]).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: (u32, u32) = (60, 40);
+
+    /// Photographs of a scene that moves by `shift` pixels a view, black outside a circle.
+    fn views(
+        shift: u32,
+        scene: impl Fn(u32, u32) -> f32,
+        radius: f64,
+    ) -> impl Iterator<Item = Image> {
+        (0..5).map(move |view| {
+            Image::from_fn(SIZE.0, SIZE.1, |x, y| {
+                let (from_x, from_y) = (f64::from(x) - 29.5, f64::from(y) - 19.5);
+                let is_seen = from_x.hypot(from_y) < radius;
+                [if is_seen { scene(x + shift * view, y + shift * view) } else { 0.0 }; 3]
+            })
+        })
+    }
+
+    fn textured(x: u32, y: u32) -> f32 {
+        0.03 + 0.04 * ((x * 7 + y * 13) % 11) as f32 / 11.0
+    }
+
+    #[test]
+    fn black_corners_are_found_with_what_interpolation_mixes_them_into() {
+        let border = border(views(3, textured, 30.0), SIZE).unwrap();
+        let is_outside = |pixel: usize, radius: f64| {
+            let (x, y) = ((pixel % 60) as f64 - 29.5, (pixel / 60) as f64 - 19.5);
+            x.hypot(y) >= radius
+        };
+        assert!(border.iter().all(|&pixel| is_outside(pixel, 30.0 - 5.0)));
+        let outside = (0..2400).filter(|&pixel| is_outside(pixel, 30.0));
+        assert!(outside.into_iter().all(|pixel| border.binary_search(&pixel).is_ok()));
+    }
+
+    #[test]
+    fn a_dark_scene_has_no_border() {
+        assert_eq!(border(views(3, textured, 100.0), SIZE), None, "no black");
+        let sky = |_: u32, y: u32| if y < 25 { 0.0 } else { 0.1 };
+        assert_eq!(border(views(4, sky, 100.0), SIZE), None, "a sky whose horizon moves");
+        let fade = |_: u32, y: u32| 0.0005 * y as f32;
+        assert_eq!(border(views(0, fade, 100.0), SIZE), None, "a sky that fades");
+        assert_eq!(border(views(0, |_, _| 0.0, 100.0), SIZE), None, "all black");
+        assert_eq!(border(views(3, textured, 30.0).take(2), SIZE), None, "two views tell nothing");
+        let one = views(3, textured, 30.0).take(1).chain(views(3, textured, 100.0));
+        assert_eq!(border(one, SIZE), None, "in one view only");
+    }
+}

@@ -1,0 +1,158 @@
+//! Where a dataset has its listing: in the folder that is named, above it, or in an archive.
+
+use std::path::{Path, PathBuf};
+
+use super::{Split, colmap, transforms};
+use crate::base::tree;
+use crate::photographs::image::files::{is_hidden, photographs_in};
+use crate::{Error, Result};
+
+/// A dataset's folder and what lists its photographs.
+#[derive(Clone, Debug)]
+pub(super) struct Layout {
+    /// What paths are relative to.
+    pub(super) root: PathBuf,
+    /// The place of a COLMAP model that was named itself.
+    named: Option<PathBuf>,
+}
+
+/// Where COLMAP and its users put models below a dataset's root, most likely first; a folder may hold several in folders.
+/// The root itself may be one, as what tools export is; `distorted` is of 3DGS's converter.
+const MODEL_FOLDERS: [&str; 8] = [
+    "sparse",
+    "colmap_sparse",
+    "derived_colmap/sparse",
+    "colmap/sparse",
+    "colmap_text",
+    "distorted/sparse",
+    "",
+    "undistorted/sparse",
+];
+/// How far above a model its photographs may lie: `distorted/sparse/0`.
+const MOST_ABOVE: usize = 3;
+
+impl Layout {
+    /// The layout of what a user names: a dataset's folder or archive, its transforms file, or its COLMAP model.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where it is neither, or an archive that cannot be read.
+    pub(super) fn of(given: &Path) -> Result<Self> {
+        tree::check(given)
+            .map_err(|error| Error::input(given, format!("cannot be read: {error}")))?;
+        let ending = given.extension().unwrap_or_default().to_ascii_lowercase();
+        if tree::is_file(given) && ending == "json" {
+            let root = given.parent().unwrap_or(Path::new(".")).to_owned();
+            return Ok(Self { root, named: None });
+        }
+        if !tree::is_dir(given) {
+            let problem = if tree::is_file(given) {
+                "is a file, not a folder; of a clip `nightsplat pose` makes a dataset"
+            } else {
+                "is not a folder; name the dataset's folder"
+            };
+            return Err(Error::input(given, problem));
+        }
+        let own = Self { root: given.to_owned(), named: None };
+        if own.has_listing() {
+            return Ok(own.above_model().unwrap_or(own));
+        }
+        // An archive often holds one folder, and that the dataset.
+        if tree::archive_of(given) == Some(given)
+            && let [only] = folders_in(given).as_slice()
+        {
+            return Self::of(only);
+        }
+        Ok(own.above_model().unwrap_or(own))
+    }
+
+    /// The files of a NeRF-style listing with their splits.
+    pub(super) fn listings(&self) -> Vec<(PathBuf, Option<Split>)> {
+        if self.named.is_some() { vec![] } else { transforms::find(&self.root) }
+    }
+
+    /// The COLMAP models with what `needed` lists, of the first place that has any, by name.
+    pub(super) fn models(&self, needed: &[&str]) -> Vec<PathBuf> {
+        if let Some(place) = &self.named {
+            return colmap::models_in(place, needed);
+        }
+        let known = MODEL_FOLDERS.iter().map(|place| match *place {
+            "" => colmap::model_in(&self.root, needed).into_iter().collect(),
+            place => colmap::models_in(&self.root.join(place), needed),
+        });
+        let mut known = known.filter(|models: &Vec<PathBuf>| !models.is_empty());
+        known.next().unwrap_or_else(|| {
+            // A folder of any name; one that holds photographs as well is a dataset of its own.
+            let bare = folders_in(&self.root).into_iter().filter(|folder| !has_photographs(folder));
+            bare.filter_map(|folder| colmap::model_in(&folder, needed)).collect()
+        })
+    }
+
+    /// Whether photographs are listed with cameras.
+    pub(super) fn has_listing(&self) -> bool {
+        !self.listings().is_empty() || !self.models(&CAMERAS).is_empty()
+    }
+
+    /// Of a model that was named itself the layout of the dataset around it.
+    fn above_model(&self) -> Option<Self> {
+        let given = &self.root;
+        let folders = folders_in(given);
+        let is_model = |folder: &Path| colmap::model_in(folder, &CAMERAS).is_some();
+        let holds_models = !folders.is_empty() && folders.iter().all(|folder| is_model(folder));
+        let is_named = self.listings().is_empty() && (is_model(given) || holds_models);
+        if !is_named || has_photographs(given) {
+            return None;
+        }
+        let given = given.canonicalize().unwrap_or_else(|_| given.clone());
+        let mut above = given.ancestors().skip(1).take(MOST_ABOVE);
+        let root = above.find(|folder| has_photographs(folder))?.to_owned();
+        Some(Self { root, named: Some(given) })
+    }
+
+    /// What there is in place of a dataset, and the remedy.
+    pub(super) fn no_dataset(&self) -> String {
+        let root = &self.root;
+        let expected = "transforms_train.json, transforms.json or a COLMAP model in sparse/0";
+        if let Some(below) = self.below() {
+            return format!("holds no dataset, but {} does: name that", below.display());
+        }
+        let beside = root.canonicalize().ok().and_then(|root| {
+            let above = Self { root: root.parent()?.to_owned(), named: None };
+            above.has_listing().then_some(above.root)
+        });
+        if let Some(above) = beside {
+            return format!("holds no dataset, but its parent {} does: name that", above.display());
+        }
+        match photographs_in(root).map_or(0, |photographs| photographs.len()) {
+            0 => format!("holds no dataset; expected {expected}"),
+            count => format!(
+                "holds no dataset but {count} photographs, whose poses are not known; find them with `nightsplat pose {} --out DATASET` (expected {expected})",
+                root.display()
+            ),
+        }
+    }
+
+    /// A dataset in a folder below, two levels deep at most.
+    fn below(&self) -> Option<PathBuf> {
+        let first = folders_in(&self.root);
+        let second: Vec<PathBuf> = first.iter().flat_map(|folder| folders_in(folder)).collect();
+        let mut below = first.into_iter().chain(second).map(|root| Self { root, named: None });
+        below.find(Self::has_listing).map(|layout| layout.root)
+    }
+}
+
+/// What a model needs to list photographs with cameras.
+pub(super) const CAMERAS: [&str; 2] = ["cameras", "images"];
+
+/// The folders of a folder, by name, without hidden ones.
+fn folders_in(folder: &Path) -> Vec<PathBuf> {
+    let mut folders = tree::entries(folder).unwrap_or_default();
+    folders.retain(|path| !is_hidden(path) && tree::is_dir(path));
+    folders.sort();
+    folders
+}
+
+/// Whether photographs lie in a folder, or in one of its folders.
+fn has_photographs(folder: &Path) -> bool {
+    let directly = |folder: &Path| photographs_in(folder).is_ok_and(|paths| !paths.is_empty());
+    directly(folder) || folders_in(folder).iter().any(|folder| directly(folder))
+}

@@ -1,0 +1,17 @@
+//! A view with what its files told while they were decoded.
+
+use super::View;
+use super::original::Original;
+
+/// A decoded view.
+pub(super) struct Loaded {
+    pub(super) name: String,
+    /// `None`: a training view whose photograph does not decode.
+    pub(super) view: Option<View>,
+    /// Why files were left out, one line each.
+    pub(super) problems: Vec<String>,
+    /// Means of the photograph and of the reference image, sRGB-encoded.
+    pub(super) brightness: [Option<f32>; 2],
+    /// The file of the reference image.
+    pub(super) reference: Option<Original>,
+}

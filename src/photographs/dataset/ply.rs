@@ -1,0 +1,251 @@
+//! Points that lie in a PLY file: x, y and z of its vertices, in any of its encodings.
+
+use std::path::{Path, PathBuf};
+
+use glam::{DAffine3, DVec3};
+
+use crate::base::input;
+use crate::{Error, Result};
+
+/// A file of points.
+#[derive(Clone, Debug)]
+pub(super) struct Cloud {
+    pub(super) file: PathBuf,
+    /// What a listing applied to its cameras, and perhaps not to the points.
+    pub(super) applied: Option<DAffine3>,
+}
+
+/// How vertices are written.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Encoding {
+    Text,
+    Little,
+    Big,
+}
+
+/// A scalar property of a vertex.
+#[derive(Clone, Copy)]
+struct Property {
+    /// Bytes before it.
+    at: usize,
+    kind: Kind,
+}
+
+#[derive(Clone, Copy)]
+enum Kind {
+    Signed(usize),
+    Unsigned(usize),
+    Float(usize),
+}
+
+impl Kind {
+    fn of(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Self::Signed(1),
+            "short" | "int16" => Self::Signed(2),
+            "int" | "int32" => Self::Signed(4),
+            "uchar" | "uint8" => Self::Unsigned(1),
+            "ushort" | "uint16" => Self::Unsigned(2),
+            "uint" | "uint32" => Self::Unsigned(4),
+            "float" | "float32" => Self::Float(4),
+            "double" | "float64" => Self::Float(8),
+            _ => return None,
+        })
+    }
+
+    fn size(self) -> usize {
+        match self {
+            Self::Signed(size) | Self::Unsigned(size) | Self::Float(size) => size,
+        }
+    }
+
+    /// The value of its bytes, the least significant first.
+    fn value(self, bytes: [u8; 8]) -> f64 {
+        let unsigned = u64::from_le_bytes(bytes);
+        match self {
+            Self::Float(4) => f64::from(f32::from_bits(unsigned as u32)),
+            Self::Float(_) => f64::from_bits(unsigned),
+            Self::Unsigned(_) => unsigned as f64,
+            Self::Signed(size) => {
+                let unused = 64 - 8 * size as u32;
+                ((unsigned << unused) as i64 >> unused) as f64
+            }
+        }
+    }
+}
+
+/// What the header says of the vertices, which come first.
+struct Header {
+    encoding: Encoding,
+    count: usize,
+    /// Of the file, of each vertex: bytes, or of text fields.
+    stride: usize,
+    /// x, y and z: with the number of the field.
+    axes: [(usize, Property); 3],
+}
+
+/// The finite points of a file. Normals and colours are skipped: they may come from normal-light photographs.
+///
+/// # Errors
+/// [`Error::Input`] where it cannot be read, is no PLY file of points or is cut short; a model of Gaussians is none.
+pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
+    let bytes = input::bytes(path)?;
+    let no_points =
+        |problem: &str| Error::input(path, format!("{problem}; its points are not read"));
+    const END: &[u8] = b"end_header";
+    let end = bytes
+        .windows(END.len())
+        .take(1 << 16)
+        .position(|window| window == END)
+        .ok_or_else(|| no_points("is no PLY file"))?;
+    let line_end = bytes[end..].iter().position(|byte| *byte == b'\n').unwrap_or(END.len());
+    let text = String::from_utf8_lossy(&bytes[..end]);
+    let header = header(&text).map_err(no_points)?;
+    let body = bytes.get(end + line_end + 1..).unwrap_or_default();
+    let points = match header.encoding {
+        Encoding::Text => of_text(&String::from_utf8_lossy(body), &header),
+        _ => of_bytes(body, &header),
+    };
+    let mut points = points.ok_or_else(|| no_points("is cut short or damaged"))?;
+    points.retain(|point| point.is_finite());
+    Ok(points)
+}
+
+fn header(text: &str) -> Result<Header, &'static str> {
+    let mut lines = text.lines().map(str::split_whitespace).map(|words| words.collect::<Vec<_>>());
+    if lines.next().as_deref() != Some(&["ply"]) {
+        return Err("is no PLY file");
+    }
+    let mut encoding = None;
+    let mut count = None;
+    let (mut at, mut field) = (0, 0);
+    let mut axes = [None; 3];
+    let mut is_vertex = false;
+    for words in lines {
+        match words.as_slice() {
+            ["format", "ascii", ..] => encoding = Some(Encoding::Text),
+            ["format", "binary_little_endian", ..] => encoding = Some(Encoding::Little),
+            ["format", "binary_big_endian", ..] => encoding = Some(Encoding::Big),
+            ["element", "vertex", number] => {
+                count = number.parse().ok();
+                is_vertex = true;
+            }
+            ["element", ..] if count.is_none() => {
+                return Err("has other elements before its vertices");
+            }
+            ["element", ..] => is_vertex = false,
+            ["property", "list", ..] if is_vertex => return Err("has vertices of varying length"),
+            ["property", kind, name] if is_vertex => {
+                let kind = Kind::of(kind).ok_or("has a property of an unknown type")?;
+                if name.starts_with("f_dc_") {
+                    return Err("is a model of Gaussians, not of points");
+                }
+                if let Some(axis) = ["x", "y", "z"].iter().position(|axis| axis == name) {
+                    axes[axis] = Some((field, Property { at, kind }));
+                }
+                at += kind.size();
+                field += 1;
+            }
+            _ => {}
+        }
+    }
+    let [Some(x), Some(y), Some(z)] = axes else { return Err("has no x, y and z") };
+    let encoding = encoding.ok_or("has no format")?;
+    let count = count.ok_or("has no vertices")?;
+    Ok(Header { encoding, count, stride: at, axes: [x, y, z] })
+}
+
+fn of_bytes(body: &[u8], header: &Header) -> Option<Vec<DVec3>> {
+    let body = body.get(..header.count.checked_mul(header.stride)?)?;
+    let value = |vertex: &[u8], Property { at, kind }: Property| {
+        let mut bytes = [0; 8];
+        let own = &mut bytes[..kind.size()];
+        own.copy_from_slice(&vertex[at..at + kind.size()]);
+        if header.encoding == Encoding::Big {
+            own.reverse();
+        }
+        kind.value(bytes)
+    };
+    let point =
+        |vertex: &[u8]| DVec3::from_array(header.axes.map(|(_, property)| value(vertex, property)));
+    Some(body.chunks_exact(header.stride.max(1)).map(point).collect())
+}
+
+fn of_text(body: &str, header: &Header) -> Option<Vec<DVec3>> {
+    let lines = body.lines().filter(|line| !line.trim().is_empty()).take(header.count);
+    let point = |line: &str| {
+        let fields: Vec<&str> = line.split_whitespace().collect();
+        let mut point = DVec3::ZERO;
+        for (axis, (field, _)) in header.axes.iter().enumerate() {
+            point[axis] = fields.get(*field)?.parse().ok()?;
+        }
+        Some(point)
+    };
+    let points = lines.map(point).collect::<Option<Vec<DVec3>>>()?;
+    (points.len() == header.count).then_some(points)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str, body: &[u8]) -> Result<Vec<DVec3>> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("points.ply");
+        std::fs::write(&path, [text.as_bytes(), body].concat()).unwrap();
+        points(&path)
+    }
+
+    const AT: [f64; 3] = [1.5, -2.0, 0.25];
+
+    #[test]
+    fn every_encoding_gives_the_same_points() {
+        let head = |format: &str, kind: &str| {
+            format!(
+                "ply\r\nformat {format} 1.0\r\ncomment end\r\nelement vertex 2\r\nproperty uchar red\r\nproperty {kind} y\r\n\
+                 property {kind} x\r\nproperty int16 k\r\nproperty {kind} z\r\nelement face 0\r\n\
+                 property list uchar int vertex_indices\r\nend_header\r\n"
+            )
+        };
+        let expected = [AT.into(), DVec3::new(AT[0], AT[1], 3.0)];
+        let text = "7 -2.0 1.5 -3 0.25\n9 -2 1.5 4 3e0\n";
+        assert_eq!(read(&head("ascii", "float"), text.as_bytes()).unwrap(), expected);
+        let body = |write: &dyn Fn(f64) -> Vec<u8>| {
+            let vertex = |z| [vec![7], write(AT[1]), write(AT[0]), vec![0, 1], write(z)].concat();
+            [vertex(AT[2]), vertex(3.0)].concat()
+        };
+        let little = body(&|value| (value as f32).to_le_bytes().to_vec());
+        assert_eq!(read(&head("binary_little_endian", "float"), &little).unwrap(), expected);
+        let big = body(&|value| value.to_be_bytes().to_vec());
+        assert_eq!(read(&head("binary_big_endian", "double"), &big).unwrap(), expected);
+        let whole = Kind::of("short").unwrap().value([0xfe, 0xff, 0, 0, 0, 0, 0, 0]);
+        assert_eq!(whole, -2.0);
+    }
+
+    #[test]
+    fn what_holds_no_points_says_why() {
+        let head = |lines: &str| format!("ply\nformat ascii 1.0\n{lines}\nend_header\n");
+        let xyz = "property float x\nproperty float y\nproperty float z";
+        let cases = [
+            ("no ply".to_owned(), "is no PLY file"),
+            (head("element vertex 1\nproperty float x"), "has no x, y and z"),
+            (head(&format!("element face 1\nelement vertex 1\n{xyz}")), "other elements before"),
+            (
+                head(&format!("element vertex 1\n{xyz}\nproperty float f_dc_0")),
+                "a model of Gaussians",
+            ),
+            (head(&format!("element vertex 2\n{xyz}")), "cut short"),
+            (head(&format!("element vertex 99999999999999\n{xyz}")), "cut short"),
+        ];
+        for (text, expected) in cases {
+            let error = read(&text, b"1 2 3\n").unwrap_err().to_string();
+            assert!(error.contains(expected), "{expected}: {error}");
+        }
+        let binary = format!(
+            "ply\nformat binary_little_endian 1.0\nelement vertex 18446744073709551615\n{xyz}\nend_header\n"
+        );
+        assert!(read(&binary, &[0; 24]).is_err());
+        let nan = read(&head(&format!("element vertex 2\n{xyz}")), b"1 2 3\nnan 0 0\n").unwrap();
+        assert_eq!(nan, [DVec3::new(1.0, 2.0, 3.0)]);
+    }
+}

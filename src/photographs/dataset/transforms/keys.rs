@@ -1,0 +1,109 @@
+//! Keys of a listing that change nothing here though they name files, or would change the result elsewhere: named once.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde_json::{Map, Value};
+
+/// Endings of files that a key may name.
+const ENDINGS: [&str; 17] = [
+    "png", "jpg", "jpeg", "exr", "tif", "tiff", "webp", "npy", "npz", "pt", "bin", "ply", "pcd",
+    "obj", "las", "mp4", "json",
+];
+/// Keys that change what other trainers make of a frame.
+const MEANT: [&str; 4] = ["rolling_shutter", "k5", "k6", "time"];
+
+/// Collects such keys.
+#[derive(Debug, Default)]
+pub(super) struct Unsupported {
+    /// How often each stands there, and the first value.
+    keys: BTreeMap<String, (usize, String)>,
+}
+
+impl Unsupported {
+    /// Adds those of an object, whose supported keys are taken out before.
+    pub(super) fn add(&mut self, object: &Map<String, Value>) {
+        for (key, value) in object {
+            let named = file_of(key, value).or_else(|| meant(key, value));
+            if let Some(named) = named {
+                self.keys.entry(key.clone()).or_insert((0, named)).0 += 1;
+            }
+        }
+    }
+
+    /// One line that names them all; `None` where there is none.
+    pub(super) fn remark(&self, path: &Path) -> Option<String> {
+        let named = |(key, (count, value)): (&String, &(usize, String))| match count {
+            1 => format!("{key} ({value})"),
+            _ => format!("{key} ({count} times, {value} the first)"),
+        };
+        let keys: Vec<String> = self.keys.iter().map(named).collect();
+        (!keys.is_empty()).then(|| {
+            format!("{}: not supported, without effect: {}", path.display(), keys.join(", "))
+        })
+    }
+}
+
+/// Whether a frame is marked to be left out: `is_bad` of ScanNet++ and the like.
+pub(super) fn is_marked_bad(frame: &Map<String, Value>) -> bool {
+    const BAD: [&str; 5] = ["is_bad", "bad", "ignore", "skip", "excluded"];
+    const GOOD: [&str; 3] = ["is_valid", "valid", "enabled"];
+    let says = |keys: &[&str], value: bool| {
+        let mut is_marked = false;
+        for key in keys {
+            let own =
+                frame.get(*key).and_then(|own| own.as_bool().or(own.as_u64().map(|own| own != 0)));
+            is_marked |= own == Some(value);
+        }
+        is_marked
+    };
+    says(&BAD, true) | says(&GOOD, false)
+}
+
+/// The file that a value names: by its ending, or by its key.
+fn file_of(key: &str, value: &Value) -> Option<String> {
+    let text = match value {
+        Value::Array(values) => values.iter().find_map(Value::as_str)?,
+        _ => value.as_str()?,
+    };
+    let ending = text.rsplit_once('.').map(|(_, ending)| ending.to_ascii_lowercase());
+    let is_file = ending.is_some_and(|ending| ENDINGS.contains(&ending.as_str()))
+        || ["_path", "_file", "_filename"].iter().any(|end| key.ends_with(end));
+    (is_file && !text.is_empty()).then(|| text.to_owned())
+}
+
+/// The value of a key that other trainers act on, where it is not zero.
+fn meant(key: &str, value: &Value) -> Option<String> {
+    let is_zero = |value: &Value| value.is_null() || value.as_f64() == Some(0.0);
+    let is_idle = match value {
+        Value::Array(values) => values.iter().all(is_zero),
+        value => is_zero(value),
+    };
+    (MEANT.contains(&key) && !is_idle).then(|| value.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn keys_that_name_files_or_change_results_are_named_and_others_are_not() {
+        let mut unsupported = Unsupported::default();
+        let frame = json!({
+            "normal_path": "normals/a.png", "colmap_im_id": 3, "sharpness": 4.5, "note": "a.b",
+            "rolling_shutter": [0.0, 0.0, 0.1, 0.0], "k5": 0.0, "flow_file": "a",
+        });
+        let Value::Object(frame) = frame else { unreachable!() };
+        unsupported.add(&frame);
+        unsupported.add(&frame);
+        let line = unsupported.remark(Path::new("transforms.json")).unwrap();
+        assert_eq!(
+            line,
+            "transforms.json: not supported, without effect: flow_file (2 times, a the first), normal_path (2 times, \
+             normals/a.png the first), rolling_shutter (2 times, [0.0,0.0,0.1,0.0] the first)"
+        );
+        assert_eq!(Unsupported::default().remark(Path::new("a")), None);
+    }
+}

@@ -1,0 +1,177 @@
+//! `transform_matrix` as exporters write it: transposed, scaled or rounded ones are mended, left-handed ones are named.
+
+use glam::{DAffine3, DMat3, DVec3};
+use serde::{Deserialize, Deserializer};
+
+/// Rows as listed; `None` stands for NaN.
+pub(super) type Rows = Vec<Vec<Option<f64>>>;
+
+/// Rows, or the same numbers one after the other.
+pub(super) fn rows<'de, D: Deserializer<'de>>(matrix: D) -> Result<Rows, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum Listed {
+        Rows(Rows),
+        Flat(Vec<Option<f64>>),
+    }
+    Ok(match Listed::deserialize(matrix)? {
+        Listed::Rows(rows) => rows,
+        Listed::Flat(numbers) => numbers.chunks(4).map(<[_]>::to_vec).collect(),
+    })
+}
+
+/// A pose, and what was wrong with its matrix.
+#[derive(Debug)]
+pub(super) struct Pose {
+    /// World to view, `OpenCV` axes.
+    pub(super) view_from_world: DAffine3,
+    /// What its columns were divided by; 1 where they have length 1 but for rounding.
+    pub(super) scale: f64,
+    /// Whether the nearest rotation stands for one that was rounded.
+    pub(super) is_rounded: bool,
+}
+
+/// How far the lengths of columns may differ from each other, and from 1 where that is rounding.
+const LENGTH_TOLERANCE: f64 = 0.02;
+/// How far `R^T R` may be from the identity, entry by entry: two decimals are off by 0.02.
+const ROTATION_TOLERANCE: f64 = 0.05;
+/// Where it is farther off than this, single precision does not explain it.
+const IS_ROUNDED: f64 = 1e-3;
+/// Where it is closer than this, the matrix is taken as it is.
+const IS_EXACT: f64 = 1e-5;
+
+/// Whether a listing writes columns where rows are due: the translation stands in the last row of some frame, and in the
+/// last column of none.
+pub(super) fn are_transposed<'a>(matrices: impl Iterator<Item = &'a Rows> + Clone) -> bool {
+    let moves = |at: fn(&Rows, usize) -> Option<f64>| {
+        let mut matrices = matrices.clone();
+        matrices.any(|rows| (0..3).any(|axis| at(rows, axis).is_some_and(|value| value != 0.0)))
+    };
+    let is_square = |rows: &Rows| rows.len() == 4 && rows.iter().all(|row| row.len() == 4);
+    matrices.clone().all(is_square)
+        && moves(|rows, axis| rows[3][axis])
+        && !moves(|rows, axis| rows[axis][3])
+}
+
+/// The pose of a camera from view to world in OpenGL axes, as 4x4 or 3x4 rows.
+///
+/// # Errors
+/// What makes it none, to be read after "its transform_matrix".
+pub(super) fn pose(rows: &Rows, is_transposed: bool) -> Result<Pose, &'static str> {
+    let world_from_gl = affine(rows, is_transposed)
+        .filter(DAffine3::is_finite)
+        .ok_or("is no finite rotation and translation")?;
+    let DAffine3 { matrix3: matrix, translation } = world_from_gl;
+    let lengths = [matrix.x_axis, matrix.y_axis, matrix.z_axis].map(DVec3::length);
+    let mean = lengths.iter().sum::<f64>() / 3.0;
+    // Positive phrasing: a NaN fails the test too.
+    let is_uniform =
+        lengths.iter().all(|length| (length - mean).abs() <= LENGTH_TOLERANCE * mean) && mean > 0.0;
+    if !is_uniform {
+        return Err("is no rotation: its columns differ in length");
+    }
+    let scale = if (mean - 1.0).abs() > LENGTH_TOLERANCE { mean } else { 1.0 };
+    let matrix = if scale == 1.0 { matrix } else { matrix * (1.0 / scale) };
+    let off = (matrix.transpose() * matrix - DMat3::IDENTITY).to_cols_array();
+    let off = off.iter().fold(0.0_f64, |worst, entry| worst.max(entry.abs()));
+    if off > ROTATION_TOLERANCE {
+        return Err("is no rotation: its columns are not perpendicular");
+    }
+    if matrix.determinant() < 0.0 {
+        return Err("is left-handed (determinant -1, as engines of left-handed axes write it)");
+    }
+    let rotation = if off > IS_EXACT { nearest_rotation(matrix) } else { matrix };
+    let world_from_gl = DAffine3 { matrix3: rotation, translation };
+    let opencv_from_gl = DAffine3::from_scale(DVec3::new(1.0, -1.0, -1.0));
+    let view_from_world = opencv_from_gl * world_from_gl.inverse();
+    Ok(Pose { view_from_world, scale, is_rounded: off > IS_ROUNDED })
+}
+
+fn affine(rows: &Rows, is_transposed: bool) -> Option<DAffine3> {
+    let row = |index: usize| -> Option<[f64; 4]> {
+        let entry = |other: usize| {
+            let (row, column) = if is_transposed { (other, index) } else { (index, other) };
+            *rows.get(row)?.get(column)?
+        };
+        let is_complete = is_transposed || rows.get(index)?.len() == 4;
+        is_complete.then_some([entry(0)?, entry(1)?, entry(2)?, entry(3)?])
+    };
+    let [x, y, z] = [row(0)?, row(1)?, row(2)?];
+    let matrix3 =
+        DMat3::from_cols_array(&[x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2]]).transpose();
+    Some(DAffine3 { matrix3, translation: DVec3::new(x[3], y[3], z[3]) })
+}
+
+/// The orthogonal factor of the polar decomposition, by Newton's iteration (Higham 1986): of all rotations the nearest.
+fn nearest_rotation(mut matrix: DMat3) -> DMat3 {
+    for _ in 0..10 {
+        matrix = (matrix + matrix.inverse().transpose()) * 0.5;
+    }
+    matrix
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rows(matrix: DMat3, translation: DVec3) -> Rows {
+        let row = |row: usize| {
+            let own = matrix.row(row);
+            [own.x, own.y, own.z, translation[row]].map(Some).to_vec()
+        };
+        vec![row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0].map(Some).to_vec()]
+    }
+
+    fn turned() -> DMat3 {
+        DMat3::from_axis_angle(DVec3::new(1.0, 2.0, -1.0).normalize(), 1.1)
+    }
+
+    const AT: DVec3 = DVec3::new(0.5, -2.0, 3.0);
+
+    #[test]
+    fn scale_and_rounding_are_mended_and_told() {
+        let exact = pose(&rows(turned(), AT), false).unwrap();
+        assert_eq!((exact.scale, exact.is_rounded), (1.0, false));
+        let scaled = pose(&rows(turned() * 0.25, AT), false).unwrap();
+        assert!((scaled.scale - 0.25).abs() < 1e-12 && !scaled.is_rounded);
+        assert!(scaled.view_from_world.abs_diff_eq(exact.view_from_world, 1e-9));
+        for decimals in [1e2, 1e3] {
+            let round = |value: f64| (value * decimals).round() / decimals;
+            let rounded = DMat3::from_cols_array(&turned().to_cols_array().map(round));
+            let rounded = pose(&rows(rounded, AT), false).unwrap();
+            assert_eq!((rounded.scale, rounded.is_rounded), (1.0, true));
+            assert!(rounded.view_from_world.abs_diff_eq(exact.view_from_world, 4.0 / decimals));
+            let rotation = rounded.view_from_world.matrix3;
+            assert!((rotation.transpose() * rotation).abs_diff_eq(DMat3::IDENTITY, 1e-12));
+        }
+    }
+
+    #[test]
+    fn what_is_no_rotation_is_named() {
+        let problem = |matrix: DMat3| pose(&rows(matrix, AT), false).unwrap_err();
+        let mirror = DMat3::from_diagonal(DVec3::new(-1.0, 1.0, 1.0));
+        assert!(problem(mirror * turned()).contains("left-handed"));
+        let stretched = DMat3::from_diagonal(DVec3::new(1.0, 2.0, 1.0));
+        assert!(problem(turned() * stretched).contains("differ in length"));
+        assert!(problem(DMat3::ZERO).contains("differ in length"));
+        let sheared = DMat3::from_cols(DVec3::X, DVec3::new(0.6, 0.8, 0.0), DVec3::Z);
+        assert!(problem(sheared).contains("not perpendicular"));
+        assert!(problem(DMat3::from_cols(DVec3::NAN, DVec3::Y, DVec3::Z)).contains("no finite"));
+        assert!(pose(&vec![vec![Some(1.0); 4]; 2], false).is_err());
+    }
+
+    #[test]
+    fn columns_as_rows_are_found_though_one_camera_stands_at_the_origin() {
+        let transposed = |rows: &Rows| -> Rows {
+            (0..4).map(|column| rows.iter().map(|row| row[column]).collect()).collect()
+        };
+        let written = [rows(turned(), AT), rows(turned(), DVec3::ZERO)];
+        let columns = written.each_ref().map(transposed);
+        assert!(are_transposed(columns.iter()) && !are_transposed(written.iter()));
+        let exact = pose(&written[0], false).unwrap().view_from_world;
+        assert!(pose(&columns[0], true).unwrap().view_from_world.abs_diff_eq(exact, 1e-12));
+        // Three rows have no last one, and cameras in one spot tell nothing.
+        assert!(!are_transposed([written[0][..3].to_vec()].iter()));
+        assert!(!are_transposed([rows(turned(), DVec3::ZERO)].iter()));
+    }
+}

@@ -1,0 +1,345 @@
+//! Colours as a file stores them become sRGB.
+//!
+//! ```text
+//! sRGB = encode(M decode(stored))      decode: a curve per channel; M: linear light of the file's primaries to sRGB's
+//! ```
+//!
+//! Of a profile that has tables as well, the matrix is used; one of tables alone cannot be. What is sRGB to one code value of
+//! 8 bits keeps its values to the bit. What is converted is rounded to multiples of 1/65535: fine enough under any tone curve,
+//! and 16 bits keep it.
+
+mod counters;
+mod metadata;
+#[cfg(test)]
+mod tests;
+
+use glam::{DMat3, DVec3};
+use moxcms::{
+    CicpColorPrimaries, CicpProfile, ColorProfile, DataColorSpace, MatrixCoefficients, ProfileText,
+    ToneReprCurve, TransferCharacteristics,
+};
+use rayon::prelude::*;
+
+pub(super) use self::metadata::Chromaticities;
+use self::metadata::{Statement, statements};
+use super::{Image, linear_from_srgb, srgb_from_linear};
+pub(crate) use counters::ColourTally;
+
+/// What was made of the colours of a file.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Conversion {
+    /// The colour space that it was converted from, and the fraction of its pixels that sRGB does not hold; none where the
+    /// values are sRGB as they are stored, or are taken for it.
+    pub(crate) from: Option<(String, f64)>,
+    /// What it says that is not understood, in words.
+    pub(crate) unknown: Option<String>,
+}
+
+/// So far two matrices between linear colours may differ by what files round.
+const ROUNDING: f64 = 2e-3;
+/// Steps from 0 to 1 of what is converted.
+const LEVELS: f32 = 65_535.0;
+
+/// Converts a decoded picture to sRGB by what its file says.
+pub(super) fn convert(image: &mut Image, bytes: &[u8]) -> Conversion {
+    let mut unknown = None;
+    for statement in statements(bytes) {
+        match ColourSpace::of(&statement) {
+            Ok(None) => return Conversion { from: None, unknown },
+            Ok(Some(space)) => {
+                let outside = space.apply(image);
+                return Conversion { from: Some((space.name, outside)), unknown };
+            }
+            Err(problem) => unknown = unknown.or(Some(problem)),
+        }
+    }
+    Conversion { from: None, unknown }
+}
+
+/// Converts linear light of other primaries to that of sRGB's. What would be negative becomes 0; what was, stays.
+pub(super) fn convert_linear(image: &mut Image, chromaticities: Chromaticities) -> Conversion {
+    /// A code value of 8 bits near black.
+    const MARGIN: f64 = 1.0 / 255.0 / 12.92;
+    let Some(matrix) = to_srgb(chromaticities) else {
+        let unknown = Some("chromaticities of no primaries".to_owned());
+        return Conversion { from: None, unknown };
+    };
+    if matrix.abs_diff_eq(DMat3::IDENTITY, ROUNDING) {
+        return Conversion::default();
+    }
+    let count = image.pixel_count();
+    let mut outside = 0;
+    for at in 0..count {
+        let stored =
+            DVec3::from_array([0, 1, 2].map(|plane| f64::from(image.data[plane * count + at])));
+        if !(stored.is_finite() && stored.min_element() >= 0.0) {
+            continue;
+        }
+        let linear = matrix * stored;
+        outside += usize::from(linear.min_element() < -MARGIN);
+        for (plane, value) in linear.to_array().into_iter().enumerate() {
+            image.data[plane * count + at] = value.max(0.0) as f32;
+        }
+    }
+    let name = known_name(matrix).unwrap_or("primaries of its own").to_owned();
+    Conversion { from: Some((name, outside as f64 / count.max(1) as f64)), unknown: None }
+}
+
+/// The matrix from linear light of these primaries to that of sRGB; none where the primaries are none.
+fn to_srgb(chromaticities: Chromaticities) -> Option<DMat3> {
+    from_d50(to_d50(chromaticities))
+}
+
+/// The matrix to linear sRGB of colorants, XYZ at D50 as a profile has them.
+fn from_d50(colorants: DMat3) -> Option<DMat3> {
+    const D65: [f64; 2] = [0.3127, 0.3290];
+    const SRGB: Chromaticities = [D65, [0.64, 0.33], [0.30, 0.60], [0.15, 0.06]];
+    let result = to_d50(SRGB).inverse() * colorants;
+    (result.is_finite() && result.determinant().abs() > 1e-6).then_some(result)
+}
+
+/// XYZ at D50 of linear red, green and blue, adapted by Bradford's matrix (ICC.1:2022, annex E).
+fn to_d50([white, red, green, blue]: Chromaticities) -> DMat3 {
+    const BRADFORD: DMat3 = DMat3::from_cols(
+        DVec3::new(0.8951, -0.7502, 0.0389),
+        DVec3::new(0.2664, 1.7135, -0.0685),
+        DVec3::new(-0.1614, 0.0367, 1.0296),
+    );
+    const D50: DVec3 = DVec3::new(0.9642, 1.0, 0.8249);
+    let xyz = |[x, y]: [f64; 2]| DVec3::new(x / y, 1.0, (1.0 - x - y) / y);
+    let primaries = DMat3::from_cols(xyz(red), xyz(green), xyz(blue));
+    let luminances = primaries.inverse() * xyz(white);
+    let adaptation = (BRADFORD * D50) / (BRADFORD * xyz(white));
+    let adapted = BRADFORD.inverse() * DMat3::from_diagonal(adaptation) * BRADFORD;
+    adapted * primaries * DMat3::from_diagonal(luminances)
+}
+
+/// The colorants of a profile.
+fn colorants(profile: &ColorProfile) -> DMat3 {
+    DMat3::from_cols_array_2d(&profile.colorant_matrix().v).transpose()
+}
+
+type Curve = Box<dyn Fn(f32) -> f32 + Send + Sync>;
+
+/// How stored values become sRGB.
+struct ColourSpace {
+    name: String,
+    /// Of each channel to linear light.
+    curves: [Curve; 3],
+    /// From there to the linear light of sRGB.
+    matrix: DMat3,
+}
+
+impl ColourSpace {
+    /// `None` of sRGB.
+    ///
+    /// # Errors
+    /// What cannot be used, in words.
+    fn of(statement: &Statement) -> Result<Option<Self>, String> {
+        let space = match statement {
+            Statement::Srgb => return Ok(None),
+            Statement::AdobeRgb => Self::of_profile(&ColorProfile::new_adobe_rgb()),
+            Statement::Profile(bytes) => {
+                let profile = ColorProfile::new_from_slice(bytes);
+                Self::of_profile(&profile.map_err(|_| "a damaged ICC profile".to_owned())?)
+            }
+            &Statement::CodePoints(points) => Self::of_code_points(points),
+            &Statement::Primaries { chromaticities, exponent } => {
+                Self::of_primaries(chromaticities, exponent)
+            }
+            Statement::Unknown(problem) => Err(problem.clone()),
+        };
+        space.map(|space| (!space.is_srgb()).then_some(space))
+    }
+
+    fn of_profile(profile: &ColorProfile) -> Result<Self, String> {
+        let name =
+            description(profile).unwrap_or_else(|| "an ICC profile without a name".to_owned());
+        let unusable = |why: &str| format!("the ICC profile {name} ({why})");
+        let curve = |curve: &Option<ToneReprCurve>| {
+            let evaluator = curve.as_ref()?.make_linear_evaluator().ok()?;
+            Some(Box::new(move |value: f32| evaluator.evaluate_value(value)) as Curve)
+        };
+        let curves = |curves: [&Option<ToneReprCurve>; 3]| {
+            let [red, green, blue] = curves.map(curve);
+            Some([red?, green?, blue?])
+        };
+        match profile.color_space {
+            DataColorSpace::Gray => {
+                let curves = curves([&profile.gray_trc; 3]).ok_or_else(|| unusable("no curve"))?;
+                Ok(Self { name, curves, matrix: DMat3::IDENTITY })
+            }
+            DataColorSpace::Rgb => {
+                let matrix =
+                    profile.is_matrix_shaper().then(|| from_d50(colorants(profile))).flatten();
+                let curves = curves([&profile.red_trc, &profile.green_trc, &profile.blue_trc]);
+                let (matrix, curves) =
+                    matrix.zip(curves).ok_or_else(|| unusable("no matrix and curves"))?;
+                // Of sRGB's primaries with another curve, their name says nothing.
+                let known = known_name(matrix).filter(|known| *known != "sRGB");
+                Ok(Self { name: known.map_or(name, str::to_owned), curves, matrix })
+            }
+            other => Err(unusable(&format!("for {other:?}, not for RGB"))),
+        }
+    }
+
+    fn of_code_points(points: [u8; 4]) -> Result<Self, String> {
+        let unusable = |why: &str| format!("the code points {points:?} of a cICP chunk ({why})");
+        let [primaries, transfer, matrix, range] = points;
+        if matrix != 0 || range != 1 {
+            return Err(unusable("no RGB of full range"));
+        }
+        let color_primaries = CicpColorPrimaries::try_from(primaries).ok();
+        let transfer = TransferCharacteristics::try_from(transfer).ok();
+        let (Some(color_primaries), Some(transfer)) = (color_primaries, transfer) else {
+            return Err(unusable("reserved"));
+        };
+        let is_srgb_curve = match transfer {
+            TransferCharacteristics::Smpte2084 | TransferCharacteristics::Hlg => {
+                return Err(unusable("high dynamic range"));
+            }
+            TransferCharacteristics::Reserved | TransferCharacteristics::Unspecified => {
+                return Err(unusable("no transfer function"));
+            }
+            // Video is graded on a display, and every player shows it as if it were sRGB.
+            TransferCharacteristics::Bt709
+            | TransferCharacteristics::Bt601
+            | TransferCharacteristics::Bt202010bit
+            | TransferCharacteristics::Bt202012bit
+            | TransferCharacteristics::Srgb => true,
+            _ => false,
+        };
+        let matrix_coefficients = MatrixCoefficients::Identity;
+        let profile = CicpProfile {
+            color_primaries,
+            transfer_characteristics: transfer,
+            matrix_coefficients,
+            full_range: true,
+        };
+        let matrix = from_d50(colorants(&ColorProfile::new_from_cicp(profile)));
+        let matrix = matrix.ok_or_else(|| unusable("no primaries"))?;
+        let curve = |_| match is_srgb_curve {
+            true => srgb_curve(),
+            false => Box::new(move |value: f32| transfer.linearize(f64::from(value)) as f32),
+        };
+        let known = known_name(matrix).filter(|known| *known != "sRGB");
+        let name = known.map_or_else(|| format!("code points {points:?}"), str::to_owned);
+        Ok(Self { name, curves: std::array::from_fn(curve), matrix })
+    }
+
+    fn of_primaries(
+        chromaticities: Option<Chromaticities>,
+        exponent: Option<f64>,
+    ) -> Result<Self, String> {
+        let matrix = match chromaticities {
+            Some(chromaticities) => {
+                to_srgb(chromaticities).ok_or("chromaticities of no primaries")?
+            }
+            None => DMat3::IDENTITY,
+        };
+        let known = known_name(matrix);
+        // Where there is no chunk for it, the curve of sRGB and Display P3 is written as 1/2.2, and ffmpeg writes that of video,
+        // which is shown as if it were sRGB, as 1/1.961.
+        let is_srgb_curve = |exponent: &f64| {
+            let is_near = |of: f64, by: f64| (exponent - of).abs() < by;
+            is_near(1.961, 0.005)
+                || is_near(2.2, 0.03) && [Some("sRGB"), Some("Display P3")].contains(&known)
+        };
+        let exponent = exponent.filter(|exponent| !is_srgb_curve(exponent));
+        let curve = |_| match exponent {
+            Some(exponent) => {
+                Box::new(move |value: f32| value.max(0.0).powf(exponent as f32)) as Curve
+            }
+            None => srgb_curve(),
+        };
+        let primaries = known.unwrap_or("primaries of its own");
+        let name = match exponent {
+            Some(exponent) if known != Some("Adobe RGB") => {
+                format!("{primaries} at gamma {exponent:.2}")
+            }
+            _ => primaries.to_owned(),
+        };
+        Ok(Self { name, curves: std::array::from_fn(curve), matrix })
+    }
+
+    /// Whether its primaries are sRGB's to a rounding, and it moves no grey by more than a code value of 8 bits.
+    fn is_srgb(&self) -> bool {
+        let moves = |code: u8| {
+            let grey = f32::from(code) / 255.0;
+            let converted = self.encoded(self.curves.each_ref().map(|curve| curve(grey)));
+            converted.iter().any(|value| (value - grey).abs() > 1.0 / 255.0)
+        };
+        self.matrix.abs_diff_eq(DMat3::IDENTITY, ROUNDING) && !(0..=255).any(moves)
+    }
+
+    /// A pixel of linear light of this space in sRGB, unclamped.
+    fn encoded(&self, linear: [f32; 3]) -> [f32; 3] {
+        let linear = self.matrix * DVec3::from_array(linear.map(f64::from));
+        linear.to_array().map(|value| encode(value as f32))
+    }
+
+    /// Converts an image; gives the fraction of its pixels that sRGB does not hold, and clamps them.
+    fn apply(&self, image: &mut Image) -> f64 {
+        /// So far beyond 0 or 1 a value is no rounding.
+        const MARGIN: f32 = 1.0 / 255.0;
+        // Every value of a file of 8 or 16 bits is one of these.
+        let levels = || (0..=LEVELS as u32).map(|level| level as f32 / LEVELS);
+        let tables = self.curves.each_ref().map(|curve| levels().map(curve).collect::<Vec<f32>>());
+        let count = image.pixel_count();
+        let linear = |channel: usize, at: usize| {
+            tables[channel][(image.data[channel * count + at] * LEVELS).round() as usize]
+        };
+        let pixels: Vec<[f32; 3]> = (0..count)
+            .into_par_iter()
+            .map(|at| self.encoded([linear(0, at), linear(1, at), linear(2, at)]))
+            .collect();
+        // Positive phrasing: a NaN is outside.
+        let is_held = |value: &f32| (-MARGIN..=1.0 + MARGIN).contains(value);
+        let outside = pixels.iter().filter(|pixel| !pixel.iter().all(is_held)).count();
+        for (plane, values) in image.data.chunks_exact_mut(count.max(1)).enumerate() {
+            for (value, pixel) in values.iter_mut().zip(&pixels) {
+                let inside = if pixel[plane] > 0.0 { pixel[plane].min(1.0) } else { 0.0 };
+                *value = (inside * LEVELS).round() / LEVELS;
+            }
+        }
+        outside as f64 / count.max(1) as f64
+    }
+}
+
+/// The encoded value of linear light, continued below 0.
+fn encode(linear: f32) -> f32 {
+    srgb_from_linear(linear.abs()).copysign(linear)
+}
+
+fn srgb_curve() -> Curve {
+    Box::new(linear_from_srgb)
+}
+
+/// What a profile calls itself, in quotes.
+fn description(profile: &ColorProfile) -> Option<String> {
+    const MOST: usize = 60;
+    let text = match profile.description.as_ref()? {
+        ProfileText::PlainString(text) => text,
+        ProfileText::Localizable(texts) => &texts.first()?.value,
+        ProfileText::Description(text) => &text.ascii_string,
+    };
+    let text: String =
+        text.chars().filter(|character| !character.is_control()).take(MOST).collect();
+    let text = text.trim();
+    (!text.is_empty()).then(|| format!("\"{text}\""))
+}
+
+/// The name of the colour space whose primaries these are, by the matrix to linear sRGB.
+fn known_name(matrix: DMat3) -> Option<&'static str> {
+    let known = [
+        ("sRGB", ColorProfile::new_srgb()),
+        ("Display P3", ColorProfile::new_display_p3()),
+        ("Adobe RGB", ColorProfile::new_adobe_rgb()),
+        ("ProPhoto RGB", ColorProfile::new_pro_photo_rgb()),
+        ("Rec. 2020", ColorProfile::new_bt2020()),
+    ];
+    let is_near = |profile: &ColorProfile| {
+        from_d50(colorants(profile)).is_some_and(|own| own.abs_diff_eq(matrix, 0.01))
+    };
+    known.into_iter().find(|(_, profile)| is_near(profile)).map(|(name, _)| name)
+}

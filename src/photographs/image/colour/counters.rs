@@ -1,0 +1,80 @@
+//! What is said of the colours of many photographs: a line for each colour space, not for each file.
+
+use std::collections::BTreeMap;
+use std::sync::{Mutex, PoisonError};
+
+use super::Conversion;
+
+/// Counts conversions, from any thread.
+#[derive(Debug)]
+pub(crate) struct ColourTally {
+    /// What is counted, in the singular.
+    what: &'static str,
+    counts: Mutex<Counts>,
+}
+
+impl Default for ColourTally {
+    fn default() -> Self {
+        Self::of("photograph")
+    }
+}
+
+#[derive(Debug, Default)]
+struct Counts {
+    /// By colour space: photographs, and the sum of the fractions of their pixels that sRGB does not hold.
+    converted: BTreeMap<String, (usize, f64)>,
+    /// By what is not understood.
+    unknown: BTreeMap<String, usize>,
+}
+
+/// The fraction of pixels outside sRGB that is worth a warning.
+const SMALL: f64 = 0.01;
+
+impl ColourTally {
+    /// Of things of this name.
+    pub(crate) fn of(what: &'static str) -> Self {
+        Self { what, counts: Mutex::default() }
+    }
+
+    /// Counts a photograph.
+    pub(crate) fn add(&self, conversion: Conversion) {
+        let mut counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((space, outside)) = conversion.from {
+            let (count, sum) = counts.converted.entry(space).or_default();
+            *count += 1;
+            *sum += outside;
+        }
+        if let Some(problem) = conversion.unknown {
+            *counts.unknown.entry(problem).or_default() += 1;
+        }
+    }
+
+    /// Says what was counted.
+    pub(crate) fn say(&self) {
+        self.lines().iter().for_each(|line| tracing::warn!("{line}"));
+    }
+
+    pub(super) fn lines(&self) -> Vec<String> {
+        let counts = self.counts.lock().unwrap_or_else(PoisonError::into_inner);
+        let these =
+            |count: usize| format!("{count} {}{}", self.what, if count == 1 { "" } else { "s" });
+        let mut lines = vec![];
+        for (space, &(count, sum)) in &counts.converted {
+            let (whose, outside) = (these(count), sum / count as f64);
+            lines.push(format!("{whose} in {space} converted to sRGB"));
+            if outside > SMALL {
+                let percent = 100.0 * outside;
+                lines.push(format!(
+                    "{percent:.0} % of the pixels of {whose} in {space} lie outside sRGB and are clipped to it"
+                ));
+            }
+        }
+        for (problem, &count) in &counts.unknown {
+            let whose = these(count);
+            lines.push(format!(
+                "{whose} with {problem}, which is not used; convert the files if their colours are not sRGB"
+            ));
+        }
+        lines
+    }
+}

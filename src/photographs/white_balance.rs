@@ -1,0 +1,438 @@
+//! White balance that the user knows: a gain for each channel of the photographs.
+//!
+//! ```text
+//! x' = encode(g decode(x))        g: of its channel; decode, encode: of sRGB
+//! ```
+//!
+//! The colour of the light multiplies linear light, so the gains do too (von Kries), before anything is measured and before
+//! the tone curve: after a curve the same cast would differ with brightness. Values above 1 stay, the curve ends them.
+
+use std::fmt;
+use std::path::Path;
+use std::str::FromStr;
+
+use glam::{DMat3, DVec2, DVec3};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::image::{Image, linear_from_srgb, srgb_from_linear};
+use crate::{Error, Result};
+
+/// How the photographs are balanced.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum WhiteBalance {
+    /// Gains of red, green and blue in linear light.
+    Gains([f64; 3]),
+    /// The colour temperature of the light, kelvin; 6504 changes nothing.
+    Kelvin(f64),
+    /// A grey card or another neutral area of a photograph as it is stored: the view, then x, y, width and height in pixels.
+    Area(String, [u32; 4]),
+    /// The grey patches of a chart of 6 x 4 patches (ColorChecker): the view, then the corners of the chart as it is stored,
+    /// from the dark skin patch round by the blue-green, the black and the white one, x and y in pixels.
+    Chart(String, [[f64; 2]; 4]),
+}
+
+/// The gains of red, green and blue in linear light.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct WhiteBalanceGains(pub [f32; 3]);
+
+/// Colour temperatures that the approximation of the Planckian locus covers and sRGB holds, kelvin.
+const TEMPERATURES: std::ops::RangeInclusive<f64> = 2000.0..=25_000.0;
+/// The temperature at which nothing changes: that of D65.
+const NEUTRAL: f64 = 6504.0;
+/// Gains within these bounds are of a light that a photograph shows.
+const GAINS: std::ops::RangeInclusive<f64> = 1e-3..=1e3;
+
+impl WhiteBalance {
+    /// What a white balance is written as.
+    pub(crate) const FORM: &'static str = "R,G,B of 0.001 to 1000, a colour temperature of 2000 to 25000 (kelvin), VIEW,x,y,w,h of a \
+                                    neutral area in whole pixels, or VIEW,x1,y1,..,x4,y4, the corners of a colour chart";
+
+    /// The gains, measured where they have to be in one of the photographs of `root`, each with its name.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] where its area is outside, black or clipped; [`Error::Input`] where there is no such photograph, or it
+    /// cannot be read.
+    pub(crate) fn gains<'a>(
+        &self,
+        root: &Path,
+        photographs: impl IntoIterator<Item = (&'a str, &'a Path)>,
+    ) -> Result<WhiteBalanceGains> {
+        let view = match self {
+            Self::Gains(gains) => return Ok(WhiteBalanceGains(gains.map(|gain| gain as f32))),
+            Self::Kelvin(kelvin) => return Ok(neutralising(light(*kelvin) / light(NEUTRAL))),
+            Self::Area(view, _) | Self::Chart(view, _) => view,
+        };
+        let is_called = |(name, path): &(&str, &Path)| {
+            *name == view || path.file_name().is_some_and(|file| file == view.as_str())
+        };
+        let (_, path) = photographs.into_iter().find(is_called).ok_or_else(|| {
+            let problem = format!(
+                "white balance {self}: no photograph is called `{view}`; name a view or its file"
+            );
+            Error::input(root, problem)
+        })?;
+        let gains = neutralising(self.mean_of(&Image::load(path)?)?);
+        let [red, green, blue] = gains.0;
+        tracing::info!(
+            "white balance from view {view}: gains {red:.3}, {green:.3}, {blue:.3} in linear light"
+        );
+        Ok(gains)
+    }
+
+    /// The mean linear light of what is neutral in a photograph.
+    fn mean_of(&self, image: &Image) -> Result<DVec3> {
+        /// Brighter values are clipped, or next to it.
+        const CLIPPED: f32 = 0.98;
+        /// A mean below this is black: half a code value of 8 bits.
+        const BLACK: f64 = 0.5 / 255.0 / 12.92;
+        let refused = |problem: &str| Err(Error::Usage(format!("white balance {self}: {problem}")));
+        let pixels = self.pixels();
+        let is_inside = |&[x, y]: &[u32; 2]| x < image.width && y < image.height;
+        if !pixels.iter().flatten().all(is_inside) {
+            let (width, height) = (image.width, image.height);
+            return refused(&format!(
+                "it leaves the photograph, which is {width}x{height} as it is stored"
+            ));
+        }
+        let mut sum = DVec3::ZERO;
+        let mut count = 0.0;
+        for patch in &pixels {
+            let colours = patch.iter().map(|&[x, y]| image.pixel(x, y));
+            let usable =
+                |colour: &[f32; 3]| colour.iter().all(|value| (0.0..CLIPPED).contains(value));
+            let colours: Vec<[f32; 3]> = colours.filter(usable).collect();
+            // Of a clipped patch the rest is a choice of its dark pixels.
+            if 2 * colours.len() < patch.len() {
+                continue;
+            }
+            for colour in &colours {
+                sum += DVec3::from_array(colour.map(|value| f64::from(linear_from_srgb(value))));
+            }
+            count += colours.len() as f64;
+        }
+        if count == 0.0 {
+            return refused("it is clipped; take an area that is not white");
+        }
+        let mean = sum / count;
+        if mean.min_element() < BLACK {
+            return refused("a channel of it is black; take a brighter area");
+        }
+        Ok(mean)
+    }
+
+    /// The pixels of each neutral patch, column and row; they may lie outside the photograph.
+    fn pixels(&self) -> Vec<Vec<[u32; 2]>> {
+        match self {
+            Self::Gains(_) | Self::Kelvin(_) => vec![],
+            Self::Area(_, [x, y, width, height]) => {
+                let column = |x: u32| (*y..y.saturating_add(*height)).map(move |y| [x, y]);
+                vec![(*x..x.saturating_add(*width)).flat_map(column).collect()]
+            }
+            Self::Chart(_, corners) => (0..6).map(|patch| grey_patch(*corners, patch)).collect(),
+        }
+    }
+}
+
+/// Samples of the middle of a patch of the chart's last row, columns and rows of pixels.
+fn grey_patch(corners: [[f64; 2]; 4], patch: u32) -> Vec<[u32; 2]> {
+    /// Samples each way.
+    const SAMPLES: u32 = 16;
+    let map = homography(corners);
+    let sample = |index: u32| {
+        let part = [index % SAMPLES, index / SAMPLES]
+            .map(|at| 0.3 + 0.4 * (f64::from(at) + 0.5) / f64::from(SAMPLES));
+        let place =
+            map * DVec3::new((f64::from(patch) + part[0]) / 6.0, (3.0 + part[1]) / 4.0, 1.0);
+        // A place left of or above the photograph becomes one far right or below.
+        let pixel = |value: f64| if value >= 0.0 { value as u32 } else { u32::MAX };
+        [pixel(place.x / place.z), pixel(place.y / place.z)]
+    };
+    (0..SAMPLES * SAMPLES).map(sample).collect()
+}
+
+/// The projective map of the unit square, from (0, 0) round by (1, 0), to these corners (Heckbert 1989, 2.2.3).
+fn homography(corners: [[f64; 2]; 4]) -> DMat3 {
+    let [a, b, c, d] = corners.map(DVec2::from_array);
+    let (right, down, excess) = (b - c, d - c, a - b + c - d);
+    let determinant = right.perp_dot(down);
+    let g = excess.perp_dot(down) / determinant;
+    let h = right.perp_dot(excess) / determinant;
+    let (across, along) = (b - a + g * b, d - a + h * d);
+    DMat3::from_cols(across.extend(g), along.extend(h), a.extend(1.0))
+}
+
+/// The linear sRGB of a black body (Kang et al. 2002), of luminance 1.
+fn light(kelvin: f64) -> DVec3 {
+    let t = 1e3 / kelvin;
+    let x = if kelvin <= 4000.0 {
+        ((-0.266_123_9 * t - 0.234_358_9) * t + 0.877_695_6) * t + 0.179_910
+    } else {
+        ((-3.025_846_9 * t + 2.107_037_9) * t + 0.222_634_7) * t + 0.240_390
+    };
+    let y = if kelvin <= 2222.0 {
+        ((-1.106_381_4 * x - 1.348_110_2) * x + 2.185_558_32) * x - 0.202_196_83
+    } else if kelvin <= 4000.0 {
+        ((-0.954_947_6 * x - 1.374_185_93) * x + 2.091_370_15) * x - 0.167_488_67
+    } else {
+        ((3.081_758_0 * x - 5.873_386_7) * x + 3.751_129_97) * x - 0.370_014_83
+    };
+    // IEC 61966-2-1.
+    let from_xyz = DMat3::from_cols(
+        DVec3::new(3.2406, -0.9689, 0.0557),
+        DVec3::new(-1.5372, 1.8758, -0.2040),
+        DVec3::new(-0.4986, 0.0415, 1.0570),
+    );
+    from_xyz * DVec3::new(x / y, 1.0, (1.0 - x - y) / y)
+}
+
+/// The gains that make a colour grey and keep its luminance.
+fn neutralising(linear: DVec3) -> WhiteBalanceGains {
+    let luminance = linear.dot(DVec3::new(0.2126, 0.7152, 0.0722));
+    WhiteBalanceGains((luminance / linear).to_array().map(|gain| gain as f32))
+}
+
+impl WhiteBalanceGains {
+    /// Balances a photograph.
+    pub(crate) fn apply(self, image: &mut Image) {
+        /// Values that a thread changes in one go.
+        const VALUES: usize = 1 << 14;
+        let pixels = image.pixel_count().max(1);
+        for (plane, gain) in image.data.chunks_exact_mut(pixels).zip(self.0) {
+            if gain == 1.0 {
+                continue;
+            }
+            let balance =
+                |value: &mut f32| *value = srgb_from_linear(gain * linear_from_srgb(*value));
+            plane.par_chunks_mut(VALUES).for_each(|values| values.iter_mut().for_each(balance));
+        }
+    }
+}
+
+impl FromStr for WhiteBalance {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        parsed(text).ok_or_else(|| {
+            let (key, value) = ("white_balance".to_owned(), text.to_owned());
+            Error::Setting { key, value, rule: Self::FORM.to_owned() }
+        })
+    }
+}
+
+fn parsed(text: &str) -> Option<WhiteBalance> {
+    let fields: Vec<&str> = text.split(',').map(str::trim).collect();
+    let numbers: Option<Vec<f64>> = fields.iter().map(|field| field.parse().ok()).collect();
+    match numbers.as_deref() {
+        Some(&[kelvin]) => {
+            return TEMPERATURES.contains(&kelvin).then_some(WhiteBalance::Kelvin(kelvin));
+        }
+        Some(&[red, green, blue]) => {
+            let gains = [red, green, blue];
+            return gains
+                .iter()
+                .all(|gain| GAINS.contains(gain))
+                .then_some(WhiteBalance::Gains(gains));
+        }
+        _ => {}
+    }
+    // A view's name may hold commas, or be a number.
+    let numbers_after_view = |count: usize| {
+        let (view, rest) = fields.split_at_checked(fields.len().checked_sub(count)?)?;
+        let numbers: Option<Vec<f64>> = rest.iter().map(|field| field.parse().ok()).collect();
+        (!view.concat().is_empty()).then_some((view.join(","), numbers?))
+    };
+    if let Some((view, numbers)) = numbers_after_view(8) {
+        let [a, b, c, d] = *numbers.as_chunks::<2>().0 else { return None };
+        let is_chart = homography([a, b, c, d]).is_finite();
+        return is_chart.then_some(WhiteBalance::Chart(view, [a, b, c, d]));
+    }
+    let (view, numbers) = numbers_after_view(4)?;
+    // No photograph is larger, and an area is listed pixel by pixel.
+    let is_whole = |number: &f64| (0.0..=65_536.0).contains(number) && number.fract() == 0.0;
+    let [x, y, width, height] = *numbers else { return None };
+    let is_area = numbers.iter().all(is_whole) && width > 0.0 && height > 0.0;
+    is_area.then(|| WhiteBalance::Area(view, [x, y, width, height].map(|number| number as u32)))
+}
+
+impl fmt::Display for WhiteBalance {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let listed =
+            |numbers: &[f64]| numbers.iter().map(f64::to_string).collect::<Vec<_>>().join(",");
+        match self {
+            Self::Gains(gains) => out.write_str(&listed(gains)),
+            Self::Kelvin(kelvin) => write!(out, "{kelvin}"),
+            Self::Area(view, [x, y, width, height]) => {
+                write!(out, "{view},{x},{y},{width},{height}")
+            }
+            Self::Chart(view, corners) => write!(out, "{view},{}", listed(corners.as_flattened())),
+        }
+    }
+}
+
+impl TryFrom<String> for WhiteBalance {
+    type Error = Error;
+
+    fn try_from(text: String) -> Result<Self> {
+        text.parse()
+    }
+}
+
+impl From<WhiteBalance> for String {
+    fn from(balance: WhiteBalance) -> Self {
+        balance.to_string()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+
+    /// A photograph whose pixels reflect some of a light, in linear light.
+    fn lit(light: [f32; 3], reflectance: impl Fn(u32, u32) -> f32) -> Image {
+        Image::from_fn(60, 40, |x, y| {
+            light.map(|light| srgb_from_linear(light * reflectance(x, y)))
+        })
+    }
+
+    fn saved(image: &Image) -> (PathBuf, tempfile::TempDir) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("v1.png");
+        image.save_png16(&path).unwrap();
+        (path, folder)
+    }
+
+    fn gains(text: &str, image: &Image) -> Result<[f32; 3]> {
+        let (path, _folder) = saved(image);
+        let balance: WhiteBalance = text.parse().unwrap();
+        Ok(balance.gains(Path::new("photos"), [("v1", path.as_path())])?.0)
+    }
+
+    /// Largest over smallest channel of a pixel in linear light.
+    fn cast(image: &Image, x: u32, y: u32) -> f32 {
+        let colour = image.pixel(x, y).map(linear_from_srgb);
+        colour.iter().copied().fold(0.0, f32::max) / colour.iter().copied().fold(1.0, f32::min)
+    }
+
+    #[test]
+    fn a_grey_card_makes_every_grey_neutral_and_keeps_its_luminance() {
+        let mut image = lit([0.06, 0.03, 0.015], |x, y| 0.1 + 0.8 * ((x + y) as f32 / 98.0));
+        let found = gains("v1,20,10,4,4", &image).unwrap();
+        WhiteBalanceGains(found).apply(&mut image);
+        for (x, y) in [(0, 0), (30, 20), (59, 39)] {
+            assert!(cast(&image, x, y) < 1.002, "{:?}", image.pixel(x, y));
+        }
+        let weights = [0.2126, 0.7152, 0.0722];
+        let before: f32 =
+            [0.06, 0.03, 0.015].iter().zip(weights).map(|(light, weight)| light * weight).sum();
+        let grey = linear_from_srgb(image.pixel(59, 39)[0]);
+        assert!((grey / (0.9 * before) - 1.0).abs() < 2e-3, "{grey} {before}");
+    }
+
+    #[test]
+    fn a_chart_that_is_seen_aslant_gives_its_greys() {
+        // Only where the greys of the chart lie the photograph is neutral but for the light.
+        let corners = [[10.0, 5.0], [50.0, 8.0], [46.0, 32.0], [14.0, 35.0]];
+        let map = homography(corners).inverse();
+        let light = [0.3, 0.2, 0.1];
+        let image = Image::from_fn(60, 40, |x, y| {
+            let place = map * DVec3::new(f64::from(x) + 0.5, f64::from(y) + 0.5, 1.0);
+            let [u, v] = [place.x / place.z, place.y / place.z];
+            let is_grey = (0.75..1.0).contains(&v) && (0.0..1.0).contains(&u);
+            let grey = [0.9, 0.6, 0.36, 0.2, 0.09, 0.03][((6.0 * u) as usize).min(5)];
+            light.map(|light: f32| srgb_from_linear(if is_grey { light * grey } else { 0.5 }))
+        });
+        let listed: Vec<String> = corners.as_flattened().iter().map(f64::to_string).collect();
+        let [red, green, blue] = gains(&format!("v1,{}", listed.join(",")), &image).unwrap();
+        assert!((red * 0.3 / (green * 0.2) - 1.0).abs() < 1e-2, "{red} {green} {blue}");
+        assert!((blue * 0.1 / (green * 0.2) - 1.0).abs() < 1e-2, "{red} {green} {blue}");
+    }
+
+    #[test]
+    fn a_temperature_is_that_of_the_light() {
+        let of = |kelvin: f64| WhiteBalance::Kelvin(kelvin).gains(Path::new(""), []).unwrap().0;
+        assert!(of(6504.0).iter().all(|gain| (gain - 1.0).abs() < 1e-3), "{:?}", of(6504.0));
+        // Illuminant A, 2856 K: x = .44757, y = .40745, beside D65.
+        let [red, green, blue] = of(2856.0);
+        let (x, y) = (0.447_57, 0.407_45);
+        let xyz = [x / y, 1.0, (1.0 - x - y) / y];
+        let linear = [
+            3.2406 * xyz[0] - 1.5372 - 0.4986 * xyz[2],
+            -0.9689 * xyz[0] + 1.8758 + 0.0415 * xyz[2],
+            0.0557 * xyz[0] - 0.2040 + 1.0570 * xyz[2],
+        ];
+        let expected = [linear[1] / linear[0], linear[1] / linear[2]];
+        for (own, expected) in [red / green, blue / green].into_iter().zip(expected) {
+            // D65 lies beside the locus of black bodies.
+            assert!((own / expected - 1.0).abs() < 0.08, "{own} {expected}");
+        }
+        assert!(of(10_000.0)[0] > 1.0 && of(10_000.0)[2] < 1.0);
+    }
+
+    #[test]
+    fn gains_of_one_keep_every_bit() {
+        let image = lit([0.06, 0.03, 0.015], |x, _| x as f32 / 60.0);
+        let mut balanced = image.clone();
+        WhiteBalanceGains([1.0; 3]).apply(&mut balanced);
+        assert_eq!(balanced, image);
+        WhiteBalanceGains([1.0, 1.0, 2.0]).apply(&mut balanced);
+        assert_eq!(balanced.data[..2 * 2400], image.data[..2 * 2400]);
+    }
+
+    #[test]
+    fn what_is_written_is_read_again() {
+        for text in [
+            "1.5,1,0.8",
+            "5200",
+            "v1,1,2,30,40",
+            "a,b,1,2,3,4",
+            "007,1,2,3,4",
+            "v1,1,2,30.5,2,31,40,0,39",
+        ] {
+            let balance: WhiteBalance = text.parse().unwrap();
+            assert_eq!(balance.to_string(), text);
+        }
+    }
+
+    #[test]
+    fn what_makes_no_sense_is_refused_in_a_line() {
+        for text in [
+            "",
+            "1,2",
+            "0,1,1",
+            "-1,1,1",
+            "NaN,1,1",
+            "inf,1,1",
+            "1500",
+            "40000",
+            "1e5,1,1",
+            "v1,1,2,0,4",
+            "v1,-1,2,3,4",
+            "v1,1.5,2,3,4",
+            "v1,1,1,1,1,1,1,1,1",
+            ",1,2,3,4",
+            "warm",
+        ] {
+            let message = text.parse::<WhiteBalance>().unwrap_err().to_string();
+            assert!(
+                message.starts_with("white_balance is ") && message.lines().count() == 1,
+                "{text}: {message}"
+            );
+        }
+        let image = lit([1.0, 0.5, 0.0], |x, _| if x < 30 { 0.0 } else { 2.0 });
+        for (text, part) in [
+            ("v2,1,2,3,4", "no photograph is called `v2`"),
+            ("v1,58,2,3,4", "leaves the photograph, which is 60x40"),
+            ("v1,1,65536,3,4", "leaves the photograph"),
+            ("v1,-5,0,40,0,40,30,-5,30", "leaves the photograph"),
+            ("v1,1,2,3,4", "is black"),
+            ("v1,40,2,3,4", "is clipped"),
+        ] {
+            let message = gains(text, &image).unwrap_err().to_string();
+            assert!(message.contains(part) && message.lines().count() == 1, "{text}: {message}");
+        }
+    }
+}

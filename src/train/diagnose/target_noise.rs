@@ -1,0 +1,211 @@
+//! Noise as it appears in a target: of the sensor, of whole codes and of JPEG together, under the tone curve.
+//!
+//! What JPEG and whole codes leave of dark photographs is flat to the code or blotched: second differences see nothing
+//! of it, and the tone curve multiplies it. So a part of the photograph is tone-mapped, and what a patch deviates from
+//! the plane through it by is taken, of the luminance Y and of the colour differences R - Y and B - Y. A patch is wider
+//! than the 16 pixels that one chroma block of JPEG covers. Of the patches of middle brightness, half show texture,
+//! which is mostly grey: the luminance is that of the first quartile, the chroma that of the median.
+
+use serde::Serialize;
+
+use super::geometry::median;
+use crate::photographs::image::Image;
+use crate::photographs::tone::{Exposure, luminance, measurable, soft};
+
+/// Side of a patch, pixels.
+const SIDE: u32 = 32;
+/// Every second pixel of a patch is looked at.
+const STRIDE: u32 = 2;
+/// Patches of a photograph, an even choice of them.
+const MOST: u32 = 400;
+/// Of the patches by their variances, the part that is below the noise of luma and of chroma.
+const QUANTILES: [f64; 2] = [0.25, 0.5];
+
+/// The standard deviation of the noise in the target of one photograph, of encoded values.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct TargetNoise {
+    /// Of the luminance.
+    pub luma: f64,
+    /// Root mean square over R - Y and B - Y.
+    pub chroma: f64,
+}
+
+impl TargetNoise {
+    /// The median of each; `None` without a value.
+    pub(super) fn median(of: impl Iterator<Item = Self>) -> Option<Self> {
+        let (luma, chroma) = of.map(|one| (one.luma, one.chroma)).unzip();
+        Some(Self { luma: median(luma)?, chroma: median(chroma)? })
+    }
+}
+
+/// The noise in the target of a photograph under the automatic curve that its own exposure asks for; `None` of one that
+/// is smaller than a patch.
+pub(super) fn target_noise(image: &Image, exposure: &Exposure) -> Option<TargetNoise> {
+    let (columns, rows) = (image.width / SIDE, image.height / SIDE);
+    let step = (columns * rows).div_ceil(MOST).max(1) as usize;
+    let places = (0..columns * rows).step_by(step);
+    let mut patches: Vec<Patch> = places
+        .map(|place| Patch::of(image, [place % columns * SIDE, place / columns * SIDE], exposure))
+        .collect();
+    patches.sort_unstable_by(|a, b| a.brightness.total_cmp(&b.brightness));
+    let quarter = patches.len() / 4;
+    let middle = &patches[quarter..patches.len() - quarter];
+    let deviation = |of: fn(&Patch) -> f64, part: f64| {
+        let mut variances: Vec<f64> = middle.iter().map(of).collect();
+        variances.sort_unstable_by(f64::total_cmp);
+        variances.get((variances.len() as f64 * part) as usize).map(|variance| variance.sqrt())
+    };
+    let [luma, chroma] = QUANTILES;
+    Some(TargetNoise {
+        luma: deviation(|patch| patch.luma, luma)?,
+        chroma: deviation(|patch| patch.chroma, chroma)?,
+    })
+}
+
+/// A square of a target.
+struct Patch {
+    brightness: f64,
+    /// Variances about the planes through it.
+    luma: f64,
+    chroma: f64,
+}
+
+impl Patch {
+    fn of(image: &Image, [left, top]: [u32; 2], exposure: &Exposure) -> Self {
+        let side = SIDE / STRIDE;
+        let mut values = [const { Vec::new() }; 3];
+        for y in 0..side {
+            for x in 0..side {
+                let stored = image.pixel(left + STRIDE * x, top + STRIDE * y);
+                let rgb = tone_mapped(stored.map(measurable), exposure);
+                let luma = f64::from(luminance(rgb));
+                let [red, _, blue] = rgb.map(f64::from);
+                for (values, value) in values.iter_mut().zip([luma, red - luma, blue - luma]) {
+                    values.push(value);
+                }
+            }
+        }
+        let [luma, red, blue] =
+            values.each_ref().map(|values| variance_about_plane(values, side as usize));
+        let brightness = values[0].iter().sum::<f64>() / values[0].len() as f64;
+        Self { brightness, luma, chroma: 0.5 * (red + blue) }
+    }
+}
+
+/// A pixel under the automatic curve, a third of it keeping the ratios of the channels.
+fn tone_mapped(rgb: [f32; 3], exposure: &Exposure) -> [f32; 3] {
+    const KEPT: f64 = 1.0 / 3.0;
+    let (gain, weight) = (exposure.gain, exposure.weight());
+    let y = f64::from(luminance(rgb)).max(1e-6);
+    let black = soft(0.0, gain);
+    let ratio = (soft(y, gain) - black) / y;
+    rgb.map(|value| {
+        let value = f64::from(value);
+        let curved = (1.0 - KEPT) * soft(value, gain) + KEPT * (black + value * ratio);
+        (value + weight * (curved - value)).min(1.0) as f32
+    })
+}
+
+/// The variance of a square of values about the plane that fits them best.
+fn variance_about_plane(values: &[f64], side: usize) -> f64 {
+    let middle = (side as f64 - 1.0) / 2.0;
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
+    let (mut squares, mut across, mut along, mut spread) = (0.0, 0.0, 0.0, 0.0);
+    for (index, value) in values.iter().enumerate() {
+        let (x, y) = ((index % side) as f64 - middle, (index / side) as f64 - middle);
+        squares += (value - mean).powi(2);
+        across += x * value;
+        along += y * value;
+        spread += x * x;
+    }
+    // Three degrees of freedom are the plane's.
+    let rest = squares - (across * across + along * along) / spread;
+    rest.max(0.0) / (values.len() - 3) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::noise;
+    use super::*;
+    use crate::base::random::Stream;
+    use crate::photographs::image::linear_from_srgb;
+    use crate::photographs::tone::LuminanceHistogram;
+
+    const SIZE: [u32; 2] = [512, 384];
+
+    fn found(image: &Image) -> TargetNoise {
+        target_noise(image, &exposure(image)).unwrap()
+    }
+
+    fn exposure(image: &Image) -> Exposure {
+        Exposure::of([&LuminanceHistogram::of(&image.data)], None).unwrap()
+    }
+
+    /// A dark gradient in every patch, with noise of this deviation in each channel, and a textured half.
+    fn dark(deviation: [f64; 3]) -> Image {
+        let stream = Stream::new(3, 0);
+        Image::from_fn(SIZE[0], SIZE[1], |x, y| {
+            let texture =
+                if x < SIZE[0] / 2 { 0.0 } else { 0.02 * f64::from(x % 7 + y % 5) / 10.0 };
+            let signal = 0.04 + 0.02 * f64::from(y) / f64::from(SIZE[1]) + texture;
+            let draw = 3 * u64::from(y * SIZE[0] + x);
+            [0, 1, 2].map(|channel| {
+                (signal + deviation[channel] * stream.normal(draw + channel as u64)) as f32
+            })
+        })
+    }
+
+    #[test]
+    fn noise_of_each_channel_is_found_as_the_curve_leaves_it() {
+        let image = dark([0.002; 3]);
+        let gain = exposure(&image).gain;
+        // Of the middle of the flat half; the curve is next to linear in the noise.
+        let slope = (soft(0.051, gain) - soft(0.049, gain)) / 0.002;
+        let kept = (soft(0.05, gain) - soft(0.0, gain)) / 0.05;
+        let own = 2.0 / 3.0 * slope + kept / 3.0;
+        let weights = [0.299, 0.587, 0.114];
+        let squares = |of: [f64; 3]| of.iter().map(|weight| weight * weight).sum::<f64>().sqrt();
+        let chroma = |channel: usize| {
+            let mut of = weights.map(|weight| -weight);
+            of[channel] += 1.0;
+            squares(of)
+        };
+        let chroma = (0.5 * (chroma(0).powi(2) + chroma(2).powi(2))).sqrt();
+        let found = found(&image);
+        assert!((found.luma / (0.002 * slope * squares(weights)) - 1.0).abs() < 0.15, "{found:?}");
+        assert!((found.chroma / (0.002 * own * chroma) - 1.0).abs() < 0.15, "{found:?}");
+    }
+
+    #[test]
+    fn a_clean_photograph_has_none_and_a_small_one_tells_none() {
+        let found = found(&dark([0.0; 3]));
+        assert!(found.luma < 3e-3 && found.chroma < 3e-3, "{found:?}");
+        let small = Image::filled(31, 200, [0.1; 3]);
+        assert_eq!(target_noise(&small, &exposure(&small)), None);
+    }
+
+    #[test]
+    fn jpeg_of_a_dark_photograph_shows_where_the_sensor_seems_quiet() {
+        let stored = dark([0.004, 0.004, 0.006]).to_jpeg(90).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.jpg");
+        std::fs::write(&path, stored).unwrap();
+        let image = Image::load(&path).unwrap();
+        let linear: Vec<f32> = image.data.iter().map(|&value| linear_from_srgb(value)).collect();
+        let patches = noise::patches(&linear[..image.pixel_count()], SIZE[0] as usize, 1.0 / 255.0);
+        let sensor = noise::fit(patches).map_or(0.0, |noise| noise.deviation(0.004));
+        let found = found(&image);
+        assert!(found.chroma > 0.005 && found.luma > 0.005, "{found:?}, sensor {sensor}");
+        assert!(sensor < 5e-4, "{found:?}, sensor {sensor}");
+    }
+
+    #[test]
+    fn whole_codes_show_too() {
+        let plain = dark([0.002; 3]);
+        let data = plain.data.iter().map(|x| (x * 255.0).round() / 255.0).collect();
+        let [plain, coded] =
+            [plain.clone(), Image { data, ..plain }].map(|image| found(&image).luma);
+        // A step of a code adds its square over 12 to the variance of half a code in each channel.
+        assert!((coded / plain - 1.155).abs() < 0.08, "{coded} {plain}");
+    }
+}

@@ -1,0 +1,136 @@
+//! Photographs in other colour spaces, and white balance, in a dataset.
+
+use std::fs;
+use std::path::Path;
+
+use nightsplat::LoadOptions;
+use nightsplat::photographs::dataset::{Dataset, View};
+use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
+
+use super::synthetic::*;
+use super::{load, view};
+use crate::common::command::{refused, run};
+
+/// Puts a chunk in front of the pixels of a PNG.
+fn put_chunk(path: &Path, name: &[u8; 4], data: &[u8]) {
+    let mut file = fs::read(path).unwrap();
+    let body = [&name[..], data].concat();
+    let crc = !body.iter().fold(u32::MAX, |crc, &byte| {
+        (0..8).fold(crc ^ u32::from(byte), |crc, _| (crc >> 1) ^ (0xEDB8_8320 * (crc & 1)))
+    });
+    let chunk = [&(data.len() as u32).to_be_bytes()[..], &body, &crc.to_be_bytes()].concat();
+    // Behind the signature and IHDR.
+    file.splice(33..33, chunk);
+    fs::write(path, file).unwrap();
+}
+
+/// Says that every picture of a folder is linear light.
+fn mark_linear(folder: &Path) {
+    for entry in fs::read_dir(folder).unwrap() {
+        put_chunk(&entry.unwrap().path(), b"gAMA", &100_000_u32.to_be_bytes());
+    }
+}
+
+fn pixel(view: &View) -> [f32; 3] {
+    view.loaded().unwrap().unwrap().pixel(9, 9)
+}
+
+#[test]
+fn photographs_and_references_become_srgb_and_masks_do_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    lom(root, 10, &[2, 5]);
+    let before = load(root);
+    mark_linear(&root.join("low"));
+    mark_linear(&root.join("high"));
+    // A mask of 0.4 hides; as linear light it would be 0.66 and show.
+    fs::create_dir(root.join("masks")).unwrap();
+    let mask = root.join("masks/v03.png");
+    Image::from_fn(SIZE.0, SIZE.1, |x, _| [if x < 4 { 0.4 } else { 1.0 }; 3])
+        .save_png8(&mask)
+        .unwrap();
+    mark_linear(&root.join("masks"));
+    let after = load(root);
+    for (before, after) in before.views.iter().zip(&after.views) {
+        let expected = pixel(before).map(srgb_from_linear);
+        let off = pixel(after).iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(off < 1e-5, "{}: {:?} for {expected:?}", after.name, pixel(after));
+        if let (Some(before), Some(after)) = (&before.reference, &after.reference) {
+            assert!((after.data[0] - srgb_from_linear(before.data[0])).abs() < 1e-5);
+        }
+    }
+    let hidden = view(&after, "v03").mask.as_ref().unwrap();
+    assert_eq!(hidden.weights.iter().filter(|&&weight| weight == 0.0).count(), 4 * SIZE.1 as usize);
+    let (_, message) = run(&format!("tone apply {}", root.display()), 0);
+    let lines: Vec<&str> =
+        message.lines().filter(|line| line.contains("converted to sRGB")).collect();
+    assert_eq!(lines.len(), 1, "{message}");
+    assert!(lines[0].contains("photographs in sRGB at gamma 1.00"), "{message}");
+}
+
+#[test]
+fn a_profile_that_cannot_be_used_is_named_once_for_the_dataset() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    lom(root, 10, &[2, 5]);
+    for entry in fs::read_dir(root.join("low")).unwrap() {
+        put_chunk(&entry.unwrap().path(), b"iCCP", b"name\0\0damaged");
+    }
+    let (_, message) = run(&format!("diagnose {}", root.display()), 0);
+    let lines: Vec<&str> =
+        message.lines().filter(|line| line.contains("a damaged ICC profile")).collect();
+    assert_eq!(lines.len(), 1, "{message}");
+}
+
+/// The photographs of a dataset under the light of a lamp.
+fn lamp_lit(root: &Path) {
+    lom(root, 10, &[2, 5]);
+    for entry in fs::read_dir(root.join("low")).unwrap() {
+        let path = entry.unwrap().path();
+        let grey = Image::load(&path).unwrap().data[0];
+        let lit = [2.0, 1.0, 0.5].map(|light| srgb_from_linear(light * linear_from_srgb(grey)));
+        Image::filled(SIZE.0, SIZE.1, lit).save_png16(&path).unwrap();
+    }
+}
+
+#[test]
+fn one_grey_card_balances_every_photograph_kept_or_read_anew() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    lamp_lit(root);
+    let balanced = |keep: Option<u64>, white: &str| {
+        let white_balance = Some(white.parse().unwrap());
+        Dataset::load(root, &LoadOptions { white_balance, keep, ..LoadOptions::default() }).unwrap()
+    };
+    let (stored, kept) = (load(root), balanced(None, "v03,2,2,5,5"));
+    for (own, stored) in kept.views.iter().zip(&stored.views) {
+        let [red, green, blue] = pixel(own);
+        assert!((red - green).abs() < 1e-4 && (blue - green).abs() < 1e-4, "{}", own.name);
+        assert_eq!(own.reference, stored.reference);
+    }
+    let anew = balanced(Some(0), "v03.png,2,2,5,5");
+    for (own, kept) in anew.views.iter().zip(&kept.views) {
+        assert!(own.image.is_none());
+        assert_eq!(*own.loaded().unwrap().unwrap(), *kept.loaded().unwrap().unwrap());
+    }
+    let same = balanced(None, "1,1,1");
+    assert!(same.views.iter().zip(&stored.views).all(|(a, b)| a.image == b.image));
+}
+
+#[test]
+fn a_white_balance_that_cannot_be_is_refused_in_a_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    lamp_lit(root);
+    let out = root.join("run");
+    for (white, code, part) in [
+        ("0,1,1", 2, "white_balance (--white-balance) is \"0,1,1\"; it must be R,G,B"),
+        ("warm", 2, "(--white-balance) is \"warm\""),
+        ("v99,2,2,5,5", 3, "no photograph is called `v99`"),
+        ("v03,39,2,5,5", 2, "it leaves the photograph, which is 40x30"),
+    ] {
+        let arguments =
+            format!("train {} --out {} --white-balance {white}", root.display(), out.display());
+        refused(&arguments, code, &[part]);
+    }
+}

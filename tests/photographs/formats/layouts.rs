@@ -1,0 +1,369 @@
+//! Folders as tools leave them, and listings of another machine.
+
+use std::fs;
+use std::fs::File;
+use std::io::Write;
+use std::path::Path;
+
+use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat::photographs::image::Image;
+use serde_json::json;
+use zip::write::{SimpleFileOptions, ZipWriter};
+
+use super::synthetic::*;
+use super::{assert_camera_is_view, load, names, view};
+use crate::common::log::warnings;
+
+/// Nine views, each with its photograph and camera, and the points of the model.
+fn assert_whole(dataset: &Dataset, what: &str) {
+    assert_eq!(dataset.views.len(), 9, "{what}: {:?}", dataset.skipped);
+    assert!(dataset.skipped.is_empty(), "{what}: {:?}", dataset.skipped);
+    for (index, view) in dataset.views.iter().enumerate() {
+        assert_camera_is_view(view, index);
+        assert_eq!(super::level(view.image.as_ref()), Some(10.0 + index as f32), "{what}");
+    }
+    assert_eq!(dataset.points.len(), 20, "{what}");
+    assert_eq!(dataset.points[1].views, [2, 5, 8], "{what}");
+}
+
+#[test]
+fn a_model_and_its_photographs_are_found_where_tools_leave_them() {
+    for (images, model_folder) in [
+        ("images", ""),
+        ("", ""),
+        ("", "sparse/0"),
+        ("input", "sparse/0"),
+        ("input", "distorted/sparse/0"),
+        ("images", "model"),
+        ("rgb", "colmap/sparse"),
+        ("data/photos", "sparse"),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        photographs(folder.path(), images, 0..9, 1.0);
+        model(9).write_binary(&folder.path().join(model_folder));
+        assert_whole(&load(folder.path()), &format!("{images}, {model_folder}"));
+    }
+}
+
+#[test]
+fn a_model_or_listing_that_is_named_itself_is_the_dataset_around_it() {
+    let folder = tempfile::tempdir().unwrap();
+    photographs(folder.path(), "images", 0..9, 1.0);
+    for place in ["sparse/0", "sparse/1"] {
+        model(9).write_binary(&folder.path().join(place));
+    }
+    // Of the other model one camera is elsewhere.
+    let mut other = model(9);
+    other.points.truncate(7);
+    other.write_text(&folder.path().join("sparse/1"));
+    for file in ["cameras.bin", "images.bin", "points3D.bin"] {
+        fs::remove_file(folder.path().join("sparse/1").join(file)).unwrap();
+    }
+    assert_whole(&load(&folder.path().join("sparse/0")), "sparse/0");
+    assert_eq!(load(&folder.path().join("sparse/1")).points.len(), 7);
+
+    let folder = tempfile::tempdir().unwrap();
+    lom(folder.path(), 9, &[2]);
+    let dataset = load(&folder.path().join("transforms_train.json"));
+    assert_eq!(names(&dataset, Split::Test), ["v02"]);
+}
+
+#[test]
+fn shrunk_copies_scale_the_camera_and_the_largest_is_taken() {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, size) in [("images_4", (24, 18)), ("images_2", (32, 24))] {
+        (0..9).for_each(|index| {
+            photograph(&folder.path().join(name).join(format!("v0{index}.png")), size, 0.1);
+        });
+    }
+    model(9).write_binary(&folder.path().join("sparse/0"));
+    let lines = warnings(|| {
+        let dataset = load(folder.path());
+        let camera = view(&dataset, "v01").camera;
+        assert_eq!((camera.width, camera.height), (32, 24));
+        assert!((camera.focal.x - 0.8 * FOCAL.x).abs() < 1e-9);
+    });
+    assert_eq!(lines.lines().count(), 1, "{lines}");
+    assert!(lines.contains("those of the same names in images_2 are taken"), "{lines}");
+
+    let images = Some(folder.path().join("images_4"));
+    let options = LoadOptions { images, ..LoadOptions::default() };
+    let dataset = Dataset::load(folder.path(), &options).unwrap();
+    assert_eq!(view(&dataset, "v01").camera.width, 24, "where it is named, that is read");
+}
+
+#[test]
+fn a_folder_that_the_user_names_holds_the_photographs() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().join("set");
+    photographs(&root, "images", 0..9, 4.0);
+    photographs(folder.path(), "mine", 0..9, 1.0);
+    model(9).write_binary(&root.join("sparse/0"));
+    let images = Some(folder.path().join("mine"));
+    let options = LoadOptions { images, ..LoadOptions::default() };
+    assert_whole(&Dataset::load(&root, &options).unwrap(), "--images");
+    let images = Some(folder.path().join("absent"));
+    let options = LoadOptions { images, ..LoadOptions::default() };
+    assert!(Dataset::load(&root, &options).unwrap_err().to_string().contains("absent"));
+}
+
+#[test]
+fn where_two_folders_hold_the_names_none_is_guessed() {
+    let folder = tempfile::tempdir().unwrap();
+    photographs(folder.path(), "monday", 0..9, 1.0);
+    photographs(folder.path(), "tuesday", 0..9, 1.0);
+    model(9).write_binary(&folder.path().join("sparse/0"));
+    let error = Dataset::load(folder.path(), &LoadOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("monday and tuesday hold files of their names"), "{error}");
+    assert!(error.contains("--images"), "{error}");
+}
+
+#[test]
+fn paths_of_another_machine_lead_to_the_files_of_their_names_and_that_is_said_once() {
+    for before in [
+        "/home/user/scan/images/",
+        "C:\\Users\\user\\scan\\images\\",
+        "./..\\datasets\\scan\\images/",
+        "../elsewhere/",
+        "input/",
+        "scan/deep/er/",
+    ] {
+        for is_json in [true, false] {
+            let folder = tempfile::tempdir().unwrap();
+            photographs(folder.path(), "images", 0..9, 1.0);
+            let path = |index: usize| format!("{before}{}.png", name(index));
+            let mut written = model(9);
+            if is_json {
+                let frames = (0..9).map(|index| frame(index, &path(index))).collect();
+                write_json(folder.path().join("transforms.json"), &transforms(frames));
+                written.write_binary(&folder.path().join("colmap/sparse/0"));
+            } else {
+                written.images.iter_mut().for_each(|(.., name)| *name = format!("{before}{name}"));
+                written.write_text(&folder.path().join("sparse/0"));
+            }
+            let lines = warnings(|| assert_whole(&load(folder.path()), before));
+            assert_eq!(lines.lines().count(), 1, "{before}: {lines}");
+            assert!(lines.contains("9 of its photographs are not where it lists them"), "{lines}");
+        }
+    }
+}
+
+#[test]
+fn of_a_rig_on_another_machine_folders_are_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    for camera in ["left", "right"] {
+        photographs(folder.path(), &format!("images/{camera}"), 0..4, 1.0);
+    }
+    let path = |camera: &str, index: usize| format!("D:\\rig\\{camera}\\{}.png", name(index));
+    let frames = (0..4).map(|index| frame(index, &path("left", index)));
+    let frames = frames.chain((0..4).map(|index| frame(index + 4, &path("right", index))));
+    write_json(folder.path().join("transforms.json"), &transforms(frames.collect()));
+    let dataset = load(folder.path());
+    assert_eq!(dataset.views.len(), 8);
+    assert_camera_is_view(view(&dataset, "right_v01"), 5);
+}
+
+#[test]
+fn test_photographs_that_are_kept_back_are_looked_for_nowhere_else() {
+    let folder = tempfile::tempdir().unwrap();
+    photographs(folder.path(), "train", 0..8, 1.0);
+    photographs(folder.path(), "elsewhere", 0..8, 1.0);
+    let listed = |split: &str, views: std::ops::Range<usize>| {
+        transforms(views.map(|index| frame(index, &format!("{split}/{}", name(index)))).collect())
+    };
+    write_json(folder.path().join("transforms_train.json"), &listed("train", 0..6));
+    write_json(folder.path().join("transforms_test.json"), &listed("test", 6..8));
+    let dataset = load(folder.path());
+    assert!(dataset.test_views().all(|view| view.image.is_none() && view.reference.is_none()));
+}
+
+#[test]
+fn splits_may_hold_equal_names() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    for (split, views) in [("train", 0..5), ("val", 5..7), ("test", 7..9)] {
+        let frames = views.clone().enumerate().map(|(k, index)| {
+            photograph(&root.join(split).join(format!("r_{k}.png")), SIZE, dark(index));
+            frame(index, &format!("./{split}/r_{k}"))
+        });
+        let listing = json!({ "camera_angle_x": 1.0, "frames": frames.collect::<Vec<_>>() });
+        write_json(root.join(format!("transforms_{split}.json")), &listing);
+    }
+    let dataset = load(root);
+    assert_eq!(names(&dataset, Split::Test), ["test_r_0", "test_r_1"]);
+    assert_eq!(names(&dataset, Split::Train).len(), 5);
+    assert!(names(&dataset, Split::Train).contains(&"train_r_1"));
+}
+
+#[test]
+fn names_are_compared_however_unicode_writes_them() {
+    let (composed, decomposed) = ("K\u{fc}che", "Ku\u{308}che");
+    for (on_disk, listed) in [(composed, decomposed), (decomposed, composed)] {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str, index: usize| format!("{name} {index}.png");
+        for index in 0..9 {
+            let file = folder.path().join("images").join(path(on_disk, index));
+            photograph(&file, SIZE, dark(index));
+        }
+        let mut written = model(9);
+        for (.., name) in &mut written.images {
+            let index: usize = name[1..3].parse().unwrap();
+            *name = path(listed, index);
+        }
+        written.write_binary(&folder.path().join("sparse/0"));
+        fs::write(folder.path().join("test.txt"), path(on_disk, 3)).unwrap();
+        let dataset = load(folder.path());
+        assert_whole(&dataset, on_disk);
+        assert_eq!(names(&dataset, Split::Test), [format!("{composed} 3")]);
+    }
+}
+
+#[test]
+fn files_that_begin_with_a_dot_are_no_photographs() {
+    let folder = tempfile::tempdir().unwrap();
+    photographs(folder.path(), "images", 0..9, 1.0);
+    for index in 0..9 {
+        let name = format!("images/._{}.png", name(index));
+        fs::write(folder.path().join(name), b"\0\x05\x16\x07Mac OS X").unwrap();
+    }
+    fs::write(folder.path().join("images/._a.heic"), "x").unwrap();
+    model(9).write_binary(&folder.path().join("sparse/0"));
+    let lines = warnings(|| assert_whole(&load(folder.path()), "dot files"));
+    assert_eq!(lines, "");
+}
+
+/// Packs a folder into an archive, below `prefix`.
+pub(super) fn pack(from: &Path, zip: &Path, prefix: &str) {
+    let mut writer = ZipWriter::new(File::create(zip).unwrap());
+    let packed = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Deflated);
+    let mut folders = vec![from.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(&folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            let name = path.strip_prefix(from).unwrap().to_str().unwrap();
+            writer.start_file(format!("{prefix}{name}"), packed).unwrap();
+            writer.write_all(&fs::read(&path).unwrap()).unwrap();
+        }
+    }
+    writer.start_file("__MACOSX/._x.png", packed).unwrap();
+    writer.finish().unwrap();
+}
+
+#[test]
+fn an_archive_is_read_in_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().join("set");
+    photographs(&root, "images", 0..9, 1.0);
+    model(9).write_binary(&root.join("sparse/0"));
+    let zip = folder.path().join("set.zip");
+    for prefix in ["", "scan/"] {
+        pack(&root, &zip, prefix);
+        assert_whole(&load(&zip), prefix);
+    }
+    // Photographs that are read anew as well.
+    let options = LoadOptions { keep: Some(0), ..LoadOptions::default() };
+    let dataset = Dataset::load(&zip, &options).unwrap();
+    let image = dataset.views[3].loaded().unwrap();
+    assert_eq!(super::level(image.as_deref()), Some(13.0));
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2, "something was unpacked");
+    // What its listing names outside it is not read.
+    let outside = folder.path().join("outside.png");
+    Image::filled(SIZE.0, SIZE.1, [0.1; 3]).save_png8(&outside).unwrap();
+    let listing = transforms(vec![
+        frame(0, outside.to_str().unwrap()),
+        frame(1, "../outside.png"),
+        frame(2, "images/v02.png"),
+    ]);
+    write_json(root.join("transforms.json"), &listing);
+    pack(&root, &zip, "");
+    let options = LoadOptions { test_every: Some(0), ..LoadOptions::default() };
+    let dataset = Dataset::load(&zip, &options).unwrap();
+    assert_eq!(names(&dataset, Split::Train), ["v02"]);
+
+    fs::write(&zip, "no archive").unwrap();
+    let error = Dataset::load(&zip, &LoadOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("set.zip: cannot be read"), "{error}");
+}
+
+#[test]
+fn a_dataset_below_or_above_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().join("a/scan");
+    photographs(&root, "images", 0..9, 1.0);
+    model(9).write_binary(&root.join("sparse/0"));
+    for (given, named) in
+        [(folder.path().to_owned(), "a/scan does"), (root.join("images"), "scan does")]
+    {
+        let error = Dataset::load(&given, &LoadOptions::default()).unwrap_err().to_string();
+        assert!(error.contains(named) && error.contains("name that"), "{error}");
+    }
+}
+
+#[test]
+fn black_borders_of_undistorted_photographs_are_masked_and_those_of_a_dark_scene_are_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let paint = |corner: f64, shift: u32| {
+        for index in 0..9 {
+            let image = Image::from_fn(SIZE.0, SIZE.1, |x, y| {
+                let (from_x, from_y) = (f64::from(x) - 19.5, f64::from(y) - 14.5);
+                let value = 0.04 + 0.05 * ((x + 3 * y + shift * index) % 7) as f32 / 7.0;
+                [if from_x.hypot(from_y) < corner { value } else { 0.0 }; 3]
+            });
+            image.save_png8(folder.path().join(format!("images/v0{index}.png"))).unwrap();
+        }
+    };
+    fs::create_dir_all(folder.path().join("images")).unwrap();
+    model(9).write_binary(&folder.path().join("sparse/0"));
+    paint(20.0, 2);
+    let lines = warnings(|| {
+        for view in &load(folder.path()).views {
+            let mask = view.mask.as_ref().unwrap();
+            assert_eq!((mask.weights[0], mask.weights[15 * 40 + 20]), (0.0, 1.0), "{}", view.name);
+        }
+    });
+    assert!(
+        lines.contains("black in the same place at the border") && lines.contains("masked"),
+        "{lines}"
+    );
+    let options = LoadOptions { mask_borders: false, ..LoadOptions::default() };
+    assert!(
+        Dataset::load(folder.path(), &options)
+            .unwrap()
+            .views
+            .iter()
+            .all(|view| view.mask.is_none())
+    );
+    paint(100.0, 2);
+    assert!(load(folder.path()).views.iter().all(|view| view.mask.is_none()));
+}
+
+#[test]
+fn references_as_dark_as_the_photographs_are_photographs() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    for (split, views) in [("train", 0..7), ("test", 7..9)] {
+        photographs(root, split, views.clone(), if split == "test" { 0.8 } else { 1.0 });
+        let frames = views.map(|index| frame(index, &format!("{split}/{}.png", name(index))));
+        write_json(root.join(format!("transforms_{split}.json")), &transforms(frames.collect()));
+    }
+    let lines = warnings(|| {
+        let dataset = load(root);
+        for view in dataset.test_views() {
+            assert!(view.image.is_some() && view.reference.is_none(), "{}", view.name);
+        }
+        let options = LoadOptions { keep: Some(0), downscale: 1.5, ..LoadOptions::default() };
+        let dataset = Dataset::load(root, &options).unwrap();
+        assert!(dataset.test_views().all(|view| view.loaded().unwrap().is_some()));
+    });
+    assert!(lines.contains("2 reference images are as dark as the photographs"), "{lines}");
+    // Bright ones are references, and so are those of bright photographs.
+    photographs(root, "test", 7..9, 4.0);
+    assert!(load(root).test_views().all(|view| view.reference.is_some()));
+    photographs(root, "test", 7..9, 12.0);
+    photographs(root, "train", 0..7, 12.0);
+    assert!(load(root).test_views().all(|view| view.reference.is_some()));
+}

@@ -1,0 +1,156 @@
+//! `nightsplat pose`: which photographs share a camera, which are left out, and how COLMAP is asked again.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+
+use super::load;
+use super::pose::{photographed, stub};
+use super::synthetic::*;
+use crate::common::command::{refused, run};
+
+/// Copies a photograph and says in its Exif which focal length it was taken at, as of 35 mm film.
+fn taken_at(path: &Path, focal: u8) {
+    let exif = [
+        &b"MM\0*\0\0\0\x08\0\x01\x87\x69\0\x04\0\0\0\x01\0\0\0\x1a\0\0\0\0\0\x01\xa4\x05\0\x03\0\0\0\x01\0"[..],
+        &[focal],
+        b"\0\0\0\0\0\0",
+    ]
+    .concat();
+    let jpeg = fs::read(crate::common::fixture("jpeg/444.jpg")).unwrap();
+    let length = (exif.len() as u16 + 8).to_be_bytes();
+    let segment = [&[0xFF, 0xE1][..], &length, b"Exif\0\0", &exif].concat();
+    fs::write(path, [&jpeg[..2], &segment, &jpeg[2..]].concat()).unwrap();
+}
+
+#[test]
+fn photographs_of_one_size_lens_and_focal_length_share_a_camera() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let photos = root.join("photos");
+    fs::create_dir_all(&photos).unwrap();
+    for index in 0..6 {
+        let focal = if index % 2 == 0 { 37 } else { 75 };
+        taken_at(&photos.join(format!("{index}.jpg")), focal);
+    }
+    photograph(&photos.join("other.png"), SIZE, 0.05);
+    photograph(&photos.join("another.png"), (32, 20), 0.05);
+    let lists = root.join("lists");
+    let cases =
+        format!("feature_extractor) {{ tr '\\n' ' ' < $list; echo; }} >> {};;", lists.display());
+    let colmap = stub(root, &cases);
+    let (photos, out) = (photos.display(), root.join("scene"));
+    let (_, stderr) =
+        run(&format!("pose {photos} --out {} --colmap {}", out.display(), colmap.display()), 3);
+    assert!(stderr.contains("3 groups of photographs by size, lens and focal length"), "{stderr}");
+    let lists = fs::read_to_string(lists).unwrap();
+    let lists: BTreeSet<&str> = lists.lines().map(str::trim).collect();
+    let expected = ["0.jpg 2.jpg 4.jpg", "1.jpg 3.jpg 5.jpg", "another.png other.png"];
+    assert_eq!(lists, BTreeSet::from(expected));
+}
+
+#[test]
+fn a_photograph_that_does_not_decode_stops_nothing_and_dot_files_are_none() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let (photos, out) = (photographed(root), root.join("scene"));
+    fs::write(photos.join("broken.jpg"), "no photograph").unwrap();
+    fs::write(photos.join("._v00.png"), "Mac OS X").unwrap();
+    photograph(&photos.join("dynamic_mask_v01.png"), SIZE, 1.0);
+    model(9).write_binary(&root.join("models/0"));
+    let colmap = stub(root, &format!("mapper) cp -r {}/models/* $output;;", root.display()));
+    let arguments =
+        format!("pose {} --out {} --colmap {}", photos.display(), out.display(), colmap.display());
+    let (stdout, stderr) = run(&arguments, 0);
+    assert!(stdout.contains("9 of 9 photographs with their cameras, one calibrated"), "{stdout}");
+    assert!(stderr.contains("left out: ") && stderr.contains("broken.jpg"), "{stderr}");
+    assert!(!stderr.contains("._v00"), "{stderr}");
+    let dataset = load(&out);
+    let masked: Vec<bool> = dataset.views.iter().map(|view| view.mask.is_some()).collect();
+    // All of it moves, so that nothing is left to train on.
+    assert_eq!((dataset.views.len(), masked.contains(&true)), (8, false));
+}
+
+#[test]
+fn a_calibration_that_no_camera_has_is_said_to_be_implausible() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let photos = photographed(root);
+    for (out, fy, is_plausible) in [("good", 36.0, true), ("bad", 60.0, false)] {
+        let cameras = vec![(3, "PINHOLE", 1, vec![35.0, fy, 20.0, 15.0])];
+        Model { cameras, ..model(9) }.write_binary(&root.join("models/0"));
+        let colmap = stub(root, &format!("mapper) cp -r {}/models/* $output;;", root.display()));
+        let out = root.join(out);
+        let arguments = format!(
+            "pose {} --out {} --colmap {}",
+            photos.display(),
+            out.display(),
+            colmap.display()
+        );
+        let (stdout, stderr) = run(&arguments, 0);
+        assert_eq!(
+            stderr.contains("is implausible: its focal lengths are 71 % apart"),
+            !is_plausible,
+            "{stderr}"
+        );
+        assert!(stdout.contains("40x30 with focal length 35"), "{stdout}");
+    }
+}
+
+#[test]
+fn few_photographs_begin_with_a_closer_pair_and_options_go_to_the_command_that_has_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let (photos, out) = (photographed(root), root.join("scene"));
+    model(9).write_binary(&root.join("models/0"));
+    let copy = format!("cp -r {}/models/* $output", root.display());
+    let pose = |cases: &str, more: &str| {
+        let colmap = stub(root, cases);
+        format!(
+            "pose {} --out {} --overwrite --colmap {} {more}",
+            photos.display(),
+            out.display(),
+            colmap.display()
+        )
+    };
+    let relaxed = format!("mapper) [ \"$angle\" = 2 ] && {copy}; exit 0;;");
+    let (stdout, stderr) = run(&pose(&relaxed, ""), 0);
+    assert!(stdout.contains("9 of 9 photographs"), "{stdout}");
+    assert_eq!(stderr.matches("placed once more, from a closer pair").count(), 2, "{stderr}");
+    let log = fs::read_to_string(out.join("colmap.log")).unwrap();
+    assert!(
+        log.contains("--Mapper.init_max_forward_motion 1 --Mapper.init_min_num_inliers 50"),
+        "{log}"
+    );
+
+    // The user's value is the only one.
+    let asked = format!("mapper) [ \"$angle\" = 3 ] && {copy}; exit 0;;");
+    run(&pose(&asked, "--colmap-option Mapper.init_min_tri_angle=3"), 0);
+    let log = fs::read_to_string(out.join("colmap.log")).unwrap();
+    assert_eq!(log.matches("init_min_tri_angle").count(), 1, "{log}");
+    for (option, parts) in [
+        (
+            "Mapper.nothing=3",
+            ["Mapper.nothing", "feature_extractor, exhaustive_matcher, mapper none has"],
+        ),
+        ("Mapper.init_min_tri_angle", ["Mapper.init_min_tri_angle", "is no NAME=VALUE"]),
+    ] {
+        refused(&pose(&asked, &format!("--colmap-option {option}")), 2, &parts);
+    }
+}
+
+#[test]
+fn an_archive_of_photographs_is_posed_in_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let (photos, out) = (photographed(root), root.join("scene"));
+    let zip = root.join("photos.zip");
+    super::layouts::pack(&photos, &zip, "scan/");
+    model(9).write_binary(&root.join("models/0"));
+    let colmap = stub(root, &format!("mapper) cp -r {}/models/* $output;;", root.display()));
+    let arguments =
+        format!("pose {} --out {} --colmap {}", zip.display(), out.display(), colmap.display());
+    let (stdout, _) = run(&arguments, 0);
+    assert!(stdout.contains("9 of 9 photographs"), "{stdout}");
+    assert_eq!(load(&out).views.len(), 9);
+}
