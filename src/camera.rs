@@ -3,6 +3,7 @@
 //! Axes are those of `OpenCV` (x right, y down, z forward). Pixel coordinates: the image's corner is (0, 0), pixel
 //! centres are at +0.5.
 
+mod axes;
 #[cfg(feature = "io")]
 pub mod frame;
 mod model;
@@ -11,8 +12,10 @@ mod path;
 #[cfg(feature = "io")]
 mod poses;
 
-use glam::{DAffine3, DVec2, DVec3};
+use glam::{DAffine3, DMat3, DVec2, DVec3, Vec2Swizzles as _};
 
+#[cfg(feature = "io")]
+pub(crate) use axes::upwards;
 #[cfg(feature = "io")]
 pub use frame::TrainingFrame;
 pub use model::{CameraModel, KannalaBrandt};
@@ -111,6 +114,26 @@ impl Camera {
         all.filter(|&pixel| !is_within(corner(pixel), DVec2::ONE))
             .map(|pixel| pixel as usize)
             .collect()
+    }
+
+    /// The camera whose image is that of this one turned clockwise by quarter turns: turned about its optical axis.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn turned(&self, quarters: u32) -> Self {
+        (0..quarters % 4).fold(*self, |own, _| {
+            // Right of the turned image is up of the other, down is right.
+            let turn = DMat3::from_cols(DVec3::Y, DVec3::NEG_X, DVec3::Z);
+            Self {
+                width: own.height,
+                height: own.width,
+                focal: own.focal.yx(),
+                principal_point: DVec2::new(
+                    f64::from(own.height) - own.principal_point.y,
+                    own.principal_point.x,
+                ),
+                model: own.model,
+                view_from_world: DAffine3::from_mat3(turn) * own.view_from_world,
+            }
+        })
     }
 
     /// The same camera with another image size.
@@ -332,6 +355,24 @@ mod tests {
         let (full, other) =
             (camera().project(point).unwrap(), camera().resized(25, 30).project(point).unwrap());
         assert!(other.distance(full * DVec2::new(0.25, 0.5)) < 1e-9);
+    }
+
+    #[test]
+    fn a_turned_camera_shows_the_turned_image() {
+        let point = in_world(DVec3::new(0.3, -0.2, 1.5));
+        let DVec2 { x, y } = camera().project(point).unwrap();
+        let (width, height) = (f64::from(camera().width), f64::from(camera().height));
+        let turned = [(x, y), (height - y, x), (width - x, height - y), (y, width - x), (x, y)];
+        for (quarters, (x, y)) in (0..).zip(turned) {
+            let turned = camera().turned(quarters);
+            assert!(turned.project(point).unwrap().distance(DVec2::new(x, y)) < 1e-9, "{quarters}");
+            assert!(turned.center().distance(camera().center()) < 1e-12);
+            let is_upright = quarters % 2 == 0;
+            assert_eq!(
+                (turned.width, turned.height),
+                if is_upright { (100, 60) } else { (60, 100) }
+            );
+        }
     }
 
     const NONE: Distortion = Distortion {

@@ -188,7 +188,7 @@ pub use splats::scene::{DeviceGaussians, Features, GaussianSlice, Gaussians, Lay
 pub use {
     loss::Term,
     photographs::dataset::{Dataset, DepthOptions, LoadOptions, Original, Point, Split, View},
-    photographs::image::Mask,
+    photographs::image::{Mask, Orientation},
     photographs::metrics::Scores,
     photographs::tone::{Profile, Table, ToneCurve, ToneSettings},
     photographs::white_balance::WhiteBalance,

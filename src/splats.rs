@@ -5,6 +5,7 @@
 //!
 //! - [`attributes`]: the table of the attributes of a Gaussian
 //! - [`packed_sh`]: storage formats, and 16-bit SH coefficients
+//! - [`harmonics`]: the SH basis on the host, and its rotation
 //! - [`batches`]: buffers of Gaussians that exceed one binding
 //! - [`scene`]: Gaussians on the host and on the device, PLY
 //! - [`sort`]: scan and radix sort on the device
@@ -16,6 +17,8 @@ pub mod attributes;
 pub mod batches;
 #[cfg(feature = "io")]
 pub mod densify;
+#[cfg(any(feature = "io", feature = "check"))]
+pub mod harmonics;
 #[cfg(feature = "io")]
 pub mod optimizer;
 pub mod packed_sh;

@@ -193,6 +193,8 @@ impl Setting {
             value.as_ref().and_then(number)
         } else if let Some(values) = value.downcast_ref::<[f64; 3]>() {
             values.iter().find_map(number)
+        } else if let Some(values) = value.downcast_ref::<Option<[f64; 3]>>() {
+            values.iter().flatten().find_map(number)
         } else if let Some(value) = value.downcast_ref::<u64>() {
             whole(*value)
         } else if let Some(values) = value.downcast_ref::<[u64; 2]>() {

@@ -1,10 +1,11 @@
 //! Camera paths through the poses of photographs, for videos.
 
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
 
 use glam::{DAffine3, DMat3, DQuat, DVec3, DVec4};
 
 use super::Camera;
+use super::axes::{forward, mean, nearest_to_axes, upwards};
 use crate::{Error, Result};
 
 /// The shape of a path.
@@ -12,6 +13,8 @@ use crate::{Error, Result};
 pub enum CameraPath {
     /// A circle around the point nearest to all optical axes, at the mean height and distance of the cameras.
     Orbit,
+    /// The part of that circle which the cameras cover, there and back.
+    Arc,
     /// Two turns around the mean pose, as wide as the spread of the cameras, looking at their common point (LLFF).
     Spiral,
     /// A smooth curve through all poses, in order.
@@ -21,20 +24,61 @@ pub enum CameraPath {
 /// Turns of a spiral, with one oscillation along the optical axis.
 const TURNS: f64 = 2.0;
 
+/// Cameras surround a scene if no gap between neighbours is larger, radians.
+const SURROUNDED: f64 = 100.0 * PI / 180.0;
+
+/// Cameras that cover less of a circle count as parallel, radians.
+const MIN_ARC: f64 = 20.0 * PI / 180.0;
+
 impl CameraPath {
+    /// The path that stays where the cameras of `poses` show the scene: an orbit if they surround it, an arc if they
+    /// cover a part of the circle, a spiral if they are parallel, and a curve through all of them if they look
+    /// outwards.
+    pub fn suited(poses: &[Camera]) -> Self {
+        Self::suited_about(poses, upwards(poses))
+    }
+
+    /// The same about a given up direction, a unit vector.
+    pub(crate) fn suited_about(poses: &[Camera], up: DVec3) -> Self {
+        let Some(circle) = Circle::new(poses, up) else { return Self::Spiral };
+        let faces = |pose: &&Camera| forward(pose).dot(circle.target - pose.center()) > 0.0;
+        let facing = poses.iter().filter(faces).count();
+        let [begin, end] = circle.covered(poses);
+        if 4 * facing < 3 * poses.len() {
+            Self::Interpolate
+        } else if TAU - (end - begin) < SURROUNDED {
+            Self::Orbit
+        } else if end - begin < MIN_ARC {
+            Self::Spiral
+        } else {
+            Self::Arc
+        }
+    }
+
     /// `frames` cameras with the image size and focal lengths of the first of `poses`.
     ///
     /// # Errors
     /// [`Error::Usage`]: there is no pose, or the cameras are parallel, so that there is no point to orbit.
     pub fn cameras(self, poses: &[Camera], frames: usize) -> Result<Vec<Camera>> {
+        self.cameras_about(poses, upwards(poses), frames)
+    }
+
+    /// The same about a direction that is up, a unit vector.
+    pub(crate) fn cameras_about(
+        self,
+        poses: &[Camera],
+        up: DVec3,
+        frames: usize,
+    ) -> Result<Vec<Camera>> {
         let first = poses.first().ok_or_else(|| {
             Error::Usage("a path leads along cameras, and there are none".to_owned())
         })?;
         let at = |view_from_world| Camera { view_from_world, ..*first };
         let views: Vec<DAffine3> = match self {
             Self::Interpolate => interpolated(poses, frames),
-            Self::Orbit => orbit(poses, frames)?,
-            Self::Spiral => spiral(poses, frames),
+            Self::Orbit => orbit(poses, up, frames)?,
+            Self::Arc => arc(poses, up, frames)?,
+            Self::Spiral => spiral(poses, up, frames),
         };
         Ok(views.into_iter().map(at).collect())
     }
@@ -76,32 +120,77 @@ fn weights(t: f64) -> [f64; 4] {
     ]
 }
 
-fn orbit(poses: &[Camera], frames: usize) -> Result<Vec<DAffine3>> {
-    let target = nearest_to_axes(poses).ok_or_else(|| {
-        let problem = "the cameras look in parallel: there is no point to orbit; take --path spiral or interpolate";
-        Error::Usage(problem.to_owned())
-    })?;
-    let up = upwards(poses);
-    let offsets = poses.iter().map(|pose| pose.center() - target);
-    let level = |offset: DVec3| offset - offset.dot(up) * up;
-    let height = offsets.clone().map(|offset| offset.dot(up)).sum::<f64>() / poses.len() as f64;
-    let radius =
-        offsets.clone().map(|offset| level(offset).length()).sum::<f64>() / poses.len() as f64;
-    let begin = offsets.map(level).next().unwrap_or_default();
-    let begin = begin.try_normalize().unwrap_or_else(|| up.any_orthonormal_vector());
-    let side = up.cross(begin);
+/// A circle around what all cameras look at, as high above it and as far from it as they are on the mean.
+struct Circle {
+    target: DVec3,
+    up: DVec3,
+    /// Unit vectors to the azimuths 0, which is that of the first camera, and a quarter.
+    axes: [DVec3; 2],
+    height: f64,
+    radius: f64,
+}
+
+impl Circle {
+    /// `None` where the cameras look in parallel.
+    fn new(poses: &[Camera], up: DVec3) -> Option<Self> {
+        let target = nearest_to_axes(poses)?;
+        let offsets = poses.iter().map(|pose| pose.center() - target);
+        let level = |offset: DVec3| offset - offset.dot(up) * up;
+        let count = poses.len() as f64;
+        let height = offsets.clone().map(|offset| offset.dot(up)).sum::<f64>() / count;
+        let radius = offsets.clone().map(|offset| level(offset).length()).sum::<f64>() / count;
+        let first = offsets.map(level).next().unwrap_or_default();
+        let first = first.try_normalize().unwrap_or_else(|| up.any_orthonormal_vector());
+        Some(Self { target, up, axes: [first, up.cross(first)], height, radius })
+    }
+
+    /// World to view at an azimuth, radians.
+    fn at(&self, azimuth: f64) -> DAffine3 {
+        let Self { target, up, axes: [x, y], height, radius } = *self;
+        let (sin, cos) = azimuth.sin_cos();
+        looking(target + height * up + radius * (cos * x + sin * y), target, up)
+    }
+
+    /// The azimuths that the cameras cover, from the first to the last, without the largest gap between two neighbours.
+    fn covered(&self, poses: &[Camera]) -> [f64; 2] {
+        let azimuth = |pose: &Camera| {
+            let [x, y] = self.axes.map(|axis| axis.dot(pose.center() - self.target));
+            y.atan2(x)
+        };
+        let mut azimuths: Vec<f64> = poses.iter().map(azimuth).collect();
+        azimuths.sort_by(f64::total_cmp);
+        let next = azimuths.iter().skip(1).copied().chain([azimuths[0] + TAU]);
+        let gaps = azimuths.iter().zip(next).map(|(own, next)| (next - own, *own, next));
+        let (_, end, begin) = gaps.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
+        [begin, if end < begin { end + TAU } else { end }]
+    }
+}
+
+fn orbit(poses: &[Camera], up: DVec3, frames: usize) -> Result<Vec<DAffine3>> {
+    let circle = Circle::new(poses, up).ok_or_else(parallel)?;
+    let frame = |index: usize| circle.at(TAU * index as f64 / frames.max(1) as f64);
+    Ok((0..frames).map(frame).collect())
+}
+
+/// Slow at both ends.
+fn arc(poses: &[Camera], up: DVec3, frames: usize) -> Result<Vec<DAffine3>> {
+    let circle = Circle::new(poses, up).ok_or_else(parallel)?;
+    let [begin, end] = circle.covered(poses);
     let frame = |index: usize| {
-        let (sin, cos) = (TAU * index as f64 / frames.max(1) as f64).sin_cos();
-        let center = target + height * up + radius * (cos * begin + sin * side);
-        looking(center, target, up)
+        let along = 0.5 - 0.5 * (TAU * index as f64 / frames.max(1) as f64).cos();
+        circle.at(begin + along * (end - begin))
     };
     Ok((0..frames).map(frame).collect())
 }
 
-fn spiral(poses: &[Camera], frames: usize) -> Vec<DAffine3> {
+fn parallel() -> Error {
+    let problem = "the cameras look in parallel: there is no point to orbit; take --path spiral or interpolate";
+    Error::Usage(problem.to_owned())
+}
+
+fn spiral(poses: &[Camera], up: DVec3, frames: usize) -> Vec<DAffine3> {
     let center = mean(poses.iter().map(Camera::center));
     let forward = mean(poses.iter().map(forward)).normalize_or(DVec3::Z);
-    let up = upwards(poses);
     let middle = looking(center, center + forward, up);
     let from_middle = |pose: &Camera| middle.transform_point3(pose.center()).abs();
     let radii = [0, 1, 2].map(|axis| {
@@ -132,61 +221,13 @@ fn looking(center: DVec3, target: DVec3, up: DVec3) -> DAffine3 {
     DAffine3::from_mat3_translation(world_from_view, center).inverse()
 }
 
-/// The point with the least squared distances to the optical axes; `None` where they are almost parallel.
-fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
-    /// Smaller rotations do not determine a distance.
-    const MIN_DETERMINANT: f64 = 1e-6;
-    let (mut matrix, mut vector) = (DMat3::ZERO, DVec3::ZERO);
-    for pose in poses {
-        let axis = forward(pose);
-        let across =
-            DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
-        matrix += across;
-        vector += across * pose.center();
-    }
-    let matrix = matrix * (1.0 / poses.len() as f64);
-    let is_definite = matrix.determinant() > MIN_DETERMINANT;
-    is_definite.then(|| matrix.inverse() * (vector / poses.len() as f64))
-}
-
-/// In the world.
-fn forward(pose: &Camera) -> DVec3 {
-    pose.view_from_world.matrix3.row(2)
-}
-
-/// The world's up direction, for cameras that are held level: perpendicular to all their horizontal axes, on the side
-/// of the mean up vector. The mean of cameras on one side that look down leans.
-fn upwards(poses: &[Camera]) -> DVec3 {
-    let mut horizontal = DMat3::from_diagonal(DVec3::splat(1e-6));
-    for pose in poses {
-        let right = pose.view_from_world.matrix3.row(0);
-        let axes = [right * right.x, right * right.y, right * right.z];
-        horizontal += DMat3::from_cols(axes[0], axes[1], axes[2]) * (1.0 / poses.len() as f64);
-    }
-    // Inverse iteration converges to the eigenvector of the smallest eigenvalue.
-    let (inverse, mut up) = (horizontal.inverse(), mean(poses.iter().map(up)));
-    for _ in 0..8 {
-        up = (inverse * up).normalize_or(DVec3::NEG_Y);
-    }
-    up
-}
-
-/// In world space; an image's y points down.
-fn up(pose: &Camera) -> DVec3 {
-    -pose.view_from_world.matrix3.row(1)
-}
-
-fn mean(vectors: impl ExactSizeIterator<Item = DVec3>) -> DVec3 {
-    let count = vectors.len().max(1) as f64;
-    vectors.sum::<DVec3>() / count
-}
-
 #[cfg(test)]
 mod tests {
     use glam::DVec2;
 
     use super::*;
     use crate::camera::CameraModel;
+    use crate::camera::axes::up;
 
     const TARGET: DVec3 = DVec3::new(0.5, -0.25, 2.0);
 
@@ -246,6 +287,43 @@ mod tests {
         let refused = CameraPath::Orbit.cameras(&[poses[0], parallel], 3).unwrap_err().to_string();
         assert!(refused.contains("in parallel") && refused.contains("spiral"), "{refused}");
         assert!(CameraPath::Orbit.cameras(&[], 3).is_err());
+    }
+
+    #[test]
+    fn an_arc_goes_over_what_the_cameras_cover_and_back() {
+        let poses = ring(9, 2.25);
+        let frames = CameraPath::Arc.cameras(&poses, 16).unwrap();
+        assert!(frames.iter().all(sees_the_target_in_the_middle));
+        let [first, last] = [0, 8].map(|index| poses[index].center());
+        let [begin, middle, end] = [0, 8, 15].map(|index| frames[index].center());
+        let [there, back] = [begin.distance(first), begin.distance(last)];
+        assert!(there.min(back) < 1e-6, "{begin}");
+        let other = if there < back { last } else { first };
+        assert!(middle.distance(other) < 1e-6 && end.distance(begin) < 0.3, "{middle} {end}");
+        for frame in &frames {
+            let nearest = poses.iter().map(|pose| pose.center().distance(frame.center()));
+            assert!(nearest.fold(f64::MAX, f64::min) < 0.4, "{}", frame.center());
+        }
+    }
+
+    #[test]
+    fn the_path_that_suits_stays_where_cameras_are() {
+        // Of eight on a circle, the last are left out one by one.
+        for (count, path) in [(8, CameraPath::Orbit), (7, CameraPath::Orbit), (6, CameraPath::Arc)]
+        {
+            assert_eq!(CameraPath::suited(&ring(8, TAU)[..count]), path, "{count}");
+        }
+        assert_eq!(CameraPath::suited(&ring(9, 0.3)), CameraPath::Spiral);
+        let mut parallel = ring(1, 0.0)[0];
+        parallel.view_from_world.translation += DVec3::X;
+        assert_eq!(CameraPath::suited(&[ring(1, 0.0)[0], parallel]), CameraPath::Spiral);
+        let outwards = |mut pose: Camera| {
+            let center = pose.center();
+            pose.view_from_world = looking(center, 2.0 * center - TARGET, DVec3::NEG_Y);
+            pose
+        };
+        let outwards: Vec<Camera> = ring(8, TAU).into_iter().map(outwards).collect();
+        assert_eq!(CameraPath::suited(&outwards), CameraPath::Interpolate);
     }
 
     #[test]

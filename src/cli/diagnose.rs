@@ -53,7 +53,8 @@ pub struct DiagnoseArgs {
     /// Plan for photographs shrunk to this longest side, pixels; 0 or none: no limit [default: {max_resolution}]
     #[arg(long, value_name = "N|none", value_parser = max_resolution)]
     pub max_resolution: Option<u32>,
-    /// Balance the photographs' white before they are measured, as `train` has it: R,G,B, kelvin, VIEW,x,y,w,h or VIEW,x1,y1,..,x4,y4
+    /// Balance the photographs' white before they are measured, as `train` has it: R,G,B, kelvin, VIEW,x,y,w,h or
+    /// VIEW,x1,y1,..,x4,y4
     #[arg(long, value_name = "WHITE")]
     pub white_balance: Option<WhiteBalance>,
     /// Plan for this preset: draft, fast, balanced or best [default: balanced]

@@ -1,5 +1,7 @@
 //! `nightsplat export`: writes the model of a run in other formats.
 
+mod up;
+
 use std::path::PathBuf;
 
 use anyhow::Result;
@@ -19,6 +21,8 @@ use crate::splats::scene::{Gaussians, MAX_SH_DEGREE};
 use crate::train::TrainConfig;
 use crate::{Error, results::run};
 
+pub use up::Up;
+
 /// Write a run's model in the format of a viewer, as bright as it was trained to be.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
@@ -31,6 +35,10 @@ pub struct ExportArgs {
     /// File to write or replace [default: model.FORMAT in the run]
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
+    /// The dataset's up direction: x, y, z, -x, -y, -z or X,Y,Z. It becomes +Y in GLB and SPZ, -Y in PLY and SOG;
+    /// none keeps the dataset's axes [default: the run's for GLB, SPZ and html; none for PLY and SOG]
+    #[arg(long, value_name = "DIRECTION", allow_hyphen_values = true)]
+    pub up: Option<Up>,
     /// Version of SPZ; more programs read 3
     #[arg(long, value_name = "3|4", default_value_t = 4, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub spz: u8,
@@ -108,7 +116,9 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     if has_networks(&config) {
         tracing::warn!("{}: the networks are not exported, only the Gaussians", args.run.display());
     }
-    let provenance = provenance(args, &config);
+    let (rotation, turned) = args.rotation(&config).unwrap_or_default();
+    let gaussians = up::turned(gaussians, rotation);
+    let provenance = Provenance { rotation, ..provenance(args, &config) };
     let format = match args.to {
         To::Ply => Some(Format::Ply),
         To::Spz if args.spz == 3 => Some(Format::Spz(spz::Version::V3)),
@@ -129,7 +139,7 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     let (shown, count) = (out.display().to_string(), gaussians.count);
     let kib = std::fs::metadata(out).map_or(0, |file| file.len()).div_ceil(1024);
     let brightness = if is_model(&args.run) { "" } else { ", as bright as their targets" };
-    let wrote = format!("{shown}: {count} Gaussians in {kib} KiB{brightness}");
+    let wrote = format!("{shown}: {count} Gaussians in {kib} KiB{brightness}{turned}");
     Ok((out.clone(), wrote))
 }
 
@@ -179,6 +189,7 @@ fn provenance(args: &ExportArgs, config: &TrainConfig) -> Provenance {
         dataset,
         curve: config.tone.curve.to_string(),
         exposure: exposure.unwrap_or_else(|| "that of its targets".to_owned()),
+        ..Provenance::default()
     }
 }
 
@@ -192,7 +203,8 @@ fn page(
 ) -> Result<String> {
     let mut frame = config.frame.unwrap_or_default();
     let title = format!("{} by nightsplat", provenance.dataset);
-    let bookmarks = if has_networks(config) {
+    let up = args.up(config);
+    let (bookmarks, up) = if has_networks(config) {
         let FinishedRun { mut model_renderer, dataset, .. } = FinishedRun::open_with(
             &args.run,
             args.dataset.as_deref(),
@@ -201,10 +213,11 @@ fn page(
                 own.undistort = true;
             },
         )?;
-        bookmarks(args, gaussians.origin, &dataset, |view| {
+        let bookmarks = bookmarks(args, gaussians.origin, &dataset, |view| {
             let networks = model_renderer.render(view)?.output().clone();
             Ok(Some(("model with its networks".to_owned(), networks)))
-        })?
+        })?;
+        (bookmarks, up.unwrap_or_else(|| dataset.up()))
     } else {
         let mut config = config.clone();
         if let Some(dataset) = &args.dataset {
@@ -217,10 +230,11 @@ fn page(
         if is_model(&args.run) {
             frame = dataset.frame();
         }
-        bookmarks(args, gaussians.origin, &dataset, |_| Ok(None))?
+        let bookmarks = bookmarks(args, gaussians.origin, &dataset, |_| Ok(None))?;
+        (bookmarks, up.unwrap_or_else(|| dataset.up()))
     };
     let near = f64::from(config.render_settings().near) / frame.scale;
-    Ok(Page { title, gaussians, provenance, bookmarks, near }.html()?)
+    Ok(Page { title, gaussians, provenance, bookmarks, near, up }.html()?)
 }
 
 fn bookmarks(
@@ -241,10 +255,13 @@ fn bookmarks(
             view.loaded_reference()?.map(|image| ("reference".to_owned(), image.into_owned())),
             rendered(view)?,
         ];
+        // A mirrored photograph is of a mirrored world, which the page shows as it is.
+        let turned =
+            |(label, image): (String, Image)| (label, image.turned(view.orientation.turn()));
         Ok(Bookmark {
             name: view.name.clone(),
-            camera: moved(&view.camera, origin),
-            pictures: pictures.into_iter().flatten().collect(),
+            camera: moved(&view.upright_camera(), origin),
+            pictures: pictures.into_iter().flatten().map(turned).collect(),
         })
     };
     (0..count).map(bookmark).collect()

@@ -159,8 +159,8 @@ pub fn run(args: &PoseArgs) -> Result<()> {
     for lens in &lenses {
         if let Some(problem) = cameras::implausible(lens) {
             tracing::warn!(
-                "the calibration of {} is implausible: {problem}; photographs of several lenses may share it, or show too little \
-                 in common",
+                "the calibration of {} is implausible: {problem}; photographs of several lenses may \
+                 share it, or overlap too little",
                 cameras::shown(lens)
             );
         }

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use glam::DVec3;
 
 use super::words::Words;
 use super::{ImageFormat, finish, progress_bar, word};
@@ -11,11 +12,12 @@ use crate::base::output::{check_writable, create_folder, printable};
 use crate::camera::{Camera, CameraPath};
 use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::{Dataset, Split, View};
-use crate::photographs::image::Image;
+use crate::photographs::image::{Image, Orientation};
 use crate::results::eval::RenderLayer;
 use crate::results::finished_run::FinishedRun;
 use crate::results::video;
 use crate::results::view_exposures::ViewExposures;
+use crate::train::TrainConfig;
 
 /// Render a run from the cameras of its dataset, or along a path through them.
 ///
@@ -64,26 +66,43 @@ pub struct RenderArgs {
 
 const EXAMPLES: &str = "Examples:
   nightsplat render run --split test --out pictures
-  nightsplat render run --path orbit --frames 180 --out frames --video orbit.mp4
-  nightsplat render run --path interpolate --out frames --video flight.png";
+  nightsplat render run --path auto --frames 180 --out frames --video flight.mp4
+  nightsplat render run --path interpolate --out frames --video moving.png";
 
 /// A camera path on the command line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum PathChoice {
+    /// Orbit, arc, spiral or interpolate, whichever stays where the cameras are
+    Auto,
     /// Circle around the point nearest to all optical axes
     Orbit,
+    /// The part of the orbit that the cameras cover, there and back
+    Arc,
     /// Two turns about the mean camera, for photographs from one side
     Spiral,
     /// Smooth path through all training cameras by name
     Interpolate,
 }
 
-impl From<PathChoice> for CameraPath {
-    fn from(path: PathChoice) -> Self {
-        match path {
-            PathChoice::Orbit => Self::Orbit,
-            PathChoice::Spiral => Self::Spiral,
-            PathChoice::Interpolate => Self::Interpolate,
+impl PathChoice {
+    /// The path about what is up; says which one suits the cameras where that is asked.
+    fn path(self, poses: &[Camera], up: DVec3) -> CameraPath {
+        match self {
+            Self::Auto => {
+                let path = CameraPath::suited_about(poses, up);
+                let reason = match path {
+                    CameraPath::Orbit => "an orbit: the cameras surround the scene",
+                    CameraPath::Arc => "an arc: the cameras stand on a part of the circle",
+                    CameraPath::Spiral => "a spiral: the cameras look in parallel",
+                    CameraPath::Interpolate => "through all cameras: they look outwards",
+                };
+                tracing::info!("the path is {reason}");
+                path
+            }
+            Self::Orbit => CameraPath::Orbit,
+            Self::Arc => CameraPath::Arc,
+            Self::Spiral => CameraPath::Spiral,
+            Self::Interpolate => CameraPath::Interpolate,
         }
     }
 }
@@ -114,6 +133,8 @@ struct Shot {
     /// File name without extension.
     name: String,
     camera: Camera,
+    /// How its image is turned to be what people see.
+    orientation: Orientation,
 }
 
 /// Renders the views or the path.
@@ -129,24 +150,28 @@ pub fn run(args: &RenderArgs) -> Result<()> {
         return Err(Error::Usage(problem).into());
     }
     args.video.iter().chain([out]).try_for_each(|path| check_writable(path))?;
-    let FinishedRun { dataset, mut model_renderer, .. } =
+    let FinishedRun { config, dataset, mut model_renderer, .. } =
         FinishedRun::open(run, args.dataset.as_deref(), device.as_ref())?;
     let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
-    let shots = shots(args, &dataset)?;
+    let shots = shots(args, &config, &dataset)?;
     make_folder(out, &dataset, run)?;
     let bar = progress_bar(shots.len());
-    for Shot { name, camera } in &shots {
+    for Shot { name, camera, orientation } in &shots {
         bar.set_message(printable(name).into_owned());
         let path = file(out, name, *format);
-        let color = |image: Image| match &exposures {
-            Some(exposures) => format.save(&exposures.applied(name, image), &path),
-            None => format.save(&image, &path),
+        let color = |image: Image| {
+            let image = image.turned(*orientation);
+            match &exposures {
+                Some(exposures) => format.save(&exposures.applied(name, image), &path),
+                None => format.save(&image, &path),
+            }
         };
         match layer {
             None => color(model_renderer.render_camera(camera)?.output().clone())?,
             Some(layer) if layer.is_color() => color(model_renderer.layer(camera, *layer)?)?,
             Some(layer) => {
-                save_numbers(model_renderer.layer(camera, *layer)?, *layer, *format, &path)?;
+                let numbers = model_renderer.layer(camera, *layer)?.turned(*orientation);
+                save_numbers(numbers, *layer, *format, &path)?;
             }
         }
         bar.inc(1);
@@ -166,25 +191,31 @@ fn file(folder: &Path, name: &str, format: ImageFormat) -> PathBuf {
 }
 
 /// The images to render.
-fn shots(args: &RenderArgs, dataset: &Dataset) -> crate::Result<Vec<Shot>> {
+fn shots(args: &RenderArgs, config: &TrainConfig, dataset: &Dataset) -> crate::Result<Vec<Shot>> {
     let Some(path) = args.path else {
         let includes = |view: &&View| args.split.is_none_or(|split| split.includes(view));
         let views = dataset.views.iter().filter(includes);
-        let shots: Vec<Shot> =
-            views.map(|view| Shot { name: view.name.clone(), camera: view.camera }).collect();
+        let shot = |view: &View| {
+            let View { name, camera, orientation, .. } = view;
+            Shot { name: name.clone(), camera: *camera, orientation: *orientation }
+        };
+        let shots: Vec<Shot> = views.map(shot).collect();
         if shots.is_empty() {
             let problem = "has no view of that split; try --split all";
             return Err(Error::input(&dataset.root, problem));
         }
         return Ok(shots);
     };
-    let poses: Vec<Camera> = dataset.train_views().map(|view| view.camera).collect();
-    let cameras = CameraPath::from(path).cameras(&poses, args.frames as usize)?.into_iter();
+    let poses: Vec<Camera> = dataset.train_views().map(View::upright_camera).collect();
+    let up = config.up.and_then(|up| DVec3::from_array(up).try_normalize());
+    let up = up.unwrap_or_else(|| dataset.up());
+    let cameras = path.path(&poses, up).cameras_about(&poses, up, args.frames as usize)?;
+    // A mirrored photograph is of a mirrored world.
+    let first = dataset.train_views().next().map(|view| view.orientation.mirror());
+    let orientation = first.unwrap_or_default();
     // Numbered as ffmpeg expects.
-    Ok(cameras
-        .zip(0..)
-        .map(|(camera, index)| Shot { name: format!("{index:05}"), camera })
-        .collect())
+    let shot = |(index, camera)| Shot { name: format!("{index:05}"), camera, orientation };
+    Ok((0..).zip(cameras).map(shot).collect())
 }
 
 /// Saves a layer that is not colour; EXR keeps the values.

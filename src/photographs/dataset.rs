@@ -32,6 +32,7 @@ mod split;
 mod stamp;
 pub mod synthetic;
 mod transforms;
+mod turns;
 mod undistort;
 mod unused;
 
@@ -43,7 +44,7 @@ use glam::{DVec3, UVec2};
 
 use crate::camera::{Camera, Lens};
 use crate::photographs::image::files::Files;
-use crate::photographs::image::{Image, Mask, MaskFile};
+use crate::photographs::image::{Image, Mask, MaskFile, Orientation};
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 pub use fingerprint::Fingerprint;
@@ -80,8 +81,11 @@ pub struct View {
     pub name: String,
     /// Whether it is trained on or scored.
     pub split: Split,
-    /// Undistorted, at the loaded resolution.
+    /// Undistorted, at the loaded resolution; where the photograph's Exif turns it, this is of the pixels as they are stored
+    /// unless the dataset's sizes say otherwise.
     pub camera: Camera,
+    /// How its images are turned to be what people see.
+    pub orientation: Orientation,
     /// The photograph to train on; of every training view it is here, or is read anew whenever it is looked at
     /// ([`View::loaded`]).
     pub image: Option<Image>,
@@ -106,6 +110,7 @@ impl View {
             name: name.to_owned(),
             split,
             camera,
+            orientation: Orientation::UPRIGHT,
             image,
             original: None,
             reference: None,
@@ -113,6 +118,17 @@ impl View {
             mask: None,
             depth: None,
         }
+    }
+
+    /// The camera as people see its images, mirrored ones as they are stored: turned about its optical axis.
+    pub fn upright_camera(&self) -> Camera {
+        self.camera.turned(self.orientation.quarters())
+    }
+
+    /// An image of its camera as people see it.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn upright(&self, image: Image) -> Image {
+        image.turned(self.orientation)
     }
 
     /// Whether the view is trained on.

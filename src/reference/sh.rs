@@ -1,38 +1,9 @@
-//! Real spherical harmonics to degree 3, as `include/sh.glsl` has them, in f64.
+//! Real spherical harmonics to degree 3 and their derivatives, as `include/sh.glsl` has them, in f64.
 
 use glam::DVec3;
 
-use crate::kernels::sh::{SH_C0, SH_C1, SH_C2, SH_C3};
-
-/// Coefficients per colour up to a degree.
-pub fn sh_count(degree: u32) -> usize {
-    (degree as usize + 1).pow(2)
-}
-
-/// The basis in the unit direction `d`; entries above `degree` are zero.
-pub fn sh_basis(degree: u32, d: DVec3) -> [f64; 16] {
-    let [x, y, z] = d.to_array();
-    let mut basis = [
-        SH_C0,
-        -SH_C1 * y,
-        SH_C1 * z,
-        -SH_C1 * x,
-        SH_C2[0] * x * y,
-        SH_C2[1] * y * z,
-        SH_C2[2] * (2.0 * z * z - x * x - y * y),
-        SH_C2[3] * x * z,
-        SH_C2[4] * (x * x - y * y),
-        SH_C3[0] * y * (3.0 * x * x - y * y),
-        SH_C3[1] * x * y * z,
-        SH_C3[2] * y * (4.0 * z * z - x * x - y * y),
-        SH_C3[3] * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y),
-        SH_C3[4] * x * (4.0 * z * z - x * x - y * y),
-        SH_C3[5] * z * (x * x - y * y),
-        SH_C3[6] * x * (x * x - 3.0 * y * y),
-    ];
-    basis[sh_count(degree)..].fill(0.0);
-    basis
-}
+use crate::kernels::sh::{SH_C1, SH_C2, SH_C3};
+pub use crate::splats::harmonics::{sh_basis, sh_count};
 
 /// The derivative of the basis with respect to x, y, z of the direction.
 pub fn sh_basis_gradient(degree: u32, d: DVec3) -> [DVec3; 16] {

@@ -203,7 +203,8 @@ impl ScoredImages<'_> {
             let folder = folder.join(name);
             std::fs::create_dir_all(&folder)
                 .map_err(|error| Error::output(&folder, format!("cannot be made ({error})")))?;
-            image.save_png8(folder.join(format!("{}.png", self.view.name)))?;
+            let path = folder.join(format!("{}.png", self.view.name));
+            self.view.upright(image.clone()).save_png8(path)?;
         }
         Ok(())
     }

@@ -14,7 +14,7 @@ use std::io::Write as _;
 use std::path::Path;
 
 use flate2::{Compression, GzBuilder};
-use glam::{DVec3, Vec3};
+use glam::{DMat3, DQuat, DVec3, Vec3};
 
 use crate::base::output::write_whole;
 use crate::splats::scene::{Gaussians, ply};
@@ -60,8 +60,15 @@ impl Format {
         path: &Path,
     ) -> Result<()> {
         let bytes = match self {
-            Self::Ply => return ply::save_with_comments(gaussians, path, &provenance.lines()),
-            Self::Spz(version) => spz::encode(gaussians, version)?,
+            Self::Ply => {
+                let mut lines = provenance.lines();
+                // The origin that a reader adds is of the turned world.
+                let turned = provenance.rotation != DQuat::IDENTITY;
+                let line = provenance.world_line(gaussians, false).filter(|_| turned);
+                lines.extend(line.map(|line| format!("dataset's {line}")));
+                return ply::save_with_comments(gaussians, path, &lines);
+            }
+            Self::Spz(version) => spz::encode(gaussians, provenance, version)?,
             Self::Glb => glb::encode(gaussians, provenance)?,
             Self::Sog => sog::encode(gaussians, provenance)?,
         };
@@ -98,6 +105,8 @@ pub struct Provenance {
     pub curve: String,
     /// The exposure that it shows, in words.
     pub exposure: String,
+    /// By which its world was turned, [`Gaussians::rotated`].
+    pub rotation: DQuat,
 }
 
 /// The program, as files name it.
@@ -106,7 +115,7 @@ pub const GENERATOR: &str = concat!("nightsplat ", env!("CARGO_PKG_VERSION"));
 impl Provenance {
     /// Lines for a header.
     pub fn lines(&self) -> Vec<String> {
-        let Self { dataset, curve, exposure } = self;
+        let Self { dataset, curve, exposure, .. } = self;
         let lines = [
             ("generator", GENERATOR),
             ("dataset", dataset),
@@ -117,6 +126,32 @@ impl Provenance {
             format!("{key}: {}", value.replace(char::is_control, " ").trim())
         };
         lines.into_iter().filter(|(_, value)| !value.is_empty()).map(line).collect()
+    }
+}
+
+impl Provenance {
+    /// What a file's positions are in the dataset's world, where they are not the same: a line for a header. `half_turned`: the
+    /// file's axes are those of OpenGL.
+    fn world_line(&self, gaussians: &Gaussians, half_turned: bool) -> Option<String> {
+        let back = self.rotation.inverse();
+        let position = if self.rotation != DQuat::IDENTITY {
+            let sign = if half_turned { -1.0 } else { 1.0 };
+            let half_turn = DVec3::new(1.0, sign, sign);
+            let rows = (DMat3::from_quat(back) * DMat3::from_diagonal(half_turn)).transpose();
+            let row = |row: DVec3| format!("[{}, {}, {}]", row.x, row.y, row.z);
+            let [x, y, z] = [rows.x_axis, rows.y_axis, rows.z_axis].map(row);
+            format!("[{x}, {y}, {z}] (x, y, z)")
+        } else if half_turned {
+            "(x, -y, -z)".to_owned()
+        } else {
+            "(x, y, z)".to_owned()
+        };
+        let [x, y, z] = (back * gaussians.origin).to_array();
+        if gaussians.origin != DVec3::ZERO {
+            Some(format!("world = {position} + ({x}, {y}, {z})"))
+        } else {
+            (self.rotation != DQuat::IDENTITY).then(|| format!("world = {position}"))
+        }
     }
 }
 
@@ -154,14 +189,6 @@ fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// What is added to a model's positions to get those of the world, where that is not nothing: a line for a header. `turned`: the
-/// file's axes are those of OpenGL.
-fn origin_line(gaussians: &Gaussians, turned: bool) -> Option<String> {
-    let [x, y, z] = gaussians.origin.to_array();
-    let position = if turned { "(x, -y, -z)" } else { "(x, y, z)" };
-    (gaussians.origin != DVec3::ZERO).then(|| format!("world = {position} + ({x}, {y}, {z})"))
-}
-
 fn gzip(bytes: &[u8]) -> Result<Vec<u8>> {
     gzip_with(bytes, None)
 }
@@ -176,11 +203,9 @@ fn gzip_with(bytes: &[u8], comment: Option<String>) -> Result<Vec<u8>> {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use glam::{DMat3, DQuat, DVec3};
-
     use super::*;
     use crate::base::random::Stream;
-    use crate::reference::sh::sh_basis;
+    use crate::splats::harmonics::sh_basis;
     use crate::splats::scene::Shape;
 
     /// Gaussians of ordinary values, drawn.
@@ -222,22 +247,40 @@ pub(crate) mod tests {
         let has =
             |file: &[u8], text: &str| file.windows(text.len()).any(|own| own == text.as_bytes());
         for version in [spz::Version::V3, spz::Version::V4] {
-            assert!(has(&spz::encode(&model, version).unwrap(), &turned), "{version:?}");
+            let file = spz::encode(&model, &provenance, version).unwrap();
+            assert!(has(&file, &turned), "{version:?}");
         }
         assert!(has(&glb::encode(&model, &provenance).unwrap(), &turned));
         let sog = sog::encode(&model, &provenance).unwrap();
         let mut archive = zip::ZipArchive::new(std::io::Cursor::new(sog)).unwrap();
         let meta = std::io::read_to_string(archive.by_name("meta.json").unwrap()).unwrap();
         assert!(meta.contains(&format!("world = (x, y, z) + {numbers}")), "{meta}");
+        // Of a model that was turned, the world is that of before.
+        let rotation = DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
+        let provenance = Provenance { rotation, ..Provenance::default() };
+        let rotated = model.rotated(rotation);
+        let line = provenance.world_line(&rotated, true).unwrap();
+        assert!(has(&glb::encode(&rotated, &provenance).unwrap(), &line));
+        let numbers = line.split(|c: char| !"+-.e0123456789".contains(c));
+        let numbers: Vec<f64> = numbers.filter_map(|number| number.parse().ok()).collect();
+        let rows = [0, 3, 6].map(|at| DVec3::from_slice(&numbers[at..]));
+        let origin = DVec3::from_slice(&numbers[9..]);
+        for (mean, in_file) in model.means().iter().zip(half_turn(&rotated).means()) {
+            let back = rows.map(|row| row.dot(in_file.as_dvec3()));
+            let error = DVec3::from_array(back) + origin - (mean.as_dvec3() + model.origin);
+            assert!(error.length() < 1e-5, "{line}: {error}");
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("turned.ply");
+        Format::Ply.write(&rotated, &provenance, &path).unwrap();
+        assert_eq!(Gaussians::open(&path).unwrap(), rotated);
+        assert!(has(&std::fs::read(&path).unwrap(), "comment dataset's world = [["));
         model.origin = DVec3::ZERO;
-        assert!(!has(&glb::encode(&model, &provenance).unwrap(), "world ="));
+        assert!(!has(&glb::encode(&model, &Provenance::default()).unwrap(), "world ="));
     }
 
-    #[test]
-    fn a_turned_model_looks_the_same_from_a_turned_camera() {
-        let model = drawn(20, 3);
-        let turned = half_turn(&model);
-        let turn = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+    /// Asserts that `turned` is `model`, turned.
+    fn assert_turned(turned: &Gaussians, model: &Gaussians, turn: DMat3) {
         let rotation = |[w, x, y, z]: [f32; 4]| {
             let quat = DQuat::from_xyzw(x.into(), y.into(), z.into(), w.into());
             DMat3::from_quat(quat.normalize())
@@ -247,18 +290,35 @@ pub(crate) mod tests {
             let rotation = rotation(model.quats()[i]);
             rotation * scale * rotation.transpose()
         };
+        let coefficients = crate::splats::scene::rest_coefficients(model.shape.sh_degree);
         for i in 0..model.count {
-            assert_eq!(turned.means()[i].as_dvec3(), turn * model.means()[i].as_dvec3());
-            let difference = axes(&turned, i) - turn * axes(&model, i) * turn;
+            let error = turned.means()[i].as_dvec3() - turn * model.means()[i].as_dvec3();
+            assert!(error.length() < 1e-6, "{i}: {error}");
+            let difference = axes(turned, i) - turn * axes(model, i) * turn.transpose();
             assert!(difference.abs().to_cols_array().iter().all(|&error| error < 1e-6), "{i}");
             let direction = DVec3::new(0.3, -0.5 + i as f64 / 10.0, 0.7).normalize();
             let color = |model: &Gaussians, direction: DVec3| {
-                let values = sh_basis(3, direction);
-                let rest = &model.rest()[15 * i..][..15];
+                let values = sh_basis(model.shape.sh_degree, direction);
+                let rest = &model.rest()[coefficients * i..][..coefficients];
                 rest.iter().zip(&values[1..]).map(|(c, b)| c.as_dvec3() * *b).sum::<DVec3>()
             };
-            let difference = color(&turned, turn * direction) - color(&model, direction);
+            let difference = color(turned, turn * direction) - color(model, direction);
             assert!(difference.length() < 1e-6, "{i}: {difference}");
+        }
+    }
+
+    #[test]
+    fn a_turned_model_looks_the_same_from_a_turned_camera() {
+        let model = drawn(20, 3);
+        let turn = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+        assert_turned(&half_turn(&model), &model, turn);
+        for degree in 0..=3 {
+            let model = drawn(20, degree);
+            for (a, b, c) in [(0.0, 0.0, 0.0), (1.0, 2.0, -0.5), (-2.5, 0.3, 1.7), (3.1, 0.0, 0.0)]
+            {
+                let rotation = DQuat::from_euler(glam::EulerRot::XYZ, a, b, c);
+                assert_turned(&model.rotated(rotation), &model, DMat3::from_quat(rotation));
+            }
         }
     }
 }

@@ -3,7 +3,11 @@
 use std::fmt;
 use std::ops::Range;
 
+#[cfg(feature = "io")]
+use glam::{DMat3, DQuat};
 use glam::{DVec3, Vec3};
+#[cfg(feature = "io")]
+use rayon::prelude::*;
 
 mod device;
 mod features;
@@ -17,6 +21,8 @@ pub mod ply;
 use crate::camera::TrainingFrame;
 pub use crate::splats::attributes::{ATTRIBUTES, Attribute, PlaneCounts, rest_coefficients};
 use crate::splats::attributes::{column_count, planes};
+#[cfg(feature = "io")]
+use crate::splats::harmonics::HarmonicRotation;
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
 
@@ -174,6 +180,34 @@ impl Gaussians {
             *scale = (scale.as_dvec3() + log_scale).as_vec3();
         }
         moved
+    }
+
+    /// The same model in a world that is turned about its origin: what was in direction `d` is in direction `rotation
+    /// * d`.
+    ///
+    /// [`Gaussians::save`] takes the direction -y for up, as cameras that are held level in `OpenCV`'s axes have it;
+    /// a model whose `up` is another one is turned by `DQuat::from_rotation_arc(up, DVec3::NEG_Y)` first.
+    #[cfg(feature = "io")]
+    pub fn rotated(&self, rotation: DQuat) -> Self {
+        let mut rotated = self.clone();
+        rotated.origin = rotation * self.origin;
+        for mean in rotated.means_mut() {
+            *mean = (rotation * mean.as_dvec3()).as_vec3();
+        }
+        for quat in rotated.quats_mut() {
+            let [w, x, y, z] = quat.map(f64::from);
+            let DQuat { x, y, z, w } = rotation * DQuat::from_xyzw(x, y, z, w);
+            *quat = [w, x, y, z].map(|part| part as f32);
+        }
+        let coefficients = rest_coefficients(self.shape.sh_degree);
+        if coefficients > 0 {
+            let harmonics = HarmonicRotation::new(DMat3::from_quat(rotation));
+            rotated
+                .rest_mut()
+                .par_chunks_exact_mut(coefficients)
+                .for_each(|rest| harmonics.turn(rest));
+        }
+        rotated
     }
 
     /// Adds a constant to the colour from every direction.

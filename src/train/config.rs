@@ -6,6 +6,7 @@ mod stop;
 use std::ops::Bound;
 use std::path::{Path, PathBuf};
 
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use super::cache::CacheSize;
@@ -133,6 +134,9 @@ pub struct TrainConfig {
     /// Near plane, in units of the scene extent: the distance of the cameras from their centre, rounded to a power of
     /// two.
     near: f64 = 0.1 => Rule::from_to(1e-6, 1.0), "--near N";
+    /// The up direction in the dataset's world, for paths and exported files.
+    up: Option<[f64; 3]> = None, "found from the cameras, and recorded"
+        => Rule::List(3, 3, &Rule::Number(Bound::Unbounded, Bound::Unbounded));
     /// Random points to start from if the dataset has none.
     random_points: usize = 20_000 => Rule::at_least(1), in "points";
 }
@@ -365,6 +369,14 @@ impl TrainConfig {
         if let Some(frame) = self.frame {
             frame.check_rows()?;
         }
+        if self.up.is_some_and(|up| DVec3::from_array(up).try_normalize().is_none()) {
+            let rule = "a direction: three numbers that are not all 0".to_owned();
+            return Err(Error::Setting {
+                key: "up".to_owned(),
+                value: "no direction".to_owned(),
+                rule,
+            });
+        }
         if self.exposure.learn == OnOff::On && self.model.tonemapper {
             let rule = "off with a tonemapper, which fits the dark photographs: a gain of the targets does not describe \
                         their exposures";
@@ -392,7 +404,10 @@ mod tests {
         let mut config = TrainConfig::default();
         (config.exposure.learn, config.model.tonemapper) = (OnOff::On, true);
         let message = config.check().unwrap_err().to_string();
-        assert!(message.starts_with("exposure.learn is on; it must be off with a tonemapper"), "{message}");
+        assert!(
+            message.starts_with("exposure.learn is on; it must be off with a tonemapper"),
+            "{message}"
+        );
     }
 
     #[test]

@@ -11,12 +11,13 @@ use crate::base::hash::{self, Hasher};
 
 /// Settings that affect no result beyond rounding: the dataset's path, saving and logging, time limits, and values that
 /// a run finds itself.
-const FREE: [&str; 16] = [
+const FREE: [&str; 17] = [
     "dataset",
     "device",
     "tile",
     "frame.center",
     "frame.scale",
+    "up",
     "cache",
     "max_vram",
     "max_ram",

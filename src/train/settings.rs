@@ -154,7 +154,7 @@ mod tests {
 
     /// A configuration with every optional setting.
     fn whole() -> TrainConfig {
-        let set = ["reference", "init", "exposure.start", "model.depth_folder"]
+        let set = ["images", "reference", "init", "exposure.start", "model.depth_folder"]
             .map(|key| format!("{key}=a"));
         let mut set = set.to_vec();
         set.extend(["cache", "max_vram", "max_ram"].map(|key| format!("{key}=1G")));
@@ -163,6 +163,8 @@ mod tests {
             "test_every=8",
             "tile=[16,8]",
             "frame.scale=2",
+            "up=[0,0,1]",
+            "white_balance=5000",
             "tone.brightness=0.5",
         ];
         set.extend(rest.map(str::to_owned));
@@ -247,7 +249,7 @@ mod tests {
             ("stepz", "steps"),
             ("density.gradient", "density.gradient_threshold"),
             ("density.foo", "density."),
-            ("densty.fill", "density.depth_seeding"),
+            ("densty.depth_seeding", "density.depth_seeding"),
             ("stop.not-finite", "stop.not_finite"),
             ("frame.scal", "frame.scale"),
         ] {

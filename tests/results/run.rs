@@ -278,7 +278,7 @@ fn a_camera_flies_and_the_pictures_become_a_video() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
     succeed(&train(folder.path(), "run", "--steps 30"));
-    for way in ["orbit", "spiral", "interpolate"] {
+    for way in ["auto", "orbit", "arc", "spiral", "interpolate"] {
         let video = path(way).with_extension("png");
         let options = format!("--path {way} --frames 4 --fps 12 --video {}", video.display());
         let files = flight(&path("run"), &path(way), &options);

@@ -68,13 +68,13 @@ pub(super) fn frames(
     Ok(kept)
 }
 
-/// ffmpeg's filters that make sRGB of linear light above which nothing is white: HLG and PQ put that at 203 cd/m2 (BT.2408).
-/// What is brighter is clipped; a curve for it would change what is dark, too.
+/// ffmpeg's filters that make sRGB of linear light above which nothing is white: HLG and PQ put that at 203 cd/m2
+/// (BT.2408). What is brighter is clipped; a curve for it would change what is dark, too.
 const STANDARD_RANGE: &str = "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,tonemap=clip:desat=0,\
                               zscale=t=iec61966-2-1:m=gbr:r=full,format=gbrp16le";
 
-/// The filters after `fps` for a clip of this transfer function: those above for high dynamic range. Frames of wide primaries
-/// say so themselves, and are converted where they are read.
+/// The filters after `fps` for a clip of this transfer function: those above for high dynamic range. Frames of wide
+/// primaries say so themselves, and are converted where they are read.
 ///
 /// # Errors
 /// [`Error::Input`] with the command to run where this ffmpeg has no such filters.
@@ -88,7 +88,7 @@ fn filters(ffmpeg: &Tool<'_>, clip: &Path, transfer: &str) -> Result<String> {
     if !has(" zscale ") || !has(" tonemap ") {
         let path = clip.display();
         let problem = format!(
-            "is HDR ({range}), and this ffmpeg has no filters zscale and tonemap; with one that has: ffmpeg -i {path} -vf \
+            "is HDR ({range}), and this ffmpeg lacks zscale and tonemap; with one that has them: ffmpeg -i {path} -vf \
              {STANDARD_RANGE},format=yuv444p -color_primaries bt709 -color_trc iec61966-2-1 -crf 10 sdr.mp4"
         );
         return Err(Error::input(clip, problem));

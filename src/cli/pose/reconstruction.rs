@@ -61,8 +61,8 @@ fn placed_in(models: &Path) -> Result<usize> {
     Ok(Dataset::largest_model(models)?.map_or(0, |(_, placed)| placed.len()))
 }
 
-/// How the mapper may begin with few photographs: their first pair may be closer together, along the view, and have less in
-/// common than COLMAP asks for.
+/// How the mapper may begin with few photographs: their first pair may be closer together, along the view, and have
+/// less in common than COLMAP asks for.
 const RELAXED: [&[(&str, &str)]; 2] = [
     &[("Mapper.init_min_tri_angle", "6"), ("Mapper.init_min_num_inliers", "50")],
     &[
@@ -79,8 +79,8 @@ impl<'a> Reconstruction<'a> {
     /// Sets up the folder, and checks that the programs exist.
     ///
     /// # Errors
-    /// Cameras are to be placed all at once, and neither COLMAP nor GLOMAP is there that does; no command has an option that
-    /// is asked for.
+    /// Cameras are to be placed all at once, and neither COLMAP nor GLOMAP is there that does; no command has an
+    /// option that is asked for.
     pub(super) fn new(
         args: &'a PoseArgs,
         colmap: Tool<'a>,
@@ -127,9 +127,10 @@ impl<'a> Reconstruction<'a> {
         })
     }
 
-    /// The folder that holds the models, a folder each; none where the photographs show too little. Where one in ten or more is
-    /// left without a camera, they are compared once more, guided: what a small set comes to is luck otherwise, and for a large
-    /// one it would take twice as long. Where most are still left, the mapper begins with less.
+    /// The folder that holds the models, a folder each; none where the photographs show too little. Where one in ten
+    /// or more is left without a camera, they are compared once more, guided: what a small set comes to is luck
+    /// otherwise, and for a large one it would take twice as long. Where most are still left, the mapper begins with
+    /// less.
     ///
     /// # Errors
     /// A program fails.

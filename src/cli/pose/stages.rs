@@ -34,8 +34,8 @@ impl<'a> Stage<'a> {
     }
 }
 
-/// The last count that COLMAP printed: files as [3/48], blocks of pairs as [1/6, 2/6], registered photographs by a line each,
-/// of which it does not say the total: 0.
+/// The last count that COLMAP printed: files as [3/48], blocks of pairs as [1/6, 2/6], registered photographs by a
+/// line each, of which it does not say the total: 0.
 fn counted(printed: &str) -> Option<[usize; 2]> {
     let bracket = |line: &str| {
         let inside = line.split_once('[')?.1.split_once(']')?.0;

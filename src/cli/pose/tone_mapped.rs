@@ -12,9 +12,9 @@ use crate::photographs::image::{ColourTally, Image, PictureFile, exif_segment};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 
-/// Lifts the photographs into `folder`, as stored, and returns the gain of the scene. A JPEG stays one and keeps its Exif,
-/// so that COLMAP finds the focal length; everything else becomes PNG. Those that do not decode are named and taken out of
-/// `photographs`.
+/// Tone-maps the photographs into `folder`, as stored, and returns the gain of the scene. A JPEG stays one and keeps
+/// its Exif, so that COLMAP finds the focal length; everything else becomes PNG. Those that do not decode are named
+/// and taken out of `photographs`.
 ///
 /// # Errors
 /// None decodes, all are black, or the device is out of memory.
@@ -59,7 +59,7 @@ pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) ->
     Ok(scene.exposure.map_or(1.0, |exposure| exposure.gain))
 }
 
-/// The name that a photograph is lifted under.
+/// The name that a tone-mapped photograph is saved under.
 pub(super) fn name(photograph: &Path) -> String {
     let name = photograph.file_name().unwrap_or_default().to_string_lossy();
     if is_jpeg(photograph) { name.into_owned() } else { stem(&name).to_owned() + ".png" }

@@ -65,9 +65,9 @@ impl Run {
         let plan = plan.map(|path| Plan::read(&path)).transpose()?;
         let own = self.args.options.config(&self.args.dataset, plan.as_ref())?;
         let own = own.with_absolute_paths();
-        // A run records its tile and frame; if none is required, any matches.
+        // A run records its tile, frame and up direction; if none is required, any matches.
         let (tile, frame) = (own.tile.and(found.tile), own.frame.and(found.frame));
-        let found = TrainConfig { tile, frame, ..found };
+        let found = TrainConfig { tile, frame, up: own.up.and(found.up), ..found };
         if found != own {
             let differs = difference(&found.to_toml()?, &own.to_toml()?);
             let problem = format!("holds another run ({differs}); choose another --out");

@@ -7,11 +7,12 @@ use glam::UVec2;
 
 use super::MeasuredSize;
 use super::packed::Packed;
-use super::prepare::{Preparation, turn};
+use super::prepare::Preparation;
+use super::turns::Turns;
 use crate::Result;
 use crate::base::hash::Hasher;
 use crate::camera::Lens;
-use crate::photographs::image::{Image, PictureFile};
+use crate::photographs::image::{Image, Orientation, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
 use crate::photographs::white_balance::WhiteBalanceGains;
 
@@ -23,6 +24,8 @@ pub struct Original {
     lens: Lens,
     /// As [`super::LoadOptions::undistort`].
     undistort: bool,
+    /// From what is stored to what the camera took.
+    orientation: Orientation,
     /// White balance of a photograph.
     pub(super) gains: Option<WhiteBalanceGains>,
     /// The statistics of the photograph, and of which size.
@@ -34,9 +37,17 @@ pub struct Original {
 }
 
 impl Original {
-    pub(super) fn new(path: PathBuf, lens: Lens, undistort: bool) -> Self {
-        let stored = Arc::default();
-        Self { path, lens, undistort, gains: None, measured: None, checksum: None, stored }
+    pub(super) fn new(path: PathBuf, lens: Lens, undistort: bool, turns: Turns) -> Self {
+        Self {
+            path,
+            lens,
+            undistort,
+            orientation: turns.loading,
+            gains: None,
+            measured: None,
+            checksum: None,
+            stored: Arc::default(),
+        }
     }
 
     /// Width and height, undistorted.
@@ -66,8 +77,7 @@ impl Original {
         if let Some(gains) = self.gains {
             gains.apply(&mut image);
         }
-        let orientation = turn(path, (image.width, image.height), lens);
-        preparation.loaded(image.turned(orientation), path)
+        preparation.loaded(image.turned(self.orientation), path)
     }
 
     /// The statistics at a size, if they were measured while the photograph was decoded.

@@ -13,13 +13,14 @@ use super::depth::depth_map;
 use super::loaded::Loaded;
 use super::original::Original;
 use super::packed::Packed;
-use super::prepare::{Preparation, check_size, disagreement, pixel_count, turn};
+use super::prepare::{Preparation, check_size, disagreement, pixel_count};
 use super::source::{MAX_READ, Source};
+use super::turns::{Header, Turns};
 use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
 use crate::camera::{Camera, Lens};
-use crate::photographs::image::{ColourTally, Image, Mask, Orientation, PictureFile};
+use crate::photographs::image::{ColourTally, Image, Mask, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
@@ -41,13 +42,14 @@ pub(super) fn load(
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
     let memory = Allowance::new(MAX_READ);
-    let sized = sources.into_par_iter().map(|mut source| {
-        let sizes = source.sized(&memory);
-        Ok(Source { lens: fitted_lens(&source, sizes)?, ..source })
+    let fitted = sources.into_par_iter().map(|mut source| {
+        let headers = source.headers(&memory);
+        source.fit(headers)?;
+        Ok(source)
     });
     let mut groups: Vec<(Lens, Vec<Source>)> = Vec::new();
     let mut places = HashMap::new();
-    for source in sized.collect::<Result<Vec<_>>>()? {
+    for source in fitted.collect::<Result<Vec<_>>>()? {
         // Debug tells every two lenses apart.
         let place = *places.entry(format!("{:?}", source.lens)).or_insert(groups.len());
         match groups.get_mut(place) {
@@ -155,29 +157,35 @@ fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOption
     LoadOptions { keep, ..options.clone() }
 }
 
-/// The listed lens over the photograph as it is: the input's size, without one the reference image's.
-fn fitted_lens(source: &Source, sizes: [Option<(u32, u32)>; 2]) -> Result<Lens> {
-    let lens = source.lens;
-    // What has no readable header is named when it is decoded.
-    let sized = [&source.input, &source.reference].into_iter().zip(sizes);
-    let mut sized = sized.filter_map(|(path, size)| {
-        let (path, size) = (path.as_deref()?, size?);
-        Some((path, turn(path, size, &lens).size(size)))
-    });
-    let Some((path, (width, height))) = sized.next() else {
-        return Ok(lens);
-    };
-    let fitted =
-        lens.fitted(width, height).ok_or_else(|| disagreement(path, (width, height), &lens))?;
-    if (width, height) != (lens.width, lens.height) {
-        tracing::info!(
-            "{}: is {width}x{height}, its camera {}x{}; intrinsics rescaled",
-            path.display(),
-            lens.width,
-            lens.height
-        );
+impl Source {
+    /// Finds how its pictures are turned, and fits the listed lens to the photograph, without one to the reference image.
+    ///
+    /// # Errors
+    /// [`Error::Input`] where the picture has another shape than its camera.
+    fn fit(&mut self, headers: [Option<Header>; 2]) -> Result<()> {
+        let lens = self.lens;
+        // What has no readable header is named when it is decoded.
+        self.turns = headers
+            .map(|header| header.map(|header| Turns::new(header, &lens)).unwrap_or_default());
+        let sizes = headers
+            .into_iter()
+            .zip(self.turns)
+            .map(|(header, turns)| header.map(|header| turns.loading.size(header.size)));
+        let mut sized = [&self.input, &self.reference].into_iter().zip(sizes);
+        let sized = sized.find_map(|(path, size)| Some((path.as_deref()?, size?)));
+        let Some((path, (width, height))) = sized else { return Ok(()) };
+        self.lens =
+            lens.fitted(width, height).ok_or_else(|| disagreement(path, (width, height), &lens))?;
+        if (width, height) != (lens.width, lens.height) {
+            tracing::info!(
+                "{}: is {width}x{height}, its camera {}x{}; intrinsics rescaled",
+                path.display(),
+                lens.width,
+                lens.height
+            );
+        }
+        Ok(())
     }
-    Ok(fitted)
 }
 
 /// Loads the views of one lens.
@@ -242,7 +250,7 @@ struct Decoded {
     /// As it is stored.
     image: Image,
     alpha: Option<Image>,
-    orientation: Orientation,
+    turns: Turns,
 }
 
 /// What memory holds of a photograph or reference image: its pixels as they are loaded, and its file where those are not
@@ -252,25 +260,28 @@ type InMemory = (Option<Image>, Option<Original>);
 impl ViewLoader<'_> {
     fn load(&self, source: Source) -> Result<Loaded> {
         let Self { preparation, camera, unseen, loading } = self;
-        let Source { name, split, view_from_world, input, reference, mask, depth, read, .. } =
-            source;
+        let Source {
+            name, split, view_from_world, input, reference, mask, depth, read, turns, ..
+        } = source;
         let (options, [read, read_reference]) = (loading.options, read);
         let mut problems = Vec::new();
         let [colours, reference_colours] = loading.colours;
-        let mut photograph = self.decode((input, read), colours, &mut problems)?;
+        let mut photograph = self.decode((input, read, turns[0]), colours, &mut problems)?;
         if let (Some(gains), Some(photograph)) = (loading.gains, &mut photograph) {
             gains.apply(&mut photograph.image);
         }
         let reference =
-            self.decode((reference, read_reference), reference_colours, &mut problems)?;
-        let stored_mask = match photograph.as_ref().or(reference.as_ref()) {
-            Some(Decoded { path, image, alpha, orientation }) => {
+            self.decode((reference, read_reference, turns[1]), reference_colours, &mut problems)?;
+        let picture = photograph.as_ref().or(reference.as_ref());
+        let orientation = picture.map(|picture| picture.turns.viewing).unwrap_or_default();
+        let stored_mask = match picture {
+            Some(Decoded { path, image, alpha, turns }) => {
                 let decoded = (image, alpha.as_ref());
                 let own = Mask::over(path, decoded, mask.as_ref(), options.invert_masks)?;
                 let size = (image.width, image.height);
                 let border = self.loading.borders.get(&size).map(|border| border.as_slice());
                 Mask::hiding_too(own, size, border.unwrap_or_default())
-                    .map(|stored| (stored, path.clone(), *orientation))
+                    .map(|stored| (stored, path.clone(), turns.loading))
             }
             None => None,
         };
@@ -283,7 +294,7 @@ impl ViewLoader<'_> {
         let brightness = [&photograph, &reference]
             .map(|decoded| decoded.as_ref().map(|decoded| mean(&decoded.image)));
         let reference_original = reference.as_ref().map(|decoded| {
-            Original::new(decoded.path.clone(), *preparation.lens, options.undistort)
+            Original::new(decoded.path.clone(), *preparation.lens, options.undistort, decoded.turns)
         });
         let is_hidden = mask.as_ref().is_some_and(Mask::hides_all);
         if is_hidden {
@@ -304,7 +315,7 @@ impl ViewLoader<'_> {
                 .ok()
         });
         let view = View::new(&name, split, Camera { view_from_world, ..*camera }, image);
-        let view = View { original, reference, reference_file, mask, depth, ..view };
+        let view = View { orientation, original, reference, reference_file, mask, depth, ..view };
         let view = (split == Split::Test || view.has_photograph()).then_some(view);
         Ok(Loaded { name, view, problems, brightness, reference: reference_original })
     }
@@ -315,7 +326,7 @@ impl ViewLoader<'_> {
     /// The picture does not fit its camera.
     fn decode(
         &self,
-        (path, read): (Option<PathBuf>, Option<Arc<PictureFile>>),
+        (path, read, turns): (Option<PathBuf>, Option<Arc<PictureFile>>, Turns),
         colours: &ColourTally,
         problems: &mut Vec<String>,
     ) -> Result<Option<Decoded>> {
@@ -324,13 +335,10 @@ impl ViewLoader<'_> {
         let file =
             read.map_or_else(|| PictureFile::open(&path), |read| Ok(Arc::unwrap_or_clone(read)));
         if let Ok(file) = &file {
-            check_size(&path, file, lens)?;
+            check_size(&path, file, turns, lens)?;
         }
         match file.and_then(|file| file.decode_counted(colours)) {
-            Ok((image, alpha)) => {
-                let orientation = turn(&path, (image.width, image.height), lens);
-                Ok(Some(Decoded { path, image, alpha, orientation }))
-            }
+            Ok((image, alpha)) => Ok(Some(Decoded { path, image, alpha, turns })),
             Err(error) => {
                 problems.push(error.to_string());
                 Ok(None)
@@ -347,14 +355,14 @@ impl ViewLoader<'_> {
     ) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
         let options = loading.options;
-        let Decoded { path, image, orientation, .. } = decoded;
-        let whole = preparation.whole(image.turned(orientation), &path)?;
+        let Decoded { path, image, turns, .. } = decoded;
+        let whole = preparation.whole(image.turned(turns.loading), &path)?;
         let is_shrunk = preparation.size != (whole.width, whole.height);
         let is_kept = options.keep != Some(0);
         if is_kept && !is_shrunk {
             return Ok((Some(whole), None));
         }
-        let mut original = Original::new(path, *preparation.lens, options.undistort);
+        let mut original = Original::new(path, *preparation.lens, options.undistort, turns);
         original.gains = loading.gains;
         let measured = |image: &Image| match mask {
             Some(mask) => MeasuredPhotograph::of(&mask.counted(image)),
@@ -385,11 +393,12 @@ impl ViewLoader<'_> {
 
     fn reference_image(&self, decoded: Decoded) -> Result<InMemory> {
         let Self { preparation, loading, .. } = self;
-        let Decoded { path, image, orientation, .. } = decoded;
+        let Decoded { path, image, turns, .. } = decoded;
         if loading.options.keep == Some(0) {
-            let file = Original::new(path, *preparation.lens, loading.options.undistort);
+            let undistort = loading.options.undistort;
+            let file = Original::new(path, *preparation.lens, undistort, turns);
             return Ok((None, Some(file)));
         }
-        Ok((Some(preparation.loaded(image.turned(orientation), &path)?), None))
+        Ok((Some(preparation.loaded(image.turned(turns.loading), &path)?), None))
     }
 }

@@ -2,8 +2,9 @@
 
 use glam::DVec3;
 
-use super::Dataset;
-use crate::camera::{TrainingFrame, frame};
+use super::layout::Layout;
+use super::{Dataset, View};
+use crate::camera::{Camera, TrainingFrame, frame, upwards};
 
 impl Dataset {
     /// The scene's size as 3DGS takes it: 1.1 times the largest distance of a training camera to their mean, world units.
@@ -18,6 +19,16 @@ impl Dataset {
     pub(crate) fn frame(&self) -> TrainingFrame {
         let (center, extent) = self.place();
         TrainingFrame::new(center, extent)
+    }
+
+    /// The world's up direction, a unit vector: perpendicular to the horizontal axes of the training cameras. A NeRF-style
+    /// listing has z up by convention, which is exact where cameras are not held level; it is taken unless they lie on a side.
+    pub fn up(&self) -> DVec3 {
+        const MIN_COSINE: f64 = 0.7;
+        let cameras: Vec<Camera> = self.train_views().map(View::upright_camera).collect();
+        let up = upwards(&cameras);
+        let has_convention = Layout::of(&self.root).is_ok_and(|own| !own.listings().is_empty());
+        if has_convention && up.z > MIN_COSINE { DVec3::Z } else { up }
     }
 
     /// The middle of the training cameras, and the extent.

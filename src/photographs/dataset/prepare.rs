@@ -4,6 +4,7 @@ use std::path::Path;
 
 use glam::DAffine3;
 
+use super::turns::Turns;
 use super::undistort::Undistortion;
 use crate::camera::{Camera, CameraModel, Lens};
 use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
@@ -136,25 +137,14 @@ fn native_camera(lens: &Lens) -> Camera {
     }
 }
 
-/// How a photograph is turned to be what its camera took. Poses are of what is stored, as COLMAP reads it; where the
-/// camera's size is that of what is seen, and not of what is stored, they are of that.
-pub(super) fn turn(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Orientation {
-    if lens.fitted(width, height).is_some() {
-        return Orientation::UPRIGHT;
-    }
-    let stated = Orientation::of(path);
-    let (width, height) = stated.size((width, height));
-    if lens.fitted(width, height).is_some() { stated } else { Orientation::UPRIGHT }
-}
-
 /// Refuses a file by the size that it declares, before that costs memory.
 ///
 /// # Errors
 /// The picture has another shape than its camera, or far more pixels.
-pub(super) fn check_size(path: &Path, file: &PictureFile, lens: &Lens) -> Result<()> {
+pub(super) fn check_size(path: &Path, file: &PictureFile, turns: Turns, lens: &Lens) -> Result<()> {
     // A file without a readable header is named when it is decoded.
     let Ok(size) = file.size() else { return Ok(()) };
-    let (width, height) = turn(path, size, lens).size(size);
+    let (width, height) = turns.loading.size(size);
     if lens.fitted(width, height).is_none() {
         return Err(disagreement(path, size, lens));
     }

@@ -7,9 +7,10 @@ use glam::DAffine3;
 
 use super::Split;
 use super::allowance::Allowance;
+use super::turns::{Header, Turns};
 use crate::base::tree;
 use crate::camera::Lens;
-use crate::photographs::image::{Image, MaskFile, PictureFile};
+use crate::photographs::image::{Image, MaskFile, Orientation, PictureFile};
 
 /// What a view is made of.
 #[derive(Clone, Debug)]
@@ -25,6 +26,8 @@ pub(super) struct Source {
     pub(super) depth: Option<PathBuf>,
     /// Photograph and reference image, where they are read already.
     pub(super) read: [Option<Arc<PictureFile>>; 2],
+    /// How photograph and reference image are turned.
+    pub(super) turns: [Turns; 2],
 }
 
 impl Source {
@@ -35,26 +38,28 @@ impl Source {
         [input, reference, depth]: [Option<PathBuf>; 3],
         mask: Option<MaskFile>,
     ) -> Self {
-        let read = [None, None];
-        Self { name, split, lens, view_from_world, input, reference, mask, depth, read }
+        let (read, turns) = ([None, None], [Turns::default(); 2]);
+        Self { name, split, lens, view_from_world, input, reference, mask, depth, read, turns }
     }
 
-    /// Reads the files of the photograph and of the reference image; gives the size of each as it is stored, where its header
-    /// is readable, and keeps what is read while `memory` allows.
-    pub(super) fn sized(&mut self, memory: &Allowance) -> [Option<(u32, u32)>; 2] {
+    /// Reads the files of the photograph and of the reference image; gives the header of each, where it is readable, and
+    /// keeps what is read while `memory` allows.
+    pub(super) fn headers(&mut self, memory: &Allowance) -> [Option<Header>; 2] {
         let paths = [self.input.as_deref(), self.reference.as_deref()];
-        let mut sizes = [None; 2];
-        for ((path, read), size) in paths.into_iter().zip(&mut self.read).zip(&mut sizes) {
+        let mut headers = [None; 2];
+        for ((path, read), header) in paths.into_iter().zip(&mut self.read).zip(&mut headers) {
             let Some(path) = path else { continue };
             let bytes = tree::metadata(path).map_or(u64::MAX, |(length, _)| length);
             if !memory.take(bytes) {
-                *size = Image::size_of(path).ok();
+                let of_size = |size| Header { size, orientation: Orientation::of(path) };
+                *header = Image::size_of(path).ok().map(of_size);
             } else if let Ok(file) = PictureFile::open(path) {
-                *size = file.size().ok();
+                let of_size = |size| Header { size, orientation: file.orientation() };
+                *header = file.size().ok().map(of_size);
                 *read = Some(Arc::new(file));
             }
         }
-        sizes
+        headers
     }
 }
 

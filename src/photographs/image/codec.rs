@@ -15,7 +15,7 @@ use super::decoded::{Decoded, Meaning};
 use super::files::RAW_REMEDY;
 use super::files::{HEIC_REMEDY, is_raw};
 use super::source::{Source, not_an_image, reader};
-use super::{Image, budget, exr_file, from_interleaved, jpeg, linear_from_srgb};
+use super::{Image, Orientation, budget, exr_file, from_interleaved, jpeg, linear_from_srgb};
 use crate::base::output::write_whole;
 use crate::base::{input, tree};
 use crate::{Error, Result};
@@ -46,6 +46,11 @@ impl PictureFile {
         }
         let reader = reader(Cursor::new(self.bytes.as_slice()));
         size_of_reader(&self.path, reader.map_err(|error| unreadable(&self.path, &error))?)
+    }
+
+    /// How it is turned to be what people see, by its Exif.
+    pub(crate) fn orientation(&self) -> Orientation {
+        Orientation::read(&mut Cursor::new(self.bytes.as_slice()))
     }
 
     /// The photograph in sRGB, and its alpha: that of a PNG, WebP or TIFF file, or 0 where a value of an EXR file is not finite,

@@ -1,6 +1,6 @@
 //! How a photograph is turned: cameras store what the sensor saw, and say in Exif which way is up.
 
-use std::io::BufReader;
+use std::io::{BufRead, BufReader, Seek};
 use std::path::Path;
 
 use ::exif::{In, Reader, Tag};
@@ -9,9 +9,15 @@ use rayon::prelude::*;
 use super::Image;
 use crate::base::tree;
 
-/// The orientation of Exif, 1 to 8: where the first row and column of what is stored lie in what is seen.
+/// The orientation of Exif, 1 to 8: how an image is turned, and whether it is mirrored, to be what people see.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Orientation(u8);
+
+impl Default for Orientation {
+    fn default() -> Self {
+        Self::UPRIGHT
+    }
+}
 
 impl Orientation {
     /// As it is stored.
@@ -19,9 +25,13 @@ impl Orientation {
 
     /// What a file says; upright where it says nothing.
     pub fn of(path: &Path) -> Self {
-        let tagged = || {
-            let file = tree::open(path).ok()?;
-            let exif = Reader::new().read_from_container(&mut BufReader::new(file)).ok()?;
+        tree::open(path).map_or(Self::UPRIGHT, |file| Self::read(&mut BufReader::new(file)))
+    }
+
+    /// What the bytes of a file say; upright where they say nothing.
+    pub(super) fn read(file: &mut (impl BufRead + Seek)) -> Self {
+        let mut tagged = || {
+            let exif = Reader::new().read_from_container(file).ok()?;
             let value = exif.get_field(Tag::Orientation, In::PRIMARY)?.value.get_uint(0)?;
             u8::try_from(value).ok().filter(|value| (1..=8).contains(value))
         };
@@ -31,6 +41,26 @@ impl Orientation {
     /// Width and height behind turning.
     pub fn size(self, (width, height): (u32, u32)) -> (u32, u32) {
         if self.0 >= 5 { (height, width) } else { (width, height) }
+    }
+
+    /// Clockwise quarter turns, after which only a mirrored image is to be mirrored from left to right.
+    pub(crate) fn quarters(self) -> u32 {
+        match self.0 {
+            5 | 6 => 1,
+            3 | 4 => 2,
+            7 | 8 => 3,
+            _ => 0,
+        }
+    }
+
+    /// The orientation without its turn: mirrored from left to right, or upright.
+    pub(crate) fn mirror(self) -> Self {
+        if matches!(self.0, 2 | 4 | 5 | 7) { Self(2) } else { Self::UPRIGHT }
+    }
+
+    /// The orientation without its mirror: a turn alone.
+    pub(crate) fn turn(self) -> Self {
+        Self([1, 6, 3, 8][self.quarters() as usize])
     }
 
     /// Column and row of what is stored that lie at `x` and `y` of what is seen; `width` and `height` are the stored.
@@ -104,6 +134,8 @@ mod tests {
             let turned = stored.turned(orientation);
             assert_eq!((turned.width, turned.height), (3, 4), "{orientation:?}");
             assert_eq!(turned.data[..24], upright.data[..24], "{orientation:?}");
+            let in_two = drawn(rows).turned(orientation.turn()).turned(orientation.mirror());
+            assert_eq!(in_two, turned, "{orientation:?}");
         }
     }
 }

@@ -4,7 +4,7 @@
 
 use serde_json::{Map, Value, json};
 
-use super::{GENERATOR, Provenance, half_turn, origin_line, sigmoid, unit};
+use super::{GENERATOR, Provenance, half_turn, sigmoid, unit};
 use crate::photographs::image::linear_from_srgb;
 use crate::splats::scene::{Gaussians, SH_C0, rest_coefficients};
 use crate::{Error, Result};
@@ -101,7 +101,7 @@ fn description(gaussians: &Gaussians, planes: &[Plane], provenance: &Provenance)
     accessors[0]["min"] = json!(bound(f32::INFINITY, f32::min));
     accessors[0]["max"] = json!(bound(f32::NEG_INFINITY, f32::max));
     let mut lines = provenance.lines();
-    lines.extend(origin_line(gaussians, true));
+    lines.extend(provenance.world_line(gaussians, true));
     json!({
         "asset": { "version": "2.0", "generator": GENERATOR, "extras": { "provenance": lines } },
         "extensionsUsed": [EXTENSION],

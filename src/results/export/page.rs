@@ -3,6 +3,7 @@
 //! The viewer projects, shades and blends as the kernels do, so that a test view on the page is the render of `eval` but for
 //! the half floats that the page holds.
 
+use glam::DVec3;
 use half::f16;
 use serde_json::json;
 
@@ -40,6 +41,8 @@ pub struct Page<'a> {
     pub bookmarks: Vec<Bookmark>,
     /// Nothing nearer to a camera is shown, in the coordinates of the Gaussians.
     pub near: f64,
+    /// What is up, a unit vector in the coordinates of the Gaussians.
+    pub up: DVec3,
 }
 
 impl Page<'_> {
@@ -48,19 +51,22 @@ impl Page<'_> {
     /// # Errors
     /// [`Error::Usage`] for a bookmark that is no pinhole.
     pub fn html(&self) -> Result<String> {
-        let Self { title, gaussians, provenance, bookmarks, near } = self;
+        let Self { title, gaussians, provenance, bookmarks, near, up } = self;
         let other = bookmarks.iter().find(|own| own.camera.model != CameraModel::Pinhole);
         if let Some(Bookmark { name, .. }) = other {
             return Err(Error::Usage(format!(
                 "view {name} is of a fisheye, and the page shows pinholes; load its dataset with --undistort"
             )));
         }
+        // Coefficients that are all 0 need not travel.
+        let gaussians = &gaussians.with_sh_degree(gaussians.sh_degree_in_use());
         let scene = json!({
             "generator": GENERATOR,
             "provenance": provenance.lines(),
             "count": gaussians.count,
             "shDegree": gaussians.shape.sh_degree,
             "near": near,
+            "up": up.to_array(),
             "views": bookmarks.iter().map(view).collect::<Vec<_>>(),
         });
         let parts = [
@@ -159,6 +165,7 @@ mod tests {
             provenance: Provenance { dataset: evil.to_owned(), ..Provenance::default() },
             bookmarks: vec![Bookmark { name: evil.to_owned(), camera, pictures: vec![picture] }],
             near: 0.2,
+            up: DVec3::NEG_Y,
         };
         let html = page.html().unwrap();
         let mut of_fisheye = page.clone();

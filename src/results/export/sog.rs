@@ -11,7 +11,7 @@ use serde_json::json;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
 use super::palette::{codebook, nearest, vectors};
-use super::{GENERATOR, Provenance, origin_line, sigmoid, unit};
+use super::{GENERATOR, Provenance, sigmoid, unit};
 use crate::splats::scene::{Gaussians, rest_coefficients};
 use crate::{Error, Result};
 
@@ -48,7 +48,7 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
         ("sh0.webp", size, pixels(&|i| opaque(coded(&colors, gaussians.dc()[i]), opacity(i)))),
     ];
     let mut lines = provenance.lines();
-    lines.extend(origin_line(gaussians, false));
+    lines.extend(provenance.world_line(gaussians, false));
     let mut meta = json!({
         "version": 2,
         "asset": { "generator": GENERATOR, "provenance": lines },

@@ -5,7 +5,7 @@
 
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 
-use super::{gzip_with, half_turn, origin_line, sigmoid, unit};
+use super::{Provenance, gzip_with, half_turn, sigmoid, unit};
 use crate::splats::scene::{Gaussians, rest_coefficients};
 use crate::{Error, Result};
 
@@ -29,7 +29,7 @@ pub enum Version {
 ///
 /// # Errors
 /// [`Error::Usage`]: a position is farther from the origin than 24 bits of whole units reach.
-pub fn encode(gaussians: &Gaussians, version: Version) -> Result<Vec<u8>> {
+pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) -> Result<Vec<u8>> {
     let gaussians = half_turn(gaussians);
     let fraction = fractional_bits(&gaussians)?;
     let degree = gaussians.shape.sh_degree as u8;
@@ -52,7 +52,7 @@ pub fn encode(gaussians: &Gaussians, version: Version) -> Result<Vec<u8>> {
         Version::V3 => {
             file.extend([degree, fraction, 0, 0]);
             streams.iter().for_each(|stream| file.extend(stream));
-            gzip_with(&file, origin_line(&gaussians, true))
+            gzip_with(&file, provenance.world_line(&gaussians, true))
         }
         Version::V4 => {
             const HEADER: u32 = 32;
@@ -69,7 +69,7 @@ pub fn encode(gaussians: &Gaussians, version: Version) -> Result<Vec<u8>> {
             }
             compressed.iter().for_each(|stream| file.extend(stream));
             // Behind all that the table names, where a reader does not look.
-            file.extend(origin_line(&gaussians, true).unwrap_or_default().bytes());
+            file.extend(provenance.world_line(&gaussians, true).unwrap_or_default().bytes());
             Ok(file)
         }
     }
@@ -125,6 +125,10 @@ mod tests {
     use super::*;
     use crate::results::export::tests::drawn;
 
+    fn encode_alone(model: &Gaussians, version: Version) -> Vec<u8> {
+        encode(model, &Provenance::default(), version).unwrap()
+    }
+
     /// What stands behind the header, as one.
     fn body(file: &[u8]) -> Vec<u8> {
         let word = |at: usize| u64::from_le_bytes(file[at..at + 8].try_into().unwrap()) as usize;
@@ -154,8 +158,7 @@ mod tests {
     fn both_versions_hold_the_same_bytes_at_the_stated_places() {
         for degree in 0..=3 {
             let model = drawn(37, degree);
-            let [v3, v4] =
-                [Version::V3, Version::V4].map(|version| encode(&model, version).unwrap());
+            let [v3, v4] = [Version::V3, Version::V4].map(|version| encode_alone(&model, version));
             assert_eq!(&v4[..12], &[b'N', b'G', b'S', b'P', 4, 0, 0, 0, 37, 0, 0, 0]);
             assert_eq!([v4[12], v4[14]], [degree as u8, 0]);
             let body = body(&v4);
@@ -170,13 +173,13 @@ mod tests {
         model.means_mut()[0] = glam::Vec3::new(3.0, -1.0, 0.25);
         model.means_mut()[1] = glam::Vec3::ZERO;
         assert_eq!(fractional_bits(&model).unwrap(), 21);
-        let body = body(&encode(&model, Version::V4).unwrap());
+        let body = body(&encode_alone(&model, Version::V4));
         let fixed = |at: usize| i32::from_le_bytes([0, body[at], body[at + 1], body[at + 2]]) >> 8;
         // Turned: y and z change their signs.
         let position = [0, 3, 6].map(|at| fixed(at) as f32 / (1 << 21) as f32);
         assert_eq!(position, [3.0, 1.0, -0.25]);
         model.means_mut()[0].x = 1e7;
-        let error = encode(&model, Version::V4).unwrap_err().to_string();
+        let error = encode(&model, &Provenance::default(), Version::V4).unwrap_err().to_string();
         assert!(error.contains("1e7 units from the origin"), "{error}");
     }
 

@@ -168,8 +168,7 @@ fn begin(
     let lock = RunDirectory::lock(out)?;
     let resumes = if_exists == IfExists::Resume;
     let checkpoint = if resumes { generations::newest(out) } else { None };
-    let mut config =
-        with_tile_and_frame(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
+    let mut config = with_what_is_found(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
     // A disk that has room for the run has it for photographs.
     config.spool.get_or_insert_with(|| out.to_owned());
     let config = &config;
@@ -202,10 +201,10 @@ fn begin(
     Ok((directory, trainer))
 }
 
-/// The configuration with the tile and the frame that are to be recorded: the same ones give the same bits, whatever is
-/// measured later. Each is the configuration's own, else that of the run that is `resumed`, else the fastest known on the
-/// device and that of the dataset. A run that records no frame was trained in the world.
-fn with_tile_and_frame(
+/// The configuration with the tile, the frame and the direction of up that are to be recorded: the same ones give the same
+/// bits, whatever is measured later. Each is the configuration's own, else that of the run that is `resumed`, else the
+/// fastest known on the device and that of the dataset. A run that records no frame was trained in the world.
+fn with_what_is_found(
     gpu: &Gpu,
     config: &TrainConfig,
     dataset: &Dataset,
@@ -217,11 +216,13 @@ fn with_tile_and_frame(
         let tile = recorded.tile.filter(|&tile| gpu.properties().suits_tile(tile));
         config.tile = config.tile.or(tile);
         config.frame = Some(recorded.frame.unwrap_or_default());
+        config.up = config.up.or(recorded.up);
     }
     let patches = dataset.views.iter().flat_map(|view| config.patches(gpu, &view.camera));
     let sizes: Vec<[u32; 2]> = patches.map(|patch| patch.size.to_array()).collect();
     config.tile = Some(config.render_settings().tile_for(gpu, sizes.into_iter())?);
     config.frame.get_or_insert_with(|| dataset.frame());
+    config.up.get_or_insert_with(|| dataset.up().to_array());
     Ok(config)
 }
 

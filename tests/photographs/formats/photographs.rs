@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::Path;
 
+use glam::{DAffine3, DMat3, DVec3};
 use image::{ImageBuffer, Luma, Rgb, Rgba};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
 use nightsplat::photographs::image::{Image, Mask, Orientation};
@@ -175,6 +176,9 @@ fn a_photograph_is_turned_where_its_camera_saw_it_upright_and_stays_where_it_did
                 assert_eq!(columns, [false, true], "orientation {orientation} is turned");
             }
             let lone = root.join("images/v03.jpg");
+            let stated = Orientation::of(&lone);
+            let left = if is_turned { Orientation::UPRIGHT } else { stated };
+            assert_eq!(view(&dataset, "v03").orientation, left);
             let upright = Image::load(&lone).unwrap().turned(Orientation::of(&lone));
             assert_eq!((upright.width, upright.height), Orientation::of(&lone).size(stored));
         }
@@ -183,6 +187,34 @@ fn a_photograph_is_turned_where_its_camera_saw_it_upright_and_stays_where_it_did
         let upright = if orientation >= 5 { " (upright 40x36)" } else { "" };
         let expected = format!("v03.jpg: is 36x40{upright} but its camera is 40x30");
         assert!(error.contains(&expected), "{error}");
+    }
+}
+
+#[test]
+fn up_is_that_of_the_photographs_as_people_see_them() {
+    // A phone held upright stores its pictures lying on a side: orientation 6, cameras of what is stored.
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let backup = DAffine3::from_mat3(DMat3::from_cols(DVec3::NEG_Y, DVec3::X, DVec3::Z));
+    for (orientation, turn) in [(1, DAffine3::IDENTITY), (6, backup)] {
+        let mut frames = vec![];
+        for index in 0..9 {
+            let file = format!("images/{}.jpg", name(index));
+            jpeg(&root.join(&file), SIZE, orientation);
+            frames.push(frame_of(&(turn * pose(index)), &file));
+        }
+        write_json(root.join("transforms.json"), &transforms(frames));
+        let dataset = load(root);
+        let up = dataset.up();
+        assert!(up.distance(DVec3::Z) < 1e-6, "orientation {orientation}: {up}");
+        let first = &dataset.views[0];
+        let seen = first.upright_camera();
+        let size = if orientation == 6 { (30, 40) } else { SIZE };
+        assert_eq!((seen.width, seen.height), size);
+        let image = first.upright(first.image.clone().unwrap());
+        assert_eq!((image.width, image.height), size);
+        let right = seen.view_from_world.matrix3.row(0);
+        assert!(right.dot(DVec3::Z).abs() < 1e-9, "{right}");
     }
 }
 

@@ -208,7 +208,6 @@
 
   const add = (a, b, s = 1) => a.map((v, k) => v + s * b[k]);
   const dot = (a, b) => a.reduce((sum, v, k) => sum + v * b[k], 0);
-  const norm = (a) => { const l = Math.hypot(...a); return a.map((v) => v / l); };
   const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
   const rotate = (v, axis, angle) => {
     const c = Math.cos(angle), s = Math.sin(angle), along = dot(v, axis) * (1 - c), side = cross(axis, v);
@@ -228,12 +227,10 @@
     return [...columns, -dot(right, eye), -dot(down, eye), -dot(forward, eye)];
   }
 
-  // The point nearest to all optical axes, and which way is down on the mean.
+  // The point nearest to all optical axes.
   function center(poses) {
     const a = [0, 0, 0, 0, 0, 0, 0, 0, 0], b = [0, 0, 0];
-    let down = [0, 0, 0];
-    for (const { forward, eye, down: own } of poses) {
-      down = add(down, own);
+    for (const { forward, eye } of poses) {
       for (let i = 0; i < 3; i++) {
         for (let j = 0; j < 3; j++) {
           const entry = (i === j ? 1 : 0) - forward[i] * forward[j];
@@ -245,17 +242,19 @@
     const column = (k) => [a[k], a[3 + k], a[6 + k]];
     const determinant = dot(column(0), cross(column(1), column(2)));
     const first = poses[0];
-    const point = Math.abs(determinant) < 1e-9 * poses.length ** 3
+    return Math.abs(determinant) < 1e-9 * poses.length ** 3
       ? add(first.eye, first.forward, 10 * scene.near)
       : [dot(b, cross(column(1), column(2))), dot(column(0), cross(b, column(2))), dot(column(0), cross(column(1), b))]
         .map((value) => value / determinant);
-    return { point, down: Math.hypot(...down) > 1e-6 ? norm(down) : first.down };
   }
 
   function start(draw) {
     const views = scene.views, poses = views.map(pose);
-    const middle = center(poses);
-    let current = { ...poses[0] }, bookmark = 0, lens = views[0], target = [...middle.point], pending = false;
+    const down = scene.up.map((value) => -value);
+    let current = { ...poses[0] }, bookmark = 0, lens = views[0], target = center(poses), pending = false;
+    // How much of the view its picture covers, the view's left edge and width on the page, and the last bookmark.
+    let share = 0.5, across = [0, 1], last = 0;
+    const asked = /^#view=(\d+)$/.exec(location.hash);
     const reach = () => Math.max(Math.hypot(...add(target, current.eye, -1)), 2 * scene.near);
 
     const camera = () => (bookmark === null ? freed() : views[bookmark]);
@@ -277,19 +276,25 @@
     // The picture of the view lies over the left part of the model.
     const compare = () => {
       const picture = bookmark === null ? null : views[bookmark].pictures[element('compare').value];
-      element('overlay').hidden = element('sliderLabel').hidden = !picture;
+      element('overlay').hidden = element('divider').hidden = !picture;
       if (!picture) return;
-      const fit = placed(views[bookmark], canvas.clientWidth, canvas.clientHeight), share = Number(element('slider').value);
+      const fit = placed(views[bookmark], canvas.clientWidth, canvas.clientHeight);
       const [width, height] = views[bookmark].size.map((v) => v * fit.zoom);
+      across = [fit.left, width];
       Object.assign(element('overlay').style,
         { left: fit.left + 'px', top: fit.top + 'px', width: share * width + 'px', height: height + 'px' });
+      Object.assign(element('divider').style,
+        { left: fit.left + share * width + 'px', top: fit.top + 'px', height: height + 'px' });
+      element('divider').setAttribute('aria-valuenow', Math.round(100 * share));
       const image = element('picture');
       if (image.src !== picture.image) image.src = picture.image;
       Object.assign(image.style, { width: width + 'px', height: height + 'px' });
-      element('sliderText').textContent = picture.label;
+      element('leftText').textContent = picture.label;
     };
     const choose = (index) => {
       bookmark = index;
+      if (index !== null) last = index;
+      element('return').disabled = index !== null;
       element('views').value = index === null ? '' : String(index);
       const before = element('compare').value, list = element('compare');
       list.replaceChildren(new Option('model alone', ''));
@@ -302,6 +307,21 @@
       refresh();
     };
     const free = () => { if (bookmark !== null) choose(null); };
+    const back = () => { target = center(poses); choose(last); };
+    // As the page opens: the photograph, which is dark, over the left half of the model.
+    const reset = () => {
+      share = 0.5;
+      element('grey').checked = false;
+      last = asked && views[asked[1]] ? Number(asked[1]) : 0;
+      back();
+      if (views[last].pictures.length) element('compare').value = '0';
+      canvas.focus({ preventScroll: true });
+    };
+    const divide = (value) => { share = Math.max(0, Math.min(1, value)); compare(); };
+    const fill = () => {
+      if (document.fullscreenElement) document.exitFullscreen();
+      else document.documentElement.requestFullscreen?.().catch(() => {});
+    };
 
     // Dragging turns about the target, upright; moving takes the target along.
     const turn = (x, y) => {
@@ -311,14 +331,14 @@
         current.eye = add(target, arm);
         for (const key of ['right', 'down', 'forward']) current[key] = rotate(current[key], axis, angle);
       };
-      about(middle.down, x);
-      const level = dot(current.forward, middle.down);
+      about(down, x);
+      const level = dot(current.forward, down);
       if (!(level > 0.98 && y > 0) && !(level < -0.98 && y < 0)) about(current.right, y);
       refresh();
     };
     const look = (x, y) => {
       free();
-      for (const [axis, angle] of [[middle.down, x], [current.right, y]]) {
+      for (const [axis, angle] of [[down, x], [current.right, y]]) {
         for (const key of ['right', 'down', 'forward']) current[key] = rotate(current[key], axis, angle);
       }
       target = add(current.eye, current.forward, reach());
@@ -365,13 +385,17 @@
       approach(Math.exp(Math.max(-1, Math.min(1, event.deltaY / 500))));
     }, { passive: false });
     const keys = {
-      w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0],
+      w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], e: [0, -1, 0], q: [0, 1, 0],
     };
-    canvas.addEventListener('keydown', (event) => {
+    const commands = { g: 'grey', r: 'return', f: 'fullscreen', home: 'reset' };
+    // Wherever the focus is, but for controls that have keys of their own.
+    document.addEventListener('keydown', (event) => {
+      if (event.target.closest?.('select, #divider')) return;
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
       const step = keys[event.key.toLowerCase()], turns = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
       if (step) move(...step.map((v) => 0.03 * reach() * v));
       else if (turns) look(turns[0] * 0.04, turns[1] * 0.04);
-      else if (event.key.toLowerCase() === 'g') element('grey').click();
+      else if (commands[event.key.toLowerCase()]) element(commands[event.key.toLowerCase()]).click();
       else return;
       event.preventDefault();
     });
@@ -379,15 +403,25 @@
     element('views').append(new Option('free', ''), ...views.map(({ name }, k) => new Option(name, String(k))));
     element('views').addEventListener('change', ({ target: { value } }) => choose(value === '' ? null : Number(value)));
     for (const id of ['compare', 'grey']) element(id).addEventListener('change', refresh);
-    element('slider').addEventListener('input', () => compare());
+    for (const [id, act] of [['return', back], ['reset', reset], ['fullscreen', fill]]) element(id).addEventListener('click', act);
+    const divider = element('divider');
+    divider.addEventListener('pointerdown', (event) => divider.setPointerCapture(event.pointerId));
+    divider.addEventListener('pointermove', (event) => {
+      if (divider.hasPointerCapture(event.pointerId)) divide((event.clientX - canvas.getBoundingClientRect().left - across[0]) / across[1]);
+    });
+    divider.addEventListener('keydown', (event) => {
+      const to = { ArrowLeft: share - 0.05, ArrowRight: share + 0.05, Home: 0, End: 1 }[event.key];
+      if (to === undefined) return;
+      divide(to);
+      event.preventDefault();
+    });
     element('provenance').append(...[...scene.provenance, `${scene.count} Gaussians`].map((line) => {
       const item = document.createElement('li');
       item.textContent = line;
       return item;
     }));
     new ResizeObserver(refresh).observe(canvas);
-    const asked = /^#view=(\d+)$/.exec(location.hash);
-    choose(asked && views[asked[1]] ? Number(asked[1]) : 0);
+    reset();
     paint();
   }
 

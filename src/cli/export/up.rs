@@ -1,0 +1,106 @@
+//! Which direction of a model's world is up, and how an exported file is turned by it.
+
+use std::str::FromStr;
+
+use glam::{DQuat, DVec3};
+
+use super::{ExportArgs, To};
+use crate::splats::scene::Gaussians;
+use crate::train::TrainConfig;
+use crate::{Error, Result};
+
+/// Less is no turn, radians.
+const NO_TURN: f64 = 1e-6;
+
+/// What `--up` names.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Up {
+    /// The axes stay as they are.
+    Keep,
+    /// A unit vector of the dataset's world.
+    Direction(DVec3),
+}
+
+impl FromStr for Up {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        let direction = match text {
+            "none" => return Ok(Self::Keep),
+            "x" => Some(DVec3::X),
+            "y" => Some(DVec3::Y),
+            "z" => Some(DVec3::Z),
+            "-x" => Some(DVec3::NEG_X),
+            "-y" => Some(DVec3::NEG_Y),
+            "-z" => Some(DVec3::NEG_Z),
+            _ => {
+                let numbers: Option<Vec<f64>> =
+                    text.split(',').map(|number| number.trim().parse().ok()).collect();
+                let three = numbers.and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());
+                three.and_then(|numbers| DVec3::from_array(numbers).try_normalize())
+            }
+        };
+        let problem = "names no direction; x, y, z, -x, -y, -z, three numbers X,Y,Z, or none";
+        direction.map(Self::Direction).ok_or_else(|| Error::Usage(format!("`{text}` {problem}")))
+    }
+}
+
+impl ExportArgs {
+    /// What is up in the model's world, as far as that is asked for or known: a unit vector.
+    pub(super) fn up(&self, config: &TrainConfig) -> Option<DVec3> {
+        match self.up {
+            Some(Up::Direction(up)) => Some(up),
+            Some(Up::Keep) => None,
+            None => config.up.and_then(|up| DVec3::from_array(up).try_normalize()),
+        }
+    }
+
+    /// The rotation of the model that brings up to where the format has it, and what to say of it.
+    ///
+    /// Every format but a page takes -y of the model's axes for up, which GLB and SPZ call +y. GLB and SPZ, whose
+    /// axes mean something to their readers, are turned by what the run knows; PLY and SOG where `--up` is given.
+    pub(super) fn rotation(&self, config: &TrainConfig) -> Option<(DQuat, String)> {
+        let has_axes = matches!(self.to, To::Glb | To::Spz);
+        if self.to == To::Html || self.up == Some(Up::Keep) || !(has_axes || self.up.is_some()) {
+            return None;
+        }
+        let Some(up) = self.up(config) else {
+            tracing::warn!(
+                "{}: does not say what is up, which is taken to be -y of its axes; --up names another direction",
+                self.run.display()
+            );
+            return None;
+        };
+        let rotation = DQuat::from_rotation_arc(up, DVec3::NEG_Y);
+        let angle = up.angle_between(DVec3::NEG_Y);
+        let [x, y, z] = up.to_array().map(|part| format!("{:.3}", part + 0.0));
+        let axis = if has_axes { "+Y" } else { "-Y" };
+        let line = format!(
+            "; turned by {:.1} degrees: ({x}, {y}, {z}) of the dataset is {axis}, up",
+            angle.to_degrees()
+        );
+        (angle > NO_TURN).then_some((rotation, line))
+    }
+}
+
+/// The model turned, or as it is.
+pub(super) fn turned(gaussians: Gaussians, rotation: DQuat) -> Gaussians {
+    if rotation == DQuat::IDENTITY { gaussians } else { gaussians.rotated(rotation) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_direction_is_an_axis_or_three_numbers() {
+        let parsed = |text: &str| text.parse::<Up>().unwrap();
+        assert_eq!(parsed("none"), Up::Keep);
+        assert_eq!(parsed("-z"), Up::Direction(DVec3::NEG_Z));
+        assert_eq!(parsed("0, -2,0"), Up::Direction(DVec3::NEG_Y));
+        for text in ["up", "1,2", "0,0,0", "1,2,nan", "1,2,3,4", ""] {
+            let refused = text.parse::<Up>().unwrap_err().to_string();
+            assert!(refused.contains("names no direction; x, y"), "{refused}");
+        }
+    }
+}

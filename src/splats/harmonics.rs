@@ -1,0 +1,87 @@
+//! Real spherical harmonics to degree 3 on the host, in f64, and their coefficients in turned axes.
+
+use std::f64::consts::TAU;
+
+use glam::{DMat3, DVec3};
+
+use crate::kernels::sh::{SH_C0, SH_C1, SH_C2, SH_C3};
+
+/// Coefficients per colour up to a degree.
+pub fn sh_count(degree: u32) -> usize {
+    (degree as usize + 1).pow(2)
+}
+
+/// The basis in the unit direction `d`; entries above `degree` are zero.
+pub fn sh_basis(degree: u32, d: DVec3) -> [f64; 16] {
+    let [x, y, z] = d.to_array();
+    let mut basis = [
+        SH_C0,
+        -SH_C1 * y,
+        SH_C1 * z,
+        -SH_C1 * x,
+        SH_C2[0] * x * y,
+        SH_C2[1] * y * z,
+        SH_C2[2] * (2.0 * z * z - x * x - y * y),
+        SH_C2[3] * x * z,
+        SH_C2[4] * (x * x - y * y),
+        SH_C3[0] * y * (3.0 * x * x - y * y),
+        SH_C3[1] * x * y * z,
+        SH_C3[2] * y * (4.0 * z * z - x * x - y * y),
+        SH_C3[3] * z * (2.0 * z * z - 3.0 * x * x - 3.0 * y * y),
+        SH_C3[4] * x * (4.0 * z * z - x * x - y * y),
+        SH_C3[5] * z * (x * x - y * y),
+        SH_C3[6] * x * (x * x - 3.0 * y * y),
+    ];
+    basis[sh_count(degree)..].fill(0.0);
+    basis
+}
+
+/// What coefficients above degree 0 become when everything is turned: row k, column j is the part of coefficient j in
+/// the new coefficient k. Degrees do not mix.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct HarmonicRotation([[f64; 15]; 15]);
+
+impl HarmonicRotation {
+    /// Of a rotation that takes directions to where they then point.
+    ///
+    /// The basis is orthonormal over the sphere, so that a part is the integral of the product of a turned basis
+    /// function and another one. These are polynomials of degree 6: four rings after Gauss and Legendre of eight
+    /// directions each are exact.
+    pub(crate) fn new(rotation: DMat3) -> Self {
+        const RINGS: [(f64, f64); 4] = [
+            (-0.861_136_311_594_052_6, 0.347_854_845_137_453_85),
+            (-0.339_981_043_584_856_26, 0.652_145_154_862_546_1),
+            (0.339_981_043_584_856_26, 0.652_145_154_862_546_1),
+            (0.861_136_311_594_052_6, 0.347_854_845_137_453_85),
+        ];
+        const DIRECTIONS: u32 = 8;
+        let mut parts = [[0.0; 15]; 15];
+        for (z, weight) in RINGS {
+            for index in 0..DIRECTIONS {
+                let (sin, cos) = (TAU * f64::from(index) / f64::from(DIRECTIONS)).sin_cos();
+                let ring = (1.0 - z * z).sqrt();
+                let direction = DVec3::new(ring * cos, ring * sin, z);
+                let (turned, own) = (sh_basis(3, rotation * direction), sh_basis(3, direction));
+                let weight = weight * TAU / f64::from(DIRECTIONS);
+                for degree in 1..=3 {
+                    let own_degree = sh_count(degree - 1)..sh_count(degree);
+                    for k in own_degree.clone() {
+                        for j in own_degree.clone() {
+                            parts[k - 1][j - 1] += weight * turned[k] * own[j];
+                        }
+                    }
+                }
+            }
+        }
+        Self(parts)
+    }
+
+    /// Turns the coefficients above degree 0 of one Gaussian: 0, 3, 8 or 15.
+    pub(crate) fn turn(&self, rest: &mut [glam::Vec3]) {
+        let before: Vec<DVec3> = rest.iter().map(|value| value.as_dvec3()).collect();
+        for (value, parts) in rest.iter_mut().zip(&self.0) {
+            *value =
+                before.iter().zip(parts).map(|(own, part)| *own * *part).sum::<DVec3>().as_vec3();
+        }
+    }
+}
