@@ -52,7 +52,7 @@ pub struct PoseArgs {
     /// Path of GLOMAP, for --mapper global with COLMAP before 4.0
     #[arg(long, value_name = "PATH", default_value = "glomap")]
     pub glomap: PathBuf,
-    /// Option of a COLMAP command, as Mapper.init_min_tri_angle=4; may be given again
+    /// Option of a COLMAP command, as `Mapper.init_min_tri_angle=4`; may be given again
     #[arg(long, value_name = "NAME=VALUE")]
     pub colmap_option: Vec<String>,
     /// COLMAP camera model; photographs of one size, lens and focal length share a camera

@@ -182,8 +182,7 @@ impl Gaussians {
         moved
     }
 
-    /// The same model in a world that is turned about its origin: what was in direction `d` is in direction `rotation
-    /// * d`.
+    /// The same model in a world that is turned about its origin: direction `d` becomes `rotation * d`.
     ///
     /// [`Gaussians::save`] takes the direction -y for up, as cameras that are held level in `OpenCV`'s axes have it;
     /// a model whose `up` is another one is turned by `DQuat::from_rotation_arc(up, DVec3::NEG_Y)` first.

@@ -95,8 +95,8 @@ fn a_colmap_model_trains_and_what_is_wrong_with_one_is_named() {
     let same = |text: String| text;
     trains_and_says(colmap_set(same, same).path(), &[]);
 
-    let set = colmap_set(|text| text.replace(" PINHOLE ", " FISHEYE "), same);
-    refuses_to_train(set.path(), "", 3, &["FISHEYE"]);
+    let set = colmap_set(|text| text.replace(" PINHOLE ", " EUCM "), same);
+    refuses_to_train(set.path(), "", 3, &["EUCM"]);
 
     // Every pose: no view is left. One pose: the others go on.
     let spoil = |count: usize| {

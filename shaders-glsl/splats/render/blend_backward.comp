@@ -9,8 +9,8 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 //! Blend backward: a tile's subgroups, most often one, record the gradient of every intersection in its slot.
 //!
-//! Walks front to back again, as the forward pass did, with the light still to come, L_i = sum_{k >= i} c_k alpha_k T_k
-//! + T background, which starts as the render itself: dC / dalpha_i = (c_i T_i - L_i) / (1 - alpha_i). Of both, the
+//! Walks front to back again, as the forward pass did, with the light still to come, L_i = sum_{k >= i} c_k alpha_k T_k +
+//! T background, which starts as the render itself: dC / dalpha_i = (c_i T_i - L_i) / (1 - alpha_i). Of both, the
 //! product with dL/dC is all that is needed: one number a pixel, however many channels. No atomics: a slot is written
 //! by the one tile it belongs to, and the sums over a tile's parts and over a Gaussian's slots come in a fixed order.
 

@@ -49,9 +49,9 @@ pub(super) fn implausible(lens: &Lens) -> Option<String> {
     let corners = [DVec2::ZERO, DVec2::X, DVec2::Y, DVec2::ONE];
     let bent = corners.map(|corner| {
         let at = (corner * size - lens.principal_point) / lens.focal;
-        let folds = !(lens.distortion.determinant(at) > 0.0);
         let moved = lens.distortion.distort(at).distance(at) / at.length();
-        if folds { f64::INFINITY } else { moved }
+        // A NaN folds, too.
+        if lens.distortion.determinant(at) > 0.0 { moved } else { f64::INFINITY }
     });
     let most = bent.into_iter().fold(0.0, f64::max);
     let is_absurd = most > MOST_DISTORTED;

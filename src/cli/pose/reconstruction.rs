@@ -156,7 +156,7 @@ impl<'a> Reconstruction<'a> {
         }
         say(&format!("{placed} of {all} have a camera: compared once more, guided"))?;
         self.is_guided = true;
-        self.into_folder("guided")?;
+        self.use_folder("guided")?;
         self.database = features;
         match self.compare(all, &say).and_then(|()| self.place(tone_mapped, &say)) {
             // What the first comparison came to is there.
@@ -175,7 +175,7 @@ impl<'a> Reconstruction<'a> {
                     "{placed} of {all} have a camera: placed once more, from a closer pair"
                 ))?;
                 self.relaxed = relaxed;
-                self.into_folder(&format!("relaxed{step}"))?;
+                self.use_folder(&format!("relaxed{step}"))?;
                 self.place(tone_mapped, &say)?;
             }
             let found = placed_in(&self.models)?;
@@ -187,7 +187,7 @@ impl<'a> Reconstruction<'a> {
     }
 
     /// Models go into another folder from here on.
-    fn into_folder(&mut self, name: &str) -> Result<()> {
+    fn use_folder(&mut self, name: &str) -> Result<()> {
         self.models = self.work.join(name);
         Ok(create_folder(&self.models)?)
     }

@@ -44,9 +44,9 @@ fn counted(printed: &str) -> Option<[usize; 2]> {
             Some([at.parse::<usize>().ok()?, of.parse::<usize>().ok()?])
         });
         let pairs = pairs.collect::<Option<Vec<_>>>()?;
-        match pairs.as_slice() {
-            &[[at, of]] => Some([at, of]),
-            &[[row, rows], [column, columns]] => {
+        match *pairs.as_slice() {
+            [[at, of]] => Some([at, of]),
+            [[row, rows], [column, columns]] => {
                 Some([row.saturating_sub(1) * columns + column, rows * columns])
             }
             _ => None,

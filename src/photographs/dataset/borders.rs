@@ -25,6 +25,9 @@ const MAX_VIEWS: f64 = 0.9;
 const LEAST_AREA: f64 = 0.002;
 /// The part of its outline at which black must end abruptly.
 const LEAST_ABRUPT: f64 = 0.5;
+/// In most views black from the border on is at most this many times what all have in common: a sky whose horizon moves
+/// has more.
+const MOST_EXTRA: f64 = 1.2;
 /// What JPEG makes of black in a block that shows something as well is below this.
 const DIM: f32 = 8.0 / 255.0;
 /// A block of JPEG, pixels: so far around black what is dim in most views is black.
@@ -77,7 +80,7 @@ fn border(images: impl Iterator<Item = Image>, (width, height): (u32, u32)) -> O
     let plane = Plane { width: width as usize, height: height as usize };
     let least = (LEAST_AREA * plane.len() as f64).ceil().max(1.0) as usize;
     let mut counts = vec![0_u16; plane.len()];
-    let mut brightness = vec![];
+    let (mut brightness, mut areas) = (vec![], vec![]);
     for image in images {
         if image.pixel_count() != plane.len() {
             return None;
@@ -89,6 +92,7 @@ fn border(images: impl Iterator<Item = Image>, (width, height): (u32, u32)) -> O
             return None;
         }
         black.iter().for_each(|&pixel| counts[pixel] += 1);
+        areas.push(black.len());
         brightness.push(values);
     }
     let views = brightness.len();
@@ -99,6 +103,10 @@ fn border(images: impl Iterator<Item = Image>, (width, height): (u32, u32)) -> O
     let is_common = |pixel: usize| counts[pixel] >= most;
     let common: Vec<usize> = (0..plane.len()).filter(|&pixel| is_common(pixel)).collect();
     if common.len() < least || common.len() == plane.len() {
+        return None;
+    }
+    areas.sort_unstable();
+    if areas[views / 2] as f64 > MOST_EXTRA * common.len() as f64 {
         return None;
     }
     // Where black ends, what lies a block farther shows something in most views.

@@ -30,7 +30,7 @@ struct Transforms {
     #[serde(flatten)]
     shared: Intrinsics,
     frames: Vec<ListedFrame>,
-    /// Held-out frames of the same form (ScanNet++).
+    /// Held-out frames of the same form (`ScanNet++`).
     #[serde(default)]
     test_frames: Vec<ListedFrame>,
     ply_file_path: Option<String>,

@@ -243,7 +243,8 @@ fn scaled_rounded_and_transposed_matrices_are_read_and_told() {
     let dataset = load(folder.path());
     (0..9).for_each(|index| assert_camera_is_view(&dataset.views[index], index));
 
-    let cases: [(&str, fn([[f64; 4]; 4]) -> [[f64; 4]; 4]); 2] = [
+    type Change = fn([[f64; 4]; 4]) -> [[f64; 4]; 4];
+    let cases: [(&str, Change); 2] = [
         ("hold a scale (9 of them, 0.2500 the last)", |mut matrix| {
             matrix
                 .iter_mut()

@@ -44,7 +44,7 @@ impl Unsupported {
     }
 }
 
-/// Whether a frame is marked to be left out: `is_bad` of ScanNet++ and the like.
+/// Whether a frame is marked to be left out: `is_bad` of `ScanNet++` and the like.
 pub(super) fn is_marked_bad(frame: &Map<String, Value>) -> bool {
     const BAD: [&str; 5] = ["is_bad", "bad", "ignore", "skip", "excluded"];
     const GOOD: [&str; 3] = ["is_valid", "valid", "enabled"];

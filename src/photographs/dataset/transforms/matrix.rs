@@ -36,7 +36,7 @@ const LENGTH_TOLERANCE: f64 = 0.02;
 /// How far `R^T R` may be from the identity, entry by entry: two decimals are off by 0.02.
 const ROTATION_TOLERANCE: f64 = 0.05;
 /// Where it is farther off than this, single precision does not explain it.
-const IS_ROUNDED: f64 = 1e-3;
+const IS_ROUNDED: f64 = 2e-4;
 /// Where it is closer than this, the matrix is taken as it is.
 const IS_EXACT: f64 = 1e-5;
 
@@ -56,7 +56,7 @@ pub(super) fn are_transposed<'a>(matrices: impl Iterator<Item = &'a Rows> + Clon
 /// The pose of a camera from view to world in OpenGL axes, as 4x4 or 3x4 rows.
 ///
 /// # Errors
-/// What makes it none, to be read after "its transform_matrix".
+/// What makes it none, to be read after "its `transform_matrix`".
 pub(super) fn pose(rows: &Rows, is_transposed: bool) -> Result<Pose, &'static str> {
     let world_from_gl = affine(rows, is_transposed)
         .filter(DAffine3::is_finite)
