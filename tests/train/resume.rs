@@ -245,7 +245,7 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
     };
     refuses(&mut trainer, &whole[..whole.len() - 5], &["not an intact checkpoint"]);
     refuses(&mut trainer, b"", &["not an intact checkpoint"]);
-    refuses(&mut trainer, &edited("checkpoint 1", "checkpoint 9"), &["is no `nightsplat"]);
+    refuses(&mut trainer, &edited("checkpoint 1", "checkpoint 9"), &["is not a `nightsplat"]);
     refuses(&mut trainer, &edited("visit_counts", "visit_c0unts"), &["density.visit_counts"]);
     refuses(&mut trainer, &edited("first_moments", "first_m0ments"), &["gaussians.first_moments"]);
     refuses(&mut trainer, &edited("seed = 10", "seed = 11"), &["seed = 11, not 10", "--overwrite"]);
