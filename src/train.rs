@@ -1,4 +1,4 @@
-//! Training: one view a step, its pseudo-GT the target, the Gaussians what is learned.
+//! Training: each step renders one view and compares it with its pseudo-GT.
 
 mod best;
 mod cache;
@@ -88,31 +88,31 @@ mod streams {
     pub(super) const FILL: u64 = 9;
 }
 
-/// What one step did.
+/// The result of one step.
 #[derive(Clone, Debug)]
 pub struct StepReport {
-    /// Counted from 1.
+    /// The number of the step, from 1.
     pub step: u64,
-    /// The view it trained on.
+    /// The name of the view.
     pub view: String,
-    /// The weighted sum of the terms.
+    /// The loss: the weighted sum of the terms.
     pub loss: f64,
-    /// Every term that the model has, unweighted.
+    /// The unweighted terms of the model's loss.
     pub terms: Vec<(Term, f64)>,
-    /// The number of Gaussians it rendered.
+    /// The number of Gaussians rendered.
     pub gaussians: usize,
-    /// Its share of the time its submission took, in milliseconds.
+    /// Its share of the submission's time, in milliseconds.
     pub milliseconds: f64,
 }
 
 impl StepReport {
-    /// The value of a term; 0 where the model does not have it.
+    /// The value of a term; 0 if the model does not have it.
     pub fn term(&self, term: Term) -> f64 {
         self.terms.iter().find(|(own, _)| *own == term).map_or(0.0, |&(_, value)| value)
     }
 }
 
-/// A model in training, and all that its steps need; [`crate::results::run::train`] drives one into a run directory.
+/// A model in training. [`crate::results::run::train`] trains one into a run directory.
 ///
 /// ```no_run
 /// use nightsplat::{Dataset, DeviceChoice, Gpu, TrainConfig, Trainer};
@@ -133,11 +133,11 @@ impl StepReport {
 pub struct Trainer {
     gpu: Gpu,
     config: TrainConfig,
-    /// What is trained on.
+    /// The dataset's fingerprint.
     fingerprint: Fingerprint,
-    /// Where everything on the device lies.
+    /// The frame of all coordinates on the device.
     frame: TrainingFrame,
-    /// In units of the frame.
+    /// The scene's extent, in units of the frame.
     extent: f64,
     /// Steps done.
     step: u64,
@@ -148,33 +148,33 @@ pub struct Trainer {
     growth: Growth,
     convergence: Convergence,
     submissions: Submissions,
-    /// On the device, beside what follows the number of Gaussians and intersections, in bytes.
+    /// Bytes on the device that do not depend on the number of Gaussians and intersections.
     fixed_bytes: f64,
 }
 
-/// What changes the parameters, and watches over them.
+/// The optimizer and the check of the parameters.
 #[derive(Debug)]
 struct Optimizer {
     adam: Adam,
     finite: FiniteCheck,
-    /// After this step the parameters were looked at last.
+    /// The step of the last check of the parameters.
     checked: u64,
 }
 
 impl Trainer {
-    /// Uploads the training views, takes their statistics and places the first Gaussians, or those of [`TrainConfig::init`].
+    /// Uploads the training views, measures them and places the first Gaussians, or those of [`TrainConfig::init`].
     ///
     /// # Errors
-    /// The configuration makes no sense, the model to begin with does not suit it, or the device is out of memory or lost.
+    /// The configuration is invalid, the initial model does not fit it, or the device is out of memory or lost.
     pub fn new(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
         let initial = config.initial_model()?;
         Self::on_patches(gpu, config, dataset, initial.as_ref())
     }
 
-    /// The same from Gaussians that there are already.
+    /// As [`Trainer::new`], starting from given Gaussians.
     ///
     /// # Errors
-    /// As [`Trainer::new`], or the Gaussians are not made of what the configuration's model is.
+    /// As [`Trainer::new`], or the shape of the Gaussians differs from the configured model's.
     pub fn from_gaussians(
         gpu: &Gpu,
         config: TrainConfig,
@@ -184,7 +184,7 @@ impl Trainer {
         Self::on_patches(gpu, config, dataset, Some(gaussians))
     }
 
-    /// Steps done so far.
+    /// The number of steps done.
     pub fn steps_done(&self) -> u64 {
         self.step
     }
@@ -194,8 +194,7 @@ impl Trainer {
         self.model.count()
     }
 
-    /// The Gaussians as they are now, on the host, in the dataset's world as far as f32 holds it, with the SH degree that the
-    /// steps have reached.
+    /// Reads back the Gaussians, in the dataset's world as far as f32 holds it, with the SH degree reached so far.
     ///
     /// # Errors
     /// The device was lost.
@@ -203,7 +202,7 @@ impl Trainer {
         Ok(self.gaussians_in_frame()?.to_world(&self.frame))
     }
 
-    /// The same in [`Trainer::frame`], to the bit as they are trained.
+    /// The Gaussians in [`Trainer::frame`], bit for bit as trained.
     ///
     /// # Errors
     /// The device was lost.
@@ -212,18 +211,18 @@ impl Trainer {
         self.model.download(&self.gpu)
     }
 
-    /// What is trained on.
+    /// The dataset's fingerprint.
     pub(crate) fn fingerprint(&self) -> &Fingerprint {
         &self.fingerprint
     }
 
-    /// Where the Gaussians are trained.
+    /// The frame in which the Gaussians are trained.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn frame(&self) -> &TrainingFrame {
         &self.frame
     }
 
-    /// Sets how many intersections a view may have before memory has to grow, where that is known better than guessed.
+    /// Reserves memory for this number of intersections of a view.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -232,17 +231,18 @@ impl Trainer {
         self.renderer.set_intersection_capacity(intersections)
     }
 
-    /// Trains up to `until`, or for about half a second, and reports every step done; nothing is under way afterwards.
-    /// Steps that the configuration wants checked are, each on its own.
+    /// Trains up to `until`, or for about half a second, and reports every step; waits until the device is done. Steps
+    /// to be checked ([`TrainConfig::check`]) run one at a time.
     ///
     /// # Errors
-    /// [`Error::Usage`] where the run has ended early, [`Error::NotFinite`] where a loss term or a gradient is NaN and [`StopConfig::not_finite`] leaves no view out,
-    /// [`Error::TileLimit`] where the device cannot follow as many splats as lie on one tile, [`Error::Disagrees`] where a
-    /// checked step is to stop at a difference and has one, or the device is out of memory or lost.
+    /// [`Error::Usage`] if the run has ended, [`Error::NotFinite`] if a loss term or gradient is not finite and
+    /// [`StopConfig::not_finite`] says to stop, [`Error::TileLimit`] if a tile has more splats than the device can
+    /// process, [`Error::Disagrees`] if a checked step differs from its references and [`TrainConfig::check`] says to
+    /// stop, or the device is out of memory or lost.
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
         if until > self.step && self.step < self.config.steps && self.has_ended() {
             return Err(Error::Usage(format!(
-                "the run has ended at step {}, before step {until}, as the held-out views have converged; `Trainer::has_ended` tells",
+                "the run has ended at step {}, before step {until}: the held-out views have converged (`Trainer::has_ended`)",
                 self.step
             )));
         }
@@ -254,7 +254,7 @@ impl Trainer {
         }
     }
 
-    /// One step with every pass checked; a difference ends the run or is a warning, as the configuration says.
+    /// One step with every pass checked; a difference is an error or a warning, as configured.
     #[cfg(feature = "check")]
     fn agreeing_step(&mut self) -> Result<Vec<StepReport>> {
         let (reports, checks) = self.check_step();
@@ -268,23 +268,23 @@ impl Trainer {
 
     #[cfg(not(feature = "check"))]
     fn agreeing_step(&mut self) -> Result<Vec<StepReport>> {
-        let problem = "`check.every` compares steps with the references, which this build lacks";
+        let problem = "`check.every` needs the CPU references, which this build lacks";
         Err(Error::Usage(format!("{problem}: build with feature `check`, or set it to 0")))
     }
 
-    /// Trains one step with every pass checked ([`Gpu::checked`]), density control included, and reports on them. The
-    /// model is what [`Trainer::advance`] would have made of it, bit for bit; no step is reported where it has to be done
-    /// again with more memory.
+    /// Trains one step with every pass checked ([`Gpu::checked`]), density control included. The model has the bits
+    /// that [`Trainer::advance`] gives it; a step that must be redone with more memory is not reported.
     #[cfg(feature = "check")]
     pub fn check_step(&mut self) -> (Result<Vec<StepReport>>, CheckReport) {
         let next = self.step + 1;
         self.gpu.clone().checked(|| self.submit_steps(next))
     }
 
-    /// Trains one step and reports how long each of its passes took on the device.
+    /// Trains one step and measures the time of each pass on the device.
     ///
     /// # Errors
-    /// As [`Trainer::advance`]; a step that overflows its memory is not counted, the next [`Trainer::advance`] redoes it.
+    /// As [`Trainer::advance`]. A step that overflows its memory is not counted; the next [`Trainer::advance`] redoes
+    /// it.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         let step = self.step + 1;
         self.allocate_sh_degree()?;
@@ -296,7 +296,7 @@ impl Trainer {
         Ok(times)
     }
 
-    /// The algorithm: render a view, compare it with its pseudo-GT, go back, update.
+    /// Records a step: render a view, compare it with its pseudo-GT, backward pass, update.
     fn record_step(&mut self, pass: &mut Recorder<'_>, step: u64, slot: u32) -> Result<()> {
         let schedule = &self.config.schedule;
         let view = self.view_id(step);
@@ -330,20 +330,20 @@ impl Trainer {
         supervision.update(pass, &optimizer.adam, step, cooldown_factor, status)
     }
 
-    /// The networks; none where the model has none.
+    /// The networks, if the model has any.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn networks(&mut self) -> Option<&mut Networks> {
         self.supervision.networks()
     }
 
-    /// The learning rates of a step, before the settling phase or in it.
+    /// The learning rates of a step, cooldown included.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn learning_rates(&self, step: u64) -> LearningRates {
         let rates = self.config.schedule.learning_rates(step, self.extent);
         rates.scaled(self.cooldown_factor(step))
     }
 
-    /// Renders what `camera` sees, with every SH degree trained so far, before a black background.
+    /// Renders the model from `camera`, with the SH degree reached so far, on a black background.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -352,7 +352,7 @@ impl Trainer {
         self.render_of_degree(&camera, self.sh_degree_in_use())
     }
 
-    /// As [`Trainer::render`], of a camera in the frame.
+    /// As [`Trainer::render`], for a camera in the frame.
     fn render_of_degree(&mut self, camera: &Camera, sh_degree: u32) -> Result<Rendered> {
         let options = RenderOptions { sh_degree, background: [0.0; 3] };
         let gaussians = &self.model.gaussians;

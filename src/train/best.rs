@@ -1,4 +1,4 @@
-//! The best model of a run so far, kept on the host: a run that ends worse goes back to it.
+//! The best model of a run so far, kept on the host and restored if the run ends worse.
 
 use super::Trainer;
 use super::model::Model;
@@ -7,17 +7,16 @@ use crate::Result;
 /// A tensor of a checkpoint: its name, its shape and its values.
 pub(super) type Tensor = (String, Vec<usize>, Vec<f32>);
 
-/// What a model shows, without what training needs to go on: the parameters of the Gaussians and of what else is learned, as
-/// a checkpoint has them.
+/// The learned parameters, without optimizer state, as tensors of a checkpoint.
 pub(super) type Snapshot = Vec<Tensor>;
 
-/// Whether a tensor of a checkpoint is one of those.
+/// Whether a tensor of a checkpoint holds parameters.
 fn is_parameters(name: &str) -> bool {
     name.ends_with(".parameters")
 }
 
 impl Trainer {
-    /// The model as it is now.
+    /// Reads back the current parameters.
     ///
     /// # Errors
     /// The device was lost.
@@ -25,7 +24,7 @@ impl Trainer {
         self.tensors(is_parameters)
     }
 
-    /// Makes the model what it was; moments and statistics are gone.
+    /// Restores the parameters; moments and statistics are reset.
     ///
     /// # Errors
     /// The device is out of memory or lost.

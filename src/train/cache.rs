@@ -1,7 +1,7 @@
-//! Which of the training photographs are on the device, where they do not all fit: the others wait in a file.
+//! The cache of training photographs on the device; those that do not fit wait in a spool file.
 //!
-//! The file holds them as the device had them, so that the cache changes no bit. It has no name where the system allows
-//! that, and goes with the run.
+//! The file holds the device's bytes, so the cache changes no bit of the model. It is unnamed where the system allows
+//! it, and disappears with the run.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -15,15 +15,15 @@ use crate::gpu::Gpu;
 use crate::photographs::pseudo_gt::Encoded;
 use crate::{Error, Result};
 
-/// The fraction of the device's memory, and of the machine's, that photographs take where nothing else is asked for.
+/// The default share of photographs in the memory of the device and of the host.
 const SHARE: f64 = 0.25;
 
-/// How much memory the training photographs may take, on the device and decoded on the host: bytes, as `512M` or `4G`.
+/// Memory for the training photographs, on the device and decoded on the host: bytes, such as `512M` or `4G`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct CacheSize(pub u64);
 
-/// What the letters stand for, powers of 1024.
+/// Suffixes and their powers of 2.
 const UNITS: [(char, u32); 4] = [('K', 10), ('M', 20), ('G', 30), ('T', 40)];
 
 /// A smaller number needs a unit, bytes.
@@ -79,41 +79,41 @@ impl From<CacheSize> for String {
 }
 
 impl CacheSize {
-    /// What the host may keep of decoded photographs: so much, or a quarter of the memory that it may take; none where that
-    /// is not known.
+    /// Bytes of decoded photographs that the host may keep: `size`, or a quarter of `most` or of its memory; `None` if
+    /// unknown.
     pub(super) fn on_host(size: Option<Self>, most: Option<Self>) -> Option<u64> {
         let most = || most.map(|Self(bytes)| bytes).or_else(host_memory);
         size.map(|Self(bytes)| bytes).or_else(|| Some((SHARE * most()? as f64) as u64))
     }
 
-    /// What the device may keep: so much, or a quarter of the memory that may be taken of it.
+    /// Bytes that the device may keep: `size`, or a quarter of `most` or of its memory.
     pub(super) fn on_device(size: Option<Self>, most: Option<Self>, gpu: &Gpu) -> u64 {
         let most = most.map_or(gpu.properties().memory, |Self(bytes)| bytes);
         size.map_or((SHARE * most as f64) as u64, |Self(bytes)| bytes)
     }
 }
 
-/// Bytes of memory that the machine has; none where the system does not say.
+/// The host's memory in bytes; `None` if the system does not tell.
 fn host_memory() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
     Some(line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? << 10)
 }
 
-/// Which photographs are on the device.
+/// The cache of photographs on the device.
 #[derive(Debug)]
 pub(super) struct Cache {
     gpu: Gpu,
     kept: Vec<CachedImage>,
-    /// Those on the device, by when they were asked for last.
+    /// Resident photographs by the time of their last use.
     on_device: BTreeSet<(u64, usize)>,
     budget: u64,
-    /// Bytes that are on the device.
+    /// Bytes on the device.
     taken: u64,
-    /// Counts what is asked for.
+    /// Counts requests.
     clock: u64,
     folder: Option<PathBuf>,
-    /// Once something does not fit.
+    /// Created when a photograph does not fit.
     spool: Option<Arc<Spool>>,
 }
 
@@ -127,18 +127,18 @@ pub(super) struct CachedImage {
     on_device: Option<Arc<Encoded>>,
     in_file: Option<InFile>,
     bytes: u64,
-    /// When it was asked for last.
+    /// The time of its last use.
     asked: u64,
 }
 
 impl Cache {
-    /// One of `budget` bytes on the device; what does not fit lies in `folder`, or where the system has temporary files.
+    /// A cache of `budget` bytes on the device, which spools to `folder` or to the system's temporary folder.
     pub(super) fn new(gpu: &Gpu, budget: u64, folder: Option<PathBuf>) -> Self {
         let (kept, on_device) = (vec![], BTreeSet::new());
         Self { gpu: gpu.clone(), kept, on_device, budget, taken: 0, clock: 0, folder, spool: None }
     }
 
-    /// Takes in a photograph, which stays on the device where there is room.
+    /// Adds a photograph, which stays on the device if it fits.
     ///
     /// # Errors
     /// The file cannot be written, or the device was lost.
@@ -159,22 +159,22 @@ impl Cache {
         Ok(Slot(place))
     }
 
-    /// What a photograph takes on the device.
+    /// The bytes of a photograph on the device.
     pub(super) fn bytes(&self, Slot(place): Slot) -> u64 {
         self.kept[place].bytes
     }
 
-    /// A photograph that is on the device.
+    /// A resident photograph.
     ///
     /// # Errors
-    /// It was not brought there.
+    /// It is not resident.
     pub(super) fn on_device(&self, Slot(place): Slot) -> Result<&Encoded> {
         let absent =
-            || Error::Usage("a photograph is trained on that is not on the device".to_owned());
+            || Error::Usage("a photograph that is trained on is not on the device".to_owned());
         self.kept[place].on_device.as_deref().ok_or_else(absent)
     }
 
-    /// A photograph, wherever it lies.
+    /// A photograph, resident or not.
     ///
     /// # Errors
     /// The file cannot be read, or the device is out of memory or lost.
@@ -182,22 +182,21 @@ impl Cache {
         match &self.kept[place] {
             CachedImage { on_device: Some(photograph), .. } => Ok(Arc::clone(photograph)),
             CachedImage { in_file: Some(in_file), .. } => Ok(Arc::new(in_file.load(&self.gpu)?)),
-            _ => Err(Error::Usage("a photograph is gone".to_owned())),
+            _ => Err(Error::Usage("a photograph is missing from the cache".to_owned())),
         }
     }
 
-    /// Whether everything taken in so far is on the device, and always will be.
+    /// Whether all photographs are resident for good.
     pub(super) fn holds_all(&self) -> bool {
         self.spool.is_none()
     }
 
-    /// How many bytes of photographs may be asked for at once.
+    /// The most bytes that can be resident at once.
     pub(super) fn budget(&self) -> u64 {
         self.budget
     }
 
-    /// Brings `wanted` to the device, in place of those that were not asked for the longest; they stay there until the next
-    /// call.
+    /// Makes `wanted` resident until the next call, evicting the least recently used.
     ///
     /// # Errors
     /// The file cannot be read or written, or the device is out of memory or lost.
@@ -229,7 +228,7 @@ impl Cache {
         Ok(())
     }
 
-    /// Takes a photograph off the device, after it has been written to the file the first time.
+    /// Evicts a photograph; the first time, it is written to the spool file.
     fn evict(&mut self, place: usize) -> Result<()> {
         let kept = &mut self.kept[place];
         let Some(photograph) = kept.on_device.take() else { return Ok(()) };
@@ -241,7 +240,7 @@ impl Cache {
                     let folder = self.folder.clone().unwrap_or_else(std::env::temp_dir);
                     let gib = self.budget as f64 / f64::from(1 << 30);
                     tracing::info!(
-                        "the photographs exceed the cache of {gib:.2} GiB on the device: the rest waits in {}",
+                        "the photographs exceed the device's cache of {gib:.2} GiB; the rest is spooled to {}",
                         folder.display()
                     );
                     Arc::new(Spool::new(&folder)?)
@@ -255,7 +254,7 @@ impl Cache {
     }
 }
 
-/// Where a photograph lies in the file.
+/// The position of a photograph in the spool file.
 #[derive(Debug)]
 struct InFile {
     spool: Arc<Spool>,
@@ -263,7 +262,7 @@ struct InFile {
     offset: u64,
     code_bits: u32,
     value_count: usize,
-    /// Words of codes, and what they stand for after them.
+    /// The numbers of words of codes and of the table that follows them.
     lens: [usize; 2],
 }
 
@@ -297,7 +296,7 @@ impl InFile {
     }
 }
 
-/// A file that only grows.
+/// An append-only file.
 #[derive(Debug)]
 struct Spool {
     folder: PathBuf,
@@ -310,7 +309,7 @@ impl Spool {
         Ok(Self { folder: folder.to_owned(), file: Mutex::new(file) })
     }
 
-    /// Where it begins.
+    /// Appends bytes and returns their offset.
     fn append(&self, parts: &[&[u8]]) -> Result<u64> {
         let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
         let mut append = || {
@@ -333,7 +332,7 @@ impl Spool {
 
 fn unusable(folder: &Path, error: &std::io::Error) -> Error {
     let problem = format!(
-        "cannot hold the photographs that exceed the cache ({error}); raise cache or make room on the disk"
+        "cannot hold the photographs that exceed the cache ({error}); raise `cache` or free disk space"
     );
     Error::output(folder, problem)
 }
@@ -382,7 +381,7 @@ mod tests {
             .unwrap();
             plain.unwrap().wait().unwrap()
         };
-        // Few different values are coded in 8 bits, more in 16, most not at all.
+        // Few values are coded in 8 bits, more in 16, many not at all.
         let values = |photograph: usize| -> Vec<f32> {
             let different = [7, 700, 100_000][photograph % 3];
             (0..9000).map(|i| ((i * 31 + photograph) % different) as f32 / 1e5).collect()

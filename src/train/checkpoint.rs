@@ -1,8 +1,8 @@
-//! Checkpoints: a run goes on from one as if it had never stopped.
+//! Checkpoints, from which a run resumes bit for bit.
 //!
-//! Random numbers are functions of seed and step, so a checkpoint holds what a step leaves behind and no more: the
-//! Gaussians and what else is learned with their moments, and the statistics of density control; beside them what tells
-//! whether it is whole and of this run.
+//! Random numbers are functions of seed and step, so a checkpoint holds only the state after a step: all learned
+//! parameters with their moments, and the statistics of density control. A header tells whether the file is complete
+//! and belongs to the run.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -26,17 +26,17 @@ use crate::splats::optimizer::{AdamBuffers, Moments};
 use crate::splats::scene::{Gaussians, Shape, width};
 use crate::{Error, Result};
 
-/// The key of the metadata that holds a [`Header`] as JSON: several keys would come in another order every time.
+/// The metadata key of the [`Header`], as JSON; a single key, since several would be written in random order.
 const HEADER: &str = "checkpoint";
 
 const FORMAT: &str = "nightsplat checkpoint 1";
 
-/// What the names of the tensors of the best model so far begin with.
+/// The prefix of the best model's tensors.
 const BEST: &str = "best.";
 
 const VISIT_COUNTS: &str = "density.visit_counts";
 
-/// What a checkpoint says of itself.
+/// The header of a checkpoint.
 #[derive(Serialize, Deserialize)]
 struct Header {
     format: String,
@@ -44,16 +44,16 @@ struct Header {
     step: u64,
     /// The settings of the run, as TOML.
     config: String,
-    /// What the held-out views have ended.
+    /// The decisions of the held-out views so far.
     #[serde(default, rename = "ends")]
     decisions: Decisions,
-    /// The views that it trains on no more.
+    /// Views left out of training.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     left_out: Vec<String>,
-    /// What it was trained on; older files do not say.
+    /// The dataset's fingerprint; absent in older files.
     #[serde(default)]
     dataset: Option<Fingerprint>,
-    /// That of this header without it, and of the tensors; older files have none.
+    /// The checksum of the rest of the header and of the tensors; absent in older files.
     #[serde(default)]
     checksum: Option<String>,
 }
@@ -63,7 +63,7 @@ impl Header {
     fn checksum_with(&self, mut tensors: Vec<(String, &[u8])>) -> String {
         let Self { format, step, config, decisions, left_out, dataset, .. } = self;
         let mut hasher = Hasher::default();
-        // Older files have none.
+        // Absent in older files.
         left_out.iter().for_each(|name| hasher.write(name.as_bytes()));
         hasher.write(
             serde_json::json!([format, step, config, decisions, dataset]).to_string().as_bytes(),
@@ -76,35 +76,36 @@ impl Header {
         hash::text(hasher.finish())
     }
 
-    /// Whether it is the header of what the file holds.
+    /// Whether the header's checksum matches the file.
     fn describes(&self, file: &TensorFile<'_>) -> bool {
         let Some(checksum) = &self.checksum else { return true };
         *checksum == self.checksum_with(file.tensors())
     }
 }
 
-/// Whether a checkpoint is as it was written.
+/// Verifies a checkpoint's checksum.
 ///
 /// # Errors
-/// [`Error::Input`] says that it is not, or that the file cannot be read.
+/// [`Error::Input`] if it does not match or the file cannot be read.
 pub fn check_checkpoint(path: &Path) -> Result<()> {
     let bytes = input::bytes(path)?;
-    let damaged = |problem: &str| Error::input(path, format!("is no whole checkpoint ({problem})"));
+    let damaged =
+        |problem: &str| Error::input(path, format!("is not an intact checkpoint ({problem})"));
     let file = TensorFile::of(&bytes).map_err(|error| damaged(&error.to_string()))?;
     let header = file.note(HEADER).and_then(|header| serde_json::from_str::<Header>(header).ok());
     match header {
         Some(header) if header.describes(&file) => Ok(()),
-        Some(_) => Err(damaged("its checksum is another")),
+        Some(_) => Err(damaged("its checksum does not match")),
         None => Err(damaged("its header is damaged")),
     }
 }
 
-/// A tensor of the state.
+/// A tensor of the training state.
 pub(super) struct State<'a> {
     pub(super) name: String,
     pub(super) shape: Vec<usize>,
     buffer: SliceMut<'a, f32>,
-    /// How it lies in the buffer, where that is not as in the file.
+    /// The layout of the buffer, if it differs from the file's.
     batches: Option<Batches>,
 }
 
@@ -127,7 +128,7 @@ impl State<'_> {
 }
 
 impl Trainer {
-    /// Writes everything that the next step depends on as one safetensors file.
+    /// Writes the state that the next step depends on, as one safetensors file.
     ///
     /// # Errors
     /// The file cannot be written, or the device was lost.
@@ -172,17 +173,17 @@ impl Trainer {
             for (name, (_, shape, values)) in &named {
                 views.push(view(name, shape, Dtype::F32, bytemuck::cast_slice(values))?);
             }
-            // It is read by whoever may read the run: safetensors gives what it writes to its owner alone.
+            // With the permissions of other files: safetensors writes for the owner alone.
             let permissions = std::fs::File::create(path)?.metadata()?.permissions();
             safetensors::serialize_to_file(views, Some(metadata), path)
                 .map_err(std::io::Error::other)?;
             std::fs::set_permissions(path, permissions)?;
-            // A checkpoint is for the day the power fails.
+            // A checkpoint must survive a power failure.
             std::fs::File::open(path)?.sync_all()
         })
     }
 
-    /// The tensors of the state whose names are wanted, read back.
+    /// Reads back the tensors of the state whose names `wants` accepts.
     ///
     /// # Errors
     /// The device was lost.
@@ -196,18 +197,18 @@ impl Trainer {
         tensors.collect()
     }
 
-    /// Takes over the state that [`Trainer::save_checkpoint`] wrote: further steps give the bits that the run would have
-    /// had without the interruption. A run that is resumed with another number of steps takes them all; it may differ from
-    /// one that was to have them from its start, near the old end: there was no density control, and the model may have
-    /// settled.
+    /// Restores the state that [`Trainer::save_checkpoint`] wrote: further steps give the bits of an uninterrupted run.
+    /// With a larger number of steps, the run may differ from one that had it from the start: near the old end there
+    /// was no density control, and perhaps a cooldown.
     ///
     /// # Errors
-    /// The file is missing, damaged or beyond the end of this run, or it was made with other settings; the trainer is
-    /// then as it was.
+    /// The file is missing, damaged, beyond the end of this run, or made with other settings; the trainer is then
+    /// unchanged.
     pub fn restore(&mut self, path: &Path) -> Result<()> {
         let bytes = input::bytes(path)?;
-        let damaged =
-            |problem: String| Error::input(path, format!("is no whole checkpoint ({problem})"));
+        let damaged = |problem: String| {
+            Error::input(path, format!("is not an intact checkpoint ({problem})"))
+        };
         let file = TensorFile::of(&bytes).map_err(|error| damaged(error.to_string()))?;
         let (header, begun) = self.header_of(path, &file)?;
         let visits: Vec<u32> = values(&file, VISIT_COUNTS, Dtype::U32, None).map_err(damaged)?;
@@ -225,64 +226,64 @@ impl Trainer {
             (header.step, header.decisions, best);
         self.convergence.decisions.goes_on |= begun.steps != self.config.steps;
         if let Some(change) = begun.stop.change(&self.config.stop) {
-            tracing::warn!("{change}: it decides from step {} on", self.step);
+            tracing::warn!("{change}; this applies from step {} on", self.step);
         }
         self.renderer.set_sh_degree(self.model.shape().sh_degree)?;
         self.reserve()
     }
 
-    /// The SH degree that the Gaussians of a checkpoint have room for, by the columns of what Adam keeps of them.
+    /// The SH degree of a checkpoint's Gaussians, from the columns of their moments.
     fn sh_degree_of(&self, file: &TensorFile<'_>) -> u32 {
         let whole = self.model.whole_shape();
         let columns = self.model.moments.planes().first().and_then(|(name, _)| {
             file.tensor(&format!("gaussians.{name}"))?.0.shape.first().copied()
         });
         let fits = |&sh_degree: &u32| Some(width(Shape { sh_degree, ..whole })) == columns;
-        // Where none does, reading the tensor says so.
+        // If none fits, reading the tensor reports it.
         (0..=whole.sh_degree).find(fits).unwrap_or(self.model.shape().sh_degree)
     }
 
-    /// The header of a checkpoint that this run can go on from, and the settings in it.
+    /// The header and settings of a checkpoint that this run can resume from.
     fn header_of(&self, path: &Path, file: &TensorFile<'_>) -> Result<(Header, TrainConfig)> {
         let refused = |problem: String| Error::input(path, problem);
-        let anew = "begin anew with --overwrite";
+        let anew = "start again with --overwrite";
         let header = file.note(HEADER).and_then(|header| serde_json::from_str(header).ok());
         let Some(header) = header.filter(|h: &Header| h.format == FORMAT) else {
-            return Err(refused(format!("is no `{FORMAT}`; {anew}")));
+            return Err(refused(format!("is not a `{FORMAT}`; {anew}")));
         };
         let Header { step, config, dataset, .. } = &header;
         let config = TrainConfig::from_toml(config)
             .map_err(|error| refused(format!("was made by another version ({error}); {anew}")))?;
         if let Some(difference) = config.difference(&self.config) {
             return Err(refused(format!(
-                "was made with {difference}; give the settings that the run began with, or {anew}"
+                "was made with {difference}; give the settings of the run, or {anew}"
             )));
         }
         match dataset.as_ref().map(|dataset| dataset.difference(&self.fingerprint)) {
             Some(None) => {}
             Some(Some(difference)) => {
                 return Err(refused(format!(
-                    "was trained on another dataset ({difference}); give the one that the run began with, or {anew}"
+                    "was trained on another dataset ({difference}); give the dataset of the run, or {anew}"
                 )));
             }
             None => tracing::warn!(
-                "{}: is of an older version, which does not say on what it was trained; it is taken to be this dataset",
+                "{}: is from an older version, which does not name its dataset; this one is assumed",
                 path.display()
             ),
         }
         let steps = self.config.steps;
         if *step > steps {
             return Err(refused(format!(
-                "is at step {step}, this run ends at {steps}; raise steps"
+                "is at step {step}, but this run ends at {steps}; raise steps"
             )));
         }
         Ok((header, config))
     }
 
-    /// Refuses Gaussians that hold NaN or infinity.
+    /// Refuses Gaussians with NaN or infinity.
     ///
     /// # Errors
-    /// [`Error::ParameterNotFinite`] names step and plane.
+    /// [`Error::ParameterNotFinite`], with step and plane.
     pub(crate) fn refuse_not_finite(&self, gaussians: &Gaussians) -> Result<()> {
         match first_not_finite(&gaussians.parameters) {
             Some(at) => Err(self.not_finite_in(at, width(gaussians.shape))),
@@ -297,7 +298,7 @@ impl Trainer {
         }
     }
 
-    /// What to say of a value of the state, by its tensor's name.
+    /// The error for a value of the state, from its tensor's name.
     pub(super) fn not_finite(&self, name: &str, at: usize) -> Error {
         let layout = self.model.gaussians.layout;
         match name.strip_prefix("gaussians.") {
@@ -309,13 +310,13 @@ impl Trainer {
         }
     }
 
-    /// The same of Gaussians with so many columns.
+    /// The same for Gaussians with `columns` columns.
     fn not_finite_in(&self, at: usize, columns: usize) -> Error {
         let (plane, gaussian) = self.model.place_of(at, columns);
         Error::ParameterNotFinite { step: self.step, plane, gaussian }
     }
 
-    /// Every tensor is read before one is changed, but for those of the model.
+    /// Reads every tensor before changing any but the model's.
     fn read_state(
         &mut self,
         gpu: &Gpu,
@@ -333,7 +334,7 @@ impl Trainer {
         };
         let values = self.state().into_iter().map(read).collect::<Result<Vec<_>>>()?;
         if !header.describes(file) {
-            return Err(damaged("its checksum is another".to_owned()));
+            return Err(damaged("its checksum does not match".to_owned()));
         }
         self.state()
             .into_iter()
@@ -341,7 +342,7 @@ impl Trainer {
             .try_for_each(|(state, values)| state.write(gpu, &values))
     }
 
-    /// Everything that the next step depends on but the visit counts, which are integers.
+    /// The state that the next step depends on, except the visit counts, which are integers.
     pub(super) fn state(&mut self) -> Vec<State<'_>> {
         let Model { gaussians, moments, grad_norm_sums, .. } = &mut self.model;
         let layout = gaussians.layout;
@@ -378,7 +379,7 @@ fn first_not_finite(values: &[f32]) -> Option<usize> {
     values.par_iter().position_first(|value| !value.is_finite())
 }
 
-/// The best model that a checkpoint has.
+/// The best model in a checkpoint.
 fn best_of(file: &TensorFile<'_>) -> std::result::Result<Snapshot, String> {
     let of_best = |(name, _): &(String, &[u8])| name.starts_with(BEST);
     let tensors = file.tensors().into_iter().filter(of_best).map(|(name, _)| {
@@ -389,7 +390,7 @@ fn best_of(file: &TensorFile<'_>) -> std::result::Result<Snapshot, String> {
     tensors.collect()
 }
 
-/// What Adam works on, by the names of the tensors: the parameters, and then their moments.
+/// The parameters and their moments, by tensor name.
 fn optimized<'a>(
     owner: &str,
     parameters: SliceMut<'a, f32>,
@@ -399,7 +400,7 @@ fn optimized<'a>(
     all.map(move |(name, buffer)| (format!("{owner}.{name}"), buffer))
 }
 
-/// A tensor's elements, or what is wrong with it.
+/// The elements of a tensor, or its defect.
 fn values<T: bytemuck::Pod>(
     file: &TensorFile<'_>,
     name: &str,

@@ -70,23 +70,24 @@ pub struct TrainConfig {
     images: Option<PathBuf> = None, "where the dataset's listing says" => Rule::PATH, "--images DIR";
     /// Folder of reference images, under the names of the photographs, for scores only.
     reference: Option<PathBuf> = None, "found beside the photographs" => Rule::PATH, "--reference DIR";
-    /// Initial Gaussians from a PLY in the dataset's coordinates, instead of the dataset's points; all SH degrees are in
-    /// use from the first step.
+    /// Initial Gaussians from a PLY in the dataset's coordinates, instead of the dataset's points; all SH degrees are
+    /// in use from the first step.
     init: Option<PathBuf> = None, "the dataset's points" => Rule::PATH, "--init MODEL.ply";
     /// Masks (masks/NAME.png or masks/NAME.jpg.png) hide white instead of black.
     invert_masks: bool = false => Rule::Flag, "--invert-masks";
     /// Mask black borders and corners that the photographs have in the same place, as undistorting leaves them.
     mask_borders: bool = true => Rule::Flag;
-    /// White balance of the photographs before they are measured: gains R,G,B of linear light; the colour temperature of
-    /// the light in kelvin; VIEW,x,y,w,h, a neutral area of one photograph in pixels as stored; or VIEW,x1,y1,..,x4,y4,
-    /// the corners of a chart of 24 patches, from the dark skin patch round by the blue-green, the black and the white one.
+    /// White balance of the photographs before they are measured: gains R,G,B of linear light; the colour temperature
+    /// of the light in kelvin; VIEW,x,y,w,h, a neutral area of one photograph in pixels as stored; or
+    /// VIEW,x1,y1,..,x4,y4, the corners of a chart of 24 patches, from the dark skin patch round by the blue-green, the
+    /// black and the white one.
     white_balance: Option<WhiteBalance> = None, "none" => WHITE_BALANCE, "--white-balance WHITE";
     /// Undistort fisheye photographs to pinhole ones, cropped to 60 degrees off the axis, instead of training with the
     /// fisheye model; other distorted photographs are always undistorted.
     undistort: bool = false => Rule::Flag, "--undistort";
     /// Training steps (iterations), one view each.
     steps: u64 = 5000 => Rule::at_least(1), in "steps", "--steps N";
-    /// Shrink the photographs by this factor.
+    /// Resize the photographs by 1/F.
     downscale: f64 = 1.0 => DOWNSCALE, "--downscale F";
     /// Maximum longest side of the photographs, to which larger ones are shrunk; 0 or none: no limit. The tone curve is
     /// applied at full resolution.
@@ -127,42 +128,43 @@ pub struct TrainConfig {
     tensorboard: bool = false => Rule::Flag, "--tensorboard";
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu.
     device: String = String::new(), "the best" => Rule::Text("a device", |_| true), "--device DEVICE";
-    /// The tile that a workgroup renders: width and height in pixels and, where more than one subgroup share it, their number.
-    tile: Option<Tile> = None, "the fastest known on the device, and recorded"
+    /// The tile that a workgroup renders: width and height in pixels and, if several subgroups share it, their number.
+    tile: Option<Tile> = None, "the fastest known on the device; recorded"
         => Rule::List(2, 3, &Rule::Whole(0, u32::MAX as u64));
-    /// Near plane, in units of the scene extent: the distance of the cameras from their centre, rounded to a power of two.
+    /// Near plane, in units of the scene extent: the distance of the cameras from their centre, rounded to a power of
+    /// two.
     near: f64 = 0.1 => Rule::from_to(1e-6, 1.0), "--near N";
-    /// What is up in the dataset's world: paths fly about it, and exported files are turned by it.
+    /// The up direction in the dataset's world, for paths and exported files.
     up: Option<[f64; 3]> = None, "found from the cameras, and recorded"
         => Rule::List(3, 3, &Rule::Number(Bound::Unbounded, Bound::Unbounded));
-    /// Random points to begin with where the dataset has none.
+    /// Random points to start from if the dataset has none.
     random_points: usize = 20_000 => Rule::at_least(1), in "points";
 }
 sections {
-    /// The folder for what exceeds the cache; none: that of the system's temporary files.
+    /// The folder of the cache's spool file; `None`: the system's temporary folder.
     #[serde(skip)]
     spool: Option<PathBuf>;
-    /// Where the model is trained; left out, it is found from the cameras, and recorded.
+    /// The training frame; by default from the cameras, and recorded.
     frame: Option<TrainingFrame>;
-    /// The curve that lifts each photograph.
+    /// The tone curve.
     tone: ToneSettings;
-    /// Steps whose every pass is compared with its CPU reference.
+    /// Comparison of passes with their CPU references.
     check: CheckConfig;
-    /// What the first Gaussians look like.
+    /// The first Gaussians.
     start: Initialization;
-    /// Learning rates, and what else changes with the step.
+    /// Learning rates and schedule.
     schedule: Schedule;
     /// Density control.
     density: DensityConfig;
-    /// What the model has beside colour.
+    /// Parts of the model beside colour.
     model: ModelConfig;
-    /// What the parameters of the Gaussians weigh in the loss.
+    /// Loss terms on the parameters of the Gaussians.
     loss: ParameterWeights;
-    /// When a run ends before its last step.
+    /// Early stopping.
     stop: StopConfig;
     /// Gain and bias of each training view.
     exposure: ExposureConfig;
-    /// In how many bits things are kept.
+    /// Storage precision.
     precision: PrecisionConfig;
 }
 }
@@ -192,25 +194,26 @@ pub struct CheckConfig {
 
 settings! {
 "density."
-/// Which Gaussians multiply and which go; [`Schedule`] says when.
+/// Density control; [`Schedule`] has its steps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DensityConfig {
-    /// Densification: conserving splits a Gaussian into two that cover the same area; paper clones and splits as LITA-GS.
+    /// Densification: conserving splits a Gaussian into two that cover the same area; paper clones and splits as
+    /// LITA-GS.
     control: DensityControl = DensityControl::Conserving => Rule::OneOf(&["conserving", "paper"]), "--density NAME";
-    /// The mean norm of the screen-space gradient, in normalised device units, from which a Gaussian multiplies.
+    /// Densify Gaussians whose mean screen-space gradient, in normalised device coordinates, has at least this norm.
     gradient_threshold: f64 = 4e-4 => Rule::POSITIVE;
-    /// Larger than this fraction of the extent: split; smaller: cloned. Of the paper's control alone.
+    /// Paper's control only: split Gaussians larger than this fraction of the extent, clone smaller ones.
     split_scale: f64 = 0.01 => Rule::POSITIVE_OR_0;
-    /// Fainter Gaussians are removed.
+    /// Prune Gaussians of lower opacity.
     min_opacity: f64 = 0.005 => Rule::Number(Bound::Included(0.0), Bound::Excluded(1.0));
-    /// This many Gaussians come of few, a tenth of them or fewer: random points up to that tenth, and in the first round
-    /// Gaussians at the depths of what the views show. Of the conserving control alone; 0: none are added.
+    /// Depth seeding, conserving control only: if the dataset has at most a tenth of this many points, add random
+    /// points up to that tenth, and in the first round Gaussians at rendered depths up to this number; 0: off.
     depth_seeding: usize = 5_000 => Rule::COUNT, in "Gaussians";
 }
 }
 
 impl DensityConfig {
-    /// The most first Gaussians that are few.
+    /// At most this many first Gaussians count as sparse.
     pub(super) fn sparse_threshold(&self) -> usize {
         match self.control {
             DensityControl::Conserving => self.depth_seeding / 10,
@@ -218,7 +221,7 @@ impl DensityConfig {
         }
     }
 
-    /// Those of LITA-GS.
+    /// The values of LITA-GS.
     #[cfg(feature = "testing")]
     pub fn paper() -> Self {
         Self {
@@ -231,8 +234,8 @@ impl DensityConfig {
 }
 
 impl TrainConfig {
-    /// The bare method, in nothing but what is compared with it: black background, all in 32 bits, no view held out, no
-    /// Gaussians beside those that multiply, no end that settles. Measurements and tests begin with it.
+    /// The plain method, for measurements and tests: black background, 32-bit storage, no held-out views, no depth
+    /// seeding, no cooldown.
     pub fn bare() -> Self {
         Self {
             background: Background::Black,
@@ -251,12 +254,12 @@ impl TrainConfig {
     /// The configuration as TOML.
     ///
     /// # Errors
-    /// None for values that [`TrainConfig::check`] accepts.
+    /// Never for values that [`TrainConfig::check`] accepts.
     pub fn to_toml(&self) -> Result<String> {
         toml::to_string(self).map_err(|error| Error::Usage(error.to_string()))
     }
 
-    /// How the dataset is to be loaded.
+    /// The options to load the dataset with.
     pub fn load_options(&self) -> LoadOptions {
         LoadOptions {
             downscale: self.downscale,
@@ -284,7 +287,7 @@ impl TrainConfig {
         }
     }
 
-    /// Switches off the depth part where no training view has a depth map, and says so.
+    /// Disables the depth part, with a warning, if no training view has a depth map.
     pub(crate) fn disable_missing_parts(&mut self, dataset: &Dataset) {
         if !self.model.depth {
             return;
@@ -303,7 +306,7 @@ impl TrainConfig {
         }
     }
 
-    /// The same run of another copy of its dataset; what lay in its folder lies there, too.
+    /// Moves the run to another copy of its dataset, with the paths inside its folder.
     pub(crate) fn move_dataset(&mut self, dataset: &Path) {
         let from = std::mem::replace(&mut self.dataset, dataset.to_owned());
         let inside = [
@@ -319,7 +322,7 @@ impl TrainConfig {
         }
     }
 
-    /// What the rasteriser is specialised for.
+    /// The settings of the rasteriser.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn render_settings(&self) -> RenderSettings {
         RenderSettings {
@@ -333,7 +336,7 @@ impl TrainConfig {
         }
     }
 
-    /// What the loss terms of the model are built from.
+    /// The configuration of the loss.
     pub(crate) fn loss(&self) -> LossConfig {
         LossConfig {
             ssim_weight: self.ssim_weight,
@@ -346,10 +349,10 @@ impl TrainConfig {
         }
     }
 
-    /// Refuses values that make no sense, naming the field.
+    /// Refuses invalid values, by name.
     ///
     /// # Errors
-    /// [`Error::Setting`], and [`Error::Usage`] for what does not go together.
+    /// [`Error::Setting`], or [`Error::Usage`] for settings that exclude each other.
     pub fn check(&self) -> Result<()> {
         self.check_rows()?;
         self.tone.check()?;

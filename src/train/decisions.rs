@@ -1,21 +1,21 @@
-//! What the held-out views decide: when growth ends, how far the SH degree rises, and when the run has converged.
+//! Decisions of the held-out views: the end of growth, the highest SH degree, and convergence.
 //!
-//! Each is decided at a step that is known beforehand, from what the model shows then: the same run decides the same, and
-//! a checkpoint holds what was decided and from what.
+//! Each is made at a known step from the model at that step, so the same run decides the same; a checkpoint holds the
+//! decisions and their data.
 
 use serde::{Deserialize, Serialize};
 
 use super::Trainer;
 use crate::Result;
 
-/// Rounds of density control that together gain too little before growth ends.
+/// Rounds of density control over which growth must gain enough.
 const PATIENCE: usize = 4;
 
-/// A round of density control before it changed anything.
+/// The state before a round of density control.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct Round {
     step: u64,
-    /// Of the held-out views, in thousandths of a dB: whole numbers survive every file.
+    /// The score of the held-out views in thousandths of a dB, an integer so that files keep it exactly.
     score: i64,
     gaussians: usize,
 }
@@ -28,37 +28,38 @@ pub(super) struct Score {
     pub(super) score: i64,
 }
 
-/// What was decided, and from what.
+/// Decisions and their data.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub(super) struct Decisions {
     rounds: Vec<Round>,
     /// The number of Gaussians when growth ended.
     gaussians: Option<usize>,
-    /// The highest degree that paid.
+    /// The highest degree that gained enough.
     pub(super) sh_degree: Option<u32>,
     /// Every score of the held-out views so far.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(super) scores: Vec<Score>,
-    /// The step at which the run had converged: it settles from there, and ends.
+    /// The step at which the run converged, after which it cools down and ends.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) converged: Option<u64>,
-    /// The run was resumed with another number of steps: it takes them all.
+    /// The run was resumed with another number of steps, and takes them all.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub(super) goes_on: bool,
-    /// The held-out views are due to be scored, which could not be done yet.
+    /// Scoring of the held-out views is due.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub(super) score_due: bool,
-    /// The intersections of the last step, where a round of density control is due that could not be done yet.
+    /// The intersections of the last step, if a round of density control is due.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) density_due: Option<u32>,
-    /// Where it is due to decide if the SH degree in use has paid, and could not be done yet.
+    /// A decision on the SH degree is due.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub(super) degree_due: bool,
 }
 
 impl Decisions {
-    /// Whether growth has ended at the last round, where each doubling of the Gaussians has to gain so many dB.
+    /// Whether growth ends at the last round, since it gained less than `growth_gain` dB for each doubling of the
+    /// Gaussians.
     fn gains_too_little(&self, growth_gain: f64) -> bool {
         let Some(before) = self.rounds.len().checked_sub(PATIENCE) else { return false };
         let (before, since) = self.rounds.split_at(before);
@@ -73,18 +74,18 @@ impl Decisions {
 }
 
 impl Trainer {
-    /// The SH degree that a step trains.
+    /// The SH degree of a step.
     pub(super) fn sh_degree(&self, step: u64) -> u32 {
         let highest = self.convergence.decisions.sh_degree.unwrap_or(self.config.sh_degree);
         self.config.sh_degree_at(step, highest)
     }
 
-    /// The SH degree of what the model shows.
+    /// The SH degree reached so far.
     pub(super) fn sh_degree_in_use(&self) -> u32 {
         self.sh_degree(self.step).min(self.model.shape().sh_degree)
     }
 
-    /// Makes room for the SH degree of the next step.
+    /// Allocates memory for the SH degree of the next step.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -93,7 +94,7 @@ impl Trainer {
         if degree > self.model.shape().sh_degree { self.set_sh_degree(degree) } else { Ok(()) }
     }
 
-    /// Model and renderer have another SH degree from now on.
+    /// Changes the SH degree of model and renderer.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -102,14 +103,14 @@ impl Trainer {
         self.renderer.set_sh_degree(degree)
     }
 
-    /// The most Gaussians that the held-out views leave room for, decided anew before a round of density control.
+    /// The limit of Gaussians by the held-out views, decided before every round of density control.
     ///
     /// # Errors
     /// The device is out of memory or lost.
     pub(super) fn growth_limit(&mut self) -> Result<usize> {
         let growth_gain = self.config.stop.growth_gain;
         let [_, whole] = self.config.schedule.resolution_steps;
-        // What was scored before the memory was out is not scored twice.
+        // A score taken before memory ran out is not taken again.
         let is_scored =
             self.convergence.decisions.rounds.last().is_some_and(|round| round.step == self.step);
         if growth_gain > 0.0 && self.convergence.decisions.gaussians.is_none() && self.step >= whole
@@ -136,8 +137,8 @@ impl Trainer {
         Ok(self.convergence.decisions.gaussians.unwrap_or(usize::MAX))
     }
 
-    /// Whether it is decided after this step if the SH degree in use has paid: the next step would raise it, or would if
-    /// there were a higher one.
+    /// Whether the SH degree in use is judged after this step: the next would raise it, or would if there were a higher
+    /// one.
     pub(super) fn decides_degree_at(&self, step: u64) -> bool {
         let interval = self.config.schedule.sh_degree_interval.max(1);
         self.config.stop.degree_gain > 0.0
@@ -147,8 +148,8 @@ impl Trainer {
             && self.config.schedule.sh_degree(step, self.config.sh_degree) > 0
     }
 
-    /// Compares what the held-out views show with and without the SH degree in use: one that gains too little goes, and none
-    /// comes after it.
+    /// Compares the held-out views with and without the SH degree in use; a degree that gains too little is removed for
+    /// good.
     ///
     /// # Errors
     /// The device is out of memory or lost.

@@ -1,8 +1,8 @@
-//! More Gaussians where the dataset has few points: at the depths that the first steps have found.
+//! Depth seeding: more Gaussians at rendered depths, for datasets with few points.
 //!
-//! Few Gaussians learn within a hundred steps how far away things are, but each round of density control doubles them at
-//! most. The first round lets a pixel here and there of some training views become a Gaussian instead: of the pixel's
-//! colour, where the expected depth of what is rendered there says. All begin anew in Adam.
+//! A few Gaussians learn the depth of the scene within a hundred steps, but a round of density control at most doubles
+//! them. Instead, the first round turns pixels of some training views into Gaussians: of the pixel's colour, at the
+//! expected depth rendered there. The moments of all Gaussians are reset.
 
 use glam::{DVec2, DVec3, Vec3};
 
@@ -21,17 +21,17 @@ use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::init::Initialization;
 use crate::splats::scene::{Gaussians, SH_C0, width};
 
-/// Views that are looked at, at most.
+/// The most views that are sampled.
 const VIEWS: usize = 16;
-/// Pixels that are looked at for each Gaussian that is wanted.
+/// Sampled pixels for each Gaussian.
 const PIXELS_EACH: usize = 4;
-/// Pixels of a view for each Gaussian that there is to be, at least: with more of them small views may score lower after
-/// thousands of steps (docs/benchmarks.md).
+/// The fewest pixels of a view for each Gaussian: with more Gaussians, small views may score lower after thousands of
+/// steps.
 const MIN_PIXELS_EACH: usize = 8;
-/// What covers less of a pixel than this says nothing of its depth.
+/// The least alpha at which a pixel has a depth.
 const MIN_COVER: f32 = 0.5;
 
-/// What a pixel shows, in the frame.
+/// A pixel's point and colour, in the frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct DepthSample {
     position: DVec3,
@@ -39,7 +39,7 @@ struct DepthSample {
 }
 
 impl Trainer {
-    /// The round behind this step fills, if it is the first and there are few Gaussians.
+    /// Whether the round after this step seeds: it is the first, and there are few Gaussians.
     pub(super) fn seeds_at(&self, step: u64) -> bool {
         let (sparse_threshold, count) =
             (self.config.density.sparse_threshold(), self.model.count());
@@ -47,31 +47,31 @@ impl Trainer {
         is_due && count <= sparse_threshold && count < self.seeded_count()
     }
 
-    /// As many as there are to be behind that round.
+    /// The number of Gaussians after that round.
     pub(super) fn seeded_count(&self) -> usize {
         let pixels = |view: &TrainView| Patch::from(&view.patch.camera).pixel_count();
         let most = self.supervision.views.photographs().map(pixels).max().unwrap_or_default();
         self.config.density.depth_seeding.min(most / MIN_PIXELS_EACH)
     }
 
-    /// As many Gaussians as there are, or as there are to be once a later round has filled.
+    /// The number of Gaussians, or their number after seeding if that is still to come.
     pub(super) fn count_once_filled(&self) -> usize {
         let (count, first) = (self.model.count(), self.config.schedule.first_round());
         let fills = self.step < first && self.seeds_at(first) && self.densifies_at(first);
         if fills { self.seeded_count().max(count) } else { count }
     }
 
-    /// Adds Gaussians until there are so many.
+    /// Adds Gaussians until there are `wanted`.
     ///
     /// # Errors
-    /// A photograph can no longer be read, or the device is out of memory or lost: the model is as it was.
+    /// A photograph can no longer be read, or the device is out of memory or lost; the model is then unchanged.
     pub(super) fn seed_depths(&mut self, wanted: usize) -> Result<()> {
         let more = wanted.saturating_sub(self.model.count());
         if more == 0 {
             return Ok(());
         }
         let old = self.gaussians_in_frame()?;
-        // Whoever looks at the parameters next says where they are none.
+        // The next check of the parameters reports those that are not finite.
         if !old.means().iter().all(|mean| mean.is_finite()) {
             return Ok(());
         }
@@ -82,7 +82,7 @@ impl Trainer {
         let picked: Vec<DepthSample> =
             order.into_iter().take(more).map(|i| depth_samples[i]).collect();
         tracing::info!(
-            "step {}: {} Gaussians at depths of the views beside {}",
+            "step {}: {} Gaussians seeded at rendered depths beside {}",
             self.step,
             picked.len(),
             old.count
@@ -93,7 +93,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// What pixels of some views show, about [`PIXELS_EACH`] times so many.
+    /// Samples of some views, about [`PIXELS_EACH`] times `more`.
     fn depth_samples(&self, gaussians: &Gaussians, more: usize) -> Result<Vec<DepthSample>> {
         let settings = RenderSettings {
             shape: 0.into(),
@@ -124,7 +124,7 @@ impl Trainer {
         Ok(depth_samples)
     }
 
-    /// In place of colours, the sum of the depths of what covers a pixel by how much it does, and the sum of how much.
+    /// Renders, in place of colours, the alpha-weighted depth and the accumulated alpha.
     fn depths(
         &self,
         renderer: &mut Renderer,
@@ -145,7 +145,7 @@ impl Trainer {
         renderer.render_image(&bare.upload(&self.gpu)?, camera, &options)
     }
 
-    /// The mask of a view's photograph, as an image of three equal channels.
+    /// The mask of a view, as an image of three equal channels.
     fn mask_of(&self, view: &TrainView) -> Result<Option<Image>> {
         if self.supervision.masks.of_view(view.number).is_none() {
             return Ok(None);
@@ -161,7 +161,7 @@ impl Trainer {
     }
 }
 
-/// The same camera with about so many pixels, if it has more.
+/// The camera with about `pixels` pixels, if it has more.
 fn coarse(camera: &Camera, pixels: usize) -> Camera {
     let own = f64::from(camera.width) * f64::from(camera.height);
     let scale = (pixels as f64 / own).sqrt().min(1.0);
@@ -169,7 +169,7 @@ fn coarse(camera: &Camera, pixels: usize) -> Camera {
     camera.resized(side(camera.width), side(camera.height))
 }
 
-/// What the pixels show that something covers and no mask hides in part.
+/// The samples of pixels that are covered and not masked.
 fn seen(camera: &Camera, depths: &Image, target: &Image, mask: Option<&Image>) -> Vec<DepthSample> {
     let (pixels, world_from_view) = (depths.pixel_count(), camera.view_from_world.inverse());
     let depth_sample = |at: usize| {
@@ -186,7 +186,7 @@ fn seen(camera: &Camera, depths: &Image, target: &Image, mask: Option<&Image>) -
     (0..pixels).filter_map(depth_sample).collect()
 }
 
-/// Gaussians with those of what is seen behind them, which have the features of the nearest.
+/// The old Gaussians, followed by those of the samples with the features of the nearest old one.
 fn joined(old: &Gaussians, new: &[DepthSample], start: &Initialization) -> Result<Gaussians> {
     let means = old.means().iter().map(|mean| mean.as_dvec3());
     let positions: Vec<DVec3> =
@@ -239,7 +239,7 @@ mod tests {
 
     #[test]
     fn a_pixel_is_where_its_expected_depth_says_unless_little_covers_it_or_a_mask_hides_it() {
-        // The sum of depths by cover, and the cover: half a Gaussian at depth 4 is at depth 4.
+        // Weighted depth and alpha: alpha 1/2 at depth 4 has depth 4.
         let image = |data: &[f32]| Image { width: 2, height: 1, data: data.to_vec() };
         let target = image(&[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]);
         let shown =

@@ -1,4 +1,4 @@
-//! What a capture is, and what its model needs.
+//! The diagnosis of a capture, from which its model is planned.
 //!
 //! ```text
 //! photographs as stored -> brightness, code values, noise, blur ┐
@@ -6,7 +6,7 @@
 //! cameras, points -> overlap, exposures ------------------------┘
 //! ```
 //!
-//! Only training photographs are looked at, and no reference image. The host measures; it takes seconds.
+//! Only training photographs are measured, never references, on the host, in seconds.
 
 mod geometry;
 mod noise;
@@ -34,10 +34,10 @@ use photograph::PhotographStatistics;
 pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
 pub use target_noise::TargetNoise;
 
-/// A view this many times as blurred as the median is named, and at least so many pixels more.
+/// A view is reported as blurred from this many times the median, and this many pixels more.
 const BLURRED: [f64; 2] = [1.6, 0.7];
 
-/// What is known of a training photograph. Luminance is that of encoded values unless light is said.
+/// The diagnosis of a training photograph. Luminance is of encoded values, light is linear.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ViewDiagnosis {
     /// The view's name.
@@ -48,42 +48,41 @@ pub struct ViewDiagnosis {
     pub p10: f64,
     /// The 90th percentile of the luminance.
     pub p90: f64,
-    /// p10 / p90; 1 where all is black.
+    /// p10 / p90; 1 if all is black.
     pub r: f64,
     /// The mean luminance.
     pub mean_luminance: f64,
-    /// The cubic mean of the luminance, what exceeds the 99.9 % quantile counted as that.
+    /// The cubic mean of the luminance, clamped at its 99.9 % quantile.
     pub cubic_mean: f64,
     /// The mean luminance in linear light.
     pub light: f64,
-    /// How many times more light would expose it as a meter has it: 0.18 / light.
+    /// The factor of light to a metered exposure: 0.18 / light.
     pub darkening: f64,
-    /// How much more light it shows of what it shares with others, stops, 0 on the mean; none where it shares too little.
+    /// Its exposure relative to the others at shared points, in stops, with mean 0; `None` if it shares too few.
     pub exposure: Option<f64>,
     /// The fraction of the values that are 1 or more.
     pub clipped_fraction: f64,
     /// The fraction of the values that are 0.
     pub zero_fraction: f64,
-    /// How many different values there are.
+    /// The number of different values.
     pub code_values: usize,
-    /// None where no part is flat and not cut off.
+    /// `None` if no part is flat and unclipped.
     pub noise: Option<Noise>,
     /// As the tone curve shows it, with that of whole codes and of JPEG; none of a black or a tiny photograph.
     pub noise_in_target: Option<TargetNoise>,
-    /// The blur of the edges, standard deviation in pixels; none where there are no edges.
+    /// The blur of the edges, as a standard deviation in pixels; `None` without edges.
     pub blur: Option<f64>,
-    /// Standard deviation over large regions of log2 of their light: lamps and windows.
+    /// The standard deviation of log2 light over large regions, due to lamps and windows.
     pub unevenness: f64,
-    /// Points of the dataset that it shows.
+    /// The number of the dataset's points that it shows.
     pub points: usize,
-    /// Of what it shows, the mean fraction of the other training views that look there too.
+    /// The mean fraction of the other training views that see the points it shows.
     pub overlap: f64,
-    /// It shows next to nothing, and is left out of training.
+    /// It is black, and left out of training.
     pub is_black: bool,
 }
 
-/// What is known of all training photographs together, those that are as good as black left out; without another word the
-/// mean over the views.
+/// The diagnosis of all training photographs but black ones; means over the views unless stated.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 #[allow(missing_docs, reason = "as in `ViewDiagnosis`")]
 pub struct SceneDiagnosis {
@@ -95,66 +94,63 @@ pub struct SceneDiagnosis {
     pub light: f64,
     /// 0.18 / the mean light.
     pub darkening: f64,
-    /// How many times brighter the targets would be than the photographs; below 1.5 no curve is needed.
+    /// The brightness of the targets over that of the photographs; below 1.5 no curve is needed.
     pub brightening: f64,
-    /// The gain that the rule of `--curve auto` finds, of encoded values.
+    /// The gain of `--curve auto`, for encoded values.
     pub gain: f64,
-    /// Standard deviation over the views of their exposure, stops; where the points do not tell, of the gain that each asks
-    /// for.
+    /// The standard deviation of the views' exposures, in stops; if the points do not tell, of their gains.
     pub exposure_spread: f64,
-    /// Whether shared points told the spread.
+    /// Whether the spread is measured at shared points.
     pub spread_is_measured: bool,
-    /// How much of a view's exposure the curve takes away, of 1, where each view has its own gain.
+    /// The fraction of a view's exposure that its own gain compensates.
     pub exposure_share: f64,
     pub clipped_fraction: f64,
     pub zero_fraction: f64,
     pub code_values: f64,
-    /// Of the patches of all views.
+    /// Fitted to the patches of all views.
     pub noise: Option<Noise>,
     /// The medians over the views.
     pub noise_in_target: Option<TargetNoise>,
-    /// The noise that is left in a target once the views that look at a place are averaged, standard deviation of encoded
-    /// values.
+    /// The noise left in a target after averaging the views of a point, as a standard deviation of encoded values.
     pub target_noise: f64,
-    /// The median.
+    /// The median over the views.
     pub blur: Option<f64>,
     pub unevenness: f64,
     pub overlap: f64,
-    /// How many training views look at a point, on the mean.
+    /// The mean number of training views that see a point.
     pub views_per_point: f64,
-    /// How many points the dataset has.
+    /// The number of points in the dataset.
     pub points: usize,
 }
 
-/// What a capture is.
+/// The diagnosis of a capture.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Diagnosis {
-    /// The folder.
+    /// The dataset's folder.
     pub dataset: PathBuf,
-    /// How many views are held out.
+    /// The number of test views.
     pub test_views: usize,
-    /// The pixels of all training views as they are loaded.
+    /// The number of pixels of all training views, as loaded.
     pub pixels: u64,
-    /// What is remarkable, a sentence each.
+    /// Remarks, a sentence each.
     pub remarks: Vec<String>,
-    /// Photographs beside the training photographs that have no pose, by name.
+    /// The names of photographs without a pose.
     pub without_pose: Vec<String>,
-    /// All of them.
+    /// All training views together.
     pub scene: SceneDiagnosis,
     /// The training views by name.
     pub views: Vec<ViewDiagnosis>,
-    /// How many training views have a depth map.
+    /// The number of training views with a depth map.
     pub depth_maps: usize,
     #[serde(skip)]
     fingerprint: PlannedViews,
 }
 
 impl Diagnosis {
-    /// Loads a dataset, and looks at its training photographs, as stored, while they are decoded, and at what its cameras
-    /// share.
+    /// Loads a dataset and diagnoses its training photographs, as stored, while they are decoded.
     ///
     /// # Errors
-    /// As [`Dataset::load`], or every photograph is as good as black.
+    /// As [`Dataset::load`], or every photograph is black.
     pub fn load(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
         let looked_at = Mutex::new(HashMap::new());
         let look = |name: &str, image: &Image, mask: Option<&Mask>| {
@@ -168,15 +164,15 @@ impl Diagnosis {
         Ok((dataset, diagnosis))
     }
 
-    /// The same of a dataset that is loaded, whose photographs are read anew; `options` are those that it was loaded with.
+    /// Diagnoses a loaded dataset, whose photographs are read again; `options` are those that it was loaded with.
     ///
     /// # Errors
-    /// Every photograph is as good as black, or one cannot be read any more.
+    /// Every photograph is black, or one can no longer be read.
     pub fn of(dataset: &Dataset, options: &LoadOptions) -> Result<Self> {
         Self::with_photographs(dataset, options, HashMap::new())
     }
 
-    /// Of photographs by name; those that are missing are read.
+    /// From photographs by name; missing ones are read.
     fn with_photographs(
         dataset: &Dataset,
         options: &LoadOptions,
@@ -214,7 +210,7 @@ impl Diagnosis {
         let remarks = remarks(&own, &photographs, &views, &without_pose);
         let mut scene =
             SceneDiagnosis::of(&own, photographs, &shared, &exposure, dataset.points.len());
-        // A pixel of a shrunk target is the mean of so many, each way.
+        // A pixel of a resized target averages this many pixels in each direction.
         let shrink = own.iter().map(|view| options.shrink(view.size[0], view.size[1]));
         scene.target_noise /= shrink.fold(1.0, f64::max);
         Ok(Self {
@@ -230,7 +226,7 @@ impl Diagnosis {
         })
     }
 
-    /// The names of the training views that are as good as black.
+    /// The names of the black training views.
     pub fn black_views(&self) -> Vec<String> {
         self.views.iter().filter(|view| view.is_black).map(|view| view.name.clone()).collect()
     }
@@ -240,7 +236,7 @@ fn pixels(camera: &Camera) -> u64 {
     u64::from(camera.width) * u64::from(camera.height)
 }
 
-/// Reads photographs and looks at them; each with its name.
+/// Reads and measures photographs; each with its name.
 fn read(
     root: &Path,
     all: &[dataset::Photograph],
@@ -267,7 +263,7 @@ fn read(
     Ok(photographs)
 }
 
-/// A photograph and what was measured of it.
+/// A photograph with its measurements.
 struct Photograph {
     size: [u32; 2],
     measured: PhotographStatistics,
@@ -378,16 +374,16 @@ impl SceneDiagnosis {
     }
 }
 
-/// How many times more light would expose a photograph of this mean as a meter has it.
+/// The factor of light to a metered exposure, for a photograph of this mean light.
 fn darkening(light: f64) -> f64 {
     f64::from(MIDDLE_GREY) / light.max(f64::MIN_POSITIVE)
 }
 
-/// The noise of a pixel of the mean light, in the target, averaged over the views that look at a place.
+/// The noise of a target at the mean light, averaged over the views of a point.
 fn target_noise(noise: Noise, light: f64, exposure: &Exposure, shared: &Shared) -> f64 {
     let encoded = f64::from(crate::photographs::image::srgb_from_linear(light as f32));
     let weight = exposure.weight();
-    // The curve's own slope where the photograph's mean lies; without a curve 1.
+    // The curve's slope at the photograph's mean; 1 without a curve.
     let soft = |x: f64| crate::photographs::tone::soft(x, exposure.gain);
     let step = 1e-4;
     let slope = (soft(encoded + step) - soft(encoded - step)) / (2.0 * step);
@@ -395,7 +391,7 @@ fn target_noise(noise: Noise, light: f64, exposure: &Exposure, shared: &Shared) 
     slope * noise.deviation(light) / noise::slope(light) / shared.views_per_point.max(1.0).sqrt()
 }
 
-/// The standard deviation; none of fewer than two values.
+/// The standard deviation; `None` for fewer than two values.
 fn deviation(values: impl Iterator<Item = f64>) -> Option<f64> {
     let values: Vec<f64> = values.collect();
     let count = values.len() as f64;
@@ -404,7 +400,7 @@ fn deviation(values: impl Iterator<Item = f64>) -> Option<f64> {
     (values.len() >= 2).then(|| variance.sqrt())
 }
 
-/// The photographs beside those of the training views that are no view's.
+/// The names of photographs in the folder that belong to no view.
 fn without_pose(
     paths: &[&dataset::Photograph],
     files: &[dataset::Photograph],
@@ -425,7 +421,7 @@ fn without_pose(
     Ok(names)
 }
 
-/// What a user should know before training.
+/// Remarks that a user should read before training.
 fn remarks(
     views: &[ViewDiagnosis],
     photographs: &[Photograph],
@@ -448,25 +444,28 @@ fn remarks(
             remarks.push(format!("{} {what}: {}", names.len(), named(names)));
         }
     };
-    say(names(&|place| views[place].is_black), "as good as black, left out of training");
+    say(names(&|place| views[place].is_black), "black, left out of training");
     let mut checksums = HashSet::new();
     let is_new =
         photographs.iter().map(|photograph| checksums.insert(photograph.measured.checksum));
     let is_new: Vec<bool> = is_new.collect();
-    say(names(&|place| !is_new[place] && !views[place].is_black), "the same photograph as another");
+    say(
+        names(&|place| !is_new[place] && !views[place].is_black),
+        "identical to another photograph",
+    );
     let blur = geometry::median(views.iter().filter_map(|view| view.blur).collect());
     let [times, more] = BLURRED;
     let is_blurred = |place: usize| {
         let own = views[place].blur.zip(blur);
         own.is_some_and(|(own, median)| own > times * median && own > median + more)
     };
-    say(names(&is_blurred), "blurred more than the others");
+    say(names(&is_blurred), "more blurred than the others");
     say(without_pose.iter().map(String::as_str).collect(), "without a pose, not used");
     let centers: Vec<_> = cameras.iter().map(|(_, view)| view.camera.center()).collect();
     if cameras.len() == 1 {
-        remarks.push("one photograph tells no depth: other views will not look right".to_owned());
+        remarks.push("one photograph gives no depth: other views will look wrong".to_owned());
     } else if centers.windows(2).all(|two| two[0].distance(two[1]) < 1e-9) {
-        remarks.push("all cameras stand in one spot: they tell no depth".to_owned());
+        remarks.push("all cameras are at one position, which gives no depth".to_owned());
     }
     remarks
 }

@@ -1,4 +1,4 @@
-//! In which settings two runs differ, as far as a result depends on them.
+//! Differences between the settings of two runs that affect results.
 
 use std::collections::BTreeMap;
 
@@ -9,8 +9,8 @@ use super::layers::values;
 use crate::Result;
 use crate::base::hash::{self, Hasher};
 
-/// The settings that no result depends on beyond its rounding: where the dataset lies, what is kept and logged and when,
-/// how long the run may take, and what it finds for itself.
+/// Settings that affect no result beyond rounding: the dataset's path, saving and logging, time limits, and values that
+/// a run finds itself.
 const FREE: [&str; 17] = [
     "dataset",
     "device",
@@ -32,10 +32,9 @@ const FREE: [&str; 17] = [
 ];
 
 impl TrainConfig {
-    /// The first setting in which a run of `self` differs from one of `other`, with both values: `tone.alpha = 0.1, not
-    /// 0.12`. Left out is what changes no step beyond its rounding: how long the run is, where the photographs lie, when it
-    /// is scored and saved, on which device and by which tiles. A lower limit of the Gaussians is no difference either: a
-    /// run that outgrows its machine goes on with what it has.
+    /// The first setting that differs from `other`'s, with both values: `tone.alpha = 0.1, not 0.12`. Settings that
+    /// change no step beyond rounding do not count: the number of steps, paths, scoring and saving, device and tiles.
+    /// Nor does a lower limit of the Gaussians, so that a run that outgrows its machine can resume.
     pub(crate) fn difference(&self, other: &Self) -> Option<String> {
         const ALSO: [&str; 5] = ["steps", "reference", "stop.every", "stop.gain", "stop.margin"];
         let values = [self, other].map(values);
@@ -57,11 +56,10 @@ impl TrainConfig {
             .map(|key| format!("{key} = {}, not {}", value(own, key), value(others, key)))
     }
 
-    /// A checksum of every setting that a result depends on: all but where the dataset lies, when the run is saved and
-    /// checked, how long it may take, and what it finds for itself.
+    /// A checksum of every setting that affects results.
     ///
     /// # Errors
-    /// None for a configuration that [`TrainConfig::check`] accepts.
+    /// Never for a configuration that [`TrainConfig::check`] accepts.
     pub(crate) fn checksum(&self) -> Result<String> {
         let own = self.clone().with_absolute_paths();
         let mut hasher = Hasher::default();

@@ -1,11 +1,10 @@
-//! Early stopping: a run whose held-out views gain nothing any more settles and ends, and keeps its best model.
+//! Early stopping: a run whose held-out views stop improving cools down, ends, and keeps its best model.
 //!
-//! ```text
-//! growth -> converged, or the last steps begin -> settling: no density control, learning rates decay -> end
+//! ```text growth -> converged, or the last steps begin -> cooldown: no density control, learning rates decay -> end
 //! ```
 //!
-//! The scores go up and down with the views seen last, and with every round of density control. So they are never taken
-//! right after a round, and a run never ends where it converged: its last steps are for the parameters to settle.
+//! Scores fluctuate with the views seen last and with every round of density control. So they are never taken right
+//! after a round, and a run never ends where it converged, but after a cooldown.
 
 use serde::{Deserialize, Serialize};
 
@@ -18,27 +17,27 @@ use crate::photographs::dataset::{Dataset, Split};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::SceneTone;
 
-/// Steps after a round of density control in which the held-out views are not scored: the model has settled by then.
+/// Steps after a round of density control in which the held-out views are not scored.
 const SETTLING_DISTANCE: u64 = 50;
 
 /// Why a run has ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum EndReason {
-    /// The held-out views gained nothing any more.
+    /// The held-out views have stopped improving.
     Converged,
-    /// Its steps are done.
+    /// All steps are done.
     Steps,
 }
 
-/// How a run has ended.
+/// The end of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ended {
     /// Why.
     pub reason: EndReason,
     /// Its last step.
     pub step: u64,
-    /// The step whose model is kept: the last, unless the held-out views scored higher before.
+    /// The step whose model is kept: the last, unless the held-out views scored higher at an earlier one.
     pub best_step: u64,
 }
 
@@ -58,17 +57,17 @@ impl std::fmt::Display for Ended {
     }
 }
 
-/// What tells when a run ends, and with which model.
+/// The state of early stopping.
 #[derive(Debug)]
 pub(super) struct Convergence {
     pub(super) held_out: TargetViews,
     pub(super) decisions: Decisions,
-    /// The model with the best score of the held-out views; empty where there is none.
+    /// The model with the best score of the held-out views; empty without one.
     pub(super) best: Snapshot,
 }
 
 impl Convergence {
-    /// That of a run before its first step, with the targets of the views that are held out.
+    /// The state before the first step, with the targets of the held-out views.
     ///
     /// # Errors
     /// A photograph cannot be read again, or the device is out of memory or lost.
@@ -82,21 +81,21 @@ impl Convergence {
         let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
         let held_out = TargetViews::new(pseudo_gt, held_out, &frame, scene)?;
         if config.stop.views > 0 && held_out.is_empty() {
-            tracing::info!("no held-out view shows anything: the run takes all its steps");
+            tracing::info!("every held-out view is black or masked: the run takes all its steps");
         }
         Ok(Self { held_out, decisions: Decisions::default(), best: vec![] })
     }
 }
 
 impl Trainer {
-    /// The step that ends the run, as far as that is known now: fewer than its steps once it has converged.
+    /// The last step of the run, as far as known: earlier than configured once the run has converged.
     pub fn last_step(&self) -> u64 {
         let early =
             self.converged().map(|converged| converged + self.config.effective_cooldown_steps());
         early.map_or(self.config.steps, |early| early.min(self.config.steps))
     }
 
-    /// The step at which the run has converged, if it ends for that.
+    /// The step at which the run converged, if it ends for that.
     fn converged(&self) -> Option<u64> {
         self.convergence.decisions.converged.filter(|_| !self.convergence.decisions.goes_on)
     }
@@ -113,14 +112,14 @@ impl Trainer {
         is_open && self.step < self.cooldown_begin() && !self.convergence.held_out.is_empty()
     }
 
-    /// The step after which the model settles: there is no density control any more, and learning rates decay.
+    /// The step after which the cooldown begins: no density control, decaying learning rates.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn cooldown_begin(&self) -> u64 {
         let planned = self.config.steps - self.config.effective_cooldown_steps();
         self.converged().map_or(planned, |converged| converged.min(planned))
     }
 
-    /// What all learning rates of a step are multiplied by.
+    /// The factor of all learning rates of a step.
     pub(super) fn cooldown_factor(&self, step: u64) -> f64 {
         let (length, since) =
             (self.config.effective_cooldown_steps(), step.saturating_sub(self.cooldown_begin()));
@@ -136,8 +135,8 @@ impl Trainer {
         self.convergence.decisions.scores.iter().map(|score| (score.step, score.score as f64 / 1e3))
     }
 
-    /// Whether the held-out views are scored after this step: at the end, and every few steps but not right after a round
-    /// of density control.
+    /// Whether the held-out views are scored after this step: at the end, and every
+    /// [`StopConfig::every`](super::StopConfig::every) steps but not right after a round of density control.
     pub(super) fn scores_at(&self, step: u64) -> bool {
         if self.convergence.held_out.is_empty() {
             return false;
@@ -147,7 +146,7 @@ impl Trainer {
         step == self.last_step() || is_first && !self.is_unsettled(step)
     }
 
-    /// Whether a round of density control was so near before this step that a score would show that.
+    /// Whether a round of density control was so recent that it would affect a score.
     fn is_unsettled(&self, step: u64) -> bool {
         let interval = self.config.schedule.densify_interval.max(1);
         let round = (step - 1) / interval * interval;
@@ -183,16 +182,16 @@ impl Trainer {
         Ok(())
     }
 
-    /// The best score since views have their full size, the first of equals: that of [`Trainer::best`].
+    /// The first of the best scores since views have their full size: that of the kept model.
     fn best_score(&self) -> Option<Score> {
         let [_, whole] = self.config.schedule.resolution_steps;
         let scores = self.convergence.decisions.scores.iter().filter(|score| score.step >= whole);
         scores.copied().reduce(|best, next| if next.score > best.score { next } else { best })
     }
 
-    /// How the run has ended, with the best of its models: where the held-out views score lower at the end than before by
-    /// more than [`StopConfig::margin`](super::StopConfig::margin), the model of the best score is restored. No steps follow: a run that is to go on
-    /// from its end goes on from a checkpoint that was saved before.
+    /// Ends the run with its best model: if the last score is lower than the best by more than
+    /// [`StopConfig::margin`](super::StopConfig::margin), the model of the best is restored. No steps may follow; to
+    /// continue, save a checkpoint before.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -237,7 +236,7 @@ mod tests {
         }
     }
 
-    /// A call returns early where the machine is slow, so that progress can be shown.
+    /// A call may return before `step` on a slow machine.
     fn train_until(trainer: &mut Trainer, step: u64) {
         while trainer.step < step {
             trainer.train_steps(step, &mut vec![]).unwrap();
@@ -271,7 +270,7 @@ mod tests {
             let mut trainer = scored(margin);
             let best = trainer.gaussians().unwrap();
             train_until(&mut trainer, 20);
-            // Damage: nothing is seen any more.
+            // Damage: no Gaussian is visible.
             let gpu = trainer.gpu.clone();
             let parameters = &mut trainer.model.gaussians.parameters;
             let faint = vec![-20.0; parameters.len()];

@@ -1,4 +1,4 @@
-//! The order in which steps take the training views: every epoch takes each view once, in an order of its own.
+//! The order of the training views: every epoch takes each view once, in its own order.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -6,18 +6,18 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::streams;
 use crate::base::random::Stream;
 
-/// The orders of the epochs that steps are in, each drawn once.
+/// The orders of recent epochs, each drawn once.
 #[derive(Debug, Default)]
 pub(super) struct Epochs(Mutex<VecDeque<(Key, Arc<[usize]>)>>);
 
-/// Seed, number of views and epoch, on which alone an order depends.
+/// Seed, number of views and epoch, which determine an order.
 type Key = (u64, usize, u64);
 
-/// Steps are reported while later ones are recorded, at an epoch's end in the next.
+/// The most orders kept: steps are reported while those of the next epoch are recorded.
 const MAX_KEPT: usize = 4;
 
 impl Epochs {
-    /// The views of the epoch of a step, counted from 1, and the step's place among them.
+    /// The order of the epoch of a step, counted from 1, and the step's position in it.
     pub(super) fn of_step(&self, seed: u64, step: u64, view_count: usize) -> (Arc<[usize]>, usize) {
         let count = view_count as u64;
         let (epoch, place) = ((step - 1) / count, (step - 1) % count);
@@ -34,7 +34,7 @@ impl Epochs {
     }
 }
 
-/// Fisher-Yates from the end; the draws of an epoch depend on its number alone.
+/// A Fisher-Yates shuffle; its draws depend only on seed and epoch.
 fn order(seed: u64, view_count: usize, epoch: u64) -> Vec<usize> {
     let stream = Stream::new(seed, streams::VIEWS);
     let mut order: Vec<usize> = (0..view_count).collect();

@@ -1,4 +1,4 @@
-//! What is learned of the training views' exposures, and where they begin.
+//! Learned exposures of the training views, and their initial values.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -14,7 +14,7 @@ use crate::photographs::tone::{MeasuredPhotograph, SceneTone};
 use crate::{Error, Result};
 
 impl Trainer {
-    /// What the exposure of each training view makes of the model, by name; none where exposures are not learned.
+    /// The exposure of each training view, by name; `None` if exposures are not learned.
     ///
     /// # Errors
     /// The device was lost.
@@ -26,23 +26,22 @@ impl Trainer {
     }
 }
 
-/// Where the exposure of a view begins.
+/// The initial exposure of a view.
 #[derive(Clone, Copy, Debug)]
 enum InitialExposures {
-    /// At these stops of the photograph, from anywhere.
+    /// Stops of the photograph, up to a constant.
     Stops(f64),
-    /// At this affine of the target.
+    /// Gain and bias of the target.
     Affine(Affine),
 }
 
 impl Views {
-    /// Where the exposures of the training views begin; none where they are not learned.
+    /// The exposures of the training views with their initial values; `None` if they are not learned.
     ///
-    /// A table says what is known; without one the photographs do, where cameras have written their exposure. A view of
-    /// which nothing is known begins at the identity.
+    /// Initial values come from a table, or from the photographs' EXIF; otherwise they are the identity.
     ///
     /// # Errors
-    /// The table cannot be read or names a view that there is not; the device is out of memory or lost.
+    /// The table cannot be read or names an unknown view; the device is out of memory or lost.
     pub(super) fn exposures(
         &self,
         pseudo_gt: &PseudoGt,
@@ -84,7 +83,7 @@ impl Views {
         let unknown: Vec<&str> = names.filter(|name| !views.contains(name)).collect();
         if !unknown.is_empty() {
             let problem = format!(
-                "names views that the dataset has not: {}; take them out, or name the photographs",
+                "names views that are not in the dataset: {}; remove or correct them",
                 unknown.join(", ")
             );
             return Err(Error::input(path, problem));
@@ -98,12 +97,10 @@ impl Views {
         let missing: Vec<&str> = self.names().filter(|name| !starts.contains_key(*name)).collect();
         let place = path.display();
         if missing.is_empty() {
-            tracing::info!("{place}: exposures begin there");
+            tracing::info!("initial exposures from {place}");
         } else {
             let names = missing.join(", ");
-            tracing::warn!(
-                "{place}: says nothing of {names}: their exposures begin at the identity"
-            );
+            tracing::warn!("{place} lacks {names}: their exposures start at the identity");
         }
         Ok(starts)
     }
@@ -124,11 +121,11 @@ impl Views {
         match starts.len() {
             0 => {}
             all if all == names.len() => {
-                tracing::info!("exposures begin where the photographs' EXIF has them");
+                tracing::info!("initial exposures from the photographs' EXIF");
             }
             some => {
                 tracing::warn!(
-                    "{some} of {} photographs have their exposure in EXIF; those of the others begin at the identity",
+                    "{some} of {} photographs have their exposure in EXIF; the others start at the identity",
                     names.len()
                 );
             }
@@ -137,7 +134,7 @@ impl Views {
     }
 }
 
-/// Makes targets of photographs that are not in the dataset, as those of it are made.
+/// Makes targets from photographs outside the dataset, as for those inside.
 struct Targets<'a> {
     pseudo_gt: &'a PseudoGt,
     dataset: &'a Dataset,
@@ -151,9 +148,9 @@ impl Targets<'_> {
         self.pseudo_gt.tone_mapped(photograph, &tone_mapping)
     }
 
-    /// What `stops` of a photograph's exposure, in linear light, make of its target: the affine that brings the target of the
-    /// photograph without them nearest to the target of the photograph as it is. A curve that follows from each photograph
-    /// takes much of the difference away before.
+    /// The affine of the target for `stops` of the photograph in linear light: it brings the target of the photograph
+    /// without these stops nearest to the target of the photograph as it is. A curve that follows each photograph
+    /// compensates much of the difference.
     fn affine_of_stops(&mut self, name: &str, stops: f64) -> Result<Affine> {
         let views = &self.dataset.views;
         let place = views.binary_search_by(|view| view.name.as_str().cmp(name));
@@ -167,7 +164,7 @@ impl Targets<'_> {
         let [neutral, own] =
             [&neutral, &*photograph].map(|photograph| self.target(photograph, &view.camera));
         let affine = Affine::least_squares(&neutral?, &own?)?;
-        // Of a photograph of one colour there is no more to say than that.
+        // A photograph of one colour has no affine.
         let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);
         Ok(if is_exposure { affine } else { Affine::IDENTITY })
     }

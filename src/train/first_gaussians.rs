@@ -1,4 +1,4 @@
-//! The first Gaussians: one per point, coloured as the targets of the training views show it.
+//! The first Gaussians: one for each point, with its colour in the targets of the training views.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -19,7 +19,7 @@ use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
 use crate::{Error, Result};
 
 impl Views {
-    /// The points of the dataset, with random ones behind them where there is none or few.
+    /// The points of the dataset, followed by random ones if there are few or none.
     fn points<'a>(
         &self,
         dataset: &'a Dataset,
@@ -37,14 +37,14 @@ impl Views {
         let cameras: Vec<Camera> = firsts.map(|view| view.patch.camera).collect();
         let seed = Stream::new(config.seed, streams::POINTS).bits(0);
         let found = if own.is_empty() { "no".to_owned() } else { own.len().to_string() };
-        tracing::info!("{found} points in the dataset: {count} random ones");
+        tracing::info!("{found} points in the dataset; {count} random ones added");
         let point = |position| Point { position: frame.unframed(position), views: vec![] };
         let random = init::random(&cameras, count, seed).into_iter().map(point);
         own.iter().cloned().chain(random).collect()
     }
 
-    /// One Gaussian per point of the dataset, and per random point where there is none or few, coloured as the targets of
-    /// the training views show it.
+    /// One Gaussian for each point of the dataset, and for random points if there are few or none, with their colours
+    /// in the targets of the training views.
     pub(super) fn initial_gaussians(
         &self,
         gpu: &Gpu,
@@ -56,7 +56,7 @@ impl Views {
         let frame = config.frame.unwrap_or_default();
         let points = self.points(dataset, config, &frame);
         let kept = &sampled(points, config, gpu);
-        // Of the views of the dataset, the place of each among those that are trained on.
+        // The position of each view of the dataset among those trained on.
         let mut places = vec![None; dataset.views.len()];
         self.photographs().for_each(|view| places[view.index] = Some(view.place));
         let mut targets = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Targets);
@@ -86,13 +86,14 @@ impl Views {
         Ok(gaussians)
     }
 
-    /// Warns of every view in which none of the first Gaussians, given in the frame, has its mean: most often its pose is wrong.
+    /// Warns of every view that contains the mean of none of the first Gaussians, given in the frame: its pose is
+    /// probably wrong.
     pub(super) fn warn_of_empty_views(&self, gaussians: &Gaussians) {
         let means: Vec<DVec3> = gaussians.means().iter().map(|mean| mean.as_dvec3()).collect();
         for TrainView { name, patch, .. } in self.photographs() {
             if !scattered(means.len()).any(|at| patch.camera.sees(means[at]).is_some()) {
                 tracing::warn!(
-                    "view {name} shows nothing: none of the {} first Gaussians lies in it; check its pose",
+                    "view {name} contains none of the {} first Gaussians; check its pose",
                     means.len()
                 );
             }
@@ -100,13 +101,13 @@ impl Views {
     }
 }
 
-/// Pictures of the photographs one after the other, made several at a time.
+/// Targets of the photographs in order, made in batches.
 struct ImageBatches<'a> {
     views: &'a Views,
     gpu: &'a Gpu,
     pseudo_gt: &'a PseudoGt,
     kind: ImageKind,
-    /// By place.
+    /// By position.
     made: BTreeMap<usize, Image>,
 }
 
@@ -115,9 +116,9 @@ impl<'a> ImageBatches<'a> {
         Self { views, gpu, pseudo_gt, kind, made: BTreeMap::new() }
     }
 
-    /// That of a place; those before are gone.
+    /// The target at a position; earlier ones are dropped.
     fn next(&mut self, place: usize) -> Result<Image> {
-        /// Of those that are made at a time.
+        /// The pixels of a batch.
         const MAX_PIXELS: usize = 1 << 20;
         let Self { views, gpu, pseudo_gt, kind, ref mut made } = *self;
         if !made.contains_key(&place) {
@@ -139,10 +140,11 @@ impl<'a> ImageBatches<'a> {
     }
 }
 
-/// Sets the features that parts of the model begin with so that nothing changes: no structure, and the illumination that
-/// makes of each point's colour what the dark photographs show of it. Depth, which is correlated, stays as drawn.
+/// Initialises features so that the parts of the model start as the identity: structure 0, and illumination as each
+/// point's colour in the dark photographs over that in the targets. Depth, which is trained by correlation, stays
+/// random.
 fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
-    /// Darker targets say nothing of the light.
+    /// Darker targets tell nothing about the illumination.
     const DARKEST: f32 = 1.0 / 255.0;
     let features = gaussians.shape.features;
     let places = |feature| {
@@ -158,8 +160,8 @@ fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
     }
 }
 
-/// The numbers below `count`, each once, with neighbours far apart: what is found at some place in a list is found after few
-/// steps, however the list is sorted.
+/// A permutation of the numbers below `count` with neighbours far apart, so that a search through a sorted list samples
+/// all of it early.
 fn scattered(count: usize) -> impl Iterator<Item = usize> {
     const GOLDEN: f64 = 0.618_033_988_75;
     let divides_both = |step: usize| {
@@ -197,8 +199,8 @@ fn sampled<'a>(points: Cow<'a, [Point]>, config: &TrainConfig, gpu: &Gpu) -> Cow
     even_sample(of, count, seed).into_iter().map(|index| points[index].clone()).collect()
 }
 
-/// `count` of the indices below `of`, ascending, spread evenly: one at random of each of `count` stretches of equal length. A scan
-/// lists neighbours in rows, and a fixed stride would meet the same place of each row.
+/// `count` of the indices below `of`, ascending, spread evenly: one at random of each of `count` stretches of equal
+/// length. A scan lists neighbours in rows, and a fixed stride would meet the same place of each row.
 fn even_sample(of: usize, count: usize, seed: u64) -> Vec<usize> {
     if count >= of {
         return (0..of).collect();

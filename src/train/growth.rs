@@ -1,4 +1,4 @@
-//! Density control in a run: when it acts, and how many Gaussians it may leave.
+//! Density control in a run: its steps, and the limits of growth.
 
 use glam::UVec2;
 
@@ -15,22 +15,22 @@ use crate::splats::densify::{Densifier, DensifyReport, DensifySettings, DensityC
 use crate::splats::render::RenderOptions;
 use crate::splats::scene::GaussianSlice;
 
-/// dB. A round that costs the probes more is tried again with fewer splits. All training views may lose somewhat more.
+/// The most dB that a round may cost the probes before it is tried again with fewer splits. The training views as a
+/// whole may lose somewhat more.
 const MAX_LOST: f64 = 0.2;
 
-/// What makes Gaussians more and fewer.
+/// The state of density control.
 #[derive(Debug)]
 pub(super) struct Growth {
     pub(super) densifier: Densifier,
-    /// Training views that tell what a round costs; none where nothing is done about it.
+    /// Training views on which the cost of a round is measured; empty if it is not.
     pub(super) probes: TargetViews,
-    /// That there is no room to grow was said.
+    /// Whether the end of growth for lack of capacity was logged.
     pub(super) has_logged_capacity: bool,
 }
 
 impl Trainer {
-    /// Density control acts after this step: never in the settling phase, nor so late that the run ends before what it
-    /// added has settled.
+    /// Whether density control acts after this step: never in the cooldown, nor within the last interval of the run.
     pub(super) fn densifies_at(&self, step: u64) -> bool {
         let schedule = &self.config.schedule;
         let is_in_time = step + schedule.densify_interval <= self.config.steps;
@@ -66,7 +66,7 @@ impl Trainer {
         self.reserve()
     }
 
-    /// A round of density control that makes only as many splits as leave what the probes show about as it was.
+    /// A round of density control with as many splits as the probes tolerate.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -88,8 +88,8 @@ impl Trainer {
         Ok(report)
     }
 
-    /// How many Gaussians there is room for, at least as many as there are, and what there is no more of. A view may have
-    /// twice as many intersections for each Gaussian as the last one had.
+    /// The largest number of Gaussians that fits, at least their present number, and the limiting resource. A view may
+    /// have twice the intersections per Gaussian of the last one.
     fn capacity(&self, intersections: u32) -> (usize, &'static str) {
         let pixels = |size: UVec2| f64::from(size.x) * f64::from(size.y);
         let largest = self.supervision.views.sizes().into_iter().map(pixels).fold(0.0, f64::max);
@@ -100,24 +100,24 @@ impl Trainer {
         let bindable = f64::from(self.renderer.max_intersections()) / each;
         let bindable = self.max_renderable().min(bindable as usize);
         let bounds = [
-            (bindable, "all that the device can bind at once"),
-            (self.fitting_in_vram(each), "all that fits into max_vram"),
-            (self.fitting_in_ram(each), "all that fits into max_ram"),
+            (bindable, "the most that the device binds"),
+            (self.fitting_in_vram(each), "the most that fits in max_vram"),
+            (self.fitting_in_ram(each), "the most that fits in max_ram"),
         ];
         let (capacity, why) =
             bounds.into_iter().min_by_key(|(capacity, _)| *capacity).unwrap_or(bounds[0]);
         (capacity.max(count), why)
     }
 
-    /// The most Gaussians there may be, by the setting and by what passes of the renderer bind.
+    /// The limit of Gaussians by the setting and by the buffers that the renderer binds.
     pub(super) fn max_renderable(&self) -> usize {
         let renderable = self.config.render_settings().peak_gaussians(&self.gpu);
         self.config.max_gaussians.min(renderable)
     }
 }
 
-/// The share of a round's splits that stays where all of them cost this many dB. The loss grows with the square root of that
-/// share, as the splits with the largest gradients cost most (docs/benchmarks.md); a tenth is to spare.
+/// The share of a round's splits to keep if all of them cost `lost` dB. The cost grows with the square root of the
+/// share, since the splits with the largest gradients cost most; with a margin of a tenth.
 fn share_that_stays(lost: f64) -> f64 {
     if lost > MAX_LOST { (0.9 * MAX_LOST / lost).powi(2) } else { 1.0 }
 }
@@ -125,7 +125,7 @@ fn share_that_stays(lost: f64) -> f64 {
 /// Density control in the frame, for the cameras of the training views.
 ///
 /// # Errors
-/// A setting makes no sense, or the device refuses a pipeline.
+/// A setting is invalid, or the device refuses a pipeline.
 pub(super) fn densifier(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Densifier> {
     let frame = config.frame.unwrap_or_default();
     let cameras = dataset.train_views().map(|view| frame.camera(&view.camera));
@@ -153,10 +153,10 @@ mod tests {
     use crate::train::measuring::measured;
     use crate::train::target_views::TargetViews;
 
-    /// dB that no round may cost the training views.
+    /// The most dB that a round may cost the training views.
     const BOUND: f64 = 0.3;
 
-    /// What each round of a run costs all training views, in dB, by step.
+    /// The cost of each round of a run on all training views, in dB, by step.
     fn losses(config: &TrainConfig) -> Vec<(u64, f64)> {
         let gpu = gpu();
         let dataset = Dataset::load(&config.dataset, &config.load_options()).unwrap();
@@ -215,7 +215,7 @@ mod tests {
         }
     }
 
-    /// The scenes in the folder that `NIGHTSPLAT_SCENES` names, each at whole, half and quarter size, with three seeds.
+    /// The scenes that `NIGHTSPLAT_SCENES` names, at full, half and quarter size, with three seeds.
     #[test]
     #[ignore = "takes hours: `scripts/stress.py growth`"]
     fn no_round_of_a_real_scene_costs_the_training_views_much() {

@@ -1,7 +1,7 @@
-//! The settings of a run from everything that says one: defaults, preset, plan, file, options, `--set`. The later wins.
+//! The settings of a run, merged from defaults, preset, plan, file, options and `--set`; later ones win.
 //!
-//! Each is a [`SettingsLayer`]: some keys of config.toml with their values. [`Settings`] merges them, and knows of every value
-//! where it comes from.
+//! Each is a [`SettingsLayer`]: keys of config.toml with values. [`Settings`] merges them and keeps the origin of every
+//! value.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -17,14 +17,14 @@ use crate::base::settings::{Rule, Setting};
 use crate::photographs::tone::{OF_CURVE, ToneCurve};
 use crate::{Error, Result};
 
-/// Where a value comes from.
+/// The origin of a value.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Origin {
-    /// Nobody says it.
+    /// The default.
     Default,
     /// This preset.
     Preset(&'static str),
-    /// What the photographs show.
+    /// The plan.
     Plan,
     /// This configuration file.
     File(PathBuf),
@@ -32,7 +32,7 @@ pub enum Origin {
     Option(&'static str),
     /// `--set`.
     Set,
-    /// The run that goes on.
+    /// The resumed run.
     Run,
 }
 
@@ -45,12 +45,12 @@ impl fmt::Display for Origin {
             Self::File(path) => write!(out, "{}", path.display()),
             Self::Option(name) => out.write_str(name),
             Self::Set => out.write_str("--set"),
-            Self::Run => out.write_str("the run that goes on"),
+            Self::Run => out.write_str("the resumed run"),
         }
     }
 }
 
-/// Some settings with their values; a later one of a key wins.
+/// Settings with their values; a later value of a key wins.
 #[derive(Clone, Debug, Default)]
 pub struct SettingsLayer(pub(super) Vec<(String, Value, Origin)>);
 
@@ -58,11 +58,11 @@ impl SettingsLayer {
     /// Every setting of a TOML text.
     ///
     /// # Errors
-    /// The text is no TOML, or has a key that is no setting or a value that its setting does not take; with its line.
+    /// The text is not TOML, or has an unknown key or an invalid value; with its line.
     pub fn of_toml(text: &str, origin: &Origin) -> Result<Self> {
         let table: Table = text.parse().map_err(|error: toml::de::Error| {
             let at = error.span().map(|span| line_at(text, span.start));
-            Error::Usage(format!("is no TOML: {}{}", error.message(), at.unwrap_or_default()))
+            Error::Usage(format!("is not TOML: {}{}", error.message(), at.unwrap_or_default()))
         })?;
         let mut layer = Self::default();
         for (key, value) in flat("", table) {
@@ -76,7 +76,7 @@ impl SettingsLayer {
     /// The settings of a file.
     ///
     /// # Errors
-    /// It cannot be read, and as [`Self::of_toml`].
+    /// The file cannot be read; and as [`Self::of_toml`].
     pub fn load(path: &Path) -> Result<Self> {
         let layer = Self::of_toml(&input::text(path)?, &Origin::File(path.to_owned()));
         layer.map_err(|problem| Error::input(path, problem.to_string()))
@@ -85,20 +85,20 @@ impl SettingsLayer {
     /// `KEY=VALUE`, such as `tone.alpha=0.1`.
     ///
     /// # Errors
-    /// It has no `=`, and as [`Self::say`].
+    /// It has no `=`; and as [`Self::say`].
     pub fn assign(&mut self, assignment: &str) -> Result<()> {
         let (key, value) = assignment.split_once('=').ok_or_else(|| {
             let problem =
-                format!("`{assignment}` sets nothing; write KEY=VALUE, as in tone.alpha=0.1");
+                format!("`{assignment}` has no value; write KEY=VALUE, as in tone.alpha=0.1");
             Error::Usage(problem)
         })?;
         self.say(key.trim(), value.trim(), Origin::Set)
     }
 
-    /// A setting and its value as a command line has it: TOML, or a text without quotes.
+    /// Adds a setting with its value as on a command line: TOML, or text without quotes.
     ///
     /// # Errors
-    /// The key is no setting, or the setting does not take the value.
+    /// The key is unknown, or the value invalid.
     pub fn say(&mut self, key: &str, text: &str, origin: Origin) -> Result<()> {
         let value = value(text);
         // A device may be named 0.
@@ -114,7 +114,7 @@ impl SettingsLayer {
         self.push(key, value.unwrap_or_else(|| Value::String(text.to_owned())), origin)
     }
 
-    /// A setting and its value.
+    /// Adds a setting with its value.
     ///
     /// # Errors
     /// The key is no setting, or the setting does not take the value.
@@ -139,24 +139,24 @@ impl SettingsLayer {
         Ok(Self(values.map(|(key, value)| (key, value, Origin::Default)).collect()))
     }
 
-    /// Whether it says something of a section.
+    /// Whether it has a setting whose key starts with `section`.
     pub(super) fn names(&self, section: &str) -> bool {
         self.0.iter().any(|(key, ..)| key.starts_with(section))
     }
 
-    /// What it says of a setting.
+    /// The value of a setting.
     pub fn get(&self, key: &str) -> Option<&Value> {
         self.0.iter().rev().find_map(|(own, value, _)| (own == key).then_some(value))
     }
 }
 
-/// Every value that is said, and where it comes from.
+/// Merged settings with their origins.
 #[derive(Clone, Debug, Default)]
 pub struct Settings(BTreeMap<String, (Value, Origin)>);
 
 impl Settings {
     pub(super) fn merge(&mut self, layer: &SettingsLayer) {
-        // What belongs to a curve comes after it, wherever it stands.
+        // The settings of a curve are applied after the curve, in whatever order they stand.
         let order = |key: &str| match key {
             "tone.curve" => 0,
             "tone.auto_gain" => 1,
@@ -192,7 +192,7 @@ impl Settings {
         self.0.insert(key.to_owned(), (value, origin));
     }
 
-    /// The constants that the curve comes with.
+    /// The curve's own constants.
     fn constants(&self) -> Table {
         let curve = self.0.get("tone.curve").and_then(|(value, _)| value.as_str()?.parse().ok());
         let constants = curve.unwrap_or(ToneCurve::Auto).family().constants.iter();
@@ -202,7 +202,7 @@ impl Settings {
     /// The configuration.
     ///
     /// # Errors
-    /// [`Error::Usage`] for a curve that is not whole.
+    /// [`Error::Usage`] for an incomplete curve.
     pub(crate) fn config(&self) -> Result<TrainConfig> {
         let mut table = Table::new();
         for (key, (value, _)) in &self.0 {
@@ -218,7 +218,7 @@ impl Settings {
         table.try_into().map_err(|error: toml::de::Error| Error::Usage(error.message().to_owned()))
     }
 
-    /// Where a value comes from, in words.
+    /// The origin of a value in words.
     fn origin(&self, row: &Setting) -> String {
         let stated = self.0.get(row.key.as_ref()).map(|(_, origin)| origin.to_string());
         stated
@@ -226,10 +226,10 @@ impl Settings {
             .unwrap_or_else(|| Origin::Default.to_string())
     }
 
-    /// Every setting of a configuration: value, origin, help.
+    /// Every setting of a configuration with value, origin and help.
     ///
     /// # Errors
-    /// None for a configuration that [`TrainConfig::check`] accepts.
+    /// Never for a configuration that [`TrainConfig::check`] accepts.
     pub(crate) fn explained(&self, config: &TrainConfig) -> Result<String> {
         let values = values(config)?;
         let line = |row: &Setting| {
@@ -246,7 +246,7 @@ impl Settings {
         Ok(SETTINGS.iter().map(line).collect())
     }
 
-    /// config.toml: every setting with its help and, behind it, where its value comes from.
+    /// The text of config.toml: every setting with its help and the origin of its value.
     ///
     /// # Errors
     /// None for a configuration that [`TrainConfig::check`] accepts.
@@ -257,7 +257,7 @@ impl Settings {
                 section = format!("{name}.");
             }
             let key = line.split_once(" = ").map(|(name, _)| format!("{section}{name}"));
-            // A value of several lines has no room for a comment.
+            // A value of several lines gets no comment.
             let row = key.and_then(|key| setting(&key)).filter(|_| line.parse::<Table>().is_ok());
             written += &match row {
                 Some(row) => {
@@ -271,20 +271,20 @@ impl Settings {
 }
 
 impl TrainConfig {
-    /// Reads a TOML file; what it leaves out keeps its default.
+    /// Reads a TOML file; settings that it omits keep their defaults.
     ///
     /// # Errors
-    /// The file cannot be read, or says something that no run has.
+    /// The file cannot be read, or has an unknown key or an invalid value.
     pub fn load(path: &Path) -> Result<Self> {
         let mut settings = Settings::default();
         settings.merge(&SettingsLayer::load(path)?);
         settings.config().map_err(|problem| Error::input(path, problem.to_string()))
     }
 
-    /// Reads TOML; what it leaves out keeps its default.
+    /// Reads TOML; settings that it omits keep their defaults.
     ///
     /// # Errors
-    /// It says something that no run has.
+    /// It has an unknown key or an invalid value.
     pub fn from_toml(text: &str) -> Result<Self> {
         let mut settings = Settings::default();
         settings.merge(&SettingsLayer::of_toml(text, &Origin::Default)?);
@@ -295,14 +295,14 @@ impl TrainConfig {
     /// else a string.
     ///
     /// # Errors
-    /// [`Error::Setting`] for a value that the setting does not take, [`Error::Usage`] for a key that is no setting.
+    /// [`Error::Setting`] for an invalid value, [`Error::Usage`] for an unknown key.
     pub fn with(&self, assignments: &[String]) -> Result<Self> {
         let mut layer = SettingsLayer::default();
         assignments.iter().try_for_each(|assignment| layer.assign(assignment))?;
         self.overlaid(&layer)
     }
 
-    /// The configuration with every setting of a layer.
+    /// The configuration with the settings of a layer.
     pub(super) fn overlaid(&self, layer: &SettingsLayer) -> Result<Self> {
         let mut settings = Settings::default();
         settings.merge(&SettingsLayer::of(self)?);
@@ -312,7 +312,7 @@ impl TrainConfig {
     }
 }
 
-/// The values of a configuration that its TOML has, by key.
+/// The values in a configuration's TOML, by key.
 ///
 /// # Errors
 /// None for a configuration that [`TrainConfig::check`] accepts.
@@ -334,7 +334,7 @@ pub(crate) fn whole(text: &str) -> Option<i64> {
     (number.fract() == 0.0 && number.abs() < 9e15).then_some(number as i64)
 }
 
-/// The line of a place in a text, as messages have it.
+/// The line of an offset in a text, for messages.
 fn line_at(text: &str, at: usize) -> String {
     format!(" (line {})", text[..at].matches('\n').count() + 1)
 }
@@ -444,7 +444,7 @@ mod tests {
                 ["stop.every is 0; it must be a whole number, at least 1", "(line 4)"],
             ),
             ("steps = 3\nseed = \"x\"\n", ["seed is \"x\"", "(line 2)"]),
-            ("steps = \n", ["is no TOML", "(line 1)"]),
+            ("steps = \n", ["is not TOML", "(line 1)"]),
         ] {
             std::fs::write(&path, text).unwrap();
             let message = TrainConfig::load(&path).unwrap_err().to_string();
@@ -478,7 +478,7 @@ mod tests {
         assert_eq!(TrainConfig::from_toml(&text).unwrap(), config);
         let explained = settings.explained(&config).unwrap();
         assert!(
-            explained.contains("stop.views = 0  (preset fast)\n    The number of"),
+            explained.contains("stop.views = 0  (preset fast)\n    Hold out this many"),
             "{explained}"
         );
         assert!(explained.contains("cache  (a quarter of each memory)\n"), "{explained}");

@@ -1,5 +1,5 @@
-//! Hidden pixels of the training views. Where one is hidden the render is taken for its target, so that no term sees a
-//! difference there, and nothing of the gradient goes back: neither to the Gaussians nor to what density control counts.
+//! Masks of the training views. At masked pixels the render is replaced by its target, so that no term has a difference
+//! or a gradient there, neither for the Gaussians nor for the statistics of density control.
 
 use glam::UVec2;
 
@@ -11,12 +11,12 @@ use crate::kernels::{mask_gradient, mask_render};
 use crate::photographs::dataset::Dataset;
 use crate::splats::scene::COLOR_CHANNELS;
 
-/// The masks of the views that have one, and what applies them; a view without one costs nothing.
+/// The masks of the views, and the kernels that apply them; a view without a mask costs nothing.
 #[derive(Debug)]
 pub(super) struct Masks {
-    /// By the number of the view, (H, W).
+    /// By the number of the view; (H, W).
     weights: Vec<Option<Buffer<f32>>>,
-    /// None where no view has one.
+    /// `None` if no view has a mask.
     masking: Option<Masking>,
 }
 
@@ -39,17 +39,17 @@ impl Masks {
         Ok(Self { weights, masking: masking.transpose()? })
     }
 
-    /// Whether no view has one.
+    /// Whether no view has a mask.
     pub(super) fn is_empty(&self) -> bool {
         self.masking.is_none()
     }
 
-    /// That of a view, (H, W).
+    /// The mask of a view, (H, W).
     pub(super) fn of_view(&self, view: usize) -> Option<&Buffer<f32>> {
         self.weights.get(view)?.as_ref()
     }
 
-    /// What the loss is to see of `render`, (3, H, W): itself, or where pixels are hidden their target.
+    /// The image for the loss, (3, H, W): `render`, with the target at masked pixels.
     ///
     /// # Errors
     /// The pass cannot be recorded.
@@ -68,7 +68,7 @@ impl Masks {
         }
     }
 
-    /// Makes of dL/d shown, in every one of `channels` channels, dL/d render.
+    /// Turns dL/d shown into dL/d render, in each of `channels` channels.
     ///
     /// # Errors
     /// The pass cannot be recorded.
@@ -86,17 +86,17 @@ impl Masks {
     }
 }
 
-/// What applies a mask to an image that is compared with a target.
+/// The kernels that apply a mask to an image that is compared with a target.
 #[derive(Debug)]
 pub(super) struct Masking {
     render: Pipeline<mask_render::Kernel>,
     gradient: Pipeline<mask_gradient::Kernel>,
-    /// (3, H, W) of the largest masked image.
+    /// The masked image; (3, H, W) of the largest.
     shown: Buffer<f32>,
 }
 
 impl Masking {
-    /// For images of at most `values` values.
+    /// Kernels for images of at most `values` values.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -108,7 +108,7 @@ impl Masking {
         })
     }
 
-    /// `render`, (3, H, W), and where `weights`, (H, W), hide it the target.
+    /// `render`, (3, H, W), with the target where `weights`, (H, W), mask it.
     ///
     /// # Errors
     /// The pass cannot be recorded.
@@ -135,7 +135,7 @@ impl Masking {
         Ok(&self.shown)
     }
 
-    /// Of dL/d shown, in every one of `channels` channels, dL/d render.
+    /// Turns dL/d shown into dL/d render, in each of `channels` channels.
     ///
     /// # Errors
     /// The pass cannot be recorded.
@@ -157,7 +157,7 @@ impl Masking {
     }
 }
 
-/// Of the colours of a view.
+/// The number of colour values of a view.
 fn value_count(size: UVec2) -> usize {
     COLOR_CHANNELS * size.x as usize * size.y as usize
 }

@@ -1,4 +1,4 @@
-//! What is measured of the training photographs, and how bright their targets are.
+//! Measurements of the training photographs, and the brightness of their targets.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -11,13 +11,12 @@ use crate::photographs::dataset::{Dataset, MeasuredSize, View};
 use crate::photographs::image::Image;
 use crate::photographs::tone::{Exposure, MeasuredPhotograph, SceneTone, ToneSettings, all_black};
 
-/// How bright the targets are, and what a model makes of them.
+/// The exposure of the targets and of the model.
 #[derive(Clone, Debug, Serialize)]
 pub struct TargetExposure {
-    /// The gain that a model of views with differing gains agrees on, their geometric mean: the exposure at which it
-    /// renders and is scored.
+    /// The geometric mean of the views' gains: the exposure at which the model renders and is scored.
     pub model_gain: f64,
-    /// What was found for the training photographs together.
+    /// The exposure of the training photographs together.
     pub scene: Exposure,
     /// The gain of every training view, by name.
     pub gains: BTreeMap<String, f64>,
@@ -31,16 +30,16 @@ impl TargetExposure {
     }
 }
 
-/// The training views that have a photograph, and their places in the dataset.
+/// The training views that have a photograph, with their indices in the dataset.
 pub(super) fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &View)> {
     let views = dataset.views.iter().enumerate();
     views.filter(|(_, view)| view.is_train() && view.has_photograph())
 }
 
-/// What is measured of all training photographs together, and of each.
+/// Measures the training photographs, together and each.
 ///
 /// # Errors
-/// Every photograph is as good as black where their exposure is asked for, or a photograph can no longer be read.
+/// Every photograph is black and their exposure is needed, or a photograph can no longer be read.
 pub(super) fn measured(
     settings: &ToneSettings,
     dataset: &Dataset,
@@ -57,7 +56,7 @@ pub(super) fn measured(
     Ok((scene, measured))
 }
 
-/// What is measured of a view; known where its photograph was measured while it was decoded.
+/// The measurements of a view, already known if its photograph was measured while it was decoded.
 ///
 /// # Errors
 /// As [`tone_map_source`].
@@ -77,8 +76,8 @@ pub(super) fn measured_of(
     Ok(measured.map(|measured| measured.seen_by(&view.camera)))
 }
 
-/// What is measured of a view and becomes its target: the photograph as its camera took it where it is lifted before it is
-/// shrunk, else as it was loaded; none where the view has none.
+/// What is measured of a view and becomes its target: the photograph as its camera took it where it is lifted before it
+/// is shrunk, else as it was loaded; none where the view has none.
 ///
 /// # Errors
 /// As [`View::photograph`].

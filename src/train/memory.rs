@@ -1,7 +1,7 @@
-//! How much memory a training takes: foreseen before the first step, and kept below a limit as the model grows.
+//! Memory of a training: estimated before the first step, and limited as the model grows.
 //!
-//! Limits are held by what follows from counts, never by what the system says at the moment: growth stops at the same
-//! number of Gaussians in every run, interrupted or not.
+//! Limits use counts alone, never the system's current state: growth stops at the same number of Gaussians in every
+//! run, resumed or not.
 
 use glam::UVec2;
 use serde::Serialize;
@@ -13,45 +13,45 @@ use crate::camera::Patch;
 use crate::splats::render::RenderOptions;
 use crate::splats::scene::{Layout, Shape};
 
-/// What the program, the driver and its compiled kernels take on the host, about.
+/// Approximate host memory of the program, the driver and its compiled kernels.
 const PROGRAM: f64 = 256.0 * 1024.0 * 1024.0;
-/// What density control gathers for each Gaussian, in bytes.
+/// Bytes of density control's statistics for each Gaussian.
 const STATISTICS: f64 = 8.0;
-/// Plane sets that a checkpoint or a model is made from on the host.
+/// Plane sets on the host while a checkpoint or model is written.
 const HOST_PLANE_SETS: f64 = 3.0;
-/// A model that grows gets room for so many times as many Gaussians.
+/// The factor of capacity that a growing model allocates.
 const HEADROOM: f64 = 1.5;
-/// The fraction of the memory there may be that activations take which could be computed again.
+/// The share of memory for activations that could be recomputed.
 const ACTIVATIONS: f64 = 0.25;
-/// A view may have so many times as many intersections for each Gaussian as the last one had.
+/// The factor of intersections per Gaussian that a view may have over the last one.
 pub(super) const MARGIN: f64 = 2.0;
 
-/// What a training is going to take, in bytes.
+/// The estimated memory of a training, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct MemoryEstimate {
-    /// The Gaussians that a step has now.
+    /// The present number of Gaussians.
     pub gaussians: usize,
-    /// What steps with so many take on the device.
+    /// Device memory of steps with that number.
     pub device: u64,
-    /// What the process takes on the host then, on a software device with what that has.
+    /// Host memory of the process, including a software device's.
     pub host: u64,
-    /// The most Gaussians that there may come to be.
+    /// The largest number of Gaussians that the run can reach.
     pub peak_gaussians: usize,
-    /// The most on the device on the way there.
+    /// Peak device memory on the way there.
     pub peak_device: u64,
-    /// The most on the host on the way there.
+    /// Peak host memory on the way there.
     pub peak_host: u64,
 }
 
 impl Trainer {
-    /// Room on the renderer for every view.
+    /// Reserves the renderer's memory for every view.
     pub(super) fn reserve(&mut self) -> Result<()> {
         let Self { model, supervision, renderer, .. } = self;
         let sizes = supervision.views.all().map(TrainView::size);
         renderer.reserve_sizes(model.count(), model.capacity(), sizes)
     }
 
-    /// What the training is going to take, by what it takes now and what its largest view shows.
+    /// Estimates the memory of the training from its present memory and its largest view.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -70,7 +70,7 @@ impl Trainer {
             .max(device)
             .max(self.gpu.peak_memory() as f64);
         let host = |gaussians: f64, device: f64| {
-            // On a software device, its buffers are the process's memory.
+            // A software device's buffers are in the process's memory.
             let still_to_come = (device - self.gpu.memory_in_use() as f64).max(0.0);
             let shared = if self.gpu.properties().is_cpu { still_to_come } else { 0.0 };
             resident().unwrap_or(PROGRAM) + shared + HOST_PLANE_SETS * self.host_plane() * gaussians
@@ -85,7 +85,7 @@ impl Trainer {
         })
     }
 
-    /// How many intersections the first Gaussians have in the largest view; there is room for them then.
+    /// The intersections of the first Gaussians in the largest view, for which memory is then reserved.
     fn intersections_of_largest_view(&mut self) -> Result<u32> {
         let largest =
             self.supervision.views.all().map(|view| view.patch).max_by_key(Patch::pixel_count);
@@ -95,13 +95,12 @@ impl Trainer {
         self.renderer.intersections()
     }
 
-    /// The most Gaussians that the run can come to have: a limit that there is, or as many as all its rounds of growth can
-    /// make.
+    /// The largest number of Gaussians that the run can reach, by its limits and its rounds of growth.
     fn peak_gaussians(&self, met: f64) -> usize {
         let (count, interval) = (self.model.count(), self.config.schedule.densify_interval.max(1));
         let rounds = (self.step / interval + 1..=self.config.steps / interval)
             .filter(|round| self.densifies_at(round * interval));
-        // A Gaussian becomes two at most.
+        // A round at most doubles the Gaussians.
         let filled = self.count_once_filled();
         let doubled = (0..rounds.count()).try_fold(filled, |count, _| count.checked_mul(2));
         let limit = self.max_renderable();
@@ -110,8 +109,7 @@ impl Trainer {
         limit.min(doubled.unwrap_or(usize::MAX)).max(count)
     }
 
-    /// Keeps the activations that a denoiser's backward pass would compute again, within a fraction of what the run may have:
-    /// the rest is the model's.
+    /// Keeps activations that the denoiser's backward pass would otherwise recompute, within their share of the memory.
     pub(super) fn keep_activations(&mut self, sizes: &[UVec2]) -> Result<()> {
         let most = (ACTIVATIONS * self.max_bytes()) as u64;
         match &mut self.supervision.networks {
@@ -120,7 +118,7 @@ impl Trainer {
         }
     }
 
-    /// What there may be on the device at most, by the limits and by what it has.
+    /// The most bytes on the device, by the limits and its memory.
     fn max_bytes(&self) -> f64 {
         let device = self.gpu.properties();
         let most = |CacheSize(bytes): CacheSize| bytes.min(device.memory);
@@ -131,20 +129,20 @@ impl Trainer {
         }
     }
 
-    /// What is on the device now, less what follows the numbers of Gaussians and intersections, in bytes.
+    /// Bytes on the device that do not depend on the numbers of Gaussians and intersections.
     pub(super) fn measure_fixed_bytes(&self) -> f64 {
         self.gpu.free_unused();
         let model = self.model.capacity() as f64 * self.per_gaussian_of(self.model.shape()).model;
         (self.gpu.memory_in_use() as f64 - model - self.renderer.reserved_bytes() as f64).max(0.0)
     }
 
-    /// How many Gaussians of so many intersections each fit into what the device may have.
+    /// The number of Gaussians, with `each` intersections, that fits the device's limit.
     pub(super) fn fitting_in_vram(&self, each: f64) -> usize {
         let limit = self.config.max_vram.map(|CacheSize(bytes)| bytes as f64);
         limit.map_or(usize::MAX, |limit| self.fitting(limit - self.fixed_bytes, each, 0.0))
     }
 
-    /// How many fit into what the process may have on the host: their copies there, and on a software device themselves.
+    /// The number of Gaussians that fits the host's limit: their copies and, on a software device, themselves.
     pub(super) fn fitting_in_ram(&self, each: f64) -> usize {
         let Some(CacheSize(limit)) = self.config.max_ram else { return usize::MAX };
         let copies = HOST_PLANE_SETS * self.host_plane();
@@ -155,11 +153,11 @@ impl Trainer {
         (rest / copies).max(0.0) as usize
     }
 
-    /// How many Gaussians fit into so many bytes, with room to save them and to come to be, at `more` bytes each.
+    /// The number of Gaussians that fits in `bytes`, including growth and saving, at `more` bytes each.
     fn fitting(&self, bytes: f64, each: f64, more: f64) -> usize {
         let (per, beside) = (self.per_gaussian(), more + self.intersection_bytes(each));
         let saved = bytes / (per.saving(1.0) + beside);
-        // Those that there are may have room for half as many again.
+        // The present buffers may have 1.5 times the capacity.
         let before = HEADROOM * self.model.count() as f64;
         let grown = (bytes - per.growing(before, 0.0)) / (per.growing(0.0, 1.0) + beside);
         saved.min(grown).max(0.0) as usize
@@ -169,14 +167,14 @@ impl Trainer {
         intersections * self.renderer.bytes_per_intersection() as f64
     }
 
-    /// Once every SH degree is in use that the run comes to.
+    /// Bytes per Gaussian once the highest SH degree is in use.
     fn per_gaussian(&self) -> PerGaussian {
         let now = self.model.shape();
         let sh_degree = self.sh_degree(self.config.steps).max(now.sh_degree);
         self.per_gaussian_of(Shape { sh_degree, ..now })
     }
 
-    /// What a plane set takes of each on the host, where it has every SH degree.
+    /// Bytes of a plane set per Gaussian on the host, with every SH degree.
     fn host_plane(&self) -> f64 {
         self.per_gaussian_of(self.model.whole_shape()).plane
     }
@@ -185,7 +183,7 @@ impl Trainer {
         let layout = Layout { shape, ..self.model.gaussians.layout };
         let columns = [layout.floats().columns, layout.words()];
         let [plane, parameters] = columns.map(|columns| (columns * size_of::<f32>()) as f64);
-        // Beside the moments, gradients are planes.
+        // Gradients and moments are planes.
         let planes = 1 + self.model.moments.planes().len();
         PerGaussian {
             plane,
@@ -196,28 +194,28 @@ impl Trainer {
     }
 }
 
-/// What each Gaussian takes on the device, in bytes.
+/// Device memory per Gaussian, in bytes.
 struct PerGaussian {
     /// A float of every column.
     plane: f64,
-    /// Parameters, gradients, moments, and what density control gathers.
+    /// Parameters, gradients, moments, and statistics of density control.
     model: f64,
     /// In the renderer and in density control.
     working: f64,
 }
 
 impl PerGaussian {
-    /// So many in training.
+    /// Bytes of `count` Gaussians in training.
     fn steady(&self, count: f64) -> f64 {
         count * (self.model + self.working)
     }
 
-    /// So many on their way to the host, one plane set after the other.
+    /// Bytes while `count` Gaussians are read back, a plane set at a time.
     fn saving(&self, count: f64) -> f64 {
         self.steady(count) + count * self.plane
     }
 
-    /// The most that it takes to come from `count` with room for `capacity` to `most` by doubling, and to save them.
+    /// Peak bytes of growing from `count` Gaussians with capacity `capacity` to `most` by doubling, and of saving them.
     fn growing_to(&self, count: f64, capacity: f64, most: f64) -> f64 {
         let (mut count, mut capacity, mut peak) = (count, capacity, 0.0_f64);
         while count >= 1.0 && count < most {
@@ -231,21 +229,21 @@ impl PerGaussian {
         peak.max(self.saving(capacity))
     }
 
-    /// So many come to be from so many: both are there for a moment.
+    /// Bytes of a round from `before` to `count` Gaussians, when both exist.
     fn growing(&self, before: f64, count: f64) -> f64 {
         (before + count) * self.model + before * self.working
     }
 }
 
-/// How many intersections `gaussians` have where `count` have `met` and all of them together cover the same: each is
-/// smaller then, and meets its own tile and those beyond its edges.
+/// The intersections of `gaussians` Gaussians, if `count` have `met` and both cover the same area: smaller ones meet
+/// their own tile and those beyond their edges.
 fn met_by(gaussians: f64, met: f64, count: f64) -> f64 {
     let each = met / count.max(1.0);
     let beyond = (each.sqrt() - 1.0).max(0.0) * (count / gaussians).sqrt().min(1.0);
     gaussians * each.min((1.0 + beyond).powi(2))
 }
 
-/// What the process has in memory now, in bytes; none where the system does not say.
+/// The resident memory of the process in bytes; `None` if the system does not tell.
 fn resident() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = text.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;

@@ -13,7 +13,7 @@ use crate::splats::scene::{
 };
 
 impl Trainer {
-    /// The gradient of every parameter that the last step left, in the frame.
+    /// The gradients of all parameters in the last step, in the frame.
     ///
     /// # Errors
     /// The device was lost.
@@ -26,26 +26,26 @@ impl Trainer {
     }
 }
 
-/// Planes of every attribute with their moments and gradients, and the statistics of density control. Buffers are as long
-/// as the Gaussians need or longer.
+/// Planes of every attribute with their moments and gradients, and the statistics of density control. Buffers may be
+/// longer than the Gaussians need.
 ///
-/// SH coefficients come with their degree: before it is in use there is no memory for them, and no pass over it.
+/// SH coefficients of a degree have memory, and passes over it, only once the degree is in use.
 #[derive(Debug)]
 pub(super) struct Model {
     pub(super) gaussians: DeviceGaussians,
-    /// What Adam keeps.
+    /// Adam's moments.
     pub(super) moments: Moments,
-    /// The SH degree that the Gaussians have wherever they are seen.
+    /// The configured SH degree.
     sh_degree: u32,
-    /// As many as parameters.
+    /// Of the parameters' size.
     pub(super) gradients: Buffer<f32>,
-    /// One per Gaussian each.
+    /// One value per Gaussian.
     pub(super) grad_norm_sums: Buffer<f32>,
     pub(super) visit_counts: Buffer<u32>,
 }
 
 impl Model {
-    /// With room for the SH degree `in_use`, or what more of it the Gaussians have.
+    /// Uploads Gaussians with memory for the SH degree `in_use`, or for their own if that is higher.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -69,10 +69,10 @@ impl Model {
         })
     }
 
-    /// The name of their parameters' tensor in a checkpoint.
+    /// The tensor of the parameters in a checkpoint.
     pub(super) const PARAMETERS: &str = "gaussians.parameters";
 
-    /// The SH degree of Gaussians whose parameters take this number of words each.
+    /// The SH degree of Gaussians with this number of words of parameters.
     pub(super) fn sh_degree_of_words(&self, words: usize) -> u32 {
         let whole = self.whole_shape();
         let of = |sh_degree| {
@@ -83,7 +83,7 @@ impl Model {
             .unwrap_or(self.shape().sh_degree)
     }
 
-    /// As many others of the same make, to be overwritten.
+    /// Allocates `count` Gaussians of the same shape.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -93,20 +93,20 @@ impl Model {
         Self::upload(gpu, &Gaussians::zeros(count, self.whole_shape()), in_use, &precision)
     }
 
-    /// What the Gaussians are made of wherever they are seen.
+    /// The configured shape of the Gaussians.
     pub(super) fn whole_shape(&self) -> Shape {
         Shape { sh_degree: self.sh_degree, ..self.shape() }
     }
 
-    /// Makes room for another SH degree; coefficients beyond it go, with what Adam keeps of them.
+    /// Changes the SH degree; coefficients beyond it are dropped with their moments.
     ///
     /// # Errors
-    /// The device is out of memory or lost; the model is as it was.
+    /// The device is out of memory or lost; the model is then unchanged.
     pub(super) fn set_sh_degree(&mut self, gpu: &Gpu, sh_degree: u32) -> Result<()> {
         let own = self.gaussians.layout;
         let new = Layout { shape: Shape { sh_degree, ..own.shape }, ..own };
         let (capacity, columns) = (own.capacity, new.floats().columns);
-        // Longer buffers with what they held, one after the other, and with room for as many Gaussians as before.
+        // Grows one buffer after the other, keeping contents and capacity.
         lengthen(gpu, &mut self.gaussians.parameters, capacity * new.words())?;
         self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, capacity * columns))?;
         let parameters = self.gaussians.read(gpu)?;
@@ -125,7 +125,7 @@ impl Model {
         pairs.try_for_each(|(plane, values)| batches.write(gpu, plane, &resized(values)))
     }
 
-    /// What has a float of every column beside the parameters.
+    /// Gradients and moments: planes of floats for every column.
     fn planes_mut(&mut self) -> impl Iterator<Item = &mut Buffer<f32>> {
         let moments = self.moments.planes_mut().into_iter().map(|(_, plane)| plane);
         std::iter::once(&mut self.gradients).chain(moments)
@@ -139,16 +139,16 @@ impl Model {
         self.gaussians.layout.count
     }
 
-    /// How many Gaussians the buffers have room for.
+    /// The number of Gaussians that the buffers can hold.
     pub(super) fn capacity(&self) -> usize {
         self.gaussians.layout.capacity
     }
 
-    /// Records a step of Adam, over the columns that the SH degree in use leaves: coefficients beyond have no gradient and no
-    /// moments, so there is nothing to update. Nothing changes while the first element of `status` is not zero.
+    /// Records a step of Adam over the columns of the SH degree in use. Nothing changes while the first element of
+    /// `status` is not zero.
     ///
     /// # Errors
-    /// A pass exceeds what the device launches.
+    /// A pass exceeds the device's launch limits.
     pub(super) fn update(
         &mut self,
         (gpu, pass): (&Gpu, &mut Recorder<'_>),
@@ -179,7 +179,7 @@ impl Model {
         })
     }
 
-    /// Records the terms on parameters: adds to the gradients.
+    /// Records the terms on parameters, which add to the gradients.
     ///
     /// # Errors
     /// As [`ParameterTerms::record`].
@@ -198,8 +198,8 @@ impl Model {
         terms.record(pass, inputs, gradients, log)
     }
 
-    /// One round of density control, whose new parameters `keeps` agrees to ([`Densifier::densify`]); the statistics
-    /// begin anew.
+    /// One round of density control, if `keeps` accepts the new parameters ([`Densifier::densify`]); the statistics
+    /// restart.
     ///
     /// # Errors
     /// Those of `keeps`, or the device is out of memory or lost.
@@ -225,7 +225,7 @@ impl Model {
         Ok(report)
     }
 
-    /// Where the first parameter is that is NaN or infinite, among the planes of all Gaussians.
+    /// The index of the first parameter that is not finite, in the planes of all Gaussians.
     ///
     /// # Errors
     /// The device was lost.
@@ -247,7 +247,7 @@ impl Model {
         Ok(None)
     }
 
-    /// The attribute and the Gaussian that the number at an index of planes of so many columns belongs to.
+    /// The attribute and the Gaussian at an index of planes with `columns` columns.
     pub(super) fn place_of(&self, index: usize, columns: usize) -> (String, usize) {
         let (count, features) = (self.count().max(1), self.shape().features.width());
         let mut planes = ATTRIBUTES.iter().zip(planes(features, columns));
@@ -267,7 +267,7 @@ impl Model {
     }
 }
 
-/// A buffer that holds as much, and has so much room.
+/// Grows a buffer to `len`, keeping its contents.
 fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize) -> Result<()> {
     if buffer.len() < len {
         let mut longer = gpu.uninit_in_windows(buffer.name(), len)?;
@@ -283,7 +283,7 @@ mod tests {
     use crate::gpu::testing::gpu;
     use crate::splats::scene::Features;
 
-    /// Else the next round of density control would have to make that room again.
+    /// Otherwise the next round of density control would have to allocate again.
     #[test]
     fn another_sh_degree_keeps_the_room_and_what_the_planes_hold() {
         let gpu = gpu();
@@ -292,7 +292,7 @@ mod tests {
             let precision =
                 PrecisionConfig { rest, moments: StorageFormat::Single, ..Default::default() };
             let mut given = Gaussians::zeros(10, shape);
-            // What is in use of the degree 3 is none, and room is for that.
+            // Degree 3 is not in use, so there is no memory for it.
             given.parameters[..140].fill(0.5);
             let mut model = Model::upload(&gpu, &given, 0, &precision).unwrap();
             assert_eq!(model.gaussians.parameters.len(), 140);
@@ -300,7 +300,7 @@ mod tests {
             assert_eq!(model.gaussians.parameters.len(), 10 * model.gaussians.layout.words());
             assert_eq!(model.download(&gpu).unwrap(), given.with_sh_degree(2));
 
-            // As after a round that left room for half as many again.
+            // As after a round that left 1.5 times the capacity.
             model.gaussians.layout.count = 6;
             model.set_sh_degree(&gpu, 3).unwrap();
             let lens = model.planes_mut().map(|plane| plane.len()).collect::<Vec<_>>();

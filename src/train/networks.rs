@@ -1,4 +1,4 @@
-//! The networks of a model: what they make of a render.
+//! The networks of a model, applied to renders.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use crate::photographs::image::Image;
 use crate::splats::scene::{COLOR_CHANNELS, Feature, Features};
 use crate::{Error, Result};
 
-/// The networks that a model has, with the windows of the render that they take.
+/// The networks of a model, with the crop of the render that they take.
 #[derive(Debug)]
 pub struct Networks {
     gpu: Gpu,
@@ -20,17 +20,17 @@ pub struct Networks {
     pub(super) denoiser: Option<Denoiser>,
     pub(super) tonemapper: Option<Tonemapper>,
     pub(super) crops: CropKernels,
-    /// R_0 of the window, (3, h, w).
+    /// R_0 of the crop, (3, h, w).
     pub(super) colors: Buffer<f32>,
-    /// The noise map of the window, (3, h, w).
+    /// The noise map of the crop, (3, h, w).
     pub(super) noise: Buffer<f32>,
 }
 
 impl Networks {
-    /// The networks of the parts that are on, with fresh weights, for renders of Gaussians with these features.
+    /// The networks of the enabled parts, with initial weights, for renders of Gaussians with these features.
     ///
     /// # Errors
-    /// The Gaussians lack what a network takes, or the device is out of memory.
+    /// The Gaussians lack a feature that a network takes, or the device is out of memory.
     pub(crate) fn new(
         gpu: &Gpu,
         model: &ModelConfig,
@@ -73,10 +73,10 @@ impl Networks {
         self.denoiser.is_some()
     }
 
-    /// Takes memory for windows up to `size`.
+    /// Reserves memory for crops up to `size`.
     ///
     /// # Errors
-    /// The device is out of memory, or a map exceeds what it binds.
+    /// The device is out of memory, or a map exceeds the size that it binds.
     pub(super) fn reserve(&mut self, size: UVec2) -> Result<()> {
         let values = COLOR_CHANNELS * size.x as usize * size.y as usize;
         if self.colors.len() < values {
@@ -94,7 +94,7 @@ impl Networks {
         }
     }
 
-    /// Records R_0 to R_K of a window of `render`, (channels, H, W) of a view of `size`.
+    /// Records the denoiser on a crop of `render`, (channels, H, W) of a view of `size`.
     pub(super) fn denoise(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -112,7 +112,7 @@ impl Networks {
         denoiser.forward(pass, crop.size, &self.noise, &self.colors)
     }
 
-    /// R_K of the window denoised last; R_0 without a denoiser.
+    /// R_K of the last crop; R_0 without a denoiser.
     pub(super) fn denoised(&self) -> &Buffer<f32> {
         self.denoiser.as_ref().map_or(&self.colors, Denoiser::denoised)
     }
@@ -131,13 +131,13 @@ impl Networks {
         Ok(Image { width: size.x, height: size.y, data })
     }
 
-    /// Whether the device binds their maps of a view of `size`.
+    /// Whether the device binds the maps of a view of `size`.
     pub(super) fn fits(&self, size: UVec2) -> bool {
         self.denoiser.as_ref().is_none_or(|own| Denoiser::fits_on(&self.gpu, own.settings(), size))
             && (self.tonemapper.is_none() || Tonemapper::fits_on(&self.gpu, size))
     }
 
-    /// How far the denoiser looks, in pixels, beside its norms, which look at all that it is given.
+    /// The receptive radius of the denoiser in pixels, except for its norms, which see the whole crop.
     pub(super) fn margin(&self) -> u32 {
         self.denoiser.as_ref().map_or(0, Denoiser::margin)
     }

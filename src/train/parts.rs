@@ -1,4 +1,4 @@
-//! What a model has beside colour: each part of LITA-GS with its own switch.
+//! Parts of the model beside colour: those of LITA-GS, each with its switch.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -11,7 +11,7 @@ use crate::networks::{Denoiser, DenoiserSettings, NetworkVariant, Tonemapper};
 use crate::splats::scene::Features;
 use crate::{Error, Result};
 
-/// The models that have a name.
+/// Named models.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ModelName {
     /// Colour alone: 3DGS.
@@ -35,13 +35,13 @@ impl FromStr for ModelName {
 /// A part of the model that can be on or off.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
-    /// Stages of a network that take the noise from the render: R_0 to R_K.
+    /// A network that removes noise from the render in stages: R_0 to R_K.
     Denoiser,
-    /// A network that darkens illumination times R_K to the dark photograph.
+    /// A network that maps illumination times R_K to the dark photograph.
     Tonemapper,
-    /// A feature that is held to the colour-invariant edges of the target.
+    /// A feature trained against the colour-invariant edges of the target.
     Structure,
-    /// A feature that is held to a depth map from elsewhere.
+    /// A feature trained against a given depth map.
     Depth,
 }
 
@@ -73,16 +73,16 @@ impl FromStr for Part {
 
 settings! {
 "model."
-/// Which parts a model has beside colour, and their constants. The default is colour alone.
+/// The parts of a model beside colour, and their constants. The default is colour alone.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ModelConfig {
-    /// Stages of a network that take the noise from the render.
+    /// A network that removes noise from the render.
     denoiser: bool = false => Rule::Flag;
-    /// A network that darkens illumination times the render to the dark photograph.
+    /// A network that maps illumination times the render to the dark photograph.
     tonemapper: bool = false => Rule::Flag;
     /// A feature that is held to the colour-invariant edges of the target.
     structure: bool = false => Rule::Flag;
-    /// A feature that is held to a depth map from elsewhere; off for views without one.
+    /// A feature trained against a given depth map; not for views without one.
     depth: bool = false => Rule::Flag;
     /// Colour is the SH sum alone, as in LITA-GS, instead of max(SH + 0.5, 0), as in viewers.
     raw_colors: bool = false => Rule::Flag, "--raw-colors on|off";
@@ -96,9 +96,9 @@ pub struct ModelConfig {
     depth_is_disparity: bool = false => Rule::Flag, "--depth-is-disparity";
 }
 sections {
-    /// The size of the denoiser, and what the networks begin as.
+    /// The size of the denoiser, and the variant of the networks.
     network: DenoiserSettings;
-    /// What each term weighs beside (1 - w) L1 + w (1 - SSIM).
+    /// Weights of the terms beside (1 - w) L1 + w (1 - SSIM).
     weights: Weights;
     /// Adam's learning rates of the networks.
     rates: NetworkRates;
@@ -107,8 +107,8 @@ sections {
 
 settings! {
 "model.rates."
-/// Adam's learning rates, constant. A denoiser that begins as the identity learns in hundreds of steps at ten times the
-/// paper's rate.
+/// Adam's learning rates of the networks, constant. A denoiser that starts as the identity learns at ten times the
+/// paper's rate, within hundreds of steps.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NetworkRates {
     /// Adam's rate of the denoiser.
@@ -119,14 +119,14 @@ pub struct NetworkRates {
 }
 
 impl NetworkRates {
-    /// Those of LITA-GS.
+    /// The rates of LITA-GS.
     pub(crate) fn paper() -> Self {
         Self { denoiser: Denoiser::LEARNING_RATE, tonemapper: Tonemapper::LEARNING_RATE }
     }
 }
 
 impl ModelConfig {
-    /// What the terms weigh: 0 those of a part that the model lacks.
+    /// The weights of the terms: 0 for parts that are off.
     pub(super) fn effective_weights(&self) -> Weights {
         let of = |has: bool, weight: f64| if has { weight } else { 0.0 };
         let Weights { denoising, total_variation, low_ssim, structure, depth } = self.weights;
@@ -139,7 +139,7 @@ impl ModelConfig {
         }
     }
 
-    /// Says where the parts of a model see less than they are set to.
+    /// Logs where boxes or crops exceed the views.
     pub(super) fn log_parts(&self, sizes: &[UVec2]) {
         let shortest = sizes.iter().map(|size| size.min_element()).min().unwrap_or_default();
         let boxes = DepthBoxes::new(UVec2::splat(shortest), self.depth_box);
@@ -168,8 +168,8 @@ impl ModelConfig {
         }
     }
 
-    /// Sets what of the parts' constants is LITA-GS's own: how large the networks are, that they begin at random, how fast
-    /// they learn, and the denoiser's smoothness.
+    /// Sets LITA-GS's constants of the parts: size, random initialisation and learning rate of the networks, and the
+    /// denoiser's total variation.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn follow_paper(&mut self) {
         let precision = self.network.precision;
@@ -178,7 +178,7 @@ impl ModelConfig {
         self.weights.total_variation = Weights::paper().total_variation;
     }
 
-    /// Switches exactly these parts on.
+    /// Enables exactly these parts.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn set_parts(&mut self, parts: &[Part]) {
         self.denoiser = parts.contains(&Part::Denoiser);
@@ -187,12 +187,12 @@ impl ModelConfig {
         self.depth = parts.contains(&Part::Depth);
     }
 
-    /// What the Gaussians carry for the parts that are on.
+    /// The features of the Gaussians for the enabled parts.
     pub(crate) fn features(&self) -> Features {
         Features {
             depth: self.depth,
             structure: self.structure,
-            // Beside the colours a noise map can say nothing: what it takes away the colours need not show.
+            // A noise map is redundant: the colours need not contain what it removes.
             noise: self.denoiser && self.network.variant == NetworkVariant::Paper,
             illumination: self.tonemapper,
         }

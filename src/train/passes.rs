@@ -1,4 +1,4 @@
-//! The passes of a step, and what they work on beside the Gaussians.
+//! The kernels of a step.
 
 use super::{Background, TrainConfig, growth, streams};
 use crate::Result;
@@ -11,7 +11,7 @@ use crate::splats::optimizer::{Adam, FiniteCheck};
 use crate::splats::render::{RenderSettings, Renderer};
 use crate::splats::scene::Shape;
 
-/// What needs nothing but the device and settings.
+/// Kernels that depend only on the device and the settings.
 pub(super) struct Kernels {
     pub(super) renderer: Renderer,
     pub(super) losses: Losses,

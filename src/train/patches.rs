@@ -1,7 +1,6 @@
-//! Photographs that are too large to be trained on at once are trained on patch by patch.
+//! Patches: photographs too large for the device train in parts.
 //!
-//! A patch is a view of its own: a step takes one of them. What is measured of a photograph, its target, and what is learned
-//! of its exposure belong to all of it.
+//! A step trains on one patch, as on a view. Measurements, target and exposure belong to the whole photograph.
 
 use std::ops::Range;
 
@@ -19,10 +18,10 @@ use crate::photographs::pseudo_gt::PseudoGt;
 use crate::{Error, Result};
 
 impl TrainConfig {
-    /// What a view is trained on in: all of it where the device and [`TrainConfig::patch_pixels`] allow it.
+    /// The patches of a view: a single one if the device and [`TrainConfig::patch_pixels`] allow it.
     pub(crate) fn patches(&self, gpu: &Gpu, camera: &Camera) -> Vec<Patch> {
         let (settings, model) = (self.render_settings(), &self.model);
-        // Networks that see crops bind no more than those.
+        // Networks on crops bind only the crops.
         let sees_all = model.denoiser_crop == 0;
         let denoiser = (sees_all && model.denoiser).then_some(model.network);
         let tonemapper = sees_all && model.tonemapper;
@@ -35,8 +34,8 @@ impl TrainConfig {
 }
 
 impl Trainer {
-    /// How large patches are to be where the first Gaussians meet too many tiles of those that there are; none where they do
-    /// not, or smaller ones are no remedy.
+    /// A smaller patch size, if the first Gaussians have too many intersections with the present one; `None` if they do
+    /// not, or smaller patches do not help.
     pub(super) fn fewer_patch_pixels(&mut self) -> Result<Option<u64>> {
         let of_photograph = |patch: &Patch| Patch::from(&patch.camera).pixel_count();
         let patches = || self.supervision.views.whole().iter().map(|view| (view.place, view.patch));
@@ -57,7 +56,7 @@ impl Trainer {
 }
 
 impl Views {
-    /// Says which photographs are trained on in patches.
+    /// Logs the photographs that train in patches.
     pub(super) fn log_patches(&self, gpu: &Gpu) {
         let mut cut = self.photographs().filter(|view| !view.patch.is_whole());
         let Some(TrainView { name, place, patch, .. }) = cut.next() else { return };
@@ -72,7 +71,7 @@ impl Views {
         );
     }
 
-    /// The target of a photograph, unshrunk.
+    /// The target of a photograph, at its full size.
     ///
     /// # Errors
     /// As [`Views::pictures`].
@@ -82,7 +81,7 @@ impl Views {
         pictures.into_iter().next().ok_or_else(gone)
     }
 
-    /// Pictures of photographs, unshrunk, put together from their views.
+    /// Images of photographs at full size, assembled from their patches.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -97,7 +96,7 @@ impl Views {
         Ok(put_together(views, self.read(gpu, pseudo_gt, views, shown)?))
     }
 
-    /// The unshrunk views of some photographs.
+    /// The full-size patches of some photographs.
     pub(super) fn of_places(&self, places: Range<usize>) -> &[TrainView] {
         let views = self.whole();
         let first = |place: usize| views.partition_point(|view| view.place < place);
@@ -105,7 +104,7 @@ impl Views {
     }
 }
 
-/// Images of photographs from what their views have of them, (3, h, w) each.
+/// Images of photographs from their patches, (3, h, w) each.
 pub(super) fn put_together(views: &[TrainView], parts: Vec<Vec<f32>>) -> Vec<Image> {
     let mut images: Vec<Image> = vec![];
     for (TrainView { patch, .. }, data) in views.iter().zip(parts) {
@@ -158,17 +157,17 @@ mod tests {
             patches.iter().for_each(|patch| assert!(patch.pixel_count() <= 1 << 24));
             patches.len()
         };
-        // Colours alone: 12 bytes a pixel.
+        // Colour alone: 12 bytes a pixel.
         assert_eq!(count(&config, 4000, 2655), 1);
         assert_eq!(count(&config, 8000, 5310), 4);
         assert_eq!(count(&config, 65_535, 65_535), 400);
-        // And features: 44 bytes; then networks with maps of the whole.
+        // With features: 44 bytes; then networks with maps of the whole view.
         config.model.set_parts(&Part::ALL);
         config.model.denoiser_crop = 256;
         assert_eq!(count(&config, 4000, 2655), 4);
         config.model.denoiser_crop = 0;
         assert_eq!(count(&config, 4000, 2655), 6);
-        // What fits in no patch stays whole, and is refused by what it does not fit.
+        // A view that fits in no patch stays whole and is refused later.
         config.patch_pixels = Some(100);
         assert_eq!(count(&config, 400, 300), 1);
     }

@@ -1,14 +1,14 @@
-//! The paths of a configuration, which mean the same wherever it is read.
+//! The paths of a configuration, absolute or relative to its run.
 
 use std::path::{Path, PathBuf};
 
 use super::TrainConfig;
 
 impl TrainConfig {
-    /// The same with absolute paths, as a run records it.
+    /// The configuration with absolute paths, as a run records it.
     pub(crate) fn with_absolute_paths(mut self) -> Self {
         for path in self.paths() {
-            // Without a current folder there is nothing that it could be below.
+            // Without a current folder the path stays relative.
             if let Ok(absolute) = std::path::absolute(&*path) {
                 *path = absolute;
             }
@@ -16,8 +16,8 @@ impl TrainConfig {
         self
     }
 
-    /// The same as a run in `folder` means it: relative paths, which older runs and edited ones have, begin there. One that
-    /// leads nowhere from there begins at the current folder, which is said.
+    /// The configuration of a run in `folder`: relative paths, in older or edited files, start there or, with a
+    /// warning, in the current folder if they exist only there.
     pub(crate) fn with_paths_from(mut self, folder: &Path) -> Self {
         for path in self.paths().into_iter().filter(|path| path.is_relative()) {
             let from_run = folder.join(&*path);
@@ -25,7 +25,7 @@ impl TrainConfig {
                 *path = from_run;
             } else if path.exists() {
                 tracing::warn!(
-                    "{}: {} is taken from the current folder; make it absolute",
+                    "{}: {} is relative to the current folder; make it absolute",
                     folder.join("config.toml").display(),
                     path.display()
                 );
@@ -34,7 +34,7 @@ impl TrainConfig {
         self
     }
 
-    /// Those that are given.
+    /// The paths that are set.
     fn paths(&mut self) -> Vec<&mut PathBuf> {
         let Self { dataset, reference, init, model, exposure, .. } = self;
         let optional = [reference, init, &mut model.depth_folder, &mut exposure.start];

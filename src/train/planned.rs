@@ -1,4 +1,4 @@
-//! What is said of a run, and what is decided by looking at its photographs: the configuration that `nightsplat train` trains.
+//! The configuration that `nightsplat train` trains, from requested settings and a plan.
 
 use std::path::Path;
 
@@ -11,10 +11,10 @@ use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, LoadOptions};
 use crate::{Error, Result};
 
-/// What is said of a run beside its plan, from the weakest to the strongest.
+/// Requested settings of a run beside its plan, from the weakest to the strongest.
 #[derive(Clone, Debug, Default)]
 pub struct RequestedSettings {
-    /// A trade of time for quality, or a benchmark; none: the defaults, which are balanced.
+    /// The preset; `None`: the defaults, which are balanced.
     pub preset: Option<Preset>,
     /// A configuration file.
     pub file: SettingsLayer,
@@ -24,10 +24,10 @@ pub struct RequestedSettings {
     pub set: SettingsLayer,
 }
 
-/// What decides what is not said.
+/// The source of settings that are not requested.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PlanSource<'a> {
-    /// Nothing: it keeps the preset's values.
+    /// None: the preset's values.
     Nothing,
     /// The plan in this file.
     File(&'a Path),
@@ -35,24 +35,24 @@ pub enum PlanSource<'a> {
     Diagnosis,
 }
 
-/// A run whose every setting is decided.
+/// A run with all settings decided.
 #[derive(Debug)]
 pub struct PlannedRun {
-    /// What it trains.
+    /// Its configuration.
     pub config: TrainConfig,
-    /// Where each value of that comes from.
+    /// The origin of each value.
     pub settings: Settings,
-    /// What was decided, and why.
+    /// The plan, with its reasons.
     pub plan: Option<Plan>,
-    /// Without the views that the plan leaves out.
+    /// The dataset, without the views that the plan leaves out.
     pub dataset: Dataset,
 }
 
 impl RequestedSettings {
-    /// All that is said, and of what is not said what a plan says.
+    /// The requested settings, completed by a plan.
     ///
     /// # Errors
-    /// A plan that was written by hand has a number out of its range.
+    /// A number of a plan written by hand is out of range.
     pub fn settings(&self, plan: Option<&Plan>) -> Result<Settings> {
         let requested = [&self.file, &self.options, &self.set];
         let get = |key: &str| requested.iter().rev().find_map(|layer| layer.get(key));
@@ -63,7 +63,7 @@ impl RequestedSettings {
             settings.merge(&preset.layer(curve, Path::new(dataset))?);
         }
         if let Some(plan) = plan {
-            // Whoever says anything of how photographs are brightened has decided that.
+            // Any requested tone setting decides the curve.
             let names_a_curve = requested.iter().any(|layer| layer.names("tone."));
             // Exposures and the tonemapper exclude each other, and a plan never asks for both.
             let has_tonemapper = get("model.tonemapper") == Some(&Value::Boolean(true));
@@ -81,10 +81,10 @@ impl RequestedSettings {
         Ok(settings)
     }
 
-    /// Loads the dataset and decides what is not said.
+    /// Loads the dataset and plans what is not requested.
     ///
     /// # Errors
-    /// A setting makes no sense, the dataset cannot be used, or the plan is that of another one.
+    /// A setting is invalid, the dataset cannot be used, or the plan is another dataset's.
     pub fn planned(&self, planning: PlanSource<'_>, gpu: &Gpu) -> Result<PlannedRun> {
         let config = self.settings(None)?.config()?;
         config.check()?;
@@ -112,14 +112,14 @@ impl RequestedSettings {
     }
 }
 
-/// As the configuration's, with depth maps wherever there are some: whether there are is part of the diagnosis.
+/// The configuration's load options, with depth maps, whose presence is part of the diagnosis.
 pub fn diagnosed(config: &TrainConfig) -> LoadOptions {
     let mut options = config.load_options();
     options.depth.load = true;
     options
 }
 
-/// The plan for what a diagnosis found, whose remarks are said.
+/// The plan from a diagnosis, whose remarks are logged.
 fn planned(diagnosis: &Diagnosis, config: &TrainConfig, gpu: &Gpu) -> Plan {
     for remark in &diagnosis.remarks {
         tracing::warn!("{remark}");
@@ -128,10 +128,10 @@ fn planned(diagnosis: &Diagnosis, config: &TrainConfig, gpu: &Gpu) -> Plan {
 }
 
 impl Preset {
-    /// How `nightsplat train --preset` loads a dataset, and [`Trainer::planned`] wants it.
+    /// The options to load a dataset for [`Trainer::planned`], as `nightsplat train --preset` does.
     ///
     /// # Errors
-    /// None for the presets that there are.
+    /// Never.
     pub fn load_options(self) -> Result<LoadOptions> {
         let config = RequestedSettings { preset: Some(self), ..RequestedSettings::default() }
             .settings(None)?
@@ -141,8 +141,8 @@ impl Preset {
 }
 
 impl Trainer {
-    /// A trainer of what `nightsplat train --preset` trains: the photographs are diagnosed, unless the preset states it all.
-    /// `dataset` is what [`Preset::load_options`] loads.
+    /// A trainer as of `nightsplat train --preset`: the photographs are diagnosed, unless the preset states everything.
+    /// `dataset` is loaded with [`Preset::load_options`].
     ///
     /// # Errors
     /// The dataset cannot be used, or the device is out of memory or lost.

@@ -1,4 +1,4 @@
-//! In how many bits things are kept on the device; what is computed is always computed in 32.
+//! Storage precision on the device; arithmetic is always in 32 bits.
 
 use std::sync::Arc;
 
@@ -15,53 +15,54 @@ use crate::splats::packed_sh::StorageFormat;
 
 settings! {
 "precision."
-/// In how many bits a run keeps what it could keep in fewer.
+/// Storage precision of a run.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PrecisionConfig {
-    /// Bits of the training photographs, or of the targets that are made of them once. exact: as few as give every value back.
+    /// Bits of the stored training photographs, or of targets that are made once. exact: the fewest that restore every
+    /// value.
     photographs: PhotographBits = PhotographBits::Exact => Rule::OneOf(&["exact", "32", "16", "8"]);
     /// Bits of the SH coefficients above degree 0.
     rest: StorageFormat = StorageFormat::Half => Rule::OneOf(&["32", "16"]);
-    /// Bits of what Adam keeps of the gradients of every Gaussian.
+    /// Bits of Adam's moments of the Gaussians.
     moments: StorageFormat = StorageFormat::Half => Rule::OneOf(&["32", "16"]);
 }
 }
 
-/// In how many bits a photograph, or a target, is kept on the device.
+/// Bits of a photograph, or of a target, on the device.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum PhotographBits {
-    /// As few as give every value back bit for bit: 8 or 16 where a photograph holds few different values, as those from
-    /// 8-bit files do, else 32.
+    /// The fewest that restore every value bit for bit: 8 or 16 for photographs with few different values, such as
+    /// those of 8-bit files, else 32.
     #[default]
     #[serde(rename = "exact")]
     Exact,
     /// 32.
     #[serde(rename = "32")]
     Single,
-    /// 16 at most: where that cannot be exact, multiples of 1/65535.
+    /// At most 16: multiples of 1/65535 where that is not exact.
     #[serde(rename = "16")]
     Sixteen,
-    /// 8: where that cannot be exact, multiples of 1/255.
+    /// 8: multiples of 1/255 where that is not exact.
     #[serde(rename = "8")]
     Eight,
 }
 
-/// Brings photographs to the device in the bits that are asked for.
+/// Uploads photographs in the requested bits.
 #[derive(Debug)]
 pub(super) struct Encoder {
     gpu: Gpu,
     bits: PhotographBits,
-    /// The multiples of 1/255 and of 1/65535, once they are needed.
+    /// The multiples of 1/255 and of 1/65535, made when needed.
     grids: [Option<Arc<Buffer<f32>>>; 2],
 }
 
-/// The bits that a code may have.
+/// The possible bits of a code.
 const CODE_BITS: [u32; 2] = [8, 16];
 
-/// Words of codes that a thread packs in one go.
+/// Words of codes that a thread packs at once.
 const WORDS_AT_ONCE: usize = 1 << 12;
 
-/// Codes are worth decoding where they and what they stand for take at most this much of the values' memory.
+/// Codes are used if they and their table take at most this share of the values' memory.
 const WORTH: f64 = 0.75;
 
 impl Encoder {
@@ -89,7 +90,7 @@ impl Encoder {
             PhotographBits::Sixteen => 1,
             _ => return plain(&self.gpu),
         };
-        // A grid from 0 to 1 has no place for what lies beyond, nor for a NaN.
+        // A grid from 0 to 1 cannot hold values beyond it, nor NaN.
         if !values.iter().all(|value| (0.0..=1.0).contains(value)) {
             return plain(&self.gpu);
         }
@@ -128,7 +129,7 @@ impl Encoder {
     }
 }
 
-/// The bits of all different values, ascending, where codes for them are worth it.
+/// The bits of all different values, ascending, if codes for them save memory.
 fn palette(values: &[f32], bits: PhotographBits) -> Option<Vec<u32>> {
     let most = 1 << if bits == PhotographBits::Eight { CODE_BITS[0] } else { CODE_BITS[1] };
     let palette = different(values, most)?;
@@ -138,12 +139,12 @@ fn palette(values: &[f32], bits: PhotographBits) -> Option<Vec<u32>> {
     is_worth_it.then_some(palette)
 }
 
-/// The bits of all different values, ascending; none where there are more than so many.
+/// The bits of all different values, ascending; `None` if there are more than `most`.
 fn different(values: &[f32], most: usize) -> Option<Vec<u32>> {
     let mut found = FxHashSet::default();
     let mut last = None;
     for bits in values.iter().map(|value| value.to_bits()) {
-        // In the dark, neighbours are often alike.
+        // In dark photographs, neighbours are often equal.
         if last.replace(bits) != Some(bits) && found.insert(bits) && found.len() > most {
             return None;
         }
@@ -161,7 +162,7 @@ mod tests {
     use crate::photographs::pseudo_gt::PseudoGt;
     use crate::photographs::tone::ToneSettings;
 
-    /// What comes back of values, and in how many bits they were kept.
+    /// The restored values, and the bits they were stored in.
     fn kept(bits: PhotographBits, values: &[f32]) -> (Vec<f32>, u32) {
         let gpu = gpu();
         let photograph = Encoder::new(&gpu, bits).upload("photograph", values).unwrap();
@@ -181,7 +182,7 @@ mod tests {
         values.iter().map(|value| value.to_bits()).collect()
     }
 
-    /// Of so many different values, with those that are no numbers or no values of a file among them.
+    /// A photograph with `different` values, some of which are not finite or not of a file.
     fn photograph(len: usize, different: u64) -> Vec<f32> {
         let stream = Stream::new(7, 1);
         let value = |i| (stream.bits(i) % different) as f32 / (different - 1) as f32;
@@ -222,7 +223,7 @@ mod tests {
             let beyond = [&values[..], &[1.5; 3]].concat();
             assert_eq!(self::kept(asked, &beyond), (beyond, 32));
         }
-        // An 8-bit photograph is its own grid, and 16 bits hold what 8 cannot.
+        // An 8-bit photograph lies on the grid, and 16 bits hold what 8 cannot.
         let codes = photograph(60_005, 200)[5..].to_vec();
         assert_eq!(kept(PhotographBits::Eight, &codes), (codes, 8));
         let fine = photograph(60_003, 5_000);

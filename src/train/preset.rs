@@ -1,6 +1,6 @@
-//! Presets: how much time a run takes for its score, and every constant that the paper and its code state for a benchmark.
+//! Presets: trades of time for quality, and the constants that the paper and its code state for a benchmark.
 //!
-//! They are files in `presets/`: settings as config.toml has them, in which they differ from the defaults.
+//! They are files in `presets/`: the settings of config.toml that differ from the defaults.
 
 use std::path::Path;
 use std::str::FromStr;
@@ -12,7 +12,7 @@ use super::layers::{Origin, SettingsLayer};
 use crate::photographs::tone::ToneCurve;
 use crate::{Error, Result};
 
-/// A trade of time for quality, or a benchmark that the paper reports.
+/// A trade of time for quality, or a benchmark of the paper.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Preset {
     /// A first look.
@@ -29,7 +29,7 @@ pub enum Preset {
     Lom,
     /// The low-light scenes of `RealX3D`.
     RealX3d,
-    /// MipNeRF360 with exposures that vary.
+    /// MipNeRF360 with varying exposures.
     Mip360Varying,
 }
 
@@ -60,8 +60,8 @@ impl Preset {
         }
     }
 
-    /// The settings of a preset that trades time for quality, as TOML, in which it differs from the defaults; a benchmark has
-    /// those of the paper and more, which depend on curve and scene.
+    /// The preset's differences from the defaults, as TOML; a benchmark has those of the paper and more, which depend
+    /// on curve and scene.
     pub(crate) fn toml(self) -> &'static str {
         match self {
             Self::Draft => include_str!("presets/draft.toml"),
@@ -84,19 +84,18 @@ impl Preset {
         matches!(self, Self::Lom | Self::RealX3d | Self::Mip360Varying)
     }
 
-    /// Sets what the preset says, for the curve that the configuration has; the automatic one gives way to AP3 in those of the
-    /// paper.
+    /// Applies the preset for the configuration's curve; the paper's presets replace the automatic curve by AP3.
     ///
     /// # Errors
-    /// None for the presets that there are.
+    /// Never.
     pub fn apply(self, config: &mut TrainConfig) -> Result<()> {
         let curve = Some(config.tone.curve).filter(|&curve| curve != ToneCurve::Auto);
         *config = config.overlaid(&self.layer(curve, &config.dataset)?)?;
         Ok(())
     }
 
-    /// What the preset says, where `curve` is the one that is named: of a benchmark what the paper states for it and, where
-    /// its code has a file for the scene that the dataset's folder is named after, what that file states.
+    /// The preset's settings for a named `curve`. A benchmark has the paper's constants and, if its code has a file for
+    /// the scene that the dataset's folder is named after, that file's.
     ///
     /// # Errors
     /// None for the presets that there are.

@@ -1,4 +1,4 @@
-//! The guide's reference of settings, made from their rows and from the presets.
+//! The reference of settings, docs/settings.md, from their rows and the presets.
 
 use std::fmt::Write;
 
@@ -10,16 +10,15 @@ use super::{Preset, TrainConfig};
 use crate::Result;
 use crate::base::settings::Setting;
 
-/// Every setting and every preset, as docs/settings.md has them.
+/// The text of docs/settings.md: every setting and every preset.
 ///
 /// # Errors
-/// None for the settings and presets that there are.
+/// Never.
 pub fn reference() -> Result<String> {
     let mut text = "# Settings\n\n\
-        Every setting of a training run, by its key in `config.toml` and for `train --set KEY=VALUE`; those with an option of their\n\
-        own say which. What wins, from the weakest: default, preset, plan, `--config FILE`, options, `--set`. `train --explain` prints\n\
-        each setting with its value and who says it, and so does `config.toml` of a run. This page is made from the table that the\n\
-        command reads.\n"
+        Every setting of a training run, by its key in `config.toml` and for `train --set KEY=VALUE`, with its option if it has\n\
+        one. Precedence, weakest first: default, preset, plan, `--config FILE`, options, `--set`. `train --explain` prints each\n\
+        setting with its value and origin, as does `config.toml` of a run. This page is generated from the command's table.\n"
         .to_owned();
     let values = values(&TrainConfig::default())?;
     let mut section = None;
@@ -43,7 +42,7 @@ pub fn reference() -> Result<String> {
             escaped(&told(row)),
         );
     }
-    text += "\n## The presets\n\nEach is the defaults, which are `balanced`, but for\n\n";
+    text += "\n## The presets\n\nDifferences from the defaults, which are `balanced`:\n\n";
     presets(&mut text)?;
     Ok(text)
 }
@@ -53,7 +52,7 @@ fn told(row: &Setting) -> String {
     format!("{}.{option}", row.help())
 }
 
-/// A table of what the presets set: a row for each setting that one has otherwise.
+/// The table of presets: a row for each setting in which one differs.
 fn presets(text: &mut String) -> Result<()> {
     const SHOWN: [Preset; 5] =
         [Preset::Balanced, Preset::Draft, Preset::Fast, Preset::Best, Preset::Paper];
@@ -80,7 +79,7 @@ fn cell(value: &Value) -> String {
     format!("`{value}`")
 }
 
-/// A text within a cell of a table.
+/// Text escaped for a table cell.
 fn escaped(text: &str) -> String {
     text.replace('|', "\\|")
 }

@@ -1,4 +1,4 @@
-//! What a model shows of a view: its colours, and what its networks make of them.
+//! The render of a view: colours, and the output of the networks.
 
 use super::Networks;
 use crate::Result;
@@ -7,20 +7,20 @@ use crate::photographs::image::Image;
 use crate::splats::render::{RenderOptions, Renderer};
 use crate::splats::scene::{GaussianSlice, Layout};
 
-/// What a model shows of a view.
+/// The render of a view.
 #[derive(Clone, Debug)]
 pub struct Rendered {
     /// R_0: the Gaussians' colours.
     pub colors: Image,
-    /// R_K, where the model has a denoiser.
+    /// R_K, if the model has a denoiser.
     pub denoised: Option<Image>,
-    /// How much of the background shows at each pixel, 0 to 1, (H, W); none of a picture that is no render.
+    /// The residual transmittance of each pixel, 0 to 1, (H, W); `None` for an image that is not a render.
     pub transmittances: Option<Vec<f32>>,
 }
 
 impl Rendered {
-    /// Renders what `camera` sees of `gaussians`, and what the networks make of it: patch by
-    /// patch where the device takes no more at once. A denoiser's norms then look at each patch.
+    /// Renders `gaussians` from `camera` and applies the networks; in patches if the view exceeds the device, with a
+    /// denoiser's norms over each patch.
     ///
     /// # Errors
     /// As [`Renderer::render_image`]; the device is out of memory for the view or the networks.
@@ -56,7 +56,7 @@ impl Rendered {
         Ok(Self { denoised: Some(denoised), ..Self::of_planes(camera, planes) })
     }
 
-    /// What [`Renderer::render_planes`] shows of a camera, without a denoiser.
+    /// The planes of [`Renderer::render_planes`], without a denoiser.
     fn of_planes(&Camera { width, height, .. }: &Camera, mut planes: Vec<f32>) -> Self {
         let pixels = width as usize * height as usize;
         let transmittances = planes.split_off(planes.len() - pixels);
@@ -65,13 +65,13 @@ impl Rendered {
         Self { colors, denoised: None, transmittances: Some(transmittances) }
     }
 
-    /// What the model is scored on: R_K, or R_0 where there is no denoiser.
+    /// The image that is scored: R_K, or R_0 without a denoiser.
     pub fn output(&self) -> &Image {
         self.denoised.as_ref().unwrap_or(&self.colors)
     }
 }
 
-/// A picture that is no render, a photograph say.
+/// An image that is not a render, such as a photograph.
 impl From<Image> for Rendered {
     fn from(colors: Image) -> Self {
         Self { colors, denoised: None, transmittances: None }

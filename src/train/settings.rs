@@ -1,4 +1,4 @@
-//! The table of all settings: which key is one, which values it takes, and what is said of others.
+//! The table of all settings: keys, values, and errors for others.
 
 use std::sync::LazyLock;
 
@@ -18,7 +18,7 @@ use crate::photographs::tone::ToneSettings;
 use crate::splats::optimizer::{LearningRates, Schedule};
 use crate::splats::scene::init::Initialization;
 
-/// Every setting that there is, in the order of config.toml.
+/// Every setting, in the order of config.toml.
 pub static SETTINGS: LazyLock<Vec<Setting>> = LazyLock::new(|| {
     let rates: Vec<Setting> = LearningRates::settings().collect();
     [
@@ -62,7 +62,7 @@ pub(super) fn flat(prefix: &str, table: Table) -> Vec<(String, Value)> {
     table.into_iter().flat_map(of).collect()
 }
 
-/// Whether settings stand under the name.
+/// Whether the name is a section of settings.
 fn is_section(name: &str) -> bool {
     SETTINGS.iter().any(|row| row.key.strip_prefix(name).is_some_and(|rest| rest.starts_with('.')))
 }
@@ -88,14 +88,14 @@ pub(super) fn number(value: &Value) -> Option<f64> {
     value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64))
 }
 
-/// A TOML value; none where the text is no single one.
+/// The text as a TOML value; `None` if it is not a single one.
 pub(super) fn value(text: &str) -> Option<Value> {
     let mut table: Table = toml::from_str(&format!("value = {text}")).ok()?;
     (table.len() == 1).then(|| table.remove("value")).flatten()
 }
 
-/// What is to be said of a key that is no setting: the settings of the section that it is, or the nearest one by name, in its
-/// own section if there is one.
+/// The error for an unknown key: the settings of the section that it names, or the nearest setting, preferably in its
+/// section.
 pub(super) fn unknown(key: &str) -> Error {
     if is_section(key) {
         let keys = SETTINGS.iter().map(|row| row.key.as_ref());
@@ -103,7 +103,7 @@ pub(super) fn unknown(key: &str) -> Error {
         return Error::Usage(format!("{key} is a section; set one of {}", inner.join(", ")));
     }
     let (section, name) = key.rsplit_once('.').unwrap_or(("", key));
-    // A key without its section, or in one that there is not, is the one of that name.
+    // A key without a section, or in an unknown one, is compared by its last name.
     let is_within = !section.is_empty() && is_section(section);
     let far = |row: &&Setting| {
         let (own_section, own) = row.key.rsplit_once('.').unwrap_or(("", &row.key));
@@ -115,8 +115,7 @@ pub(super) fn unknown(key: &str) -> Error {
     Error::Usage(format!("no setting is called `{key}`{hint}"))
 }
 
-/// How far two names are apart: the insertions, deletions and replacements that turn one into the other (Levenshtein), less
-/// the letters that they begin with alike: half a name is near the whole.
+/// The Levenshtein distance of two names less the length of their common prefix, so that half a name is near the whole.
 fn distance(from: &str, to: &str) -> i64 {
     let alike = from.chars().zip(to.chars()).take_while(|(from, to)| from == to).count();
     let to: Vec<char> = to.chars().collect();
@@ -153,7 +152,7 @@ mod tests {
         }
     }
 
-    /// A configuration with every setting that may be left out.
+    /// A configuration with every optional setting.
     fn whole() -> TrainConfig {
         let set = ["images", "reference", "init", "exposure.start", "model.depth_folder"]
             .map(|key| format!("{key}=a"));
@@ -178,7 +177,7 @@ mod tests {
         let rows: BTreeSet<&str> = keys.iter().copied().collect();
         assert_eq!(keys.len(), rows.len(), "a key has two rows");
         let mut written: BTreeSet<String> = values(&whole()).unwrap().into_keys().collect();
-        // They come with a curve.
+        // These come with a curve.
         written.extend(["tone.constants", "tone.table", "tone.profile"].map(str::to_owned));
         assert_eq!(written, rows.into_iter().map(str::to_owned).collect());
         let options: Vec<_> =

@@ -1,4 +1,4 @@
-//! From a configuration and a dataset to a trainer before its first step.
+//! Construction of a trainer from a configuration and a dataset.
 
 use std::panic::resume_unwind;
 use std::thread::{self, ScopedJoinHandle};
@@ -29,10 +29,10 @@ use crate::splats::scene::{FEATURES, Gaussians, Shape, ply};
 use crate::{Error, Result};
 
 impl TrainConfig {
-    /// The Gaussians of [`TrainConfig::init`], made of what the configuration's model is; features that it lacks go.
+    /// The Gaussians of [`TrainConfig::init`] in the shape of the configured model; further features are dropped.
     ///
     /// # Errors
-    /// The file is no model, or one of a higher SH degree or without a feature that the configuration asks for.
+    /// The file is not a model, has a higher SH degree, or lacks a feature of the configured model.
     pub(super) fn initial_model(&self) -> Result<Option<Gaussians>> {
         let Some(path) = &self.init else { return Ok(None) };
         let mut gaussians = ply::load(path)?;
@@ -58,15 +58,15 @@ impl TrainConfig {
         Ok(Some(gaussians.with_features(features)))
     }
 
-    /// The SH degree that is in use at a step, of at most `highest`.
+    /// The SH degree in use at a step, at most `highest`.
     pub(super) fn sh_degree_at(&self, step: u64, highest: u32) -> u32 {
-        // Without the degrees that a model has, the first steps would teach it to do without them.
+        // With fewer degrees, the first steps would train a given model to do without them.
         if self.init.is_some() { highest } else { self.schedule.sh_degree(step, highest) }
     }
 }
 
 impl Trainer {
-    /// A trainer whose state a checkpoint is to replace: the model that its run began with need not be there any more.
+    /// A trainer for [`Trainer::restore`], which does not read [`TrainConfig::init`].
     ///
     /// # Errors
     /// As [`Trainer::new`].
@@ -74,7 +74,7 @@ impl Trainer {
         Self::on_patches(gpu, config, dataset, None)
     }
 
-    /// Begins anew on smaller patches where the first Gaussians show that the device could not follow them on these.
+    /// Restarts with smaller patches if the first Gaussians exceed the device on the present ones.
     pub(super) fn on_patches(
         gpu: &Gpu,
         mut config: TrainConfig,
@@ -105,7 +105,7 @@ impl Trainer {
         config.disable_missing_parts(dataset);
         config.frame.get_or_insert_with(|| dataset.frame());
         thread::scope(|scope| {
-            // The driver compiles on another thread while the views are uploaded and looked at.
+            // Pipelines compile on another thread while the views are uploaded and measured.
             let own = config.clone();
             let beside = scope
                 .spawn(move || Ok((Kernels::new(gpu, &own, dataset)?, Fingerprint::of(dataset)?)));
@@ -156,7 +156,7 @@ impl Trainer {
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = config.render_settings().channels() * pixels.unwrap_or_default();
         let pictures = views.largest_view_values();
-        // Beside the target only networks look at the photograph.
+        // Only networks use the photograph beside the target.
         let photographs = if networks.is_some() { pictures } else { 0 };
         let supervision = Supervision {
             views,
@@ -189,7 +189,7 @@ impl Trainer {
             fixed_bytes: 0.0,
             config,
         };
-        // Gaussians that are given may have what the first step does not use.
+        // Given Gaussians may have SH degrees that the first step does not use.
         trainer.renderer.set_sh_degree(trainer.model.shape().sh_degree)?;
         trainer.reserve()?;
         trainer.keep_activations(&sizes)?;
@@ -198,22 +198,24 @@ impl Trainer {
     }
 }
 
-/// Gaussians to begin with, in the frame. A run that ended before its highest SH degree was in use has a model without it.
+/// Initial Gaussians, in the frame. The model of a run that ended early may lack the highest SH degree.
 ///
 /// # Errors
-/// They are not made of what the configuration's model is.
+/// Their shape differs from the configured model's.
 fn given(gaussians: &Gaussians, config: &TrainConfig) -> Result<Gaussians> {
     let shape = config.render_settings().shape;
     if !shape.holds(gaussians.shape) {
         let own = gaussians.shape;
-        return Err(Error::Usage(format!("Gaussians of {own:?} make no model of {shape:?}")));
+        return Err(Error::Usage(format!(
+            "Gaussians of shape {own:?} do not fit a model of {shape:?}"
+        )));
     }
     Ok(gaussians.with_sh_degree(shape.sh_degree).to_frame(&config.frame.unwrap_or_default()))
 }
 
-/// Training views that tell what a round of density control costs.
+/// Training views on which the cost of a round of density control is measured.
 const PROBES: usize = 8;
-/// The pixels of one: all take 100 MB of the host at the most.
+/// The pixels of one; all take at most 100 MB of the host.
 const MAX_PROBE_PIXELS: usize = 1 << 20;
 
 fn probes(
@@ -226,7 +228,7 @@ fn probes(
     if config.density.control == DensityControl::Paper {
         return Ok(TargetViews::default());
     }
-    // No larger than what steps render.
+    // No larger than the views that steps render.
     let largest = sizes.iter().map(|size| size.element_product() as usize).max();
     let pixels = largest.unwrap_or_default().min(MAX_PROBE_PIXELS);
     let frame = config.frame.unwrap_or_default();

@@ -1,8 +1,8 @@
-//! Steps in submissions: while the device works on one, the next is recorded.
+//! Submissions of steps: while the device runs one, the next is recorded.
 //!
-//! A submission is long enough to be worth it and short enough for the watchdog of a slow device. How steps are grouped
-//! and how many submissions are in flight changes no bit: a step that cannot be done raises a flag on the device, and
-//! those behind it change nothing until the host has answered it.
+//! A submission is long enough to hide its overhead and short enough for the watchdog of a slow device. Batching
+//! changes no bit: a step that cannot be done raises a flag on the device, and later steps change nothing until the
+//! host has handled it.
 
 use std::collections::VecDeque;
 use std::ops::RangeInclusive;
@@ -15,22 +15,22 @@ use crate::loss::{LossLogDownload, StepLosses};
 use crate::splats::render::Status;
 use crate::{Error, Result};
 
-/// Steps that one submission holds at most.
+/// The most steps of a submission.
 pub(super) const MAX_STEPS: u64 = 64;
-/// What a submission is to take.
+/// The target time of a submission.
 const SUBMISSION: Duration = Duration::from_millis(50);
-/// Whoever trains hears of it about this often.
+/// The interval of reports.
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
-/// The parameters are looked at for NaN after so many steps: a hundredth part of what Adam reads of them.
+/// The interval of checks for NaN, which read a hundredth of what Adam reads.
 const FINITE_STEPS: u64 = 50;
-/// One runs, one waits for it.
+/// The most submissions in flight: one runs, one waits.
 const IN_FLIGHT: usize = 2;
 
-/// How steps are grouped, by what the last submission took.
+/// The number of steps per submission, from the time of the last one.
 #[derive(Debug)]
 pub(super) struct StepBatching {
     in_flight: usize,
-    /// As many steps always, where a test says so.
+    /// A fixed number of steps, for tests.
     steps: Option<u64>,
     step: Duration,
     last_done: Instant,
@@ -43,13 +43,13 @@ impl Default for StepBatching {
 }
 
 impl StepBatching {
-    /// Steps of the next submission.
+    /// The steps of the next submission.
     fn steps(&self) -> u64 {
         let fitting = SUBMISSION.as_secs_f64() / self.step.as_secs_f64().max(1e-6);
         self.steps.unwrap_or(fitting as u64).clamp(1, MAX_STEPS)
     }
 
-    /// Takes the time of a submission that is done: from when the device was free for it.
+    /// Measures a finished submission, from when the device was free for it.
     fn measure(&mut self, submitted: Instant, steps: u64) {
         let done = Instant::now();
         let took = done.duration_since(submitted.max(self.last_done));
@@ -57,15 +57,15 @@ impl StepBatching {
     }
 }
 
-/// How steps reach the device, and what became of the last that did.
+/// The state of submissions.
 #[derive(Debug, Default)]
 pub(super) struct Submissions {
     pub(super) batching: StepBatching,
-    /// What ended the last call after steps that were done.
+    /// The error that ended the last call after finished steps.
     pub(super) failed: Option<Error>,
 }
 
-/// Steps on their way through the device.
+/// Submitted steps.
 struct Submitted {
     steps: RangeInclusive<u64>,
     at: Instant,
@@ -74,7 +74,7 @@ struct Submitted {
 }
 
 impl Trainer {
-    /// Has always so many submissions in flight, of so many steps each; none: as long as suits the device.
+    /// Fixes the number of submissions in flight, and of steps in each; `None`: as suits the device.
     #[doc(hidden)]
     pub fn set_batching(&mut self, in_flight: usize, steps: Option<u64>) {
         self.submissions.batching =
@@ -83,8 +83,8 @@ impl Trainer {
 
     /// Trains up to `until`, to the next step of density control, or for about half a second.
     ///
-    /// Where that fails behind steps that are done, these are reported first and the next call says why: what is reported
-    /// is what the model has.
+    /// If that fails after finished steps, these are reported first and the next call returns the error, so that
+    /// reports match the model.
     pub(super) fn submit_steps(&mut self, until: u64) -> Result<Vec<StepReport>> {
         if let Some(error) = self.submissions.failed.take() {
             return Err(error);
@@ -94,7 +94,7 @@ impl Trainer {
             Err(error) if !reports.is_empty() => self.submissions.failed = Some(error),
             done => done?,
         }
-        // A model that is broken is nobody's, and neither are its steps.
+        // Steps before a non-finite parameter are not reported.
         if self.step >= self.optimizer.checked + FINITE_STEPS {
             self.check_finite()?;
         }
@@ -102,18 +102,18 @@ impl Trainer {
     }
 
     fn train_interval(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
-        // A run that goes on from where memory was out has that before it.
+        // A run resumed after running out of memory starts with what was due.
         self.control()?;
         self.train_steps(until, reports)?;
         self.control()
     }
 
-    /// Trains up to `until`, to the next step after which something is due, or for about half a second.
+    /// Trains up to `until`, to the next step with a due action, or for about half a second.
     pub(super) fn train_steps(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
         self.allocate_sh_degree()?;
         let (begin, mut next) = (Instant::now(), self.step + 1);
         let until = until.min(self.last_step());
-        // Density control may change the number of Gaussians, and another SH degree their memory.
+        // Density control may change the number of Gaussians, and a higher SH degree their memory.
         let rises = |step| self.sh_degree(step + 1) > self.sh_degree(step);
         let changes = |&step: &u64| {
             self.densifies_at(step)
@@ -133,14 +133,14 @@ impl Trainer {
                     break;
                 }
                 let steps = next..=last.min(next + self.submissions.batching.steps() - 1);
-                // Where one cannot be sent, those before it still change the model.
+                // If one cannot be submitted, those before it still change the model.
                 sent = self.load_and_submit(steps).map(|submitted| {
                     next = submitted.steps.end() + 1;
                     in_flight.push_back(submitted);
                 });
             }
             let Some(oldest) = in_flight.pop_front() else { break };
-            // What is in flight behind a step that failed changes nothing.
+            // Steps in flight after a failed one change nothing.
             if !self.finish(oldest, reports)? {
                 break;
             }
@@ -149,19 +149,19 @@ impl Trainer {
         self.convergence.decisions.degree_due =
             !reports.is_empty() && self.decides_degree_at(self.step);
         if !reports.is_empty() && self.densifies_at(self.step) {
-            // Due whether or not there is memory to ask.
+            // Due whether or not there is memory for it.
             self.convergence.decisions.density_due = Some(0);
             self.convergence.decisions.density_due = Some(self.renderer.intersections()?);
         }
         sent
     }
 
-    /// Does what is due behind the last step: each is done, or the model is as it was and it stays due.
+    /// Performs the actions due after the last step. An action that fails leaves the model unchanged and stays due.
     pub(super) fn control(&mut self) -> Result<()> {
         if self.convergence.decisions.score_due {
             self.score_held_out()?;
             self.convergence.decisions.score_due = false;
-            // A run that has just converged grows no more.
+            // A run that has converged does not grow.
             self.convergence
                 .decisions
                 .density_due
@@ -183,10 +183,10 @@ impl Trainer {
         self.submit(first..=fitting)
     }
 
-    /// Looks at every parameter of the Gaussians on the device.
+    /// Checks every parameter of the Gaussians on the device.
     ///
     /// # Errors
-    /// [`Error::ParameterNotFinite`] names the last step and the plane.
+    /// [`Error::ParameterNotFinite`], with the last step and the plane.
     fn check_finite(&mut self) -> Result<()> {
         self.optimizer.checked = self.step;
         match self.model.first_not_finite(&self.gpu, &mut self.optimizer.finite)? {
@@ -217,15 +217,15 @@ impl Trainer {
         Ok(Submitted { steps, at: Instant::now(), log, status })
     }
 
-    /// Waits for a submission and reports its steps; false where one has to be done again.
+    /// Waits for a submission and reports its steps; false if one has to be redone.
     fn finish(&mut self, submitted: Submitted, reports: &mut Vec<StepReport>) -> Result<bool> {
         let Submitted { steps, at, log, status } = submitted;
         let (log, status) = (log.wait()?, Status::from_words(&status.wait()?));
         let count = steps.end() - steps.start() + 1;
         self.submissions.batching.measure(at, count);
-        // The steps from the first failed one on have changed nothing.
+        // Steps from the first failed one on have changed nothing.
         let done = log.iter().take(count as usize).take_while(|losses| losses.status == 0).count();
-        // That flag goes up behind the loss: of the step before the first that saw it.
+        // This flag is raised after the loss: by the step before the first that saw it.
         let done = if status.gradient_not_finite { done.saturating_sub(1) } else { done };
         let milliseconds =
             self.submissions.batching.step.as_secs_f64() * 1e3 * count as f64 / done.max(1) as f64;
@@ -239,7 +239,7 @@ impl Trainer {
         Ok(false)
     }
 
-    /// Does what a raised flag asks for, before the next step is done again.
+    /// Handles a raised flag before the step is redone.
     fn answer(&mut self, status: Status, losses: &StepLosses) -> Result<()> {
         let step = self.step + 1;
         let view = || self.view_of(step).name.clone();
@@ -264,13 +264,11 @@ impl Trainer {
         if self.config.stop.not_finite == NotFinite::Stop || !self.leave_out_view_of(step)? {
             return Err(error);
         }
-        tracing::warn!(
-            "{error}; the step has changed nothing, and the run goes on without the view"
-        );
+        tracing::warn!("{error}; the step changed nothing; the run continues without the view");
         Ok(())
     }
 
-    /// Trains on the view of a step no more, as if that had never begun; false where it is the last view.
+    /// Leaves out the view of a step, which is undone; false if it is the last view.
     fn leave_out_view_of(&mut self, step: u64) -> Result<bool> {
         let place = self.view_of(step).place;
         if !self.supervision.views.leave_out(place) {
@@ -279,7 +277,7 @@ impl Trainer {
         let Self { model, renderer, .. } = self;
         self.gpu.clone().run("clear_status", |pass| {
             renderer.clear_status(pass);
-            // Some Gaussians may have added to what density control goes by before the flag was up.
+            // Some Gaussians may have added to the statistics before the flag was raised.
             pass.fill(&mut model.grad_norm_sums, 0);
             pass.fill(&mut model.visit_counts, 0);
             Ok(())
@@ -287,7 +285,7 @@ impl Trainer {
         Ok(true)
     }
 
-    /// The view that a step trains on.
+    /// The view of a step.
     pub(super) fn view_id(&self, step: u64) -> ViewId {
         let level = self.config.schedule.resolution_level(step);
         self.supervision.views.of_step(self.config.seed, step, level)

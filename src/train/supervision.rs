@@ -1,5 +1,4 @@
-//! What the render of a training view is compared with: from the stored photograph to the gradient of the loss with respect
-//! to the render.
+//! Supervision: from the stored photograph to the gradient of the loss with respect to the render.
 //!
 //! ```text
 //! stored photograph -> pseudo-GT pass -> target ┐
@@ -27,13 +26,13 @@ use crate::splats::scene::{COLOR_CHANNELS, Features};
 #[derive(Debug)]
 pub(super) struct Supervision {
     pub(super) views: Views,
-    /// What the curves of the photographs have in common.
+    /// The shared part of the photographs' tone curves.
     pub(super) scene: SceneTone,
     pub(super) target_exposure: Option<TargetExposure>,
     pub(super) pseudo_gt: PseudoGt,
-    /// The target of a step's view, (3, H, W),
+    /// The target of a step's view, (3, H, W).
     pub(super) target: Buffer<f32>,
-    /// and its dark photograph, where a network sees that.
+    /// Its dark photograph, if a network uses it.
     pub(super) photograph: Buffer<f32>,
     pub(super) masks: Masks,
     pub(super) exposures: Option<Exposures>,
@@ -46,15 +45,15 @@ pub(super) struct Supervision {
 }
 
 impl Supervision {
-    /// The networks, where the model has any.
+    /// The networks, if the model has any.
     pub(super) fn networks(&mut self) -> Option<&mut Networks> {
         self.networks.as_mut().map(|terms| &mut terms.networks)
     }
 
-    /// Records the terms of the loss of a step, in a slot of the log, and their gradient with respect to what was rendered.
+    /// Records the loss terms of a step, in a slot of the log, and their gradient with respect to the render.
     ///
     /// # Errors
-    /// A pass exceeds what the device launches.
+    /// A pass exceeds the device's launch limits.
     pub(super) fn compare(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -116,7 +115,7 @@ impl Supervision {
         model.record_terms((gpu, pass), terms, &mut LogSlot { log: &mut self.log, slot, status })
     }
 
-    /// Records Adam's step of what is learned beside the Gaussians.
+    /// Records Adam's step of the learned parameters beside the Gaussians.
     ///
     /// # Errors
     /// As [`Supervision::compare`].
@@ -137,7 +136,7 @@ impl Supervision {
         }
     }
 
-    /// Everything that is learned beside the Gaussians: Adam trains it, and checkpoints keep it.
+    /// The learned parameters beside the Gaussians, for Adam and checkpoints.
     pub(super) fn learnables(&mut self) -> impl Iterator<Item = &mut dyn Learnable> {
         let networks = self.networks.iter_mut().flat_map(|terms| terms.networks.parameters_mut());
         let networks = networks.map(|parameters| parameters as &mut dyn Learnable);

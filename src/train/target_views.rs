@@ -1,4 +1,4 @@
-//! Views that the model is scored on against their targets: those held out from training, and probes among those trained on.
+//! Views scored against their targets: held-out views, and probes among the training views.
 
 use glam::{DVec2, UVec2};
 
@@ -24,19 +24,19 @@ use super::rendered::Rendered;
 #[derive(Debug, Default)]
 pub(super) struct TargetViews(Vec<TargetView>);
 
-/// A view in the frame, and what it is to show where no mask hides it.
+/// A view in the frame, with its target and mask.
 #[derive(Debug)]
 struct TargetView {
     camera: Camera,
     target: Image,
     mask: Option<Mask>,
-    /// Of the training photograph whose learned exposure the target has; `None` for the neutral exposure.
+    /// The training photograph whose learned exposure the target has; `None` for the neutral exposure.
     place: Option<usize>,
 }
 
 impl TargetViews {
-    /// The views that show something, with their targets, made as those of training views are. A view that is black or
-    /// masked entirely says nothing of a model: it is left out, with a warning.
+    /// The views with their targets, made as those of training views. Views that are black or masked entirely are left
+    /// out, with a warning.
     ///
     /// # Errors
     /// A photograph can no longer be read, or the device is out of memory or lost.
@@ -64,8 +64,8 @@ impl TargetViews {
         Ok(Self(shown))
     }
 
-    /// `count` training views that cover the cameras, for a look at what a change costs. Views with more than `pixels` are
-    /// resized to about that.
+    /// `count` training views that cover the cameras, to measure the cost of a change. Views with more than `pixels`
+    /// are resized to about that.
     ///
     /// # Errors
     /// As [`TargetViews::new`].
@@ -91,8 +91,8 @@ impl TargetViews {
         Ok(Self(probes))
     }
 
-    /// The mean PSNR, dB, of the colours and of the output of what `render` shows of each camera; `None` if there is no
-    /// view. `affines` are the exposures of the training photographs.
+    /// The mean PSNR, dB, of colours and output of `render` for each camera; `None` without views. `affines` are the
+    /// exposures of the training photographs.
     ///
     /// # Errors
     /// Those of `render`.
@@ -120,7 +120,7 @@ impl TargetViews {
 }
 
 impl TargetView {
-    /// The same, shrunk to about this number of pixels if it has more.
+    /// The view, resized to about this number of pixels if it has more.
     fn shrunk(self, pixels: usize) -> Self {
         let size = DVec2::new(self.camera.width.into(), self.camera.height.into());
         let scale = (pixels as f64 / size.element_product()).sqrt().min(1.0);
@@ -137,7 +137,7 @@ fn clamped(image: &Image) -> Image {
     Image { data, ..*image }
 }
 
-/// The target that a view's photograph becomes, made as those of the training views are.
+/// The target of a view, made as those of the training views.
 fn target_of(
     pseudo_gt: &PseudoGt,
     view: &View,
@@ -150,8 +150,7 @@ fn target_of(
     Ok(target.resized(view.camera.width, view.camera.height))
 }
 
-/// The targets that the test views would have were they trained on: what `tone apply` makes of their photographs in the scene of
-/// the training photographs.
+/// The targets of test views: their photographs through the tone curve of the training photographs, as by `tone apply`.
 #[derive(Debug)]
 pub struct TestTargets {
     pseudo_gt: PseudoGt,
@@ -162,14 +161,14 @@ impl TestTargets {
     /// Measures the training photographs.
     ///
     /// # Errors
-    /// Every training photograph is as good as black where their exposure is asked for; a photograph can no longer be read;
-    /// the device is out of memory or lost.
+    /// Every training photograph is black and their exposure is needed; a photograph can no longer be read; the device
+    /// is out of memory or lost.
     pub fn new(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
         let (scene, _) = measured(tone, dataset)?;
         Self::in_scene(gpu, tone, &scene)
     }
 
-    /// The same where the training photographs are measured already.
+    /// As [`TestTargets::new`], for training photographs that are already measured.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -177,7 +176,7 @@ impl TestTargets {
         Ok(Self { pseudo_gt: PseudoGt::new(gpu, tone)?, scene: scene.clone() })
     }
 
-    /// That of a view, of its camera's size; none where it has no photograph.
+    /// The target of a view, of its camera's size; `None` without a photograph.
     ///
     /// # Errors
     /// The photograph can no longer be read, or the device is out of memory or lost.
@@ -189,18 +188,19 @@ impl TestTargets {
 }
 
 impl Trainer {
-    /// What the curves of the training photographs have in common, for [`TestTargets::in_scene`].
+    /// The shared part of the tone curves, for [`TestTargets::in_scene`].
     pub(crate) fn scene(&self) -> &SceneTone {
         &self.supervision.scene
     }
 
-    /// How bright the targets are; none where the curve's constants say that.
+    /// The exposure of the targets; `None` if the curve's constants determine it.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn target_exposure(&self) -> Option<&TargetExposure> {
         self.supervision.target_exposure.as_ref()
     }
 
-    /// The mean PSNR, dB, of what the Gaussians show of the held-out views against their targets; none where there are none.
+    /// The mean PSNR, dB, of the Gaussians' colours on the held-out views against their targets; `None` without
+    /// held-out views.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -209,7 +209,7 @@ impl Trainer {
         self.held_out_psnr_of_degree(self.sh_degree(self.step))
     }
 
-    /// As [`Trainer::held_out_psnr`], with the colours of an SH degree.
+    /// As [`Trainer::held_out_psnr`], with an SH degree.
     pub(super) fn held_out_psnr_of_degree(&mut self, sh_degree: u32) -> Result<Option<f64>> {
         Ok(self.psnr_of_held_out(sh_degree)?.map(|[colors, _]| colors))
     }
@@ -222,13 +222,13 @@ impl Trainer {
         scores
     }
 
-    /// Leaves out what the denoiser has learned where it shows the held-out views, or without any some of the training views,
-    /// hardly better than R_0 does: it is the identity again. For the end of a run, not on its way; the paper's stays.
+    /// Resets the denoiser to the identity if it hardly improves the held-out views, or else some training views, over
+    /// R_0. For the end of a run; the paper's denoiser stays.
     ///
     /// # Errors
     /// The device is out of memory or lost.
     pub(crate) fn drop_unused_degree(&mut self) -> Result<()> {
-        /// Less on few views, dB, is chance.
+        /// In dB; less, on few views, is chance.
         const MIN_GAIN: f64 = 0.05;
         if !self.supervision.networks.as_ref().is_some_and(NetworkTerms::follow_target) {
             return Ok(());
@@ -249,7 +249,7 @@ impl Trainer {
             tracing::info!("the denoiser gains {gain:.2} dB on targets");
             return Ok(());
         }
-        tracing::info!("the denoiser gains nothing on targets ({gain:.2} dB): it is left out");
+        tracing::info!("the denoiser gains nothing on targets ({gain:.2} dB) and is left out");
         match self.supervision.networks.as_mut().and_then(|terms| terms.networks.denoiser.as_mut())
         {
             Some(denoiser) => denoiser.become_identity(),
@@ -277,7 +277,7 @@ impl Trainer {
         Ok(TargetViews(some.collect::<Result<_>>()?))
     }
 
-    /// The exposure of every training photograph, where exposures are learned.
+    /// The exposure of every training photograph, if exposures are learned.
     ///
     /// # Errors
     /// The device was lost.

@@ -1,4 +1,4 @@
-//! The networks in a training step: windows of the render, forward, what the outputs are held to, backward.
+//! The networks in a training step: crop of the render, forward, loss terms, backward.
 
 use glam::UVec2;
 
@@ -17,18 +17,18 @@ use crate::networks::{Denoiser, NetworkVariant};
 use crate::splats::scene::{COLOR_CHANNELS, Feature};
 use crate::{Error, Result};
 
-/// What the networks of a view are held to, (3, H, W) each.
+/// The images of a view that the networks are trained against, (3, H, W) each.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Photographs<'a> {
-    /// Which pixels count, (H, W); all where there is none.
+    /// The mask, (H, W); `None`: all pixels count.
     pub(super) mask: Option<&'a Buffer<f32>>,
     /// The dark photograph.
     pub(super) low: &'a Buffer<f32>,
-    /// Its target; the paper's networks do not look at it.
+    /// Its target; the paper's networks do not use it.
     pub(super) target: &'a Buffer<f32>,
 }
 
-/// The networks in training, and the terms that their outputs are held to.
+/// The networks in training, with the loss terms of their outputs.
 #[derive(Debug)]
 pub(super) struct NetworkTerms {
     pub(super) networks: Networks,
@@ -38,21 +38,21 @@ pub(super) struct NetworkTerms {
     crops: Stream,
     denoising: DenoisingLoss,
     low: Loss,
-    /// None where no view has a mask.
+    /// `None` if no view has a mask.
     masking: Option<CropMask>,
-    /// Of the window, (3, h, w) each: inputs, then gradients.
+    /// Inputs of the crop and their gradients, (3, h, w) each.
     illumination: Buffer<f32>,
-    /// What an output is held to.
+    /// The image that an output is compared with.
     photograph: Buffer<f32>,
     d_colors: Buffer<f32>,
     d_denoised: Buffer<f32>,
-    /// Of what the denoiser's first stage begins with.
+    /// The gradient of the noise map, the input of the denoiser's first stage.
     d_noise: Buffer<f32>,
     d_illumination: Buffer<f32>,
     d_output: Buffer<f32>,
 }
 
-/// The mask of a window.
+/// The mask of a crop.
 #[derive(Debug)]
 struct CropMask {
     masking: Masking,
@@ -72,15 +72,15 @@ impl CropMask {
         self.masking.shown(pass, &self.weights, size, output, held_to)
     }
 
-    /// As [`Masking::hide`], of colours.
+    /// As [`Masking::hide`], for colours.
     fn hide(&self, pass: &mut Recorder<'_>, size: UVec2, d_output: &mut Buffer<f32>) -> Result<()> {
         self.masking.hide(pass, &self.weights, (size, COLOR_CHANNELS), d_output)
     }
 }
 
 impl NetworkTerms {
-    /// The networks and terms of the parts that are on, with memory for views of these sizes, of which some may have masks;
-    /// none where no part has any.
+    /// The networks and terms of the enabled parts, with memory for views of these sizes, some with masks; `None` if no
+    /// part has a network.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -137,7 +137,7 @@ impl NetworkTerms {
         Ok(Some(terms))
     }
 
-    /// Keeps the activations of the denoiser's every stage in the windows of views of such sizes, where that takes no more than
+    /// Keeps the activations of every stage of the denoiser, for crops of views of these sizes, if that takes at most
     /// `most` bytes and the device has them.
     ///
     /// # Errors
@@ -148,11 +148,11 @@ impl NetworkTerms {
         let mut kept =
             crops.into_iter().map(|padded_crop| denoiser.keep_activations(padded_crop, most));
         let are_kept = kept.try_fold(true, |all, kept| Ok::<_, Error>(all & kept?))?;
-        tracing::debug!("activations of every stage of the denoiser are kept: {are_kept}");
+        tracing::debug!("activations of every stage of the denoiser kept: {are_kept}");
         Ok(())
     }
 
-    /// The largest window of a view of `size`.
+    /// The largest crop of a view of `size`.
     fn max_of(&self, size: UVec2) -> UVec2 {
         match self.crop {
             0 => size,
@@ -160,7 +160,7 @@ impl NetworkTerms {
         }
     }
 
-    /// Memory for the windows of views of `size`.
+    /// Reserves memory for the crops of views of `size`.
     fn reserve(&mut self, gpu: &Gpu, size: UVec2) -> Result<()> {
         let size = self.max_of(size);
         self.networks.reserve(size)?;
@@ -184,14 +184,14 @@ impl NetworkTerms {
         Ok(())
     }
 
-    /// How far the terms of a pixel look, in pixels.
+    /// The radius of the terms of a pixel, in pixels.
     fn margin(&self) -> u32 {
         let denoiser = self.networks.denoiser.as_ref().map_or(0, Denoiser::margin);
         let tonemapper = self.networks.tonemapper.as_ref();
         denoiser + tonemapper.map_or(0, |tonemapper| tonemapper.margin() + RADIUS as u32)
     }
 
-    /// Whether a network is held to the targets.
+    /// Whether a network is trained against the targets.
     pub(super) fn follow_target(&self) -> bool {
         self.variant == NetworkVariant::Identity && self.networks.has_denoiser()
     }
@@ -217,7 +217,7 @@ impl NetworkTerms {
         }
         match self.variant {
             NetworkVariant::Identity => {
-                // What the denoiser learns is its own: the render stays what it would be without it.
+                // Stop-gradient: the denoiser does not affect the render.
                 self.record_denoising(pass, &padded_crop, photographs, inputs.size, log)?;
                 self.denoise_backward(pass, &padded_crop, inputs, d_render)?;
                 pass.fill(&mut self.d_colors, 0);
@@ -234,7 +234,7 @@ impl NetworkTerms {
         crops.scatter(pass, &self.d_colors, &padded_crop, 0..COLOR_CHANNELS, inputs.size, d_render)
     }
 
-    /// R_K against the target, in the paper's form against R_0.
+    /// R_K against the target, or in the paper's variant against R_0.
     fn record_denoising(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -281,7 +281,7 @@ impl NetworkTerms {
         mask.hide(pass, padded_crop.size, &mut self.d_colors)
     }
 
-    /// From `dL/dR_K` to the noise map, and to R_0 in `d_colors`.
+    /// Propagates `dL/dR_K` to the noise map, and to R_0 in `d_colors`.
     fn denoise_backward(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -307,7 +307,7 @@ impl NetworkTerms {
         }
     }
 
-    /// The dark photograph from illumination and R_K, in the identity form R_0, and back to both.
+    /// The dark photograph from illumination and R_K, or R_0 in the identity variant, and the gradients of both.
     fn record_low(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -366,7 +366,7 @@ impl NetworkTerms {
     }
 }
 
-/// The pixels of a window that the terms count.
+/// The pixels of a crop that the terms count.
 fn loss_region(padded_crop: &PaddedCrop) -> LossRegion {
     LossRegion { origin: padded_crop.crop_origin, size: padded_crop.crop_size }
 }

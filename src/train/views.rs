@@ -1,4 +1,4 @@
-//! The training views on the device: dark photographs, their curves, and the order in which steps take them.
+//! The training views on the device: photographs, their curves, and the order of steps.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
@@ -23,63 +23,63 @@ use crate::photographs::tone::SceneTone;
 use crate::splats::render::{Viewpoint, Viewpoints};
 use crate::splats::scene::COLOR_CHANNELS;
 
-/// One training view: a photograph, or a patch of one that is too large to be trained on at once.
+/// A training view: a photograph, or a patch of a large one.
 #[derive(Debug)]
 pub(super) struct TrainView {
     pub(super) name: String,
-    /// Its place among the training views of all levels.
+    /// Its number among the training views of all levels.
     pub(super) number: usize,
-    /// Its photograph's place among those that are trained on.
+    /// The position of its photograph among those trained on.
     pub(super) place: usize,
     /// Index into the dataset's views.
     pub(super) index: usize,
-    /// What it is of its photograph, in the frame.
+    /// Its part of the photograph, in the frame.
     pub(super) patch: Patch,
-    /// Depth from elsewhere, (H, W), where the dataset's is of another size.
+    /// The given depth, (H, W), if the dataset's has another size.
     depth: Option<Vec<f32>>,
-    /// What its target is made of in every step, planar (3, H, W), sRGB-encoded.
+    /// The stored image from which its target is made in every step: planar (3, H, W), sRGB-encoded.
     stored: Slot,
-    /// Whether that is the dark photograph, and gets the curve of its place; else it is the target, whose curve was applied to
-    /// the photograph at its own size.
+    /// Whether that is the dark photograph, to which the curve is applied; else it is the target, tone-mapped at the
+    /// photograph's own size.
     gets_curve: bool,
-    /// The dark photograph, where that is not what is stored and a network sees it.
+    /// The dark photograph, if it is not the stored image and a network uses it.
     photograph: Option<Slot>,
 }
 
-/// Which of the training views.
+/// A training view.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ViewId {
-    /// Of the resolution schedule.
+    /// The level of the resolution schedule.
     level: usize,
-    /// Among the views of the level.
+    /// The index among the views of the level.
     index: usize,
 }
 
-/// All training views in the dataset's order, as they are and then by level of the resolution schedule, each half the
-/// size of the one before.
+/// All training views in the dataset's order, at full size and then for each level of the resolution schedule at half
+/// the size of the one before.
 #[derive(Debug)]
 pub(super) struct Views {
     levels: Vec<Vec<TrainView>>,
-    /// By their numbers.
+    /// By number.
     viewpoints: Viewpoints,
-    /// The places of those that are trained on no more.
+    /// The positions of photographs left out of training.
     left_out: BTreeSet<usize>,
     cache: Cache,
     epochs: Epochs,
-    /// The curve of every photograph, by place.
+    /// The curve of every photograph, by position.
     curves: Buffer<ToneParameters>,
 }
 
-/// A view whose shorter side would fall below this is not shrunk any more, in pixels.
+/// A view is not resized below this shorter side, in pixels.
 const SHORTEST_SIDE: u32 = 32;
 
 impl Views {
-    /// Measures every training photograph, and uploads it or its target in as many sizes as there are levels; the
-    /// photographs too where a network sees them. One photograph at a time is in memory at its own size.
+    /// Measures every training photograph, and uploads it or its target for every level, and the photograph if a
+    /// network uses it. Only one photograph at a time is in memory at its own size.
     ///
     /// # Errors
-    /// Every photograph is as good as black where their exposure is asked for; a photograph can no longer be read; the
-    /// device is out of memory or lost.
+    /// Every photograph is black and their exposure is needed; a photograph can no longer be read; the device is out of
+    /// memory or lost.
     pub(super) fn upload(
         gpu: &Gpu,
         pseudo_gt: &PseudoGt,
@@ -104,7 +104,7 @@ impl Views {
             let own = UVec2::new(image.width, image.height);
             let sizes = (0..views.len()).map(|level| shrunk(own, level as u32));
             let sizes: Vec<UVec2> = sizes.collect();
-            // What is trained on at its own size gets its curve in every step.
+            // At its own size, the curve is applied in every step.
             let own = view.own_size().filter(|_| settings.full_resolution);
             let is_larger = own.filter(|own| sizes.iter().any(|size| size != own));
             let whole = if is_larger.is_some() { view.photograph()? } else { None };
@@ -142,17 +142,17 @@ impl Views {
             epochs: Epochs::default(),
             curves: gpu.buffer("curves", &curves)?,
         };
-        // The targets of a profile are as bright as its references.
+        // A profile determines the brightness of its targets.
         let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
         let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
         Ok((views, scene, exposure))
     }
 
-    /// Brings to the device what steps need of their views, as many steps as fit there side by side but one at least; the
-    /// last of them.
+    /// Makes the images of the next steps resident, for as many steps as fit but at least one; returns the last of
+    /// them.
     ///
     /// # Errors
-    /// Photographs that wait in a file cannot be read, or the device is out of memory or lost.
+    /// The spool file cannot be read, or the device is out of memory or lost.
     pub(super) fn make_resident(
         &mut self,
         config: &TrainConfig,
@@ -182,7 +182,7 @@ impl Views {
         Ok(last)
     }
 
-    /// What the loss terms may compare the views with.
+    /// The images that loss terms compare views with.
     pub(super) fn sources<'a>(
         &'a self,
         gpu: &'a Gpu,
@@ -197,10 +197,10 @@ impl Views {
         self.levels.iter().flatten().map(source).collect()
     }
 
-    /// Records the target of a view that is on the device, (3, H, W); it may be `scratch` or what is stored.
+    /// Records the target of a resident view, (3, H, W), which is either `scratch` or the stored image.
     ///
     /// # Errors
-    /// The photograph is not on the device, or `scratch` is shorter.
+    /// The photograph is not resident, or `scratch` is too short.
     pub(super) fn record_target<'a>(
         &'a self,
         pass: &mut Recorder<'_>,
@@ -211,7 +211,7 @@ impl Views {
         pseudo_gt.record(pass, self.cache.on_device(view.stored)?, self.curve(view), scratch)
     }
 
-    /// The same for the dark photograph of a view, where that is kept.
+    /// As [`Self::record_target`], for the dark photograph of a view, if that is kept.
     ///
     /// # Errors
     /// As there.
@@ -226,12 +226,12 @@ impl Views {
         pseudo_gt.record(pass, photograph, None, scratch)
     }
 
-    /// The curve that makes the target of what is stored of a view.
+    /// The curve from the stored image of a view to its target.
     fn curve(&self, view: &TrainView) -> Option<(&Buffer<ToneParameters>, u32)> {
         view.gets_curve.then_some((&self.curves, view.place as u32))
     }
 
-    /// Targets or dark photographs, (3, H, W), of views wherever they are stored, in one submission.
+    /// Reads back targets or dark photographs of views, (3, H, W), in one submission.
     pub(super) fn read(
         &self,
         gpu: &Gpu,
@@ -258,7 +258,7 @@ impl Views {
         downloads.into_iter().map(Download::wait).collect()
     }
 
-    /// The target of a view, (3, H, W), in a buffer of its own or in the one that it is stored in.
+    /// The target of a view, (3, H, W), in a new buffer or in the stored one.
     fn target(
         &self,
         gpu: &Gpu,
@@ -277,8 +277,8 @@ impl Views {
         Ok(Arc::new(target))
     }
 
-    /// The view that a step trains on, at one of the levels: every epoch takes each view once, in an order of its own, and
-    /// for one that is left out the next again.
+    /// The view of a step at a level: every epoch takes each view once, in its own order, and the next one twice for
+    /// one that is left out.
     pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> ViewId {
         let views = &self.levels[level];
         let (order, place) = self.epochs.of_step(seed, step, views.len());
@@ -296,19 +296,19 @@ impl Views {
         self.viewpoints.get(self.get(view).number)
     }
 
-    /// Trains on a view no more; false where there is no other.
+    /// Leaves a photograph out of training; false if it is the last.
     pub(super) fn leave_out(&mut self, place: usize) -> bool {
         let has_others = self.left_out.len() + 1 < self.photographs().count();
         has_others && self.left_out.insert(place)
     }
 
-    /// The names of the views that are trained on no more.
+    /// The names of the views left out.
     pub(super) fn left_out(&self) -> Vec<String> {
         let views = self.photographs().filter(|view| self.left_out.contains(&view.place));
         views.map(|view| view.name.clone()).collect()
     }
 
-    /// Leaves these views out, and no other.
+    /// Leaves out exactly these views.
     pub(super) fn set_left_out(&mut self, names: &[String]) {
         let views = self.photographs().filter(|view| names.contains(&view.name));
         self.left_out = views.map(|view| view.place).collect();
@@ -319,18 +319,18 @@ impl Views {
         self.levels.iter().flatten()
     }
 
-    /// The views, unshrunk, those of a photograph side by side.
+    /// The full-size views, grouped by photograph.
     pub(super) fn whole(&self) -> &[TrainView] {
         self.levels.first().map_or(&[], Vec::as_slice)
     }
 
-    /// How many floats the largest view has.
+    /// The number of values of the largest view.
     pub(super) fn largest_view_values(&self) -> usize {
         let values = |view: &TrainView| COLOR_CHANNELS * view.size().element_product() as usize;
         self.all().map(values).max().unwrap_or_default()
     }
 
-    /// One view of every photograph, unshrunk.
+    /// One full-size view of every photograph.
     pub(super) fn photographs(&self) -> impl Iterator<Item = &TrainView> {
         self.whole().iter().filter(|view| view.patch.is_first())
     }
@@ -340,18 +340,18 @@ impl Views {
         self.photographs().map(|view| view.name.as_str())
     }
 
-    /// Width and height of every view, unshrunk.
+    /// Width and height of every full-size view.
     pub(super) fn sizes(&self) -> Vec<UVec2> {
         self.whole().iter().map(TrainView::size).collect()
     }
 }
 
-/// What is looked at of a view.
+/// The kind of image of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum ImageKind {
-    /// What it is held to.
+    /// Its target.
     Targets,
-    /// What it was made of; only where that is kept.
+    /// Its dark photograph, if that is kept.
     Photographs,
 }
 
@@ -361,11 +361,11 @@ struct LevelImage<'a> {
     place: usize,
     index: usize,
     photograph: Image,
-    /// Where its curve was applied at another size.
+    /// Its target, if the curve was applied at another size.
     target: Option<Image>,
-    /// Whether the photograph stays beside the target.
+    /// Whether the photograph is kept beside the target.
     keeps_photograph: bool,
-    /// Where it is not the dataset's.
+    /// The depth, if it is not the dataset's.
     depth: Option<Vec<f32>>,
 }
 
@@ -395,13 +395,13 @@ impl LevelImage<'_> {
     }
 }
 
-/// A size halved as often as its level says and its shorter side allows.
+/// A size halved once for each level, as far as its shorter side allows.
 fn shrunk(size: UVec2, level: u32) -> UVec2 {
     let suits = |&level: &u32| level == 0 || (size >> level).min_element() >= SHORTEST_SIDE;
     (0..=level).rev().find(suits).map_or(size, |level| size >> level)
 }
 
-/// A plane of the size of `image` at another size: the means of the areas.
+/// A plane of the size of `image`, resized by area means.
 fn resized_plane(plane: &[f32], image: &Image, size: UVec2) -> Vec<f32> {
     let Image { width, height, .. } = *image;
     let mut data = Image { width, height, data: plane.repeat(3) }.resized(size.x, size.y).data;

@@ -63,7 +63,7 @@ fn points_that_no_device_holds_and_views_that_show_nothing_are_said() {
         }
         listing.to_string()
     });
-    trains_and_says(set.path(), &["view 002 shows nothing"]);
+    trains_and_says(set.path(), &["view 002 contains none"]);
 }
 
 #[test]

@@ -163,7 +163,7 @@ fn a_blurred_photograph_and_one_without_a_pose_are_named() {
     fs::copy(set.path().join("low/001.png"), set.path().join("low/stray.png")).unwrap();
     let found = diagnosis_of(set.path());
     assert_eq!(found.without_pose, ["stray"]);
-    for remark in ["blurred more than the others: 003", "without a pose, not used: stray"] {
+    for remark in ["more blurred than the others: 003", "without a pose, not used: stray"] {
         assert!(found.remarks.iter().any(|own| own.contains(remark)), "{:?}", found.remarks);
     }
     let view = |name: &str| found.views.iter().find(|view| view.name == name).unwrap();
@@ -261,7 +261,7 @@ fn a_plan_survives_its_file_and_fits_its_dataset_alone() {
     }
     fs::write(&path, "[curve]\non = maybe\n").unwrap();
     let refusal = Plan::load(&path, &dataset).unwrap_err().to_string();
-    assert!(refusal.contains("is no plan") && refusal.contains("line 2"), "{refusal}");
+    assert!(refusal.contains("is not a plan") && refusal.contains("line 2"), "{refusal}");
 }
 
 // ---------------------------------------------------------------------------
@@ -398,7 +398,7 @@ fn a_run_that_has_ended_early_goes_on_from_its_end() {
     let again = format!("train {root} --out {} {options} --resume --set", out.display());
     let (_, message) = run(&format!("{again} stop.gain=80"), 0);
     assert!(
-        message.contains("stop.gain was 90 and is 80: it decides from step 21 on"),
+        message.contains("stop.gain was 90 and is 80; this applies from step 21 on"),
         "{message}"
     );
     refused(&format!("{again} stop.views=0"), 3, &["was made with stop.views = 1, not 0"]);
@@ -433,7 +433,7 @@ fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
     let (root, out) = (set.path().display(), set.path().join("run"));
     let (message, warned) = run(&format!("train {root} --out {} --steps 2", out.display()), 0);
     assert!(
-        message.contains("8 views") && warned.contains("2 as good as black"),
+        message.contains("8 views") && warned.contains("2 black, left out of training"),
         "{message} {warned}"
     );
     let log = fs::read_to_string(out.join("train.csv")).unwrap();
@@ -458,7 +458,7 @@ fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
     }
     fs::write(&path, list.to_string()).unwrap();
     let remarks = diagnosis_of(set.path()).remarks.join("; ");
-    assert!(remarks.contains("the same photograph") && remarks.contains("one spot"), "{remarks}");
+    assert!(remarks.contains("identical") && remarks.contains("one position"), "{remarks}");
 
     // One view and two.
     for count in [2, 1] {
@@ -468,7 +468,7 @@ fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
         assert_eq!(found.views.len(), count);
         let plan = Plan::new(&found, &TrainConfig::default(), MEMORY);
         assert_eq!(plan.sh_degree.value, 0);
-        let told = found.remarks.join("; ").contains("one photograph tells no depth");
+        let told = found.remarks.join("; ").contains("one photograph gives no depth");
         assert_eq!(told, count == 1);
     }
 }
@@ -482,7 +482,7 @@ fn a_plan_of_another_dataset_or_none_at_all_is_refused_in_one_line() {
     let train = format!("train {root} --out {} --steps 1 --plan {}", out.display(), plan.display());
     refused(&train, 3, &["plan.toml", "another dataset"]);
     fs::write(&plan, "steps = 4\n").unwrap();
-    refused(&train, 3, &["plan.toml", "is no plan"]);
+    refused(&train, 3, &["plan.toml", "is not a plan"]);
     fs::remove_file(&plan).unwrap();
     refused(&train, 3, &["plan.toml", "cannot be read"]);
     assert!(!out.exists());

@@ -243,9 +243,9 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
         let at = whole.windows(from.len()).position(|window| window == from.as_bytes()).unwrap();
         [&whole[..at], to.as_bytes(), &whole[at + from.len()..]].concat()
     };
-    refuses(&mut trainer, &whole[..whole.len() - 5], &["no whole checkpoint"]);
-    refuses(&mut trainer, b"", &["no whole checkpoint"]);
-    refuses(&mut trainer, &edited("checkpoint 1", "checkpoint 9"), &["is no `nightsplat"]);
+    refuses(&mut trainer, &whole[..whole.len() - 5], &["not an intact checkpoint"]);
+    refuses(&mut trainer, b"", &["not an intact checkpoint"]);
+    refuses(&mut trainer, &edited("checkpoint 1", "checkpoint 9"), &["is not a `nightsplat"]);
     refuses(&mut trainer, &edited("visit_counts", "visit_c0unts"), &["density.visit_counts"]);
     refuses(&mut trainer, &edited("first_moments", "first_m0ments"), &["gaussians.first_moments"]);
     refuses(&mut trainer, &edited("seed = 10", "seed = 11"), &["seed = 11, not 10", "--overwrite"]);

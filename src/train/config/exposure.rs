@@ -1,4 +1,4 @@
-//! What is learned of the training views' exposures.
+//! Settings of learned exposures.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -9,14 +9,14 @@ use crate::base::settings::{Rule, settings};
 use crate::loss::exposure::ExposureRates;
 use crate::{Error, Result};
 
-/// Whether something is learned.
+/// A switch.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum OnOff {
-    /// It is not there: no buffer, no kernel.
+    /// Off: no buffer, no kernel.
     #[default]
     Off,
-    /// It is.
+    /// On.
     On,
 }
 
@@ -27,7 +27,7 @@ impl FromStr for OnOff {
         match name {
             "off" => Ok(Self::Off),
             "on" => Ok(Self::On),
-            _ => Err(Error::Usage(format!("`{name}` is neither off nor on"))),
+            _ => Err(Error::Usage(format!("`{name}` is neither on nor off"))),
         }
     }
 }

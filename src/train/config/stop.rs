@@ -1,4 +1,4 @@
-//! When a run ends before its last step.
+//! Early stopping.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,37 +7,38 @@ use crate::base::settings::{Rule, settings};
 
 settings! {
 "stop."
-/// When a run, or a part of it, ends before its last step. Scores are against targets, never against references.
+/// Early stopping of a run or of a part of it. Scores are against targets, never against references.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StopConfig {
-    /// The number of training views that are held out, an eighth of them at most; 0: none, and no run ends early.
+    /// Hold out this many training views, an eighth of them at most; 0: none, and no run stops early.
     views: usize = 8 => Rule::COUNT, in "views";
-    /// The steps from one score of theirs to the next. A score that falls within 50 steps after a round of density control is
-    /// taken at the end of these.
+    /// Score them every N steps. A score due within 50 steps after a round of density control is taken at the end of
+    /// these.
     every: u64 = 250 => Rule::at_least(1), in "steps";
-    /// Once two scores in a row do not exceed the best before by this much, the run has converged: it settles and ends.
+    /// The run has converged once two scores in a row do not exceed the best before by this much; it then cools down
+    /// and ends.
     gain: f64 = 0.05 => Rule::POSITIVE_OR_0, in "dB";
-    /// A run that ends worse than its best score by more than this keeps the model of that score.
+    /// A run whose last score is below its best by more than this restores the model of its best.
     margin: f64 = 0.25 => Rule::POSITIVE_OR_0, in "dB";
-    /// Growth ends once four rounds of density control gain less than this for each doubling of the Gaussians; 0: it goes on
-    /// to its last step.
+    /// Growth ends once four rounds of density control gain less than this for each doubling of the Gaussians; 0:
+    /// never.
     growth_gain: f64 = 0.0 => Rule::POSITIVE_OR_0, in "dB";
-    /// What is done about a view whose loss or gradient is not finite: stop ends the run with an error that names step, view
-    /// and term, skip-view trains on that view no more.
+    /// A loss or gradient that is not finite: stop ends the run with an error that names step, view and term; skip-view
+    /// leaves the view out from then on.
     not_finite: NotFinite = NotFinite::Stop => Rule::OneOf(&["stop", "skip-view"]);
-    /// The SH degree rises no further, and falls back, once the one in use gains less than this; 0: it always rises.
+    /// The SH degree returns to the previous one, for good, once the one in use gains less than this; 0: never.
     degree_gain: f64 = 0.0 => Rule::POSITIVE_OR_0, in "dB";
 }
 }
 
-/// What is done about a view whose loss or gradient is NaN or infinite. The step that finds it changes nothing, either way.
+/// The treatment of a view whose loss or gradient is not finite. The step itself changes nothing in either case.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum NotFinite {
-    /// The run ends with an error that names step, view and term.
+    /// End the run with an error that names step, view and term.
     #[default]
     Stop,
-    /// The view is trained on no more.
+    /// Leave the view out from then on.
     SkipView,
 }
 
@@ -52,7 +53,7 @@ impl StopConfig {
         best(&scores[before..]) < best(&scores[..before]) + self.gain
     }
 
-    /// The first of the settings that a resumed run may change in which `other` differs, with both values.
+    /// The first setting that differs in `other` among those that a resumed run may change, with both values.
     pub(in crate::train) fn change(&self, other: &Self) -> Option<String> {
         let settings = [
             ("every", self.every as f64, other.every as f64),
@@ -65,7 +66,7 @@ impl StopConfig {
 }
 
 impl TrainConfig {
-    /// The length of the settling phase: that of the schedule, or a third of a run that is short for it.
+    /// The number of cooldown steps: the schedule's, or a third of a short run.
     pub(crate) fn effective_cooldown_steps(&self) -> u64 {
         self.schedule.cooldown_steps.min(self.steps / 3)
     }

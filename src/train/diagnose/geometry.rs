@@ -1,4 +1,4 @@
-//! What the cameras share: points, overlap, and how much brighter one shows a point than another.
+//! What the cameras share: points, overlap, and relative exposures.
 
 use glam::DVec2;
 use rayon::prelude::*;
@@ -10,30 +10,30 @@ use crate::photographs::image::{Image, linear_from_srgb};
 use crate::photographs::tone::{luminance, measurable};
 use crate::splats::scene::init;
 
-/// Random points in front of the cameras where the dataset has none.
+/// Random points in front of the cameras if the dataset has none.
 const RANDOM_POINTS: usize = 2000;
-/// More points tell no more of exposures.
+/// The most points used for exposures.
 const MAX_POINTS: usize = 20_000;
-/// A point's brightness is the mean over a square of pixels that reaches so far from its middle.
+/// The brightness of a point is the mean over a square with this half-width, in pixels.
 const REACH: i64 = 2;
-/// A view with fewer shared points has no known exposure.
+/// The fewest shared points for an exposure.
 const MIN_SHARED: usize = 12;
 
 /// What the cameras of the training views share.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Shared {
-    /// How many points each view shows: those that it helped to triangulate, where the dataset says.
+    /// The number of points of each view: those it helped to triangulate, if the dataset tells.
     pub(super) points: Vec<usize>,
-    /// Of what each view shows, the mean fraction of the other views that look at it too.
+    /// For each view, the mean fraction of the other views that see the points it shows.
     pub(super) overlaps: Vec<f64>,
-    /// The mean number of views that look at a point.
+    /// The mean number of views of a point.
     pub(super) views_per_point: f64,
-    /// log2 of how much more light each view shows of what it shares with others, mean 0; none where it shares too little.
+    /// log2 exposure of each view at shared points, with mean 0; `None` if it shares too few.
     pub(super) exposures: Vec<Option<f64>>,
 }
 
 impl Shared {
-    /// Of training views, in their order.
+    /// For training views, in their order.
     ///
     /// # Errors
     /// A photograph can no longer be read.
@@ -71,7 +71,7 @@ impl Shared {
         counted.iter().flatten().for_each(|&place| counts[place] += 1);
         let visible = seen.iter().map(Vec::len).filter(|&count| count > 0);
         let (sum, visible) = visible.fold((0, 0), |(sum, n), count| (sum + count, n + 1));
-        // Random points are not the dataset's.
+        // Random points are not points of the dataset.
         let each = if dataset.points.is_empty() { 0 } else { stride };
         Ok(Self {
             points: counts.into_iter().map(|count| each * count).collect(),
@@ -86,7 +86,7 @@ impl Shared {
     }
 }
 
-/// The places of the training views, ascending by index, that triangulated a point.
+/// The positions, in `views`, of those that triangulated a point; ascending.
 fn track(point: &Point, views: &[(usize, &View)]) -> Vec<usize> {
     let place =
         |&view: &u32| views.binary_search_by_key(&(view as usize), |(index, _)| *index).ok();
@@ -99,7 +99,7 @@ fn pixel(camera: &Camera, point: &Point) -> Option<DVec2> {
     (pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all()).then_some(pixel)
 }
 
-/// Of each point (view, log2 of the linear luminance around it), where it is neither black nor white.
+/// For each point, (view, log2 of the linear luminance around it) where it is neither black nor white.
 fn brightness(
     points: &[&Point],
     seen: &[Vec<usize>],
@@ -110,7 +110,7 @@ fn brightness(
         places.iter().for_each(|&place| of_view[place].push(point));
     }
     let mut lights = vec![vec![]; points.len()];
-    // One photograph after another: they may have to be read anew.
+    // One photograph at a time, since they may have to be read again.
     for (place, ((_, view), shown)) in views.iter().zip(of_view).enumerate() {
         let Some(image) = view.loaded()? else { continue };
         for point in shown {
@@ -142,8 +142,8 @@ fn light_around(image: &Image, at: DVec2) -> Option<f64> {
     (mean > 0.0).then_some(mean)
 }
 
-/// Alternating medians: a point's brightness over its views, a view's exposure over its points. Of all points the brighter
-/// half counts, judged without the exposures: noise and whole codes distort the logarithm of little light.
+/// Alternating medians: a point's brightness over its views, a view's exposure over its points. Only the brighter half
+/// of the points counts, judged without the exposures: noise and quantisation distort the logarithm of dim light.
 fn exposures(points: &[Vec<(usize, f64)>], view_count: usize) -> Vec<Option<f64>> {
     const ROUNDS: usize = 20;
     let mut exposures = vec![Some(0.0); view_count];
@@ -153,7 +153,7 @@ fn exposures(points: &[Vec<(usize, f64)>], view_count: usize) -> Vec<Option<f64>
             let own = point.iter().filter_map(|&(view, light)| Some(light - exposures[view]?));
             median(own.collect())
         };
-        // Once the exposures are about right, they say which points are bright.
+        // Approximate exposures tell which points are bright.
         if round == ROUNDS / 2 {
             let typical = median(points.iter().filter_map(|point| level(point)).collect());
             kept.retain(|point| level(point) >= typical);

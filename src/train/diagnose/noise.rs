@@ -1,43 +1,43 @@
-//! Sensor noise, from the flat parts of photographs.
+//! Estimates sensor noise from the flat parts of photographs.
 //!
 //! ```text
 //! variance = gain * signal + read^2        in linear light, of one channel of one pixel
 //! ```
 //!
-//! Shot noise is proportional to the light and read noise is not: that is a line in linear light, and no simple law in
-//! encoded values, so photographs are linearised first. What encoding them to whole codes adds is known and taken off.
+//! The variance of shot noise is proportional to the light, that of read noise is constant: a line in linear light, so
+//! photographs are linearised first. The variance of quantisation is known and subtracted.
 //!
-//! Second differences along rows see no brightness and no gradient; of white noise their mean square is six variances.
-//! How flat a patch is say the means of 2x2 pixels: they know next to nothing of what the second differences measure, so
-//! that choosing the flattest patches does not make their noise smaller.
+//! Second differences along rows cancel brightness and gradients; for white noise their mean square is six variances.
+//! The flatness of a patch is judged by the means of 2x2 pixels, which are nearly independent of the second
+//! differences, so that choosing flat patches does not bias their noise.
 
 use serde::Serialize;
 
-/// Side of a patch, pixels.
+/// Side of a patch in pixels.
 const SIDE: usize = 8;
 /// The fraction of the patches of one brightness that count as flat.
 const FLAT: f64 = 0.25;
-/// Bins of brightness that the line goes through.
+/// Bins of brightness for the fit of the line.
 const BINS: usize = 24;
-/// A bin with fewer flat patches says nothing.
+/// The fewest flat patches of a bin.
 const MIN_PATCHES: usize = 12;
-/// Patches with less than this fraction of the variance that whole codes add are flat to the code:
-/// compression, or too few codes, took their noise.
+/// Patches with less than this fraction of the quantisation's variance have lost their noise to compression or coarse
+/// codes.
 const DEAD: f64 = 0.25;
-/// Where more values than this are black, noise is cut off at zero and looks smaller than it is.
+/// Above this fraction of black values, noise is clipped at zero and underestimated.
 const MAX_ZEROS: f64 = 0.002;
 
-/// The noise of a channel in linear light, white at 1.
+/// The noise of a channel in linear light; white is 1.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Noise {
-    /// Variance per signal: 1 / the electrons of a white pixel, where shot noise is all that there is.
+    /// Variance per signal; for pure shot noise, 1 / the electrons of a white pixel.
     pub gain: f64,
-    /// Standard deviation without light.
+    /// Standard deviation in the dark.
     pub read: f64,
 }
 
 impl Noise {
-    /// The standard deviation at a signal, both in linear light.
+    /// The standard deviation at a signal, in linear light.
     pub fn deviation(&self, signal: f64) -> f64 {
         (self.gain * signal.max(0.0) + self.read * self.read).sqrt()
     }
@@ -46,20 +46,20 @@ impl Noise {
 /// A small square of one channel.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Patch {
-    /// Its mean, linear light.
+    /// Its mean, in linear light.
     signal: f64,
     /// The variance of its noise, if it is flat.
     variance: f64,
     /// The variance of the means of 2x2 pixels.
     texture: f64,
-    /// The variance that whole codes add.
+    /// The variance of quantisation.
     quantization: f64,
     /// The fraction of its values that are 0.
     zeros: f64,
 }
 
-/// The patches of a plane of linear values, a row of `width` after the other; whole codes are `step` apart as encoded
-/// values. Every patch where there are few, an even choice of them where there are many.
+/// The patches of a plane of linear values in rows of `width`; codes are `step` apart in encoded values. All patches if
+/// there are few, else an even selection.
 pub(super) fn patches(plane: &[f32], width: usize, step: f64) -> Vec<Patch> {
     const MOST: usize = 12_000;
     let (columns, rows) = (width / SIDE, plane.len() / width.max(1) / SIDE);
@@ -70,7 +70,7 @@ pub(super) fn patches(plane: &[f32], width: usize, step: f64) -> Vec<Patch> {
         let row = |y: usize| &plane[first + y * width..][..SIDE];
         patch(std::array::from_fn(row), step)
     };
-    // A patch that reaches white is cut off there.
+    // A patch that reaches white is clipped.
     places.map(patch).filter(|patch| patch.signal.is_finite()).collect()
 }
 
@@ -106,21 +106,21 @@ pub(super) fn slope(linear: f64) -> f64 {
     }
 }
 
-/// The line through the flat patches; none where there are too few.
+/// Fits the line to the flat patches; `None` if there are too few.
 pub(super) fn fit(mut patches: Vec<Patch>) -> Option<Noise> {
-    // A plane that is not in codes has no dead patches.
+    // A plane without quantisation has no dead patches.
     patches.retain(|patch| patch.variance >= DEAD * patch.quantization);
     patches.sort_unstable_by(|a, b| a.signal.total_cmp(&b.signal));
     let per_bin = patches.len().div_ceil(BINS).max((MIN_PATCHES as f64 / FLAT) as usize);
     let mut bins: Vec<Bin> = patches.chunks_mut(per_bin).filter_map(Bin::of).collect();
-    // Where noise is cut off everywhere, what is left of it is the best that there is.
+    // If noise is clipped in every bin, use what is left.
     if bins.iter().any(|bin| bin.zeros <= MAX_ZEROS) {
         bins.retain(|bin| bin.zeros <= MAX_ZEROS);
     }
     (!bins.is_empty()).then(|| line(&bins))
 }
 
-/// What patches of one brightness say.
+/// The patches of one brightness.
 struct Bin {
     signal: f64,
     variance: f64,
@@ -144,8 +144,8 @@ impl Bin {
     }
 }
 
-/// Least squares with both coefficients at least 0. A variance is known to a fraction of itself, so each bin weighs its
-/// patches over the square of what the line has there.
+/// Least squares with non-negative coefficients. The error of a variance is proportional to it, so each bin is weighted
+/// by its patches over the square of the line's value.
 fn line(bins: &[Bin]) -> Noise {
     const ROUNDS: usize = 8;
     let mean = bins.iter().map(|bin| bin.variance.max(0.0)).sum::<f64>() / bins.len() as f64;
@@ -161,7 +161,7 @@ fn line(bins: &[Bin]) -> Noise {
         let [ones, s, ss, v, sv] = sums;
         let determinant = ones * ss - s * s;
         (gain, square) = ((ones * sv - s * v) / determinant, (ss * v - s * sv) / determinant);
-        // One brightness alone tells no slope.
+        // A single brightness has no slope.
         if !(determinant > 1e-9 * ones * ss && square >= 0.0) {
             (gain, square) = (sv / ss, 0.0);
         } else if gain < 0.0 {

@@ -1,16 +1,16 @@
-//! What one photograph is, as it is stored: brightness, code values, noise, blur.
+//! Measurements of one photograph, as stored: brightness, code values, noise, blur.
 
 use super::noise::{self, Noise, Patch};
 use super::sharpness;
 use crate::photographs::image::{Image, linear_from_srgb};
 use crate::photographs::tone::{Statistics, luminance, measurable};
 
-/// The longest side of what the blur is measured in, pixels: the middle of a larger photograph.
+/// Blur is measured in the middle of the photograph, in at most this many pixels each way.
 const BLUR_SIDE: u32 = 640;
-/// Illumination is what large regions have in common: so many columns and rows of them.
+/// Columns and rows of the regions whose light is compared.
 const REGIONS: [usize; 2] = [8, 6];
 
-/// What is measured of one photograph; fractions are over the values of all channels.
+/// Measurements of one photograph; fractions are over the values of all channels.
 #[derive(Clone, Debug)]
 pub(super) struct PhotographStatistics {
     pub(super) statistics: Statistics,
@@ -18,19 +18,19 @@ pub(super) struct PhotographStatistics {
     pub(super) light: f64,
     pub(super) clipped_fraction: f64,
     pub(super) zero_fraction: f64,
-    /// Different values, of 2 to the `bits`.
+    /// The number of different values, of 2^`bits`.
     pub(super) code_values: usize,
     pub(super) noise: Option<Noise>,
     pub(super) patches: Vec<Patch>,
     pub(super) blur: Option<f64>,
-    /// Standard deviation over large regions of log2 of their linear luminance.
+    /// The standard deviation of log2 linear luminance over large regions.
     pub(super) unevenness: f64,
-    /// Of the pixels.
+    /// A checksum of the pixels.
     pub(super) checksum: u64,
 }
 
 impl PhotographStatistics {
-    /// `counted` are the values of the pixels that count.
+    /// Measures an image; `counted` holds the values of its unmasked pixels.
     pub(super) fn of(image: &Image, counted: &[f32]) -> Self {
         let values = counted.len().max(1) as f64;
         let fraction = |is: fn(f32) -> bool| {
@@ -61,7 +61,7 @@ impl PhotographStatistics {
 /// The planes in linear light.
 struct Linear {
     planes: Vec<f32>,
-    /// Between two codes, as encoded values; 0 of a float image.
+    /// The step between two codes, in encoded values; 0 for a float image.
     step: f64,
 }
 
@@ -85,7 +85,7 @@ impl Linear {
     }
 }
 
-/// How many different values there are, as 16-bit codes.
+/// The number of different values, as 16-bit codes.
 fn code_values(data: &[f32]) -> usize {
     let mut used = vec![false; 1 << 16];
     for &value in data {
@@ -114,7 +114,7 @@ fn blur(image: &Image) -> Option<f64> {
     sharpness::blur(&middle, width as usize)
 }
 
-/// The standard deviation over large regions of log2 of their mean; 0 where all is black.
+/// The standard deviation of log2 of the mean over large regions; 0 if all is black.
 fn unevenness(luminance: &[f32], width: usize) -> f64 {
     let height = luminance.len() / width.max(1);
     let [columns, rows] = REGIONS;
@@ -127,7 +127,7 @@ fn unevenness(luminance: &[f32], width: usize) -> f64 {
     }
     let means: Vec<f64> = regions.iter().map(|&(sum, count)| sum / f64::max(count, 1.0)).collect();
     let whole = means.iter().sum::<f64>() / means.len() as f64;
-    // A black corner is no light source: what is below a thousandth of the mean counts as that.
+    // Regions are clamped at a thousandth of the mean, so that a black corner does not dominate.
     let logs: Vec<f64> = means.iter().map(|mean| mean.max(1e-3 * whole).log2()).collect();
     super::deviation(logs.iter().copied()).filter(|_| whole > 0.0).unwrap_or(0.0)
 }

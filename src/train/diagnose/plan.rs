@@ -1,4 +1,4 @@
-//! What the model of a capture has, and why: what `diagnose` prints, `train` goes by and `plan.toml` holds.
+//! The plan of a capture's model with its reasons, which `diagnose` prints, `train` follows and `plan.toml` holds.
 
 use std::path::Path;
 
@@ -14,40 +14,39 @@ use crate::train::TrainConfig;
 use crate::train::layers::{Origin, SettingsLayer};
 use crate::{Error, Result};
 
-/// Targets less than this many times brighter than their photographs are the photographs: the rule of `--curve auto`.
+/// Below this brightening, targets are the photographs themselves, as in `--curve auto`.
 const MIN_BRIGHTENING: f64 = 1.5;
-/// Targets whose exposures are spread by more stops are worth learning them. A chair of which the views differ by 1.2 stops,
-/// all but .02 of which the curve takes away, lost .4 dB by it.
+/// Exposures are learned from this spread of the targets, in stops. On a set with 1.2 stops between its photographs and
+/// .02 between its targets, learning lost .4 dB.
 const MIN_SPREAD: f64 = 0.3;
-/// From this much noise in the average over the views, of encoded values, a denoiser pays (docs/benchmarks.md).
+/// A denoiser pays from this noise in the average over the views, in encoded values (docs/benchmarks.md).
 const MIN_NOISE: f64 = 0.01;
-/// Light that varies by more stops between large regions is worth an illumination of its own. A hall with one bright window
-/// has 2.6; up to 1 the network bought .2 dB at most for two to four times the time.
+/// An illumination is learned from this variation of light between large regions, in stops. A hall with one bright
+/// window has 2.6; up to 1, the network gained .2 dB at most for two to four times the time.
 const MIN_UNEVENNESS: f64 = 3.0;
-/// Each SH coefficient of a channel is to be seen by so many views.
+/// Views wanted for each SH coefficient of a channel.
 const VIEWS_PER_COEFFICIENT: f64 = 2.0;
-/// A degree that the schedule reaches later in the run does not settle.
+/// A degree that is reached after this fraction of the steps is not worth its memory.
 const LATEST_DEGREE: f64 = 0.8;
-/// Pixels of the training views that a Gaussian is to stand for at least. Leaves that move took 9 where growth was free, a
-/// chair 80.
+/// The fewest pixels of the training views for each Gaussian. With free growth, moving leaves had 9, a chair 80.
 const PIXELS_PER_GAUSSIAN: f64 = 8.0;
 /// The fraction of the device's memory that Gaussians may take.
 const MEMORY_SHARE: f64 = 0.5;
-/// Buffers as long as the parameters: themselves, gradients, two moments; with headroom.
+/// Buffers of the parameters' size: parameters, gradients, two moments; with headroom.
 const COPIES: f64 = 4.0 * 1.5;
 
-/// A part of the model: whether it is on, and why.
+/// The decision on a part of the model, with its reason.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlannedPart {
     /// Whether the model has it.
     pub on: bool,
-    /// The reason with its figure, a sentence.
+    /// The reason with its figure, as a sentence.
     #[serde(default)]
     pub why: String,
 }
 
-/// A number of the model, and why it is that.
+/// The decision on a number of the model, with its reason.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlannedNumber {
@@ -58,20 +57,20 @@ pub struct PlannedNumber {
     pub why: String,
 }
 
-/// Which dataset a plan is for: its training views by name and loaded size.
+/// The dataset that a plan is for: its training views by name and loaded size.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlannedViews {
-    /// How many.
+    /// The number of training views.
     pub views: usize,
     /// Width and height of the first.
     pub size: [u32; 2],
-    /// Of all names and sizes.
+    /// A hash of all names and sizes.
     pub fingerprint: String,
 }
 
 impl PlannedViews {
-    /// The dataset's own.
+    /// Those of a dataset.
     pub fn of(dataset: &Dataset) -> Self {
         let views: Vec<_> = dataset.views.iter().filter(|view| view.is_for_training()).collect();
         let line =
@@ -88,18 +87,18 @@ impl PlannedViews {
     }
 }
 
-/// What the model of a capture has, and why.
+/// The plan of a capture's model, with its reasons.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Plan {
-    /// Training views that are left out, by name.
+    /// The names of training views that are left out.
     #[serde(default)]
     pub left_out: Vec<String>,
-    /// Which dataset it is for.
+    /// The dataset that it is for.
     pub dataset: PlannedViews,
-    /// A tone curve makes the targets; else the photographs are.
+    /// Whether a tone curve makes the targets; else they are the photographs.
     pub curve: PlannedPart,
-    /// Each view's exposure is learned.
+    /// Whether each view's exposure is learned.
     pub exposure: PlannedPart,
     /// [`Part::Denoiser`](crate::train::Part::Denoiser).
     pub denoiser: PlannedPart,
@@ -111,13 +110,13 @@ pub struct Plan {
     pub depth: PlannedPart,
     /// Highest degree of the spherical harmonics.
     pub sh_degree: PlannedNumber,
-    /// Density control stops growing here.
+    /// The largest number of Gaussians.
     pub max_gaussians: PlannedNumber,
 }
 
 impl Plan {
-    /// The plan for a capture under a configuration, whose steps, schedule and limits it keeps to, on a device with so many
-    /// bytes of memory.
+    /// Plans the model of a capture, within the steps, schedule and limits of a configuration, for a device with
+    /// `memory` bytes.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn new(diagnosis: &Diagnosis, config: &TrainConfig, memory: u64) -> Self {
         let scene = &diagnosis.scene;
@@ -139,10 +138,10 @@ impl Plan {
         }
     }
 
-    /// What the plan decides, as settings.
+    /// The plan's decisions as settings.
     ///
     /// # Errors
-    /// A number is out of its range, in a plan that was written by hand.
+    /// A number of a plan written by hand is out of range.
     pub(in crate::train) fn layer(&self) -> Result<SettingsLayer> {
         let mut layer = SettingsLayer::default();
         let mut say = |key: &str, value: Value| layer.push(key, value, Origin::Plan);
@@ -162,7 +161,7 @@ impl Plan {
         Ok(layer)
     }
 
-    /// Every decision: its name, what was decided, and why.
+    /// Name, decision and reason of every item.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn decisions(&self) -> Vec<(&'static str, String, &str)> {
         let switch = |name, switch: &'_ PlannedPart| {
@@ -186,7 +185,7 @@ impl Plan {
     /// The plan as TOML.
     ///
     /// # Errors
-    /// None for a plan that was made or read.
+    /// Never for a plan that was made or read.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn to_toml(&self) -> Result<String> {
         const HEAD: &str = "# What this capture needs, and why. Change what you know better and pass it to \
@@ -198,7 +197,7 @@ impl Plan {
     /// Reads the plan of a dataset.
     ///
     /// # Errors
-    /// [`Error::Input`]: the file cannot be read, holds no plan, or that of another dataset.
+    /// [`Error::Input`]: the file cannot be read, holds no plan, or one of another dataset.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
         let plan = Self::read(path)?;
@@ -206,7 +205,7 @@ impl Plan {
         if plan.dataset != own {
             let (of, is) = (plan.dataset.described(), own.described());
             let problem = format!(
-                "is the plan of another dataset ({of}; {} has {is}, by other names or sizes); diagnose this one",
+                "is the plan of another dataset ({of}; {} has {is}, with other names or sizes); diagnose this one",
                 dataset.root.display()
             );
             return Err(Error::input(path, problem));
@@ -214,7 +213,7 @@ impl Plan {
         Ok(plan)
     }
 
-    /// Reads a plan, of whichever dataset.
+    /// Reads a plan of any dataset.
     ///
     /// # Errors
     /// [`Error::Input`]: the file cannot be read or holds no plan.
@@ -226,7 +225,7 @@ impl Plan {
             let message = error.message().lines().next().unwrap_or_default();
             Error::input(
                 path,
-                format!("is no plan: {message}{place}; make one with `nightsplat diagnose`"),
+                format!("is not a plan: {message}{place}; make one with `nightsplat diagnose`"),
             )
         })
     }
@@ -237,43 +236,40 @@ fn curve(scene: &SceneDiagnosis) -> PlannedPart {
     let on = *brightening >= MIN_BRIGHTENING;
     let verdict = if on { "dark" } else { "well lit" };
     let why = format!(
-        "{verdict}: a target is {brightening:.1} times as bright as its photograph (mean luminance {mean_luminance:.3}, a curve from {MIN_BRIGHTENING})"
+        "{verdict}: targets are {brightening:.1} times as bright as the photographs (mean luminance \
+         {mean_luminance:.3}; threshold {MIN_BRIGHTENING})"
     );
     PlannedPart { on, why }
 }
 
-/// How far the exposures of the targets lie apart.
+/// The spread of the targets' exposures.
 struct Spread {
-    /// Enough to be worth learning them.
+    /// Whether the spread is wide enough to learn exposures.
     is_wide: bool,
     found: String,
 }
 
 impl Spread {
-    /// A curve that follows each view takes most of the photographs' spread away.
+    /// A curve that follows each view compensates most of the photographs' spread.
     fn of(scene: &SceneDiagnosis, follows_views: bool, views: usize) -> Self {
         let SceneDiagnosis { exposure_spread: spread, exposure_share: share, .. } = *scene;
         let left = if follows_views { (1.0 - share) * spread } else { spread };
-        let by = if scene.spread_is_measured {
-            "at shared points"
-        } else {
-            "of the gain each view asks for"
-        };
+        let by = if scene.spread_is_measured { "at shared points" } else { "by the views' gains" };
         Self {
             is_wide: left >= MIN_SPREAD && views > 2,
-            found: format!(
-                "exposures are spread by {spread:.2} stops {by}, of which the targets keep {left:.2}"
-            ),
+            found: format!("exposures spread by {spread:.2} stops {by}, {left:.2} in the targets"),
         }
     }
 
     fn exposure(&self) -> PlannedPart {
-        PlannedPart { on: self.is_wide, why: format!("{} (learned from {MIN_SPREAD})", self.found) }
+        PlannedPart { on: self.is_wide, why: format!("{} (threshold {MIN_SPREAD})", self.found) }
     }
 
     fn structure(&self, scene: &SceneDiagnosis) -> PlannedPart {
         let on = self.is_wide && scene.target_noise < MIN_NOISE;
-        PlannedPart { on, why: format!("{}: edges are the same in all of them", self.found) }
+        let why =
+            format!("{} (threshold {MIN_SPREAD}); edges do not depend on exposure", self.found);
+        PlannedPart { on, why }
     }
 }
 
@@ -281,18 +277,18 @@ fn denoiser(scene: &SceneDiagnosis) -> PlannedPart {
     let SceneDiagnosis { target_noise, views_per_point, .. } = scene;
     let on = *target_noise >= MIN_NOISE;
     let why = format!(
-        "the average of {views_per_point:.0} views leaves noise of {target_noise:.3} in the target (a network from {MIN_NOISE})"
+        "averaging {views_per_point:.0} views leaves noise of {target_noise:.3} in the targets (threshold {MIN_NOISE})"
     );
     PlannedPart { on, why }
 }
 
 fn tonemapper(scene: &SceneDiagnosis, learns_exposures: bool) -> PlannedPart {
     let unevenness = scene.unevenness;
-    // A learned exposure does not describe the dark photographs, to which the tonemapper holds the model.
+    // The tonemapper models the dark photographs, which a learned exposure of targets does not describe.
     let on =
         unevenness >= MIN_UNEVENNESS && scene.brightening >= MIN_BRIGHTENING && !learns_exposures;
     let why = format!(
-        "light varies by {unevenness:.1} stops between large regions (an illumination of its own from {MIN_UNEVENNESS}, in dark sets)"
+        "light varies by {unevenness:.1} stops between large regions (threshold {MIN_UNEVENNESS}, dark sets only)"
     );
     PlannedPart { on, why }
 }
@@ -302,7 +298,7 @@ fn depth(diagnosis: &Diagnosis) -> PlannedPart {
     PlannedPart { on: maps > 0, why: format!("{maps} of {views} training views have a depth map") }
 }
 
-/// The highest degree whose coefficients are seen often enough and trained long enough.
+/// The highest degree whose coefficients have enough views and steps.
 fn sh_degree(scene: &SceneDiagnosis, config: &TrainConfig) -> PlannedNumber {
     let seen = (scene.views_per_point / VIEWS_PER_COEFFICIENT).sqrt() - 1.0;
     let seen = seen.max(0.0) as u32;
@@ -312,11 +308,11 @@ fn sh_degree(scene: &SceneDiagnosis, config: &TrainConfig) -> PlannedNumber {
     let why = if config.sh_degree < seen.min(trained) {
         "the preset's or the configuration's limit".to_owned()
     } else if trained < seen.min(config.sh_degree) {
-        format!("{} steps are too few to train a higher one", config.steps)
+        format!("{} steps are too few for a higher one", config.steps)
     } else {
         let views = scene.views_per_point;
         format!(
-            "a point is seen by {views:.0} views, {VIEWS_PER_COEFFICIENT} are wanted for each of the (degree + 1)^2 coefficients"
+            "a point is seen by {views:.0} views; each of the (degree + 1)^2 coefficients needs {VIEWS_PER_COEFFICIENT}"
         )
     };
     PlannedNumber { value: value.into(), why }
@@ -328,7 +324,7 @@ fn max_gaussians(
     sh_degree: u64,
     memory: u64,
 ) -> PlannedNumber {
-    // Features are 8 floats at most, which the headroom covers.
+    // Features are at most 8 floats, within the headroom.
     let shape = Shape { sh_degree: sh_degree as u32, features: Features::NONE };
     let pixels = diagnosis.pixels as f64;
     let wanted = (pixels / PIXELS_PER_GAUSSIAN).max(diagnosis.scene.points as f64);
@@ -339,14 +335,14 @@ fn max_gaussians(
         "the preset's or the configuration's limit".to_owned()
     } else if fitting < wanted {
         let gib = memory as f64 / f64::from(1 << 30);
-        format!("half of the device's {gib:.1} GiB at {bytes:.0} bytes each")
+        format!("half of the device's {gib:.1} GiB, at {bytes:.0} bytes each")
     } else {
-        format!("one for {PIXELS_PER_GAUSSIAN} of the {pixels:.0} pixels to train on")
+        format!("one for every {PIXELS_PER_GAUSSIAN} of the {pixels:.0} training pixels")
     };
     PlannedNumber { value: wanted.min(fitting).min(limit).round().max(1.0) as u64, why }
 }
 
-/// The hash FNV-1a, which plans hold: equal bytes have equal hashes, on every machine.
+/// The FNV-1a hash of plans, the same on every machine.
 fn fnv1a(bytes: impl Iterator<Item = u64>) -> u64 {
     bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ byte).wrapping_mul(0x0100_0000_01b3))
 }

@@ -1,20 +1,20 @@
-//! How wide a photograph's edges are.
+//! The blur of a photograph's edges.
 //!
-//! A step edge blurred by sigma has a gradient of 1 / sigma at its middle; blurred once more by one known width s it has
-//! 1 / sqrt(sigma^2 + s^2). The ratio of both gradients R gives sigma = s / sqrt(R^2 - 1) (Zhuo and Sim 2011). It is taken
-//! at the strongest gradients, the median of them, behind a first blur that keeps noise out and is taken off again. Which are
-//! strong says the second blur: choosing by the first would choose those that noise makes stronger.
+//! A step edge blurred by sigma has a gradient of 1 / sigma at its middle; blurred once more by one known width s it
+//! has 1 / sqrt(sigma^2 + s^2). The ratio of both gradients R gives sigma = s / sqrt(R^2 - 1) (Zhuo and Sim 2011). The
+//! estimate is the median over the strongest gradients, after a first blur against noise, whose variance is subtracted.
+//! The second blur selects the gradients, since the first would favour those that noise raises.
 
-/// Standard deviations of the first blur and of the second, pixels.
+/// Standard deviations of the first and the second blur, in pixels.
 const FIRST: f64 = 1.0;
 const SECOND: f64 = 1.5;
-/// The variance of what a gradient is taken over, the difference of the pixels on both sides: a box two pixels wide.
+/// The variance of the gradient's support, a box two pixels wide.
 const DIFFERENCE: f64 = 1.0 / 3.0;
 /// The fraction of the pixels that count as edges.
 const EDGES: f64 = 0.01;
 
-/// The blur of the edges of a luminance plane as the standard deviation of a Gaussian, in pixels; none where there is
-/// no edge. A sharp photograph has about half a pixel.
+/// The blur of the edges of a luminance plane as the standard deviation of a Gaussian, in pixels; `None` without edges.
+/// A sharp photograph has about half a pixel.
 pub(super) fn blur(luminance: &[f32], width: usize) -> Option<f64> {
     let height = luminance.len() / width.max(1);
     if width.min(height) < 16 {
@@ -46,7 +46,7 @@ pub(super) fn blur(luminance: &[f32], width: usize) -> Option<f64> {
     Some(variance.max(0.0).sqrt())
 }
 
-/// A Gaussian blur; beyond the border the edge goes on.
+/// A Gaussian blur with clamped borders.
 fn blurred(plane: &[f32], width: usize, sigma: f64) -> Vec<f32> {
     let reach = (3.0 * sigma).ceil() as isize;
     let mut kernel: Vec<f32> =

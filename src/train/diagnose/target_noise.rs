@@ -1,10 +1,10 @@
 //! Noise as it appears in a target: of the sensor, of whole codes and of JPEG together, under the tone curve.
 //!
-//! What JPEG and whole codes leave of dark photographs is flat to the code or blotched: second differences see nothing of it,
-//! and the tone curve multiplies it. So a part of the photograph is tone-mapped, and what a patch deviates from the plane
-//! through it by is taken, of the luminance Y and of the colour differences R - Y and B - Y. A patch is wider than the 16
-//! pixels that one chroma block of JPEG covers. Of the patches of middle brightness, half show texture, which is mostly grey:
-//! the luminance is that of the first quartile, the chroma that of the median.
+//! What JPEG and whole codes leave of dark photographs is flat to the code or blotched: second differences see nothing
+//! of it, and the tone curve multiplies it. So a part of the photograph is tone-mapped, and what a patch deviates from
+//! the plane through it by is taken, of the luminance Y and of the colour differences R - Y and B - Y. A patch is wider
+//! than the 16 pixels that one chroma block of JPEG covers. Of the patches of middle brightness, half show texture,
+//! which is mostly grey: the luminance is that of the first quartile, the chroma that of the median.
 
 use serde::Serialize;
 
@@ -38,8 +38,8 @@ impl TargetNoise {
     }
 }
 
-/// The noise in the target of a photograph under the automatic curve that its own exposure asks for; `None` of one that is
-/// smaller than a patch.
+/// The noise in the target of a photograph under the automatic curve that its own exposure asks for; `None` of one that
+/// is smaller than a patch.
 pub(super) fn target_noise(image: &Image, exposure: &Exposure) -> Option<TargetNoise> {
     let (columns, rows) = (image.width / SIDE, image.height / SIDE);
     let step = (columns * rows).div_ceil(MOST).max(1) as usize;
