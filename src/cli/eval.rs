@@ -52,7 +52,7 @@ pub struct EvalArgs {
     pub device: Option<DeviceChoice>,
 }
 
-/// [`Range`] on the command line.
+/// The range of LPIPS inputs on the command line.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum LpipsRange {
     /// [-1, 1], as LPIPS was trained: `normalize=True` in lpips and torchmetrics, gsplat's AlexNet
