@@ -58,6 +58,7 @@ pub fn is_same_file(a: &Path, b: &Path) -> bool {
 ///
 /// # Errors
 /// [`Error::Output`] if not.
+#[cfg(feature = "io")]
 pub fn check_writable(path: &Path) -> Result<()> {
     let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let parent = absolute.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
