@@ -1,7 +1,7 @@
 //! How time and memory grow: `cargo run --release --example growth -- [WIDTH HEIGHT GAUSSIANS]`.
 //!
 //! One quantity changes at a time: Gaussians, pixels and channels of the scene of `nightsplat bench` (512 384 20000
-//! where nothing else is said), photographs and points of a capture. Of each value it prints milliseconds and the most
+//! by default), photographs and points of a capture. Of each value it prints milliseconds and the most
 //! bytes of device memory, and of each quantity the exponents of the power that fits them.
 
 use std::error::Error as StdError;

@@ -18,7 +18,7 @@
 //! d_weight(M out, N in) of tap t += d_target(M out, K pixels) input_t(K pixels, N in) for every K pixels of every row
 //! of a strip, both as `pack_map` has them. A subgroup owns BLOCKS matrices of output channels by one of input
 //! channels, for all nine taps, and slides a window of three rows down K columns after K columns: a matrix of input is
-//! loaded once. What rounding a factor costs is said in `pack_map`. Biases are summed in single precision. Reference:
+//! loaded once. `pack_map` states the rounding error. Biases are summed in single precision. Reference:
 //! `src/reference/conv3x3_weight_gradient_half.rs`.
 
 layout(local_size_x_id = 100) in;

@@ -141,15 +141,10 @@ fn holes(
         FinishedRun::open(run, Some(&args.dataset), args.device.as_ref())?;
     let mut residual_transmittances = BTreeMap::new();
     for view in &dataset.views {
-        let residual_transmittance = ResidualTransmittance::of(&model_renderer.render(view)?, view);
-        residual_transmittances.extend(
-            residual_transmittance
-                .map(|residual_transmittance| (view.name.clone(), residual_transmittance)),
-        );
+        let own = ResidualTransmittance::of(&model_renderer.render(view)?, view);
+        residual_transmittances.extend(own.map(|own| (view.name.clone(), own)));
     }
-    let views = residual_transmittances
-        .iter()
-        .map(|(name, residual_transmittance)| (name.as_str(), *residual_transmittance));
+    let views = residual_transmittances.iter().map(|(name, own)| (name.as_str(), *own));
     let healthy = || {
         let mean = ResidualTransmittance::mean(residual_transmittances.values().copied())
             .map_or(0.0, |own| own.mean);

@@ -20,7 +20,7 @@ use crate::train::OnOff;
 ///
 /// Renders every test view that has a reference image in normal light and compares the two at 8 bits: PSNR over all
 /// channels, the mean of the three channels' PSNRs (as in the paper's code), and SSIM. Without references, each view
-/// is compared with its own pseudo-GT, and the output says so: such a score tells how well the model fits its
+/// is compared with its own pseudo-GT, which the output states: such a score tells how well the model fits its
 /// targets, not how good they are. An interrupted run is scored at its last checkpoint.
 ///
 /// The residual transmittance is how much background each view shows: its mean and its 99th percentile. Against a black

@@ -34,7 +34,7 @@ pub(crate) use codec::PictureFile;
 #[cfg(all(feature = "io", test))]
 pub(crate) use codec::openings;
 #[cfg(feature = "io")]
-pub(crate) use colour::ColourTally;
+pub(crate) use colour::ColourCounts;
 #[cfg(feature = "io")]
 pub use exif::exposure_value;
 #[cfg(feature = "cli")]

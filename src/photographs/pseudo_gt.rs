@@ -4,7 +4,7 @@
 //! stored photograph, parameters -> pseudo_gt -> target
 //! ```
 //!
-//! Which parameters a photograph's statistics give is said on the host ([`ToneSettings::tone_mapping`]). A photograph beyond the
+//! The host derives the parameters from the statistics of the photograph ([`ToneSettings::tone_mapping`]). A photograph beyond the
 //! device's limits comes in tiles.
 
 mod encoded;

@@ -24,7 +24,7 @@ use serde::Serialize;
 
 use crate::camera::Camera;
 use crate::photographs::dataset::{self, Dataset, LoadOptions, View};
-use crate::photographs::image::{ColourTally, Image, MIDDLE_GREY, Mask, PictureFile, files};
+use crate::photographs::image::{ColourCounts, Image, MIDDLE_GREY, Mask, PictureFile, files};
 use crate::photographs::tone::{Exposure, LuminanceHistogram, is_black};
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
@@ -247,7 +247,7 @@ fn read(
         Image::size_of(&file.input).map(|(w, h)| u64::from(w) * u64::from(h))
     };
     let largest = files.iter().filter_map(|file| area(file).ok()).max().unwrap_or_default();
-    let colours = ColourTally::default();
+    let colours = ColourCounts::default();
     let named = || all.iter().map(|file| (file.name.as_str(), file.input.as_path()));
     let balance = options.white_balance.as_ref().filter(|_| !files.is_empty());
     let gains = balance.map(|balance| balance.gains(root, named())).transpose()?;
@@ -276,7 +276,7 @@ impl Photograph {
         file: &dataset::Photograph,
         invert_masks: bool,
         gains: Option<WhiteBalanceGains>,
-        colours: &ColourTally,
+        colours: &ColourCounts,
     ) -> Result<Self> {
         let (mut image, alpha) = PictureFile::open(&file.input)?.decode_counted(colours)?;
         if let Some(gains) = gains {

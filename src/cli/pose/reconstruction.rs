@@ -270,7 +270,7 @@ impl<'a> Reconstruction<'a> {
                 calibrated.and_then(|()| self.run(&self.colmap, GLOBAL, files, stage))
             }
         };
-        // It fails where it found nothing to begin with, which is said of the photographs.
+        // COLMAP fails without an initial pair; the error then names the photographs.
         match placed {
             Err(_) if NOTHING.iter().any(|words| self.colmap.printed(words)) => {}
             outcome => outcome?,

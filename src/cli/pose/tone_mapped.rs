@@ -8,7 +8,7 @@ use crate::base::output::create_folder;
 use crate::cli::progress_bar;
 use crate::gpu::Gpu;
 use crate::photographs::image::files::stem;
-use crate::photographs::image::{ColourTally, Image, PictureFile, exif_segment};
+use crate::photographs::image::{ColourCounts, Image, PictureFile, exif_segment};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 
@@ -25,7 +25,7 @@ pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) ->
     let pseudo_gt = PseudoGt::new(gpu, &settings)?;
     let progress = progress_bar(2 * photographs.len());
     let root = photographs.first().and_then(|path| path.parent()).unwrap_or(folder).to_owned();
-    let colours = ColourTally::default();
+    let colours = ColourCounts::default();
     let (mut measured, mut undecoded) = (vec![], None);
     photographs.retain(|path| {
         progress.inc(1);

@@ -15,7 +15,7 @@ use crate::base::output::{check_writable, create_folder, printable};
 use crate::cli::{ImageFormat, finish, progress_bar, table, word, words};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
-use crate::photographs::image::{ColourTally, Image, Mask, Orientation};
+use crate::photographs::image::{ColourCounts, Image, Mask, Orientation};
 use crate::photographs::metrics::Scores;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
@@ -319,7 +319,7 @@ struct CurveOnSet {
     /// Masks hide white.
     inverted: bool,
     /// What was made of the colours of what is mapped.
-    colours: ColourTally,
+    colours: ColourCounts,
 }
 
 impl CurveOnSet {
@@ -335,7 +335,7 @@ impl CurveOnSet {
         if settings.scene_statistics || settings.takes_exposure() {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
                 // Unusable photographs are reported when they are mapped.
-                let unsaid = ColourTally::default();
+                let unsaid = ColourCounts::default();
                 let Ok((photograph, gaps)) = loaded(listed, inverted, &unsaid) else { continue };
                 measured.push(MeasuredPhotograph::of(&without(&photograph, &gaps)));
             }
@@ -349,7 +349,7 @@ impl CurveOnSet {
             None if measured.is_empty() => SceneTone::default(),
             None => return Err(all_black(input)),
         };
-        Ok(Self { pseudo_gt, scene, inverted, colours: ColourTally::default() })
+        Ok(Self { pseudo_gt, scene, inverted, colours: ColourCounts::default() })
     }
 
     /// Statistics of a photograph, its mapped image and the gain.
@@ -369,7 +369,7 @@ impl CurveOnSet {
 }
 
 /// A photograph and the indices of its unusable pixels.
-fn loaded(listed: &Listed, inverted: bool, colours: &ColourTally) -> Result<(Image, Vec<usize>)> {
+fn loaded(listed: &Listed, inverted: bool, colours: &ColourCounts) -> Result<(Image, Vec<usize>)> {
     let (photograph, gaps) = listed.load(inverted, colours)?;
     let (photograph, gaps) = listed.turned(photograph, gaps);
     if gaps.len() == photograph.pixel_count() {

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use crate::base::output::write_whole;
 use crate::cli::{finish, table, words};
 use crate::photographs::dataset::{Dataset, LoadOptions, Split};
-use crate::photographs::image::{ColourTally, Image};
+use crate::photographs::image::{ColourCounts, Image};
 use crate::photographs::tone::{
     CurveChoice, FAMILIES, Family, Statistics, ToneCurve, ToneSettings,
 };
@@ -112,7 +112,7 @@ fn chosen(choices: &[CurveChoice]) -> Result<Vec<Curve>> {
 fn scene_statistics(root: &std::path::Path) -> Result<Statistics> {
     let photographs = Dataset::photographs(root, &LoadOptions::default())?;
     let training = photographs.iter().filter(|photograph| photograph.split == Split::Train);
-    let colours = ColourTally::default();
+    let colours = ColourCounts::default();
     let statistics = training.map(|photograph| {
         Ok(Statistics::of(&Image::load_counted(&photograph.input, &colours)?.data))
     });

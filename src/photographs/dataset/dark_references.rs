@@ -1,4 +1,4 @@
-//! Reference images that are none: photographs of another split, as dark as those to train on.
+//! Detects reference images that are dark photographs of another split.
 
 use super::loaded::Loaded;
 use super::{LoadOptions, Split};
@@ -8,7 +8,7 @@ const DARK: f32 = 0.25;
 /// A normal-light image is brighter than its dark photograph by more than this factor.
 const BRIGHTER: f32 = 1.3;
 
-/// Takes reference images that are as dark as the photographs for photographs, and says so.
+/// Treats reference images that are as dark as the photographs as photographs, with a warning.
 pub(super) fn drop_from(loaded: &mut [Loaded], options: &LoadOptions) {
     let is_trained_on =
         |own: &&Loaded| own.view.as_ref().is_some_and(|view| view.split == Split::Train);

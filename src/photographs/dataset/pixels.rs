@@ -20,7 +20,7 @@ use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
 use crate::camera::{Camera, Lens};
-use crate::photographs::image::{ColourTally, Image, Mask, PictureFile};
+use crate::photographs::image::{ColourCounts, Image, Mask, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
@@ -65,7 +65,7 @@ pub(super) fn load(
     let largest = groups.iter().map(|(lens, _)| pixel_count((lens.width, lens.height))).max();
     let at_once = Image::decoded_at_once(largest.unwrap_or_default());
     let originals = Allowance::new(bytes_for_originals(&groups, options));
-    let colours = [ColourTally::default(), ColourTally::of("reference image")];
+    let colours = [ColourCounts::default(), ColourCounts::of("reference image")];
     let loading = Loading {
         options,
         at_once,
@@ -82,7 +82,7 @@ pub(super) fn load(
         let now = now.into_par_iter().map(|(lens, group)| load_group(&lens, group, &loading));
         loaded.extend(now.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
-    colours.iter().for_each(ColourTally::say);
+    colours.iter().for_each(ColourCounts::say);
     loaded.sort_by(|a, b| a.name.cmp(&b.name));
     dark_references::drop_from(&mut loaded, options);
     let mut views = Vec::with_capacity(loaded.len());
@@ -106,7 +106,7 @@ struct Loading<'a> {
     /// Black borders of photographs by their size as stored.
     borders: &'a BTreeMap<(u32, u32), Border>,
     /// What was made of the colours of photographs and of reference images.
-    colours: &'a [ColourTally; 2],
+    colours: &'a [ColourCounts; 2],
 }
 
 /// Bytes that `keep` leaves for photographs at their own size, where a curve is applied to those: it needs the statistics
@@ -327,7 +327,7 @@ impl ViewLoader<'_> {
     fn decode(
         &self,
         (path, read, turns): (Option<PathBuf>, Option<Arc<PictureFile>>, Turns),
-        colours: &ColourTally,
+        colours: &ColourCounts,
         problems: &mut Vec<String>,
     ) -> Result<Option<Decoded>> {
         let lens = self.preparation.lens;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use super::Histogram;
-use crate::photographs::image::{ColourTally, Image, files};
+use crate::photographs::image::{ColourCounts, Image, files};
 use crate::photographs::tone::Statistics;
 use crate::photographs::tone::{luminance, measurable};
 use crate::{Error, Result};
@@ -90,7 +90,7 @@ impl FitScene {
     /// differ.
     pub fn load(folder: &Path, normal: Option<&Path>) -> Result<Self> {
         let (files, dark) = files_of(folder, normal)?;
-        let colours = ColourTally::default();
+        let colours = ColourCounts::default();
         let load = |(dark, reference): &Files| {
             let [image, bright] = [dark, reference].map(|path| Image::load_counted(path, &colours));
             Pair::new(dark, &image?, &bright?)

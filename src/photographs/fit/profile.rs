@@ -20,7 +20,7 @@ use serde::Serialize;
 
 use super::pairs::{files_of, name_of};
 use crate::kernels::pseudo_gt::SEGMENTS;
-use crate::photographs::image::{ColourTally, Image};
+use crate::photographs::image::{ColourCounts, Image};
 use crate::photographs::tone::{Exposure, LuminanceHistogram, Profile, measurable, soft};
 use crate::{Error, Result};
 
@@ -88,7 +88,7 @@ impl ColourScene {
     pub fn load(folder: &Path, normal: Option<&Path>) -> Result<Self> {
         let (files, dark) = files_of(folder, normal)?;
         let share = (COLOURS / files.len()).max(1);
-        let colours = ColourTally::default();
+        let colours = ColourCounts::default();
         let load = |(dark, reference): &(PathBuf, PathBuf)| {
             let [image, bright] = [dark, reference].map(|path| Image::load_counted(path, &colours));
             sampled(dark, &image?, &bright?, share)

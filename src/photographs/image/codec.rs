@@ -9,7 +9,7 @@ use ::image::{
     error::UnsupportedErrorKind,
 };
 
-use super::colour::{self, ColourTally};
+use super::colour::{self, ColourCounts};
 use super::decoded::{Decoded, Meaning};
 #[cfg(not(feature = "raw"))]
 use super::files::RAW_REMEDY;
@@ -59,14 +59,14 @@ impl PictureFile {
     /// # Errors
     /// As [`Image::load`].
     pub(crate) fn decode(self) -> Result<(Image, Option<Image>)> {
-        self.decode_counted(&ColourTally::default())
+        self.decode_counted(&ColourCounts::default())
     }
 
     /// The same; what was made of its colours is counted.
     ///
     /// # Errors
     /// As [`Image::load`].
-    pub(crate) fn decode_counted(self, counters: &ColourTally) -> Result<(Image, Option<Image>)> {
+    pub(crate) fn decode_counted(self, counters: &ColourCounts) -> Result<(Image, Option<Image>)> {
         let Decoded { image, alpha, conversion } = decode(&self.path, self.bytes, Meaning::Colour)?;
         counters.add(conversion);
         Ok((image, alpha))
@@ -181,7 +181,7 @@ impl Image {
     ///
     /// # Errors
     /// As [`Image::load`].
-    pub(crate) fn load_counted(path: &Path, counters: &ColourTally) -> Result<Self> {
+    pub(crate) fn load_counted(path: &Path, counters: &ColourCounts) -> Result<Self> {
         Ok(PictureFile::open(path)?.decode_counted(counters)?.0)
     }
 

@@ -23,7 +23,7 @@ use rayon::prelude::*;
 pub(super) use self::metadata::Chromaticities;
 use self::metadata::{Statement, statements};
 use super::{Image, linear_from_srgb, srgb_from_linear};
-pub(crate) use counters::ColourTally;
+pub(crate) use counters::ColourCounts;
 
 /// What was made of the colours of a file.
 #[derive(Clone, Debug, Default, PartialEq)]

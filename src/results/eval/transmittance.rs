@@ -101,16 +101,11 @@ pub fn warn_of_holes(
     if residual_transmittances.is_empty() {
         let views: Vec<&View> = dataset.views.iter().filter(|v| v.is_for_training()).collect();
         for view in views.iter().step_by(views.len().div_ceil(MOST).max(1)) {
-            let residual_transmittance = ResidualTransmittance::of(&render(view)?, view);
-            residual_transmittances.extend(
-                residual_transmittance
-                    .map(|residual_transmittance| (view.name.clone(), residual_transmittance)),
-            );
+            let own = ResidualTransmittance::of(&render(view)?, view);
+            residual_transmittances.extend(own.map(|own| (view.name.clone(), own)));
         }
     }
-    let views = residual_transmittances
-        .iter()
-        .map(|(name, residual_transmittance)| (name.as_str(), *residual_transmittance));
+    let views = residual_transmittances.iter().map(|(name, own)| (name.as_str(), *own));
     if let Some(warning) = hole_warning(views, background) {
         tracing::warn!("{warning}");
     }

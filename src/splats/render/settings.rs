@@ -17,7 +17,8 @@ pub struct RenderSettings {
     /// Colours are the raw SH sum, which can be negative, as in LITA-GS, instead of max(SH + 0.5, 0).
     pub raw_colors: bool,
     /// The storage format of the SH coefficients above degree 0: 32 bits after
-    /// [`Gaussians::upload`](crate::splats::scene::Gaussians::upload), 16 in training if the configuration says so.
+    /// [`Gaussians::upload`](crate::splats::scene::Gaussians::upload) and by default, 16
+    /// where the training configuration sets it.
     pub rest: StorageFormat,
     /// Stop-gradient: the noise and illumination channels do not affect means, scales, rotations and opacities; depth
     /// and structure, which exist to do so, do.

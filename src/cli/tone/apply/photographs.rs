@@ -9,7 +9,7 @@ use crate::base::tree;
 use crate::cli::ImageFormat;
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
-use crate::photographs::image::{ColourTally, Image, Mask, MaskFile, Orientation, PictureFile};
+use crate::photographs::image::{ColourCounts, Image, Mask, MaskFile, Orientation, PictureFile};
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 
@@ -33,7 +33,7 @@ impl Listed {
     pub(super) fn load(
         &self,
         inverted: bool,
-        colours: &ColourTally,
+        colours: &ColourCounts,
     ) -> Result<(Image, Vec<usize>)> {
         let (mut image, alpha) = PictureFile::open(&self.input)?.decode_counted(colours)?;
         if let Some(gains) = self.gains {

@@ -1,4 +1,4 @@
-//! What is said of the colours of many photographs: a line for each colour space, not for each file.
+//! Reports the colours of a set of photographs: one line for each colour space, not for each file.
 
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
@@ -7,13 +7,13 @@ use super::Conversion;
 
 /// Counts conversions, from any thread.
 #[derive(Debug)]
-pub(crate) struct ColourTally {
+pub(crate) struct ColourCounts {
     /// What is counted, in the singular.
     what: &'static str,
     counts: Mutex<Counts>,
 }
 
-impl Default for ColourTally {
+impl Default for ColourCounts {
     fn default() -> Self {
         Self::of("photograph")
     }
@@ -30,7 +30,7 @@ struct Counts {
 /// The fraction of pixels outside sRGB that is worth a warning.
 const SMALL: f64 = 0.01;
 
-impl ColourTally {
+impl ColourCounts {
     /// Of things of this name.
     pub(crate) fn of(what: &'static str) -> Self {
         Self { what, counts: Mutex::default() }

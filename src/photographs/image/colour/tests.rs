@@ -8,7 +8,7 @@ use ::image::{ExtendedColorType, ImageEncoder};
 
 use self::files::*;
 use super::super::jpeg::exif_segment;
-use super::counters::ColourTally;
+use super::counters::ColourCounts;
 use super::*;
 
 /// Linear colours from near black to bright, none of which is out of any gamut.
@@ -304,7 +304,7 @@ fn the_exif_of_a_converted_picture_says_srgb() {
 
 #[test]
 fn many_files_are_told_in_a_line_for_each_colour_space() {
-    let counters = ColourTally::default();
+    let counters = ColourCounts::default();
     for (count, from, unknown) in [
         (3, Some(("Adobe RGB", 0.0)), None),
         (1, Some(("Display P3", 0.12)), None),

@@ -257,7 +257,7 @@ pub(super) fn with_segments(jpeg: &[u8], segments: &[(u8, Vec<u8>)]) -> Vec<u8> 
     file
 }
 
-/// The parts of a profile in APP2 segments of so many bytes.
+/// A profile split into APP2 segments of a given size in bytes.
 pub(super) fn profile_segments(profile: &[u8], bytes: usize) -> Vec<(u8, Vec<u8>)> {
     let parts = profile.chunks(bytes);
     let count = parts.len() as u8;
