@@ -52,13 +52,13 @@ pub struct Session<'a> {
 /// ```no_run
 /// use std::path::Path;
 ///
-/// use nightsplat::run::{self, Event, HeldRun};
+/// use nightsplat::run::{self, Event, IfExists};
 /// use nightsplat::{Dataset, DeviceChoice, Gpu, TrainConfig};
 ///
 /// let config = TrainConfig { dataset: "photos".into(), steps: 2000, ..TrainConfig::default() };
 /// let gpu = Gpu::new(&DeviceChoice::Best)?;
 /// let dataset = Dataset::load(&config.dataset, &config.load_options())?;
-/// let trained = run::train(&gpu, &config, &dataset, Path::new("run"), HeldRun::Refuse, |event| {
+/// let trained = run::train(&gpu, &config, &dataset, Path::new("run"), IfExists::Refuse, |event| {
 ///     if let Event::Step(report) = event {
 ///         println!("step {}: loss {:.4}", report.step, report.loss);
 ///     }
