@@ -127,6 +127,8 @@ class Browser:
     def resize(self, width, height):
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.call("Emulation.setDeviceMetricsOverride", **metrics)
+        # A bar beside controls that do not fit would take its width from the canvas.
+        self.call("Emulation.setScrollbarsHidden", hidden=True)
         # Two frames: one in which the page sees its size, one in which it has drawn.
         self.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done())))")
 
@@ -145,7 +147,8 @@ class Browser:
     def fit_canvas(self, width, height):
         """Resizes the window so that the canvas has this size."""
         window = [max(width, 400), height + 200]
-        for _ in range(6):
+        # Controls that take more than the window leave nothing at first.
+        for _ in range(20):
             self.resize(*window)
             now = self.evaluate("[canvas.width, canvas.height]")
             if now == [width, height]:
@@ -177,7 +180,7 @@ def main():
             run("synth", folder / f"set-{width}", "--views", 16, "--width", width, "--height", height)
         trained = folder / f"set-{SIZES[0][0]}"
         run("train", trained, "--out", folder / "run", "--steps", 200, "--progress", "none")
-        run("export", folder / "run", "--to", "html")
+        run("export", folder / "run", "--format", "html")
         page = folder / "run/model.html"
         with Browser(program, SOFTWARE_GL, folder / "profile") as browser:
             for width, height in SIZES:
