@@ -37,9 +37,10 @@
 //! # Ok::<(), nightsplat::Error>(())
 //! ```
 //!
-//! A host with a Vulkan device of its own lends it ([`Gpu::from_host`]), records [`Renderer::forward`] into its own
-//! command buffers ([`Gpu::record_into`]) and binds the resulting buffers; `examples/embed.rs` is such a host. Without
-//! default features this is the whole API; feature `io` adds files, datasets and training.
+//! A host with a Vulkan device of its own lends it ([`Gpu::from_host`]) and has [`Renderer::draw`] record into its own
+//! command buffers ([`Gpu::record_into`]) and images; `docs/embedding.md` is the contract, `examples/embed.rs` and
+//! `examples/c/embed.c` are such hosts. Without default features this is the whole API; feature `io` adds files,
+//! datasets and training.
 //!
 //! # Train as the command does
 //!
@@ -167,9 +168,10 @@ pub use error::{Error, Result, Stop};
 
 // The device.
 pub use gpu::{
-    Buffer, CooperativeMatrix, DeviceChoice, DeviceLimits, DeviceReport, Gpu, HostDevice,
-    HostRecording, MemoryBudget, PassTime, PciAddress, Properties, Recorder, Requirement,
-    RequirementReport, Slice, Tile, devices, required_device_features,
+    Buffer, CooperativeMatrix, DeviceChoice, DeviceLimits, DeviceReport, Gpu, HostAllocation,
+    HostDevice, HostFrame, HostImage, ImageFormat, ImageState, MemoryBudget, MemoryFunctions,
+    PassTime, PciAddress, Properties, QueueLock, Recorder, Requirement, RequirementReport, Slice,
+    Tile, devices, required_device_features,
 };
 #[cfg(feature = "check")]
 pub use gpu::{CheckReport, CheckedPass, Difference, Tolerance};
@@ -179,7 +181,8 @@ pub use camera::{Camera, CameraModel, CameraPath, KannalaBrandt};
 pub use photographs::image::Image;
 pub use splats::packed_sh::StorageFormat;
 pub use splats::render::{
-    Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status, Viewpoint,
+    Damping, DepthConvention, DepthKind, Drawn, Gradients, Purpose, RenderOptions, RenderSettings,
+    Renderer, SceneDepth, Status, Target, Viewpoint,
 };
 pub use splats::scene::{DeviceGaussians, Features, GaussianSlice, Gaussians, Layout, Shape};
 
