@@ -7,14 +7,21 @@ cd "$(dirname "$0")/.."
 root=$PWD
 export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$root/target}
 
-# The folder that the build script writes to, of a build in the working directory with the given options.
-out_dir() {
-    cargo check --lib --no-default-features --message-format=json-render-diagnostics "$@" |
-        sed -n '/"reason":"build-script-executed","package_id":"path+/s|.*"out_dir":"\([^"]*\)".*|\1|p'
+# Fails unless a build ends with an error of one line that matches.
+refuses() {
+    if cargo build --lib --locked --no-default-features 2> "$scratch/error.log"; then
+        echo "failed: a build without kernels, or with those of other sources" >&2
+        exit 1
+    fi
+    grep "^error: .*$1.*; build with --features glslang" "$scratch/error.log"
 }
 
-compiled=$(out_dir --locked --features glslang)
+scratch=$(mktemp -d)
+trap 'rm -rf "$scratch"' EXIT
 rm -rf precompiled
+refuses "the kernels are not compiled"
+compiled=$(cargo check --lib --locked --no-default-features --features glslang --message-format=json-render-diagnostics |
+    sed -n '/"reason":"build-script-executed","package_id":"path+/s|.*"out_dir":"\([^"]*\)".*|\1|p')
 mkdir precompiled
 # Former kernels may lie there as well.
 grep -o '[a-z0-9_]*\.spv' "$compiled/kernels.rs" | while read -r name; do cp "$compiled/$name" precompiled/; done
@@ -24,8 +31,6 @@ version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
 crate=nightsplat-$version.crate
 package=$CARGO_TARGET_DIR/package/$crate
 
-scratch=$(mktemp -d)
-trap 'rm -rf "$scratch"' EXIT
 tar -xf "$package" -C "$scratch"
 cd "$scratch/nightsplat-$version"
 diff -r "$root/precompiled" precompiled
@@ -37,14 +42,10 @@ fi
 export CARGO_TARGET_DIR=$scratch/target CARGO_INCREMENTAL=0
 TIMEFORMAT="built without C++ in %U s of processor time and %S s of the system's"
 time cargo build --quiet --offline --locked --no-default-features --jobs 1
-
+diff -r precompiled "$(dirname "$(find "$CARGO_TARGET_DIR" -path '*/out/kernels.rs')")"
 # A shader that is not the one that was compiled is no silent mistake.
 echo "// Changed." >> shaders-glsl/splats/render/blend_forward.comp
-if cargo build --offline --locked --no-default-features 2> error.log; then
-    echo "failed: a changed shader is built from the kernels of before" >&2
-    exit 1
-fi
-grep "^error: .*precompiled/ are not those of shaders-glsl.*--features glslang" error.log
+refuses "the kernels in precompiled/ are not those of shaders-glsl"
 
 cd "$root"
 mkdir -p dist
