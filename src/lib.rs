@@ -3,7 +3,7 @@
 //! | to | begin with |
 //! |---|---|
 //! | open a device, or lend one | [`Gpu::new`], [`Gpu::from_host`], [`devices`] |
-//! | read and write models | [`Gaussians::open`], [`Gaussians::save`] |
+//! | read and write models | [`Model::load`], [`Model::save`] |
 //! | draw | [`Renderer`], [`Camera`] |
 //! | read photographs | [`Dataset::load`], [`Preset::load_options`] |
 //! | train | [`Trainer::planned`], [`TrainConfig`] |
@@ -11,20 +11,21 @@
 //! | learn what went wrong | [`Error`]: one line that names the object and the remedy |
 //!
 //! Without default features there is the renderer, forward and backward, and nothing else. Feature `io` adds files,
-//! datasets and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command.
+//! datasets and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command. `glslang` compiles
+//! the kernels, which a checkout needs and a packaged crate does not.
 //!
 //! # Render a model
 //!
 //! ```no_run
 //! use nightsplat::glam::{DAffine3, DVec3};
-//! use nightsplat::{Camera, DeviceChoice, Gaussians, Gpu, RenderOptions, RenderSettings, Renderer};
+//! use nightsplat::{Camera, DeviceChoice, Gpu, Model, RenderOptions, Renderer};
 //!
 //! let gpu = Gpu::new(&DeviceChoice::Best)?;
-//! let gaussians = Gaussians::open("model.ply")?;
+//! let model = Model::load("model.ply")?;
+//! let gaussians = &model.gaussians;
 //! let on_device = gaussians.upload(&gpu)?;
 //!
-//! let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
-//! let mut renderer = Renderer::new(&gpu, settings)?;
+//! let mut renderer = Renderer::new(&gpu, model.render_settings())?;
 //! let options = RenderOptions { sh_degree: gaussians.shape.sh_degree, background: [0.0; 3] };
 //! for frame in 0..60 {
 //!     let view_from_world = DAffine3::from_translation(DVec3::new(0.0, 0.0, 3.0))
@@ -60,7 +61,7 @@
 //!     shown.output().save_png8("now.png")?;
 //! }
 //! println!("{}", trainer.end()?);
-//! trainer.gaussians()?.save("model.spz")?;
+//! trainer.model()?.save("model.spz")?;
 //! # Ok::<(), nightsplat::Error>(())
 //! ```
 //!
@@ -179,6 +180,7 @@ pub use gpu::{CheckReport, CheckedPass, Difference, Tolerance};
 // Cameras, Gaussians, and the renderer.
 pub use camera::{Camera, CameraModel, CameraPath, KannalaBrandt};
 pub use photographs::image::Image;
+pub use splats::model::Model;
 pub use splats::packed_sh::StorageFormat;
 pub use splats::render::{
     Damping, DepthConvention, DepthKind, Drawn, Gradients, Purpose, RenderOptions, RenderSettings,
@@ -232,7 +234,7 @@ pub mod run {
         ModelRenderer, ReferenceKind, RenderLayer, ResidualTransmittance, ViewScore, means,
     };
     pub use crate::results::run::{
-        Event, IfExists, ResourceUsage, RunSummary, load_config, load_model, load_networks, train,
+        Event, IfExists, ResourceUsage, RunSummary, load_config, load_networks, train,
     };
     pub use crate::train::Networks;
 }

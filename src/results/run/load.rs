@@ -61,22 +61,18 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
     serde_json::from_str::<serde_json::Value>(note).ok()?["step"].as_u64()
 }
 
-/// The trained Gaussians of a run.
+/// The trained Gaussians of a run, in the colours that viewers show.
 ///
 /// # Errors
 /// The run has not been trained to its end or a checkpoint, or the file is cut short.
-pub fn load_model(run: &Path, raw_colors: bool) -> Result<Gaussians> {
+pub fn load_gaussians(run: &Path) -> Result<Gaussians> {
     let path = run.join("model.ply");
     if !path.is_file() {
         let problem = "has no model.ply: the run did not finish, nor come to a checkpoint; train it again, or go on with \
                        --resume";
         return Err(Error::input(run, problem));
     }
-    let mut gaussians = ply::load(path)?;
-    if raw_colors {
-        gaussians.shift_colors(0.5);
-    }
-    Ok(gaussians)
+    ply::load(path)
 }
 
 /// The trained networks of a run; none where its model has none. `features` are those that its Gaussians came to have:
