@@ -3,10 +3,7 @@
 use std::fmt;
 use std::ops::Range;
 
-#[cfg(feature = "io")]
-use glam::{DMat3, DQuat};
-use glam::{DVec3, Vec3};
-#[cfg(feature = "io")]
+use glam::{DMat3, DQuat, DVec3, Vec3};
 use rayon::prelude::*;
 
 mod device;
@@ -22,7 +19,6 @@ pub mod ply;
 use crate::camera::TrainingFrame;
 pub use crate::splats::attributes::{ATTRIBUTES, Attribute, PlaneCounts, rest_coefficients};
 use crate::splats::attributes::{column_count, planes};
-#[cfg(feature = "io")]
 use crate::splats::harmonics::HarmonicRotation;
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
 pub use facts::Facts;
@@ -188,7 +184,6 @@ impl Gaussians {
     ///
     /// [`Gaussians::save`] takes the direction -y for up, as cameras that are held level in `OpenCV`'s axes have it;
     /// a model whose `up` is another one is turned by `DQuat::from_rotation_arc(up, DVec3::NEG_Y)` first.
-    #[cfg(feature = "io")]
     pub fn rotated(&self, rotation: DQuat) -> Self {
         let mut rotated = self.clone();
         rotated.origin = rotation * self.origin;
