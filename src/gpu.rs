@@ -52,6 +52,8 @@ use std::thread::{self, ThreadId};
 
 use ash::{ext, khr, vk};
 
+#[cfg(feature = "capi")]
+pub(crate) use allocated::HostMemoryError;
 pub use buffer::Buffer;
 #[cfg(feature = "check")]
 pub use check::{CheckReport, CheckedPass, Difference, Tolerance};

@@ -12,27 +12,58 @@ use crate::gpu::{
     check_physical_device, required_device_features,
 };
 
-pub(super) type VkInstance = vk::Instance;
-pub(super) type VkPhysicalDevice = vk::PhysicalDevice;
-pub(super) type VkDevice = vk::Device;
-pub(super) type VkQueue = vk::Queue;
-pub(super) type VkPipelineCache = vk::PipelineCache;
-pub(super) type VkSemaphore = vk::Semaphore;
-pub(super) type VkDeviceMemory = vk::DeviceMemory;
-pub(super) type VkDeviceSize = vk::DeviceSize;
-pub(super) type VkMemoryRequirements = vk::MemoryRequirements;
-pub(super) type VkMemoryPropertyFlags = vk::MemoryPropertyFlags;
-pub(super) type VkAllocationCallbacks = vk::AllocationCallbacks<'static>;
-pub(super) type VkPhysicalDeviceFeatures2 = vk::PhysicalDeviceFeatures2<'static>;
-pub(super) type VkPhysicalDeviceVulkan12Features = vk::PhysicalDeviceVulkan12Features<'static>;
-pub(super) type VkPhysicalDeviceVulkan13Features = vk::PhysicalDeviceVulkan13Features<'static>;
+/// Vulkan's.
+pub type VkInstance = vk::Instance;
+/// Vulkan's.
+pub type VkPhysicalDevice = vk::PhysicalDevice;
+/// Vulkan's.
+pub type VkDevice = vk::Device;
+/// Vulkan's.
+pub type VkQueue = vk::Queue;
+/// Vulkan's.
+pub type VkPipelineCache = vk::PipelineCache;
+/// Vulkan's.
+pub type VkSemaphore = vk::Semaphore;
+/// Vulkan's.
+pub type VkDeviceMemory = vk::DeviceMemory;
+/// Vulkan's.
+pub type VkDeviceSize = vk::DeviceSize;
+/// Vulkan's.
+pub type VkMemoryRequirements = vk::MemoryRequirements;
+/// Vulkan's.
+pub type VkMemoryPropertyFlags = vk::MemoryPropertyFlags;
+/// Vulkan's.
+pub type VkAllocationCallbacks = vk::AllocationCallbacks<'static>;
+/// Vulkan's.
+pub type VkPhysicalDeviceFeatures2 = vk::PhysicalDeviceFeatures2<'static>;
+/// Vulkan's.
+pub type VkPhysicalDeviceVulkan12Features = vk::PhysicalDeviceVulkan12Features<'static>;
+/// Vulkan's.
+pub type VkPhysicalDeviceVulkan13Features = vk::PhysicalDeviceVulkan13Features<'static>;
 #[allow(non_camel_case_types, reason = "Vulkan's own name")]
-pub(super) type PFN_vkGetInstanceProcAddr = Option<vk::PFN_vkGetInstanceProcAddr>;
-pub(super) type VkResult = vk::Result;
+/// Vulkan's.
+pub type PFN_vkGetInstanceProcAddr = Option<vk::PFN_vkGetInstanceProcAddr>;
+/// Vulkan's.
+pub type VkResult = vk::Result;
 
 /// A device and what belongs to it. Any thread may use it.
 #[derive(Debug)]
 pub struct NspDevice(pub(super) Object<Gpu>);
+
+/// For tests, which make allocations fail.
+#[cfg(feature = "testing")]
+impl NspDevice {
+    /// The device.
+    ///
+    /// # Panics
+    /// It was left by a panic.
+    pub fn gpu(&self) -> Gpu {
+        self.0
+            .get("the device")
+            .map(Gpu::clone)
+            .unwrap_or_else(|failure| unreachable!("{failure:?}"))
+    }
+}
 
 /// A piece of device memory of the host's.
 #[repr(C)]

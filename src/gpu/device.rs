@@ -138,6 +138,7 @@ impl Gpu {
         let supported = Supported::gather(&instance, physical).map_err(loader_error)?;
         supported.check()?;
         let (queue, family) = (vk::Queue::from_raw(host.queue), host.queue_family);
+        check_family(&instance, physical, family)?;
         let own = properties(&instance, physical, &supported)?;
         let has_push_descriptors = own.has_push_descriptors && host.has_push_descriptors;
         let properties = Properties { has_push_descriptors, ..own };
@@ -199,6 +200,20 @@ impl Gpu {
             }),
         })
     }
+}
+
+/// # Errors
+/// The family does not exist, or does not compute.
+fn check_family(instance: &ash::Instance, physical: vk::PhysicalDevice, family: u32) -> Result<()> {
+    // SAFETY: the handle was enumerated from the instance.
+    let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
+    let own = families.get(family as usize);
+    if own.is_some_and(|own| own.queue_flags.contains(vk::QueueFlags::COMPUTE)) {
+        return Ok(());
+    }
+    Err(Error::Usage(format!(
+        "queue_family {family} has no compute; lend a queue of a family that does"
+    )))
 }
 
 /// Whether a physical device of a host's can be used.

@@ -6,6 +6,7 @@
 #[macro_use]
 mod common;
 
+mod capi;
 mod descriptors;
 mod embedding;
 mod faults;
