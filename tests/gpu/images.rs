@@ -136,7 +136,7 @@ fn cameras() -> [Camera; 2] {
 }
 
 /// Some three hundred in front of the cameras, 2 to 3 away.
-fn gaussians() -> Gaussians {
+pub(crate) fn gaussians() -> Gaussians {
     let mut gaussians = Gaussians::zeros(300, 0);
     let count = gaussians.count;
     for (i, value) in gaussians.parameters.iter_mut().enumerate() {

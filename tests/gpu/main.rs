@@ -13,3 +13,4 @@ mod faults;
 mod gpu;
 mod host;
 mod images;
+mod stereo;
