@@ -247,7 +247,7 @@ fn an_export_keeps_the_origin_and_the_page_the_near_plane() {
     let html = fs::read_to_string(Path::new(&run).join("model.html")).unwrap();
     let (_, after) = html.split_once("\"near\":").unwrap();
     let near: f64 = after.split([',', '}']).next().unwrap().parse().unwrap();
-    let config = nightsplat::results::run::load_config(&run).unwrap();
+    let config = load_config(&run).unwrap();
     let scale = config.frame.unwrap_or_default().scale;
     assert!((near - 1.0 / scale).abs() < 1e-6, "{near} at a scale of {scale}");
 }

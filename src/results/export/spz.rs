@@ -342,8 +342,8 @@ mod tests {
     #[test]
     fn positions_use_all_of_their_24_bits_and_what_they_cannot_hold_is_refused() {
         let mut model = drawn(2, 0);
-        model.means_mut()[0] = glam::Vec3::new(3.0, -1.0, 0.25);
-        model.means_mut()[1] = glam::Vec3::ZERO;
+        model.means_mut()[0] = Vec3::new(3.0, -1.0, 0.25);
+        model.means_mut()[1] = Vec3::ZERO;
         assert_eq!(fractional_bits(&model).unwrap(), 21);
         let body = body(&encode_alone(&model, Version::V4));
         let fixed = |at: usize| i32::from_le_bytes([0, body[at], body[at + 1], body[at + 2]]) >> 8;
