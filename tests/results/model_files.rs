@@ -201,20 +201,20 @@ fn what_a_file_states_is_one_line_of_an_error_where_it_is_nonsense() {
     };
     for near in ["x", "-1", "0", "NaN", "inf", ""] {
         let stated = problem(&format!("nightsplat near {near}"));
-        let expected = format!("line 6 states near `{near}`, which is not a finite number above 0");
+        let expected = format!("line 7 states near `{near}`, which is not a finite number above 0");
         assert_eq!(stated, expected);
     }
     assert_eq!(
         problem("nightsplat max_alpha 1"),
-        "line 6 states max_alpha `1`, which is not a finite number between 0 and 1"
+        "line 7 states max_alpha `1`, which is not a finite number between 0 and 1"
     );
     assert_eq!(
         problem("nightsplat raw_colors on"),
-        "line 6 states raw_colors `on`, which is neither true nor false"
+        "line 7 states raw_colors `on`, which is neither true nor false"
     );
     assert_eq!(
         problem("world = position + 1 2"),
-        "line 6 names the origin `1 2`, which is not three finite numbers"
+        "line 7 names the origin `1 2`, which is not three finite numbers"
     );
     // What a later version states is skipped.
     Model::from(Gaussians::zeros(2, 0)).save(&path).unwrap();
@@ -247,7 +247,7 @@ fn an_export_keeps_the_origin_and_the_page_the_near_plane() {
     let html = fs::read_to_string(Path::new(&run).join("model.html")).unwrap();
     let (_, after) = html.split_once("\"near\":").unwrap();
     let near: f64 = after.split([',', '}']).next().unwrap().parse().unwrap();
-    let config = nightsplat::results::run::load_config(&run).unwrap();
+    let config = load_config(&run).unwrap();
     let scale = config.frame.unwrap_or_default().scale;
     assert!((near - 1.0 / scale).abs() < 1e-6, "{near} at a scale of {scale}");
 }
