@@ -26,6 +26,7 @@ mod host;
 mod image;
 mod instance;
 mod kernel;
+mod lent;
 mod limits;
 mod memory;
 mod pci;
@@ -43,6 +44,7 @@ mod supported;
 #[doc(hidden)]
 pub mod testing;
 mod tuning;
+mod upload;
 mod validation;
 
 use std::collections::BTreeMap;
@@ -64,11 +66,11 @@ pub use cooperative::CooperativeMatrix;
 pub(crate) use device::check_physical_device;
 pub use device_report::{DeviceLimits, DeviceReport, RequirementReport, devices};
 pub use download::Download;
-pub use host::{HostAllocation, HostDevice, HostFrame, MemoryFunctions, QueueLock};
 pub use image::{HostImage, ImageFormat, ImageState};
 pub use kernel::{Binding, Bound, Interface, Kernel, Recordable};
 #[cfg(feature = "check")]
 pub use kernel::{OnHost, Reference};
+pub use lent::{HostAllocation, HostDevice, HostFrame, MemoryFunctions, QueueLock};
 pub use memory::MemoryBudget;
 pub use pci::PciAddress;
 pub use pipeline::Pipeline;
@@ -304,8 +306,8 @@ impl Shared {
     }
 
     /// Frees every retired object that no submission of ours after `reached` and no unfinished frame of the host's
-    /// uses; command buffers before the objects that they name. One thread at a time: validation layers have crashed where two threads free objects that belong
-    /// together.
+    /// uses; command buffers before the objects that they name. One thread at a time: validation layers have crashed
+    /// where two threads free objects that belong together.
     fn collect(&self, reached: u64) {
         self.collect_within(LastUse { submission: reached, frame: self.frames_reached() });
     }

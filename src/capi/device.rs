@@ -58,10 +58,10 @@ impl NspDevice {
     /// # Panics
     /// It was left by a panic.
     pub fn gpu(&self) -> Gpu {
-        self.0
-            .get("the device")
-            .map(Gpu::clone)
-            .unwrap_or_else(|failure| unreachable!("{failure:?}"))
+        match self.0.get("the device") {
+            Ok(gpu) => gpu.clone(),
+            Err(failure) => unreachable!("{failure:?}"),
+        }
     }
 }
 
@@ -311,6 +311,25 @@ unsafe fn extensions<'a>(host: &NspHostDevice) -> Result<Vec<&'a CStr>, Failure>
     }
 }
 
+type AllocateOfC = unsafe extern "C" fn(
+    *mut c_void,
+    *const VkMemoryRequirements,
+    VkMemoryPropertyFlags,
+    VkMemoryPropertyFlags,
+    *const c_char,
+    *mut NspMemory,
+) -> VkResult;
+type Allocate = unsafe extern "C" fn(
+    *mut c_void,
+    *const vk::MemoryRequirements,
+    vk::MemoryPropertyFlags,
+    vk::MemoryPropertyFlags,
+    *const c_char,
+    *mut HostAllocation,
+) -> vk::Result;
+type FreeOfC = unsafe extern "C" fn(*mut c_void, *const NspMemory);
+type Free = unsafe extern "C" fn(*mut c_void, *const HostAllocation);
+
 /// # Safety
 /// NULL or valid.
 unsafe fn memory_functions(
@@ -322,23 +341,14 @@ unsafe fn memory_functions(
         let text = "NspHostDevice::device_memory needs both allocate and free";
         return Err(Failure::usage(text));
     };
-    // SAFETY: both types have the same members in the same order.
-    unsafe {
-        type Allocate = unsafe extern "C" fn(
-            *mut c_void,
-            *const vk::MemoryRequirements,
-            vk::MemoryPropertyFlags,
-            vk::MemoryPropertyFlags,
-            *const c_char,
-            *mut HostAllocation,
-        ) -> vk::Result;
-        type Free = unsafe extern "C" fn(*mut c_void, *const HostAllocation);
-        Ok(Some(MemoryFunctions {
-            allocate: std::mem::transmute::<_, Allocate>(allocate),
-            free: std::mem::transmute::<_, Free>(free),
-            user: own.user,
-        }))
-    }
+    // SAFETY: `NspMemory` and `HostAllocation` have the same members in the same order.
+    let (allocate, free) = unsafe {
+        (
+            std::mem::transmute::<AllocateOfC, Allocate>(allocate),
+            std::mem::transmute::<FreeOfC, Free>(free),
+        )
+    };
+    Ok(Some(MemoryFunctions { allocate, free, user: own.user }))
 }
 
 /// Refuses a chain of enabled features without one that is needed.
@@ -362,6 +372,7 @@ unsafe fn check_features(features: *const VkPhysicalDeviceFeatures2) -> Result<(
     let mut next = features.cast::<vk::BaseInStructure<'_>>();
     // SAFETY: each struct begins with its type, which says what it is, and the next of the chain.
     while let Some(base) = unsafe { next.as_ref() } {
+        // SAFETY: as above.
         unsafe {
             match base.s_type {
                 vk::StructureType::PHYSICAL_DEVICE_VULKAN_1_2_FEATURES => {

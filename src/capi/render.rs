@@ -57,7 +57,7 @@ pub struct NspImageState {
     pub access: VkAccessFlags2,
 }
 
-/// A layer of an image: mip level 0, one sample; usage TRANSFER_DST to be written, TRANSFER_SRC to be read.
+/// A layer of an image: mip level 0, one sample; usage `TRANSFER_DST` to be written, `TRANSFER_SRC` to be read.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspImage {

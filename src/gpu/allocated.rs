@@ -9,7 +9,7 @@ use gpu_allocator::vulkan::{
 };
 use gpu_allocator::{AllocationError, MemoryLocation};
 
-use super::host::{HostAllocation, MemoryFunctions};
+use super::lent::{HostAllocation, MemoryFunctions};
 use super::limits::whole_quads;
 use super::{Bound, LastUse, Retired, Shared, lock};
 use crate::{Error, Result};

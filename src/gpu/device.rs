@@ -97,7 +97,7 @@ impl Gpu {
         match opened {
             Ok(parts) => {
                 let instance = owned.instance.clone();
-                Self::assemble(&instance, parts, Owner::Ours(owned))
+                Self::assemble(&instance, parts, Owner::Ours(Box::new(owned)))
             }
             Err(error) => {
                 // SAFETY: no device was created from the instance.
@@ -164,7 +164,7 @@ impl Gpu {
         let debug = owner.names_objects().then(|| ext::debug_utils::Device::new(instance, &device));
         let has_labels = owner.takes_labels();
         let (owned, host) = match owner {
-            Owner::Ours(owned) => (Some(owned), None),
+            Owner::Ours(owned) => (Some(*owned), None),
             Owner::Host(lent) => (None, Some(Host::new(lent))),
         };
         let executables = properties
@@ -246,7 +246,7 @@ struct DeviceParts {
 
 /// Who created the device.
 enum Owner<'a> {
-    Ours(OwnedInstance),
+    Ours(Box<OwnedInstance>),
     Host(&'a HostDevice),
 }
 
@@ -272,9 +272,10 @@ impl Owner<'_> {
     unsafe fn callbacks(&self) -> Option<vk::AllocationCallbacks<'static>> {
         match self {
             Self::Ours(_) => None,
-            // SAFETY: as the caller promises.
             Self::Host(lent) => {
-                unsafe { lent.host_memory.cast::<vk::AllocationCallbacks<'_>>().as_ref() }.copied()
+                let callbacks = lent.host_memory.cast::<vk::AllocationCallbacks<'_>>();
+                // SAFETY: as the caller promises.
+                unsafe { callbacks.as_ref() }.copied()
             }
         }
     }

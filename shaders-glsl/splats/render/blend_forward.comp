@@ -15,7 +15,7 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //! stays in registers: no shared memory, no barrier.
 //!
 //! With VIEW_DEPTHS the last channel is the depth in the view: a splat beyond a pixel's limit ends it, as the order is
-//! front to back, and the channel is the sum of the weighted depths, or the depth at which the transmittance passes 1/2.
+//! front to back. The channel is the sum of the weighted depths, or the depth at which the transmittance passes 1/2.
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;
