@@ -38,6 +38,14 @@ fn every_format_is_one_file_of_the_run_and_begins_as_its_readers_expect() {
         assert!(html.contains(part), "{part}");
     }
 
+    // Without reference images the targets are what the model is compared with.
+    std::fs::remove_dir_all(folder.path().join("set/high")).unwrap();
+    succeed(&format!("export {run} --to html"));
+    let html = std::fs::read_to_string(Path::new(&run).join("model.html")).unwrap();
+    let labels = ["photograph", "target", "reference"]
+        .map(|label| html.matches(&format!("\"label\":\"{label}\"")).count());
+    assert_eq!(labels, [8, 8, 0]);
+
     let copy = folder.path().join("copy.ply");
     succeed(&format!("export {run} --to ply --out {}", copy.display()));
     let header = String::from_utf8_lossy(&std::fs::read(&copy).unwrap()[..300]).into_owned();

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use super::Split;
 use super::source::Source;
-use crate::photographs::image::{Image, PictureFile};
+use crate::photographs::image::Image;
 
 /// The pixels of photographs of one size that show nothing, as indices into a plane, ascending.
 pub(super) type Border = Arc<Vec<usize>>;
@@ -47,7 +47,7 @@ pub(super) fn find<'a>(sources: impl Iterator<Item = &'a Source>) -> BTreeMap<(u
     by_size.retain(|_, sources| sources.len() >= NEEDED);
     let found = by_size.into_iter().filter_map(|(size, sources)| {
         let step = sources.len().div_ceil(LOOKED_AT);
-        let images = sources.iter().step_by(step).filter_map(|source| decoded(source));
+        let images = sources.iter().step_by(step).filter_map(|source| source.picture());
         let border = border(images, size)?;
         let (width, height) = size;
         tracing::warn!(
@@ -58,21 +58,6 @@ pub(super) fn find<'a>(sources: impl Iterator<Item = &'a Source>) -> BTreeMap<(u
         Some((size, Arc::new(border)))
     });
     found.collect()
-}
-
-/// A photograph as it is stored; what its alpha hides is not black.
-fn decoded(source: &Source) -> Option<Image> {
-    let file = match &source.read[0] {
-        Some(read) => PictureFile::clone(read),
-        None => PictureFile::open(source.input.as_deref()?).ok()?,
-    };
-    let (mut image, alpha) = file.decode().ok()?;
-    if let Some(alpha) = alpha {
-        for (value, alpha) in image.data.iter_mut().zip(alpha.data) {
-            *value = if alpha < 1.0 { 1.0 } else { *value };
-        }
-    }
-    Some(image)
 }
 
 /// The black border that images of one size have in common.

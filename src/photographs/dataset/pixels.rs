@@ -10,12 +10,14 @@ use super::allowance::Allowance;
 use super::borders::{self, Border};
 use super::dark_references;
 use super::depth::depth_map;
+use super::layout::Layout;
 use super::loaded::Loaded;
 use super::original::Original;
 use super::packed::Packed;
+use super::points;
 use super::prepare::{Preparation, check_size, disagreement, pixel_count};
 use super::source::{MAX_READ, Source};
-use super::turns::{Header, Turns};
+use super::turns::{self, Header, Pixels, Turns};
 use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
@@ -36,15 +38,20 @@ pub(crate) type Look<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>) + Sync);
 
 /// The views in order of name. Files that do not decode are named in `skipped`.
 pub(super) fn load(
-    sources: Vec<Source>,
+    mut sources: Vec<Source>,
+    layout: &Layout,
     options: &LoadOptions,
     (look, gains): (Option<Look<'_>>, Option<WhiteBalanceGains>),
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
     let memory = Allowance::new(MAX_READ);
-    let fitted = sources.into_par_iter().map(|mut source| {
-        let headers = source.headers(&memory);
-        source.fit(headers)?;
+    let headers: Vec<[Option<Header>; 2]> =
+        sources.par_iter_mut().map(|source| source.headers(&memory)).collect();
+    let own: Vec<Option<Header>> = headers.iter().map(|[own, _]| *own).collect();
+    let points = || points::of_sources(layout, &sources);
+    let pixels = turns::pixels(&sources, &own, options.orientation, points)?;
+    let fitted = sources.into_par_iter().zip(headers).map(|(mut source, headers)| {
+        source.fit(headers, pixels)?;
         Ok(source)
     });
     let mut groups: Vec<(Lens, Vec<Source>)> = Vec::new();
@@ -162,11 +169,11 @@ impl Source {
     ///
     /// # Errors
     /// [`Error::Input`] where the picture has another shape than its camera.
-    fn fit(&mut self, headers: [Option<Header>; 2]) -> Result<()> {
+    fn fit(&mut self, headers: [Option<Header>; 2], pixels: Pixels) -> Result<()> {
         let lens = self.lens;
         // What has no readable header is named when it is decoded.
-        self.turns = headers
-            .map(|header| header.map(|header| Turns::new(header, &lens)).unwrap_or_default());
+        let turns = |header: Header| Turns::new(header, &lens, pixels);
+        self.turns = headers.map(|header| header.map(turns).unwrap_or_default());
         let sizes = headers
             .into_iter()
             .zip(self.turns)
