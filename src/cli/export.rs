@@ -11,6 +11,7 @@ use glam::{DAffine3, DVec3};
 use super::{finish, word};
 use crate::base::output::{check_writable, is_same_file, write_whole};
 use crate::camera::Camera;
+use crate::camera::frame::relative_to;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
@@ -140,7 +141,9 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     let (shown, count) = (out.display().to_string(), gaussians.count);
     let kib = std::fs::metadata(out).map_or(0, |file| file.len()).div_ceil(1024);
     let brightness = if is_model(&args.run) { "" } else { ", as bright as their targets" };
-    let wrote = format!("{shown}: {count} Gaussians in {kib} KiB{brightness}{turned}");
+    let relative = relative_to(gaussians.origin).map(|line| format!("; {line}"));
+    let relative = relative.unwrap_or_default();
+    let wrote = format!("{shown}: {count} Gaussians in {kib} KiB{brightness}{turned}{relative}");
     Ok((out.clone(), wrote))
 }
 

@@ -48,6 +48,7 @@ use crate::photographs::image::files::Files;
 use crate::photographs::image::{Image, Mask, MaskFile, Orientation};
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
+pub(crate) use borders::Borders;
 pub use fingerprint::Fingerprint;
 use layout::Layout;
 use listed::{ListedView, Listing};

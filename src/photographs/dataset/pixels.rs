@@ -1,13 +1,13 @@
 //! From files to views: decode, check against the camera, undistort, shrink. Parallel over views.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use rayon::prelude::*;
 
 use super::allowance::Allowance;
-use super::borders::{self, Border};
+use super::borders::Borders;
 use super::dark_references;
 use super::depth::depth_map;
 use super::layout::Layout;
@@ -66,8 +66,8 @@ pub(super) fn load(
     }
     let options = &resolved(&groups, options);
     let borders = match options.mask_borders {
-        true => borders::find(groups.iter().flat_map(|(_, group)| group)),
-        false => BTreeMap::new(),
+        true => Borders::of_sources(groups.iter().flat_map(|(_, group)| group)),
+        false => Borders::default(),
     };
     let largest = groups.iter().map(|(lens, _)| pixel_count((lens.width, lens.height))).max();
     let at_once = Image::decoded_at_once(largest.unwrap_or_default());
@@ -111,7 +111,7 @@ struct Loading<'a> {
     /// For photographs at their own size.
     originals: &'a Allowance,
     /// Black borders of photographs by their size as stored.
-    borders: &'a BTreeMap<(u32, u32), Border>,
+    borders: &'a Borders,
     /// What was made of the colours of photographs and of reference images.
     colours: &'a [ColourCounts; 2],
 }
@@ -286,8 +286,9 @@ impl ViewLoader<'_> {
                 let decoded = (image, alpha.as_ref());
                 let own = Mask::over(path, decoded, mask.as_ref(), options.invert_masks)?;
                 let size = (image.width, image.height);
-                let border = self.loading.borders.get(&size).map(|border| border.as_slice());
-                Mask::hiding_too(own, size, border.unwrap_or_default())
+                self.loading
+                    .borders
+                    .hidden_too(own, size)
                     .map(|stored| (stored, path.clone(), turns.loading))
             }
             None => None,

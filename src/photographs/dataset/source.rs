@@ -68,14 +68,19 @@ impl Source {
             Some(read) => PictureFile::clone(read),
             None => PictureFile::open(self.input.as_deref()?).ok()?,
         };
-        let (mut image, alpha) = file.decode().ok()?;
-        if let Some(alpha) = alpha {
-            for (value, alpha) in image.data.iter_mut().zip(alpha.data) {
-                *value = if alpha < 1.0 { 1.0 } else { *value };
-            }
-        }
-        Some(image)
+        shown(file)
     }
+}
+
+/// A picture, white where its alpha hides it; `None` where it does not decode.
+pub(super) fn shown(file: PictureFile) -> Option<Image> {
+    let (mut image, alpha) = file.decode().ok()?;
+    if let Some(alpha) = alpha {
+        for (value, alpha) in image.data.iter_mut().zip(alpha.data) {
+            *value = if alpha < 1.0 { 1.0 } else { *value };
+        }
+    }
+    Some(image)
 }
 
 /// What files may take that are read before they are decoded, bytes: those beyond are opened once for their size, and again.
