@@ -19,23 +19,28 @@ pub(super) fn mean(vectors: impl ExactSizeIterator<Item = DVec3>) -> DVec3 {
     vectors.sum::<DVec3>() / count
 }
 
-/// What is up in the world, a unit vector: as perpendicular as can be to the horizontal axes of the cameras, which are held
-/// level but for an angle that is small beside how far they may be pitched. Among directions that fit these axes about as
-/// well, as where all cameras look one way, it is the one nearest to the mean of what is up in the images; that mean
-/// itself leans where cameras on one side of a scene are pitched.
+/// What is up in the world, a unit vector: as perpendicular as can be to the horizontal axes of the cameras, which are
+/// held level. The mean of what is up in the images leans where cameras on one side of a scene are pitched. It decides
+/// where all cameras look one way: their axes then tell no pitch, only how the hand shook.
 pub(crate) fn upwards(poses: &[Camera]) -> DVec3 {
-    /// The squared ratio of these two angles: 2 degrees and 30.
+    /// The squared ratio of the angles by which cameras are rolled and pitched: 2 degrees and 30.
     const ROLL_TO_PITCH: f64 = 0.005;
+    /// The variance of the sines of their azimuths from which on their axes decide alone: 6 degrees squared.
+    const ENOUGH: f64 = 0.01;
+    let right = |pose: &Camera| pose.view_from_world.matrix3.row(0);
     let squared = |axis: DVec3| DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
     let in_images = mean(poses.iter().map(up)).normalize_or(DVec3::NEG_Y);
-    let mut cost = (DMat3::IDENTITY - squared(in_images)) * ROLL_TO_PITCH;
+    let across = mean(poses.iter().map(right)).cross(in_images).normalize_or_zero();
+    let azimuths = poses.iter().map(|pose| right(pose).dot(across).powi(2)).sum::<f64>();
+    let share = (1.0 - azimuths / poses.len().max(1) as f64 / ENOUGH).max(0.0);
+    let mut cost = (DMat3::IDENTITY - squared(in_images)) * (ROLL_TO_PITCH * share);
     for pose in poses {
-        cost += squared(pose.view_from_world.matrix3.row(0)) * (1.0 / poses.len() as f64);
+        cost += squared(right(pose)) * (1.0 / poses.len() as f64);
     }
     // Inverse iteration: the direction of the least cost is left.
-    let inverse = (cost + DMat3::from_diagonal(DVec3::splat(1e-9))).inverse();
+    let inverse = (cost + DMat3::from_diagonal(DVec3::splat(1e-6))).inverse();
     let mut upwards = in_images;
-    for _ in 0..32 {
+    for _ in 0..16 {
         upwards = (inverse * upwards).normalize_or(in_images);
     }
     upwards

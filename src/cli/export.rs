@@ -247,8 +247,8 @@ fn page(
     Ok(Page { title, gaussians, provenance, bookmarks, near, up }.html()?)
 }
 
-/// What makes the targets of views that have a photograph and no reference image, where there are such views and a curve.
-/// Without a device the page has no targets.
+/// What makes the targets of views that have a photograph and no reference image, where there are such views and a
+/// curve. Without a device the page has no targets.
 fn targets(
     config: &TrainConfig,
     dataset: &Dataset,

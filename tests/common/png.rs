@@ -11,7 +11,7 @@ pub(crate) fn put_chunk(path: &Path, name: &[u8; 4], data: &[u8]) {
         (0..8).fold(crc ^ u32::from(byte), |crc, _| (crc >> 1) ^ (0xEDB8_8320 * (crc & 1)))
     });
     let chunk = [&(data.len() as u32).to_be_bytes()[..], &body, &crc.to_be_bytes()].concat();
-    // Behind the signature and IHDR.
+    // After the signature and IHDR.
     file.splice(33..33, chunk);
     fs::write(path, file).unwrap();
 }

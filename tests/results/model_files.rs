@@ -112,8 +112,8 @@ fn an_export_keeps_the_origin_and_the_page_the_near_plane() {
     gaussians.origin = DVec3::new(4_499_999.6, 519_997.7, 10_001.8);
     ply::save(&gaussians, &path).unwrap();
     let (run, out) = (place.path("run"), place.path("out.ply"));
-    let said = succeed(&format!("export {} --to ply --out {}", run.display(), out.display()));
-    assert!(said.contains("world = position + 4499999.6 519997.7 10001.8"), "{said}");
+    let message = succeed(&format!("export {} --to ply --out {}", run.display(), out.display()));
+    assert!(message.contains("world = position + 4499999.6 519997.7 10001.8"), "{message}");
     assert_eq!(ply::load(&out).unwrap(), gaussians.with_sh_degree(3));
     let line = "comment world = position + 4499999.6 519997.7 10001.8";
     assert!(String::from_utf8_lossy(&fs::read(&out).unwrap()).contains(line));

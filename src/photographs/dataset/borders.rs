@@ -72,8 +72,8 @@ impl Borders {
             let border = border(images, size)?;
             let (width, height) = size;
             tracing::warn!(
-                "{:.1} % of the photographs of {width}x{height} is black in the same place at the border, as undistorting \
-                 leaves it where the lens saw nothing: masked (mask_borders = false trains on it)",
+                "{:.1} % of the photographs of {width}x{height} is black in the same place at the border, as \
+                 undistorting leaves it where the lens saw nothing: masked (mask_borders = false trains on it)",
                 100.0 * border.len() as f64 / f64::from(width) / f64::from(height)
             );
             Some((size, border))

@@ -17,7 +17,8 @@ use super::packed::Packed;
 use super::points;
 use super::prepare::{Preparation, check_size, disagreement, pixel_count};
 use super::source::{MAX_READ, Source};
-use super::turns::{self, Header, Pixels, Turns};
+use super::tracked;
+use super::turns::{Header, Pixels, Turns};
 use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
@@ -49,7 +50,7 @@ pub(super) fn load(
         sources.par_iter_mut().map(|source| source.headers(&memory)).collect();
     let own: Vec<Option<Header>> = headers.iter().map(|[own, _]| *own).collect();
     let points = || points::of_sources(layout, &sources);
-    let pixels = turns::pixels(&sources, &own, options.orientation, points)?;
+    let pixels = tracked::pixels(&sources, &own, options.orientation, points)?;
     let fitted = sources.into_par_iter().zip(headers).map(|(mut source, headers)| {
         source.fit(headers, pixels)?;
         Ok(source)

@@ -1,13 +1,14 @@
-//! Which pixels cameras are of, found from tracked points: a point looks alike in all photographs that show it, if each is
-//! looked up where its camera has the point.
+//! Which pixels cameras are of where sizes do not tell, found from tracked points: a point looks alike in all photographs
+//! that show it, if each is looked up where its camera has the point.
 
 use rayon::prelude::*;
 
 use super::Point;
 use super::source::Source;
-use super::turns::{Header, Pixels};
+use super::turns::{Header, PixelOrientation, Pixels};
+use crate::Result;
 use crate::camera::Lens;
-use crate::photographs::image::Image;
+use crate::photographs::image::{Image, Orientation};
 
 /// Photographs that are compared.
 const MOST: usize = 12;
@@ -19,9 +20,58 @@ const STANDARD_ERRORS: f64 = 4.0;
 /// A sample is the mean of a square whose half side is this part of the longest side.
 const HALF_SIDE: f64 = 1.0 / 250.0;
 
+/// The pixels that the cameras are of where sizes do not tell. One program found them all, so that one answer holds for
+/// all photographs. `points` gives the dataset's points, with indices into `sources`.
+///
+/// # Errors
+/// Those of `points`.
+pub(super) fn pixels(
+    sources: &[Source],
+    headers: &[Option<Header>],
+    choice: PixelOrientation,
+    points: impl FnOnce() -> Result<Vec<Point>>,
+) -> Result<Pixels> {
+    let turned: Vec<(usize, Header)> = headers
+        .iter()
+        .enumerate()
+        .filter_map(|(index, header)| Some((index, (*header)?)))
+        .filter(|(_, header)| header.orientation != Orientation::UPRIGHT)
+        .collect();
+    let by_size = |(index, header): &(usize, Header)| header.by_size(&sources[*index].lens);
+    let (told, open): (Vec<_>, Vec<_>) = turned.into_iter().partition(|own| by_size(own).is_some());
+    let Some(first) = open.first() else { return Ok(Pixels::Stored) };
+    match choice {
+        PixelOrientation::Stored => return Ok(Pixels::Stored),
+        PixelOrientation::Exif => return Ok(Pixels::Exif),
+        PixelOrientation::Auto => {}
+    }
+    let mut told: Vec<Pixels> = told.iter().filter_map(by_size).collect();
+    told.dedup();
+    if let [only] = told[..] {
+        return Ok(only);
+    }
+    let found = by_points(sources, headers, &open, &points()?);
+    let (count, name) = (open.len(), &sources[first.0].name);
+    let subject = format!(
+        "Exif turns or mirrors {count} photographs, {name} the first, whose sizes do not tell which pixels their \
+         cameras are of"
+    );
+    match found {
+        Some(Pixels::Stored) => tracing::info!("{subject}: those stored, by the points they share"),
+        Some(Pixels::Exif) => {
+            tracing::info!("{subject}: those that Exif shows, by the points they share");
+        }
+        None => tracing::warn!(
+            "{subject}: those stored are taken; `--orientation exif` takes those that Exif shows, `stored` keeps \
+             these"
+        ),
+    }
+    Ok(found.unwrap_or(Pixels::Stored))
+}
+
 /// The pixels with which the photographs agree on their points; `None` where that is not clear. `open` are those, with
 /// indices into `sources`, for which the answer is wanted.
-pub(super) fn pixels(
+fn by_points(
     sources: &[Source],
     headers: &[Option<Header>],
     open: &[(usize, Header)],
@@ -100,8 +150,8 @@ fn place(source: &Source, point: &Point) -> Option<[f64; 2]> {
     is_seen.then_some(place)
 }
 
-/// The mean correlation of what photographs show of a point, each with its own mean and contrast divided out, and of how many
-/// pairs that is; `None` where no two show one point.
+/// The mean correlation of what photographs show of a point, each with its own mean and contrast divided out, and of how
+/// many pairs that is; `None` where no two show one point.
 fn agreement<'a>(
     views: impl Iterator<Item = &'a Vec<(usize, f64)>>,
     points: usize,

@@ -1,18 +1,16 @@
-//! Which pixels the cameras are of, where Exif turns or mirrors a photograph: those that are stored, as COLMAP reads them, or
-//! those that Exif shows, as many converters write them.
+//! Which pixels the cameras are of, where Exif turns or mirrors a photograph: those that are stored, as COLMAP reads
+//! them, or those that Exif shows, as many converters write them.
 
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use super::Point;
-use super::source::Source;
-use super::tracked;
 use crate::camera::Lens;
 use crate::photographs::image::Orientation;
 use crate::{Error, Result};
 
-/// Which pixels the cameras of a dataset are of, where a photograph's Exif turns or mirrors it and its size does not tell.
+/// Which pixels the cameras of a dataset are of, where a photograph's Exif turns or mirrors it and its size does not
+/// tell.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum PixelOrientation {
@@ -28,7 +26,7 @@ pub enum PixelOrientation {
 
 impl PixelOrientation {
     /// Their names.
-    pub const NAMES: [&'static str; 3] = ["auto", "stored", "exif"];
+    pub(crate) const NAMES: [&'static str; 3] = ["auto", "stored", "exif"];
 }
 
 impl FromStr for PixelOrientation {
@@ -62,7 +60,7 @@ pub(super) struct Header {
 
 impl Header {
     /// The pixels that a camera is of, by its size; `None` where both have it.
-    fn by_size(self, lens: &Lens) -> Option<Pixels> {
+    pub(super) fn by_size(self, lens: &Lens) -> Option<Pixels> {
         let fits = |(width, height): (u32, u32)| lens.fitted(width, height).is_some();
         match (fits(self.size), fits(self.orientation.size(self.size))) {
             (true, true) => None,
@@ -90,51 +88,4 @@ impl Turns {
             Pixels::Stored => Self { loading: Orientation::UPRIGHT, viewing: orientation },
         }
     }
-}
-
-/// The pixels that the cameras are of where sizes do not tell. One program found them all, so that one answer holds for
-/// all photographs. `points` gives the dataset's points, with indices into `sources`.
-///
-/// # Errors
-/// Those of `points`.
-pub(super) fn pixels(
-    sources: &[Source],
-    headers: &[Option<Header>],
-    choice: PixelOrientation,
-    points: impl FnOnce() -> Result<Vec<Point>>,
-) -> Result<Pixels> {
-    let turned: Vec<(usize, Header)> = headers
-        .iter()
-        .enumerate()
-        .filter_map(|(index, header)| Some((index, (*header)?)))
-        .filter(|(_, header)| header.orientation != Orientation::UPRIGHT)
-        .collect();
-    let by_size = |(index, header): &(usize, Header)| header.by_size(&sources[*index].lens);
-    let (told, open): (Vec<_>, Vec<_>) = turned.into_iter().partition(|own| by_size(own).is_some());
-    let Some(first) = open.first() else { return Ok(Pixels::Stored) };
-    match choice {
-        PixelOrientation::Stored => return Ok(Pixels::Stored),
-        PixelOrientation::Exif => return Ok(Pixels::Exif),
-        PixelOrientation::Auto => {}
-    }
-    let mut told: Vec<Pixels> = told.iter().filter_map(by_size).collect();
-    told.dedup();
-    if let [only] = told[..] {
-        return Ok(only);
-    }
-    let found = tracked::pixels(sources, headers, &open, &points()?);
-    let (count, name) = (open.len(), &sources[first.0].name);
-    let subject = format!(
-        "Exif turns or mirrors {count} photographs, {name} the first, whose sizes do not tell which pixels their cameras are of"
-    );
-    match found {
-        Some(Pixels::Stored) => tracing::info!("{subject}: those stored, by the points they share"),
-        Some(Pixels::Exif) => {
-            tracing::info!("{subject}: those that Exif shows, by the points they share");
-        }
-        None => tracing::warn!(
-            "{subject}: those stored are taken; `train --orientation exif` takes those that Exif shows, `stored` keeps these"
-        ),
-    }
-    Ok(found.unwrap_or(Pixels::Stored))
 }

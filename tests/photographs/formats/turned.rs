@@ -1,5 +1,5 @@
-//! Photographs that their Exif turns by half or mirrors, and square ones: their size does not tell which pixels their cameras
-//! are of.
+//! Photographs that their Exif turns by half or mirrors, and square ones: their size does not tell which pixels their
+//! cameras are of.
 
 use std::fs;
 use std::path::Path;
@@ -62,8 +62,8 @@ fn taken(index: usize, size: (u32, u32)) -> Image {
     image
 }
 
-/// Writes a capture whose photographs have the first orientation in their Exif, and whose cameras are of what is stored or
-/// of what Exif shows; with points or without.
+/// Writes a capture whose photographs have the first orientation in their Exif, and whose cameras are of what is stored
+/// or of what Exif shows; with points or without.
 fn capture(root: &Path, size: (u32, u32), turn: (u8, u8), of_exif: bool, has_points: bool) {
     fs::create_dir_all(root.join("images")).unwrap();
     fs::create_dir_all(root.join("sparse/0")).unwrap();
@@ -114,8 +114,8 @@ fn turned(image: Image, orientation: u8) -> Image {
 fn loaded(root: &Path, orientation: PixelOrientation) -> (Dataset, String) {
     let mut dataset = None;
     let options = LoadOptions { orientation, ..LoadOptions::default() };
-    let said = warnings(|| dataset = Some(Dataset::load(root, &options).unwrap()));
-    (dataset.unwrap(), said)
+    let message = warnings(|| dataset = Some(Dataset::load(root, &options).unwrap()));
+    (dataset.unwrap(), message)
 }
 
 /// Whether the photographs are what their cameras took, up to what JPEG makes of it.
@@ -137,9 +137,9 @@ fn points_that_photographs_share_tell_which_pixels_their_cameras_are_of() {
             let folder = tempfile::tempdir().unwrap();
             let root = folder.path();
             capture(root, size, turn, of_exif, true);
-            let (dataset, said) = loaded(root, PixelOrientation::Auto);
+            let (dataset, message) = loaded(root, PixelOrientation::Auto);
             assert!(are_right(&dataset, size), "{size:?} {turn:?} {of_exif}");
-            assert_eq!(said, "", "{size:?} {turn:?} {of_exif}");
+            assert_eq!(message, "", "{size:?} {turn:?} {of_exif}");
             let own = Orientation::of(&root.join("images/v00.jpg"));
             let left = if of_exif { Orientation::UPRIGHT } else { own };
             assert_eq!(view(&dataset, "v00").orientation, left);
@@ -153,16 +153,16 @@ fn without_points_what_is_stored_is_taken_with_one_warning_and_the_option_says_o
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path();
         capture(root, WIDE, HALF_TURN, of_exif, false);
-        let (dataset, said) = loaded(root, PixelOrientation::Auto);
+        let (dataset, message) = loaded(root, PixelOrientation::Auto);
         assert_eq!(are_right(&dataset, WIDE), !of_exif);
         let expected = "Exif turns or mirrors 9 photographs, v00 the first";
-        assert_eq!(said.matches(expected).count(), 1, "{said}");
-        assert!(said.contains("--orientation exif"), "{said}");
+        assert_eq!(message.matches(expected).count(), 1, "{message}");
+        assert!(message.contains("--orientation exif"), "{message}");
         let options = [(PixelOrientation::Stored, !of_exif), (PixelOrientation::Exif, of_exif)];
         for (option, is_right) in options {
-            let (dataset, said) = loaded(root, option);
+            let (dataset, message) = loaded(root, option);
             assert_eq!(are_right(&dataset, WIDE), is_right);
-            assert!(!said.contains("Exif"), "{said}");
+            assert!(!message.contains("Exif"), "{message}");
         }
     }
 }
@@ -171,8 +171,8 @@ fn without_points_what_is_stored_is_taken_with_one_warning_and_the_option_says_o
 fn the_option_overrides_what_points_tell() {
     let folder = tempfile::tempdir().unwrap();
     capture(folder.path(), WIDE, HALF_TURN, false, true);
-    let (dataset, said) = loaded(folder.path(), PixelOrientation::Exif);
-    assert!(!are_right(&dataset, WIDE) && said.is_empty(), "{said}");
+    let (dataset, message) = loaded(folder.path(), PixelOrientation::Exif);
+    assert!(!are_right(&dataset, WIDE) && message.is_empty(), "{message}");
 }
 
 #[test]
@@ -185,8 +185,8 @@ fn a_photograph_whose_size_tells_speaks_for_those_whose_size_does_not() {
         let lying = turned(taken(4, WIDE), 8);
         write(&if of_exif { lying } else { taken(4, WIDE) }, &path);
         orient(&path, 6);
-        let (dataset, said) = loaded(root, PixelOrientation::Auto);
-        assert!(are_right(&dataset, WIDE) && said.is_empty(), "{of_exif} {said}");
+        let (dataset, message) = loaded(root, PixelOrientation::Auto);
+        assert!(are_right(&dataset, WIDE) && message.is_empty(), "{of_exif} {message}");
     }
 }
 
@@ -196,6 +196,10 @@ fn the_configuration_keeps_the_option() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     capture(root, WIDE, HALF_TURN, true, false);
+    let diagnose = format!("diagnose {}", root.display());
+    assert!(run(&diagnose, 0).1.contains("--orientation exif"));
+    let (_, log) = run(&format!("{diagnose} --orientation exif"), 0);
+    assert!(!log.contains("Exif"), "{log}");
     let line = format!("train {} --out {}/run --explain", root.display(), root.display());
     let (explained, _) = run(&format!("{line} --orientation exif"), 0);
     let kept = explained.lines().find(|line| line.contains("orientation")).unwrap();
