@@ -84,8 +84,8 @@ pub struct Header {
     pub properties: Vec<Property>,
     /// Whether other elements follow the vertices.
     pub has_more: bool,
-    /// Its comments.
-    pub comments: Vec<String>,
+    /// Its comments, each with the number of its line.
+    pub comments: Vec<(usize, String)>,
 }
 
 impl Header {
@@ -111,9 +111,9 @@ impl Header {
             comments: vec![],
         };
         let (mut encoding, mut in_vertices) = (None, false);
-        for line in String::from_utf8_lossy(&bytes[..end]).lines() {
+        for (number, line) in (1..).zip(String::from_utf8_lossy(&bytes[..end]).lines()) {
             if let Some(comment) = line.trim_start().strip_prefix("comment ") {
-                header.comments.push(comment.trim_start().to_owned());
+                header.comments.push((number, comment.trim_start().to_owned()));
                 continue;
             }
             match *line.split_whitespace().collect::<Vec<_>>() {

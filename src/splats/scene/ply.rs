@@ -214,7 +214,7 @@ fn parse_origin(numbers: &str) -> Result<DVec3, String> {
 
 /// The origin that a comment gives.
 fn origin(header: &Header) -> Result<DVec3, String> {
-    let mut origins = header.comments.iter().filter_map(|comment| comment.strip_prefix(ORIGIN));
+    let mut origins = header.comments.iter().filter_map(|(_, own)| own.strip_prefix(ORIGIN));
     origins.next_back().map_or(Ok(DVec3::ZERO), parse_origin)
 }
 
