@@ -3,6 +3,7 @@
 use std::ops::Bound;
 use std::path::PathBuf;
 
+use super::PixelOrientation;
 use crate::base::settings::Rule;
 use crate::base::tree;
 use crate::photographs::white_balance::WhiteBalance;
@@ -26,6 +27,8 @@ pub struct LoadOptions {
     pub keep: Option<u64>,
     /// The folder that holds the photographs by their listed names, in place of where the listing says they are.
     pub images: Option<PathBuf>,
+    /// Which pixels the cameras are of, where a photograph's Exif turns or mirrors it and sizes do not tell.
+    pub orientation: PixelOrientation,
     /// A folder of reference images by name, in place of what is found beside the input.
     pub reference: Option<PathBuf>,
     /// Whether test views load their dark photograph too, where there is one.
@@ -78,6 +81,7 @@ impl Default for LoadOptions {
             test_every: None,
             keep: None,
             images: None,
+            orientation: PixelOrientation::Auto,
             reference: None,
             load_low_test: true,
             hold_out: 0,
