@@ -77,7 +77,8 @@ static VkDeviceMemory allocate(VkMemoryRequirements needed, VkMemoryPropertyFlag
 
 /* A camera that looks along z at the origin, from four units away. */
 static NspCamera camera(void) {
-    NspCamera own = {.width = WIDTH, .height = HEIGHT, .focal = {300, 300}, .principal_point = {WIDTH / 2.0, HEIGHT / 2.0}};
+    NspCamera own = {.width = WIDTH, .height = HEIGHT, .focal = {300, 300}};
+    own.principal_point[0] = WIDTH / 2.0, own.principal_point[1] = HEIGHT / 2.0;
     double pose[12] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4};
     memcpy(own.view_from_world, pose, sizeof pose);
     return own;
@@ -107,7 +108,8 @@ int main(int argc, char **argv) {
     VkBufferCreateInfo buffer_info = {.sType = VK_STRUCTURE_TYPE_BUFFER_CREATE_INFO,
                                       .size = 4 * WIDTH * HEIGHT,
                                       .usage = VK_BUFFER_USAGE_TRANSFER_DST_BIT};
-    VkCommandPoolCreateInfo pool_info = {.sType = VK_STRUCTURE_TYPE_COMMAND_POOL_CREATE_INFO, .queueFamilyIndex = family};
+    VkCommandPoolCreateInfo pool_info = {.sType = VK_STRUCTURE_TYPE_COMMAND_POOL_CREATE_INFO,
+                                         .queueFamilyIndex = family};
     VkSemaphoreTypeCreateInfo timeline = {.sType = VK_STRUCTURE_TYPE_SEMAPHORE_TYPE_CREATE_INFO,
                                           .semaphoreType = VK_SEMAPHORE_TYPE_TIMELINE};
     VkSemaphoreCreateInfo semaphore_info = {.sType = VK_STRUCTURE_TYPE_SEMAPHORE_CREATE_INFO, .pNext = &timeline};

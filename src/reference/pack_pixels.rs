@@ -95,7 +95,7 @@ impl Reference for Kernel {
                 };
                 let backdrop = match params.is_over != 0 {
                     true => under[c],
-                    false => encoded(params, background[c]),
+                    false => background[c],
                 };
                 pixel[c] = seen + transmittance * backdrop;
             }

@@ -15,6 +15,7 @@ use nightsplat::gpu::{
     Gpu, HostFrame, HostImage, ImageFormat, ImageState, Reference as _, Threads,
 };
 use nightsplat::kernels::{depth_limits, pack_pixels, pixels};
+use nightsplat::reference::pack_pixels as pack_pixels_reference;
 use nightsplat::splats::render::{
     DepthConvention, DepthKind, Purpose, RenderOptions, RenderSettings, Renderer, SceneDepth,
     Target,
@@ -120,6 +121,16 @@ fn planes(camera: &Camera) -> (Vec<f32>, Vec<f32>) {
     (planes, transmittances)
 }
 
+/// A display-referred value as an image counts it.
+fn encoded(encoding: u32, c: f32) -> f32 {
+    match encoding {
+        pixels::PIXELS_LINEAR_HALF | pixels::PIXELS_SRGB => {
+            (1.5 * pack_pixels_reference::eotf(c.into())) as f32
+        }
+        _ => c,
+    }
+}
+
 /// What an image should hold, by the reference of the kernel that packs pixels.
 fn expected(camera: &Camera, encoding: u32, swaps: u32, under: Option<&[u32]>) -> Vec<u32> {
     let (render, transmittances) = planes(camera);
@@ -131,7 +142,7 @@ fn expected(camera: &Camera, encoding: u32, swaps: u32, under: Option<&[u32]>) -
         swaps,
         is_over: under.is_some().into(),
         exposure: 1.5,
-        background: OPTIONS.background.into(),
+        background: OPTIONS.background.map(|c| encoded(encoding, c)).into(),
         depth_plane: 0,
         is_mean: 0,
         has_color: 1,

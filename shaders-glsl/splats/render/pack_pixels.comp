@@ -17,7 +17,7 @@ layout(push_constant, scalar) uniform Params {
     uint  swaps;       // 1: blue comes first
     uint  is_over;     // 1: over the pixels of `under`
     float exposure;    // of a linear image
-    vec3  background;  // display-referred
+    vec3  background;  // as the image counts colours
     uint  depth_plane; // of the render; 0: none
     uint  is_mean;     // 1: the depths are weighted sums, else medians
     uint  has_color;   // 1: the colour is stored
@@ -89,6 +89,6 @@ void main() {
     vec3 seen = is_linear() && alpha > 0.0 ? encoded(color / alpha) * alpha : max(color, vec3(0.0));
     vec4 pixel = vec4(seen, alpha);
     if (is_over != 0) pixel += transmittance * load(at);
-    else pixel.rgb += transmittance * encoded(background);
+    else pixel.rgb += transmittance * background;
     store(at, pixel);
 }

@@ -239,7 +239,7 @@ impl Renderer {
             swaps: swaps.into(),
             is_over: target.is_over.into(),
             exposure: target.exposure,
-            background: options.background.into(),
+            background: target.encoded(options.background),
             depth_plane: plane,
             is_mean: (target.depth_kind == super::DepthKind::Expected).into(),
             has_color: color.is_some().into(),

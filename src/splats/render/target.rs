@@ -2,6 +2,8 @@
 
 use std::fmt::Debug;
 
+use glam::Vec3;
+
 use crate::camera::Camera;
 use crate::gpu::{HostImage, ImageFormat};
 use crate::kernels::pixels::{
@@ -236,6 +238,18 @@ impl SceneDepth<'_> {
 }
 
 impl Target<'_> {
+    /// A display-referred colour as the colour image counts it: linear light with its exposure, or itself.
+    pub(super) fn encoded(&self, color: [f32; 3]) -> Vec3 {
+        let (encoding, _) = self.encoding();
+        let light = |c: f64| {
+            let curved = if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) };
+            (curved * f64::from(self.exposure)) as f32
+        };
+        let is_linear = encoding == PIXELS_LINEAR_HALF || encoding == PIXELS_SRGB;
+        let channel = |c: f32| if is_linear { light(c.max(0.0).into()) } else { c };
+        color.map(channel).into()
+    }
+
     /// The encoding of the colour image, and whether blue comes first.
     pub(super) fn encoding(&self) -> (u32, bool) {
         let format = self.color.map_or(ImageFormat::Rgba16Float, |image| image.format);

@@ -19,7 +19,9 @@ fn library() -> &'static Path {
 /// Compiles a source file with every warning an error.
 fn compile(compiler: &str, standard: &str, source: &Path, more: &[&str]) -> PathBuf {
     let library = library();
-    let out = library.join(source.file_stem().unwrap());
+    static COUNT: AtomicU64 = AtomicU64::new(0);
+    let number = COUNT.fetch_add(1, Ordering::AcqRel);
+    let out = library.join(format!("{}{number}", source.file_stem().unwrap().to_str().unwrap()));
     let mut command = Command::new(compiler);
     command.arg(standard).args(["-Wall", "-Wextra", "-pedantic", "-Werror"]).arg(source);
     command.arg("-I").arg(library.join("include")).args(more).arg("-o").arg(&out);
@@ -78,6 +80,14 @@ fn the_c_host_draws_our_own_render_without_a_message() {
     let file = std::fs::read(folder.path().join("out.ppm")).unwrap();
     let pixels = &file[file.len() - 3 * PIXELS..];
     assert_close(pixels, &own_render(&model));
+
+    // Its own memory, and ours, by the sanitizers of the compiler.
+    let mut checked = linked.clone();
+    checked.extend(["-g", "-fsanitize=address,undefined"]);
+    let program = compile("cc", "-std=c99", &root.join("examples/c/embed.c"), &checked);
+    let mut command = Command::new(program);
+    let done = command.current_dir(folder.path()).args(["model.ply", "out.ppm"]).output().unwrap();
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
 
     let failed = run("absent.ply");
     let printed = String::from_utf8_lossy(&failed.stdout).into_owned();
