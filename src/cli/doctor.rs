@@ -8,11 +8,11 @@ use anyhow::Result;
 use serde::Serialize;
 
 use super::finish;
-use super::pose::sources;
 use crate::Error;
 use crate::gpu::{
     CooperativeMatrix, DeviceChoice, DeviceReport, SUBGROUP_VARIABLE, SchedulerVariables, devices,
 };
+use crate::photographs::pose::how_to_install;
 
 /// List the Vulkan devices and check what training requires of them.
 #[derive(Clone, Copy, Debug, clap::Args)]
@@ -90,7 +90,7 @@ fn on_path(program: &str) -> Option<PathBuf> {
 fn program_lines(programs: &BTreeMap<&'static str, Option<PathBuf>>) -> String {
     let line = |(name, purpose): &(&'static str, &str)| match programs.get(name) {
         Some(Some(path)) => format!("{name}  {}, for {purpose}\n", path.display()),
-        _ => format!("{name}  not found; install it for {purpose}: {}\n", sources(name)),
+        _ => format!("{name}  not found; install it for {purpose}: {}\n", how_to_install(name)),
     };
     PROGRAMS.iter().map(line).collect::<String>() + "\n"
 }

@@ -432,7 +432,7 @@ fn an_ffmpeg_without_the_filters_for_a_wide_range_names_the_command() {
     refused(&arguments, 3, &parts);
     script(&root.join("ffprobe"), "exit 1");
     let (_, message) = run(&arguments, 3);
-    assert!(message.contains("ffprobe") && message.contains("taken for SDR"), "{message}");
+    assert!(message.contains("ffprobe") && message.contains("assuming SDR"), "{message}");
 }
 
 #[test]

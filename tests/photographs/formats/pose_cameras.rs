@@ -116,7 +116,7 @@ fn few_photographs_begin_with_a_closer_pair_and_options_go_to_the_command_that_h
     let relaxed = format!("mapper) [ \"$angle\" = 2 ] && {copy}; exit 0;;");
     let (stdout, stderr) = run(&pose(&relaxed, ""), 0);
     assert!(stdout.contains("9 of 9 photographs"), "{stdout}");
-    assert_eq!(stderr.matches("placed once more, from a closer pair").count(), 2, "{stderr}");
+    assert_eq!(stderr.matches("registering again, from a closer pair").count(), 2, "{stderr}");
     let log = fs::read_to_string(out.join("colmap.log")).unwrap();
     assert!(
         log.contains("--Mapper.init_max_forward_motion 1 --Mapper.init_min_num_inliers 50"),
@@ -131,9 +131,9 @@ fn few_photographs_begin_with_a_closer_pair_and_options_go_to_the_command_that_h
     for (option, parts) in [
         (
             "Mapper.nothing=3",
-            ["Mapper.nothing", "feature_extractor, exhaustive_matcher, mapper none has"],
+            ["Mapper.nothing", "none of feature_extractor, exhaustive_matcher, mapper has"],
         ),
-        ("Mapper.init_min_tri_angle", ["Mapper.init_min_tri_angle", "is no NAME=VALUE"]),
+        ("Mapper.init_min_tri_angle", ["Mapper.init_min_tri_angle", "is not NAME=VALUE"]),
     ] {
         refused(&pose(&asked, &format!("--colmap-option {option}")), 2, &parts);
     }
