@@ -333,8 +333,8 @@ impl Dataset {
         let has_test = listings.iter().any(|(_, split)| *split == Some(Split::Test));
         let root = layout.as_ref().map_or(root, |layout| &layout.root);
         match options.test_every {
-            Some(0) => "none, as asked for".to_owned(),
-            Some(every) => format!("every {every}th by name, as asked for"),
+            Some(0) => "none, as requested".to_owned(),
+            Some(every) => format!("every {every}th by name, as requested"),
             None if has_test => "as the transforms files say".to_owned(),
             None if split::test_list(root).is_some() => "as test.txt says".to_owned(),
             None => format!("every {TEST_EVERY}th by name"),

@@ -1,4 +1,4 @@
-//! Everything that a training run depends on: the command line, a TOML file and the run directory say it alike.
+//! Everything that a training run depends on, the same on the command line, in a TOML file and in the run directory.
 
 mod exposure;
 mod stop;
@@ -36,14 +36,14 @@ pub use stop::{NotFinite, StopConfig};
 /// Pixels of a patch; smaller ones have more border than content.
 pub(super) const MIN_PATCH: u64 = 256;
 
-/// What is seen where no splat is.
+/// The background of a render.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Background {
     /// Black, as in the paper.
     #[default]
     Black,
-    /// Another colour every step: dark surfaces cannot hide in the background.
+    /// Another colour every step, so that dark surfaces cannot be left empty.
     Random,
 }
 
@@ -156,7 +156,7 @@ sections {
     schedule: Schedule;
     /// Density control.
     density: DensityConfig;
-    /// Parts of the model beside colour.
+    /// Parts of the model in addition to colour.
     model: ModelConfig;
     /// Loss terms on the parameters of the Gaussians.
     loss: ParameterWeights;
@@ -393,14 +393,14 @@ mod tests {
     use crate::splats::attributes::Attribute;
 
     #[test]
-    fn a_configuration_survives_its_toml() {
+    fn a_configuration_is_read_back_from_its_toml() {
         let config = TrainConfig { seed: 3, background: Background::Random, ..Default::default() };
         let text = config.to_toml().unwrap();
         assert_eq!(toml::from_str::<TrainConfig>(&text).unwrap(), config);
     }
 
     #[test]
-    fn what_excludes_each_other_is_named_by_its_key() {
+    fn settings_that_exclude_each_other_are_named_by_key() {
         let mut config = TrainConfig::default();
         (config.exposure.learn, config.model.tonemapper) = (OnOff::On, true);
         let message = config.check().unwrap_err().to_string();
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_make_no_sense_are_refused_by_name() {
+    fn invalid_values_are_refused_by_key() {
         let refused = |config: TrainConfig| config.check().unwrap_err().to_string();
         assert!(refused(TrainConfig { steps: 0, ..Default::default() }).contains("steps is 0"));
         assert!(

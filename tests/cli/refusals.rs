@@ -135,7 +135,7 @@ fn a_run_directory_is_neither_replaced_unasked_nor_made_where_it_cannot_be() {
     refused(
         &format!("train {} --out {}", fixture.set(), fixture.run()),
         1,
-        &["already holds a run", "--overwrite"],
+        &["already contains a run", "--overwrite"],
     );
     assert_eq!(before, fs::read(fixture.path("run/metrics.json")).unwrap());
     let file = fixture.path("set/low/000.png");

@@ -449,7 +449,7 @@ fn a_well_lit_folder_stays_as_it_is_and_a_black_one_is_refused() {
 
     Image::filled(40, 30, [0.004; 3]).save_png8(folder.join("a.png")).unwrap();
     let error = apply(&args).unwrap_err();
-    assert!(error.to_string().contains("as good as black"), "{error}");
+    assert!(error.to_string().contains("almost black"), "{error}");
     assert_eq!(error.exit_code(), 3);
     let refused = |args: ApplyArgs, part: &str| {
         let message = apply(&args).unwrap_err().to_string();

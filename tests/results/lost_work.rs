@@ -147,7 +147,11 @@ fn a_finished_run_stays_until_the_one_that_replaces_it_has_done_a_step() {
     }
     fs::write(place.path("run/.tmpA1b2C3"), "half a checkpoint").unwrap();
     fs::write(place.path("run/config.toml"), place.read("run/.replaced/config.toml")).unwrap();
-    refused(&place.train("run", "--steps 3 --resume"), 1, &["already holds a run", "--overwrite"]);
+    refused(
+        &place.train("run", "--steps 3 --resume"),
+        1,
+        &["already contains a run", "--overwrite"],
+    );
     assert!(place.read("run/model.ply") == before && !place.path("run/.tmpA1b2C3").exists());
     succeed(&place.train("run", "--steps 4 --overwrite"));
     assert!(place.read("run/model.ply") != before && !place.path("run/.replaced").exists());
@@ -160,7 +164,7 @@ fn files_of_somebody_else_are_neither_replaced_nor_resumed() {
     for (file, content) in [("config.toml", "title = \"my app\"\n"), ("train.csv", "a,b\n")] {
         fs::write(place.path("theirs").join(file), content).unwrap();
         for held in ["--resume", "--overwrite"] {
-            refused(&place.train("theirs", held), 1, &["theirs", "somebody else's"]);
+            refused(&place.train("theirs", held), 1, &["theirs", "no config.toml"]);
         }
     }
     assert_eq!(place.read("theirs/config.toml"), b"title = \"my app\"\n");
@@ -290,7 +294,7 @@ fn who_has_read_enough_ends_a_command_quietly() {
 fn the_exit_code_says_who_can_do_something_about_it() {
     let place = Place::new();
     succeed(&place.train("done", "--steps 1"));
-    refused(&place.train("done", "--steps 1"), 1, &["already holds a run"]);
+    refused(&place.train("done", "--steps 1"), 1, &["already contains a run"]);
     refused(&place.train("new", "--steps 0"), 2, &["--steps"]);
     refused(&format!("eval {}", place.0.path().display()), 3, &["no config.toml"]);
     refused(&place.train("new", "--steps 1 --device voodoo"), 4, &["voodoo"]);

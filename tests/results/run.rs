@@ -124,8 +124,8 @@ fn a_run_says_at_its_start_what_it_trains_and_why() {
         "{message}"
     );
     let message = start("b", "--steps 1 --progress plain --plan none --curve AP3 --test-every 5");
-    assert!(message.contains("curve ap3: as asked for"), "{message}");
-    assert!(message.contains("2 test views (every 5th by name, as asked for)"), "{message}");
+    assert!(message.contains("curve ap3: as requested"), "{message}");
+    assert!(message.contains("2 test views (every 5th by name, as requested)"), "{message}");
     let message = start("c", "--steps 1 --progress json --curve none");
     let first: Value = serde_json::from_str(message.lines().next().unwrap()).unwrap();
     assert_eq!(first["event"], "started");

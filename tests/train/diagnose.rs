@@ -439,7 +439,7 @@ fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
     let log = fs::read_to_string(out.join("train.csv")).unwrap();
     assert!(!log.contains(",003,") && !log.contains(",005,"));
     black(|_| true);
-    refused(&format!("diagnose {root}"), 3, &["as good as black", "expose longer"]);
+    refused(&format!("diagnose {root}"), 3, &["almost black", "expose longer"]);
 
     // Half the views well lit.
     let set = written(&Capture { stops: vec![0.0, 4.5], ..Capture::default() });

@@ -364,7 +364,7 @@ fn a_layer_that_the_model_lacks_is_named_with_those_it_has() {
     refused(&format!("eval {at}"), 3, &["networks.safetensors"]);
     let of_paper = with_denoiser.replace("variant = \"identity\"", "variant = \"paper\"");
     std::fs::write(&config, of_paper).unwrap();
-    refused(&format!("eval {at}"), 2, &["no noise, which the denoiser takes"]);
+    refused(&format!("eval {at}"), 2, &["no noise, which the denoiser requires"]);
 }
 
 /// Without depth maps there is no depth channel, so that the others lie elsewhere than the configuration would have them.

@@ -337,7 +337,7 @@ fn a_run_tells_its_observer_everything_in_order() {
     assert_eq!((steps.unwrap(), told), (30, expected));
 
     let (refused, told) = train(&config, IfExists::Refuse);
-    assert!(refused.unwrap_err().to_string().contains("already holds a run") && told.is_empty());
+    assert!(refused.unwrap_err().to_string().contains("already contains a run") && told.is_empty());
     let (steps, told) = train(&TrainConfig { steps: 33, ..config }, IfExists::Resume);
     assert_eq!((steps.unwrap(), told[0].as_str()), (3, "started 30 of 33"));
 }
@@ -387,5 +387,5 @@ fn a_killed_run_is_resumed_to_the_same_model() {
     refused(&train(&killed, "--steps 300 --resume"), 3, &["train.csv", "step 203"]);
     fs::remove_file(&checkpoint).unwrap();
     fs::remove_file(killed.join("checkpoint.before.safetensors")).unwrap();
-    refused(&train(&killed, "--steps 300 --resume"), 1, &["already holds a run", "--overwrite"]);
+    refused(&train(&killed, "--steps 300 --resume"), 1, &["already contains a run", "--overwrite"]);
 }

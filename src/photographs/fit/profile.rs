@@ -96,13 +96,13 @@ impl ColourScene {
         let photographs = files.par_iter().map(load).collect::<Result<Vec<_>>>()?;
         colours.say();
         let Some(exposure) = Exposure::of(photographs.iter().map(|(_, y)| y), None) else {
-            let problem = "every photograph is as good as black: a profile takes one pair at least";
+            let problem = "every photograph is almost black: a profile takes one pair at least";
             return Err(Error::input(dark, problem));
         };
         let mut pairs = vec![];
         for (mut pair, luminance) in photographs {
             if crate::photographs::tone::is_black(&luminance) {
-                tracing::warn!("left out: {} is as good as black", pair.path.display());
+                tracing::warn!("left out: {} is almost black", pair.path.display());
                 continue;
             }
             let gain = exposure.gain_of(&luminance, None) as f32;

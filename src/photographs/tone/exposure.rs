@@ -52,7 +52,7 @@ const MAX_POSES: usize = 1024;
 /// Lifts up to the first leave the photograph as it is; from the second on the curve has its whole weight.
 const WELL_LIT: [f64; 2] = [1.5, 2.0];
 
-/// A photograph whose 99 % quantile is below this is as good as black: two code values of 8 bits.
+/// A photograph whose 99 % quantile is below this is almost black: two code values of 8 bits.
 const BLACK: f64 = 2.0 / 255.0;
 
 /// delta + (1 - delta) (1 - exp(-k x)): the curve whose mean the rule is about.
@@ -74,7 +74,7 @@ pub struct Exposure {
     pub spread: f64,
     /// How much of the differences between the views' own gains is in the gains of their targets: the slope of ln k.
     pub share: f64,
-    /// How many photographs are as good as black.
+    /// How many photographs are almost black.
     pub black: usize,
     /// The mean luminance that was asked for in place of the rule's.
     brightness: Option<f64>,
@@ -106,7 +106,7 @@ impl NeighbourGains {
 
 impl Exposure {
     /// The exposure of a set, from the luminance of its training photographs. `brightness` is the mean luminance of the
-    /// targets where the rule is not to find it. None where every photograph is as good as black.
+    /// targets where the rule is not to find it. None where every photograph is almost black.
     pub fn of<'a>(
         views: impl IntoIterator<Item = &'a LuminanceHistogram>,
         brightness: Option<f64>,
@@ -178,7 +178,7 @@ impl Exposure {
         Self { share: 0.0, around: None, ..self }
     }
 
-    /// k of a photograph of the scene, of training or not, and of its camera where that is known; one as good as black has
+    /// k of a photograph of the scene, of training or not, and of its camera where that is known; one almost black has
     /// the scene's.
     pub fn gain_of(&self, view: &LuminanceHistogram, camera: Option<&Camera>) -> f64 {
         if is_black(view) {
@@ -224,7 +224,7 @@ impl Exposure {
         };
         let left_out = match black {
             0 => String::new(),
-            count => format!("; {count} as good as black, left out of the measurement"),
+            count => format!("; {count} almost black, left out of the measurement"),
         };
         format!(
             "mean luminance {mean:.3}, {brightening:.1} times that is {target:.2}: {verdict}{varies}{left_out}"
@@ -269,7 +269,7 @@ impl From<Exposure> for SerializedExposure {
 
 /// Says that nothing can be lifted.
 pub(crate) fn all_black(path: &std::path::Path) -> crate::Error {
-    let problem = "every photograph is as good as black (99 % of its pixels are below 2 of 255); expose longer, or name \
+    let problem = "every photograph is almost black (99 % of its pixels are below 2 of 255); expose longer, or name \
                    a curve with --curve";
     crate::Error::input(path, problem)
 }

@@ -1,8 +1,8 @@
-//! SOG, spatially ordered Gaussians: lossless WebP images of quantised attributes in a ZIP, a fifteenth of a PLY. Source: the
-//! format's own description, version 2.
+//! SOG, spatially ordered Gaussians: lossless WebP images of quantised attributes in a ZIP, a fifteenth of a PLY.
+//! Source: the specification of the format, version 2.
 //!
-//! The axes stay those of a PLY. Positions are 16 bits of their signed logarithm, scales and colours codes of 256 numbers,
-//! rotations three bytes, and the higher coefficients one of at most 65 536 sets.
+//! The axes are those of a PLY. Positions are 16 bits of their signed logarithm, scales and colours 8-bit indices of
+//! codebooks, rotations three bytes, and the higher coefficients an index of at most 65 536 vectors.
 
 use std::io::{Cursor, Write as _};
 
@@ -15,16 +15,16 @@ use super::{GENERATOR, Provenance, sigmoid, unit};
 use crate::splats::scene::{Gaussians, rest_coefficients};
 use crate::{Error, Result};
 
-/// Sets of coefficients in a row of their image.
+/// Vectors of coefficients per row of their image.
 const SETS_PER_ROW: usize = 64;
 
-/// The file.
+/// Encodes a model.
 ///
 /// # Errors
-/// None but for what no memory is left for.
+/// [`Error::Output`] if an image or the archive cannot be encoded.
 pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>> {
     let (bounds, positions) = positions(gaussians);
-    // Neighbours in space are neighbours in the images, which compress the better for it.
+    // Neighbours in space are neighbours in the images, which compresses better.
     let mut order: Vec<usize> = (0..gaussians.count).collect();
     order.sort_by_key(|&i| morton(positions[i]));
     let size = image_size(gaussians.count);
@@ -93,7 +93,7 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
     archive(&meta.to_string(), &files)
 }
 
-/// Least and largest signed logarithm of each axis, and each position between them in 16 bits.
+/// Minimum and maximum of the signed logarithm per axis, and each position between them in 16 bits.
 fn positions(gaussians: &Gaussians) -> ([[f32; 3]; 2], Vec<[u16; 3]>) {
     let logarithm = |x: f32| (x.abs() + 1.0).ln().copysign(x);
     let logarithms = || gaussians.means().iter().map(|mean| mean.to_array().map(logarithm));
@@ -113,7 +113,7 @@ fn positions(gaussians: &Gaussians) -> ([[f32; 3]; 2], Vec<[u16; 3]>) {
     ([low, high], logarithms().map(fixed).collect())
 }
 
-/// The place along a Z-order curve.
+/// The index along a Z-order curve.
 fn morton(position: [u16; 3]) -> u64 {
     let spread =
         |value: u16| (0..16).fold(0, |bits, bit| bits | u64::from(value >> bit & 1) << (3 * bit));
@@ -121,7 +121,7 @@ fn morton(position: [u16; 3]) -> u64 {
     x | y << 1 | z << 2
 }
 
-/// The three smaller parts of (w, x, y, z) in a byte each, in order, and which was the largest.
+/// The three smaller components of (w, x, y, z) in a byte each, in order, then the index of the largest.
 fn rotation(quat: [f32; 4]) -> [u8; 4] {
     let parts = unit(quat);
     let largest =
@@ -136,12 +136,12 @@ fn rotation(quat: [f32; 4]) -> [u8; 4] {
     [next(), next(), next(), 252 + largest as u8]
 }
 
-/// A quarter of the Gaussians, and what 16 bits count.
+/// The size of the palette: a quarter of the Gaussians, at most 65 536.
 fn sets_of(count: usize) -> usize {
     (count / 4).clamp(1024, 1 << 16)
 }
 
-/// Nearly square.
+/// Width and height, nearly square.
 fn image_size(count: usize) -> [usize; 2] {
     let width = ((count as f64).sqrt().ceil() as usize).next_multiple_of(4).max(4);
     [width, count.div_ceil(width).max(1)]
@@ -149,9 +149,9 @@ fn image_size(count: usize) -> [usize; 2] {
 
 fn archive(meta: &str, files: &[(&str, [usize; 2], Vec<u8>)]) -> Result<Vec<u8>> {
     let failed = |error: &dyn std::fmt::Display| {
-        Error::output("an export", format!("cannot be put together: {error}"))
+        Error::output("an export", format!("cannot be assembled: {error}"))
     };
-    // Stored: the images are compressed.
+    // Stored, since the images are compressed.
     let stored = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
     let mut zip = ZipWriter::new(Cursor::new(vec![]));
     let mut add = |name: &str, bytes: &[u8]| {
@@ -177,7 +177,7 @@ mod tests {
     use crate::results::export::tests::drawn;
 
     #[test]
-    fn what_the_images_hold_is_the_model_within_their_bits() {
+    fn the_images_hold_the_model_within_their_precision() {
         let model = drawn(300, 2);
         let file = encode(&model, &Provenance::default()).unwrap();
         let mut zip = zip::ZipArchive::new(Cursor::new(file)).unwrap();
@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn no_gaussian_and_one_are_files_too() {
+    fn models_of_no_gaussian_and_of_one_are_encoded() {
         for count in [0, 1] {
             assert!(!encode(&drawn(count, 1), &Provenance::default()).unwrap().is_empty());
         }

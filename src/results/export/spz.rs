@@ -1,7 +1,8 @@
-//! SPZ: fixed-point positions and eight bits of all else, about a tenth of a PLY. Source: the format's own description.
+//! SPZ: fixed-point positions and 8 bits for everything else, about a tenth of a PLY. Source: the specification of the
+//! format.
 //!
-//! Version 4 has a plain header, a table and a Zstandard stream for each attribute; version 3, which more readers know, one
-//! gzip stream of a shorter header and the same bytes. Axes are those of OpenGL.
+//! Version 4 has a plain header, a table and a Zstandard stream per attribute; version 3, which more readers support,
+//! is one gzip stream of a shorter header and the same bytes. The axes are those of OpenGL.
 
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 
@@ -10,25 +11,25 @@ use crate::splats::scene::{Gaussians, rest_coefficients};
 use crate::{Error, Result};
 
 const MAGIC: u32 = 0x5053_474e;
-/// Positions are signed integers of so many bits.
+/// Bits of a position, a signed integer.
 const POSITION_BITS: u32 = 24;
-/// A colour's coefficient of degree 0 in a byte: 127.5 + this times 255.
+/// A colour coefficient c of degree 0 is the byte 127.5 + 0.15 * 255 c.
 const COLOR_SCALE: f32 = 0.15;
 
-/// The versions that can be written.
+/// The supported versions.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Version {
-    /// Gzip; read by most.
+    /// Gzip, which most readers support.
     V3,
     /// Zstandard.
     #[default]
     V4,
 }
 
-/// The file.
+/// Encodes a model.
 ///
 /// # Errors
-/// [`Error::Usage`]: a position is farther from the origin than 24 bits of whole units reach.
+/// [`Error::Usage`] if a position is beyond the range of 24 bits in whole units.
 pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) -> Result<Vec<u8>> {
     let gaussians = half_turn(gaussians);
     let fraction = fractional_bits(&gaussians)?;
@@ -68,14 +69,14 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) 
                 file.extend((stream.len() as u64).to_le_bytes());
             }
             compressed.iter().for_each(|stream| file.extend(stream));
-            // Behind all that the table names, where a reader does not look.
+            // After everything that the table lists, where readers do not look.
             file.extend(provenance.world_line(&gaussians, true).unwrap_or_default().bytes());
             Ok(file)
         }
     }
 }
 
-/// As many as leave room for the farthest position.
+/// The most fractional bits that represent the farthest position.
 fn fractional_bits(gaussians: &Gaussians) -> Result<u8> {
     let farthest =
         floats(gaussians.means()).iter().fold(0.0_f32, |most, value| most.max(value.abs()));
@@ -103,8 +104,8 @@ fn bytes<T>(values: &[T], code: impl Fn(&T) -> f32) -> Vec<u8> {
     values.iter().map(|value| code(value).round().clamp(0.0, 255.0) as u8).collect()
 }
 
-/// The largest part's place among x, y, z, w in two bits, then the others in order: a sign and nine bits each of sqrt(2)
-/// times the part. The largest part is positive and follows from these.
+/// The index of the largest component among x, y, z, w in two bits, then the others in order: a sign and nine bits of
+/// sqrt(2) times the component. The largest is positive and follows from the others.
 fn smallest_three([w, x, y, z]: [f32; 4]) -> u32 {
     let [w, x, y, z] = unit([w, x, y, z]);
     let parts = [x, y, z, w];
@@ -129,7 +130,7 @@ mod tests {
         encode(model, &Provenance::default(), version).unwrap()
     }
 
-    /// What stands behind the header, as one.
+    /// The decompressed body after the header.
     fn body(file: &[u8]) -> Vec<u8> {
         let word = |at: usize| u64::from_le_bytes(file[at..at + 8].try_into().unwrap()) as usize;
         if file.starts_with(&[0x1f, 0x8b]) {
@@ -155,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn both_versions_hold_the_same_bytes_at_the_stated_places() {
+    fn both_versions_have_the_same_bytes_at_the_stated_places() {
         for degree in 0..=3 {
             let model = drawn(37, degree);
             let [v3, v4] = [Version::V3, Version::V4].map(|version| encode_alone(&model, version));
@@ -168,14 +169,14 @@ mod tests {
     }
 
     #[test]
-    fn positions_use_all_of_their_24_bits_and_what_they_cannot_hold_is_refused() {
+    fn positions_use_all_24_bits_and_a_farther_one_is_refused() {
         let mut model = drawn(2, 0);
         model.means_mut()[0] = glam::Vec3::new(3.0, -1.0, 0.25);
         model.means_mut()[1] = glam::Vec3::ZERO;
         assert_eq!(fractional_bits(&model).unwrap(), 21);
         let body = body(&encode_alone(&model, Version::V4));
         let fixed = |at: usize| i32::from_le_bytes([0, body[at], body[at + 1], body[at + 2]]) >> 8;
-        // Turned: y and z change their signs.
+        // The half turn negates y and z.
         let position = [0, 3, 6].map(|at| fixed(at) as f32 / (1 << 21) as f32);
         assert_eq!(position, [3.0, 1.0, -0.25]);
         model.means_mut()[0].x = 1e7;
@@ -184,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rotation_comes_back_within_its_ten_bits() {
+    fn a_rotation_is_decoded_within_the_precision_of_ten_bits() {
         for quat in drawn(200, 0).quats() {
             let code = smallest_three(*quat);
             let largest = (code >> 30) as usize;

@@ -308,7 +308,7 @@ pub(super) const CASES: &[Case] = &[
     quick(case("photograph black: p90 = 0", "trains towards a target of black", Trains, |_| {
         Ok(Hostile::photograph(|_, _| [0.0; 3]))
     })),
-    case("photograph black, curve auto", "refused: all black", Refusal("as good as black"), |_| {
+    case("photograph black, curve auto", "refused: all black", Refusal("almost black"), |_| {
         let mut own = Hostile::photograph(|_, _| [0.0; 3]);
         own.config.tone = ToneSettings::new(ToneCurve::Auto);
         Ok(own)
