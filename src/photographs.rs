@@ -3,7 +3,7 @@
 //! In: image files, camera files, tone curves. Out: [`dataset::Dataset`], images, and pseudo-GT targets on the device.
 //!
 //! - [`image`]: float images and their files
-//! - [`white_balance`]: gains of the channels that the user knows
+//! - [`white_balance`]: white balance set by the user
 //! - [`metrics`]: PSNR and SSIM of a render against its reference image
 //! - [`tone`]: curves that brighten a photograph
 //! - [`fit`]: the constants of a curve from pairs of photographs

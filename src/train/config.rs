@@ -79,8 +79,8 @@ pub struct TrainConfig {
     mask_borders: bool = true => Rule::Flag;
     /// White balance of the photographs before they are measured: gains R,G,B of linear light; the colour temperature
     /// of the light in kelvin; VIEW,x,y,w,h, a neutral area of one photograph in pixels as stored; or
-    /// VIEW,x1,y1,..,x4,y4, the corners of a chart of 24 patches, from the dark skin patch round by the blue-green, the
-    /// black and the white one.
+    /// VIEW,x1,y1,..,x4,y4, the corners of a chart of 24 patches: at the dark skin, bluish green, black and white
+    /// patch.
     white_balance: Option<WhiteBalance> = None, "none" => WHITE_BALANCE, "--white-balance WHITE";
     /// Undistort fisheye photographs to pinhole ones, cropped to 60 degrees off the axis, instead of training with the
     /// fisheye model; other distorted photographs are always undistorted.

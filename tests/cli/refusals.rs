@@ -306,7 +306,7 @@ fn what_is_no_finished_run_is_refused_by_eval_and_render() {
         config.replace(&fixture().set(), &moved.display().to_string()),
     )
     .unwrap();
-    refused(&format!("eval {run}"), 3, &["model.ply", "did not finish"]);
+    refused(&format!("eval {run}"), 3, &["model.ply", "neither finished"]);
     let model = fs::read(fixture().path("run/model.ply")).unwrap();
     fs::write(folder.path().join("model.ply"), &model).unwrap();
     refused(&format!("eval {run}"), 3, &["config.toml", "moved", "--dataset"]);

@@ -111,7 +111,7 @@ fn a_profile_that_is_none_is_refused_in_one_line() {
 
     refused(&format!("tone fit {set} --profile --family ase"), 2, &["--profile", "--family"]);
     fs::remove_dir_all(folder.path().join("set/high")).unwrap();
-    refused(&format!("tone fit {set} --profile --out {file}"), 3, &["holds no pairs"]);
+    refused(&format!("tone fit {set} --profile --out {file}"), 3, &["contains no pairs"]);
     fs::create_dir(folder.path().join("set/high")).unwrap();
     refused(&format!("tone fit {set} --profile --out {file}"), 3, &["set/"]);
 }

@@ -487,7 +487,7 @@ mod ply_file {
             let problem = problem(&plain[..length]);
             assert!(problem.contains("model.ply"), "{length}: {problem}");
         }
-        assert!(problem(&plain[..plain.len() - 1]).contains("cut short"));
+        assert!(problem(&plain[..plain.len() - 1]).contains("truncated"));
     }
 
     #[test]
@@ -495,7 +495,7 @@ mod ply_file {
         let plain = bytes(&distinct(2, 1));
         for (count, words) in [
             ("1", "more than"),
-            ("3", "cut short"),
+            ("3", "truncated"),
             ("-1", "vertex count"),
             ("many", "vertex count"),
         ] {

@@ -442,7 +442,7 @@ mod tests {
         assert!(load_config(folder.path()).unwrap_err().to_string().contains("config.toml"));
         drop(create(folder.path(), &TrainConfig::default(), false).unwrap());
         assert!(
-            load_model(folder.path(), false).unwrap_err().to_string().contains("did not finish")
+            load_model(folder.path(), false).unwrap_err().to_string().contains("neither finished")
         );
     }
 

@@ -154,7 +154,7 @@ fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
     let expected = header.count.checked_mul(header.stride).ok_or("the vertex count is absurd")?;
     if body.len() < expected {
         return Err(format!(
-            "is cut short: {} vertices of {} bytes need {expected} bytes, the file holds {}",
+            "is truncated: {} vertices of {} bytes need {expected} bytes, the file has {}",
             header.count,
             header.stride,
             body.len()
@@ -232,11 +232,11 @@ impl Header {
         let end = bytes
             .windows(END.len())
             .position(|window| window == END)
-            .ok_or("is cut short in the header")?;
+            .ok_or("is truncated in the header")?;
         let newline = bytes[end..]
             .iter()
             .position(|&byte| byte == b'\n')
-            .ok_or("is cut short in the header")?;
+            .ok_or("is truncated in the header")?;
         let text = std::str::from_utf8(&bytes[..end]).map_err(|_| "the header is not text")?;
 
         let mut header = Self {

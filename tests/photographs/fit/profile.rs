@@ -104,7 +104,7 @@ fn outliers_do_not_pull_a_profile() {
 
 #[test]
 fn pairs_that_make_no_profile_are_named() {
-    assert!(fit_profile(&[], 1.345).unwrap_err().to_string().contains("one at least"));
+    assert!(fit_profile(&[], 1.345).unwrap_err().to_string().contains("at least one"));
     let dir = tempfile::tempdir().unwrap();
     scene(dir.path(), &[1.0], 0.0);
     let mut grey = load(dir.path());

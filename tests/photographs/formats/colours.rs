@@ -127,7 +127,7 @@ fn a_white_balance_that_cannot_be_is_refused_in_a_line() {
         ("0,1,1", 2, "white_balance (--white-balance) is \"0,1,1\"; it must be R,G,B"),
         ("warm", 2, "(--white-balance) is \"warm\""),
         ("v99,2,2,5,5", 3, "no photograph is called `v99`"),
-        ("v03,39,2,5,5", 2, "it leaves the photograph, which is 40x30"),
+        ("v03,39,2,5,5", 2, "it exceeds the photograph, which is 40x30"),
     ] {
         let arguments =
             format!("train {} --out {} --white-balance {white}", root.display(), out.display());
