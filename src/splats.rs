@@ -9,7 +9,7 @@
 //! - [`batches`]: buffers of Gaussians that exceed one binding
 //! - [`scene`]: Gaussians on the host and on the device, PLY
 //! - [`sort`]: scan and radix sort on the device
-//! - [`optimizer`]: Adam, what is learned beside the Gaussians, and learning-rate schedules
+//! - [`optimizer`]: Adam, learned parameters other than the Gaussians, and learning-rate schedules
 //! - [`render`]: the differentiable rasteriser
 //! - [`densify`]: density control: clone, split, prune
 

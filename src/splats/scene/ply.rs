@@ -1,10 +1,10 @@
 //! Gaussians as a PLY file in the INRIA layout, which splat viewers open.
 //!
 //! Binary little-endian, one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`.
-//! Positions far from the world's origin are relative to another one, which a comment gives: `world = position + X Y
-//! Z`. Features, where the scene has any, are between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2
-//! f_illu_0..2`, which viewers skip. Normals are zero; `f_rest_*` is channel-major (all of red, then green, then blue);
-//! opacity is before the sigmoid, scales are logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
+//! Positions far from the world's origin are relative to another origin, given in a comment: `world = position + X Y
+//! Z`. Features, if any, are between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`, which
+//! viewers skip. Normals are zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before
+//! the sigmoid, scales are logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
 
 use std::collections::HashMap;
 use std::fs;
@@ -24,7 +24,7 @@ use crate::{Error, Result};
 /// The prefix of the comment with the origin of the positions.
 const ORIGIN: &str = "world = position + ";
 
-/// A property of the file: its name, and the attribute and component that it holds.
+/// A property of the file: its name, and its attribute and component.
 struct Property {
     name: String,
     attribute: Attribute,
@@ -39,14 +39,14 @@ impl Property {
     }
 }
 
-/// All properties but the normals, which follow the means, in file order.
+/// All properties except the normals, which follow the means, in file order.
 fn properties(shape: Shape) -> Vec<Property> {
     let mut specs: Vec<&AttributeSpec> = ATTRIBUTES.iter().collect();
     specs.sort_by_key(|spec| spec.ply_place);
     let planes = planes(shape.features.width(), width(shape));
     let of_attribute = |spec: &'static AttributeSpec| {
         (0..planes[spec.attribute as usize].1).map(move |position| {
-            // The file is channel-major where the scene is coefficient-major.
+            // The file is channel-major, the scene coefficient-major.
             let component = match spec.attribute {
                 Attribute::Rest => {
                     let coefficients = rest_coefficients(shape.sh_degree);
@@ -69,8 +69,8 @@ impl Gaussians {
     /// Reads a model: a PLY in the INRIA layout, of any trainer, recognised by its content, not by its name.
     ///
     /// # Errors
-    /// [`Error::Input`] where the file is missing, of another format, truncated, longer than its header says, or where
-    /// a required property is missing or not finite.
+    /// [`Error::Input`] if the file is missing, of another format, truncated or longer than its header states, or if a
+    /// required property is missing or not finite.
     pub fn open(path: impl AsRef<Path>) -> Result<Self> {
         load(path)
     }
@@ -79,15 +79,15 @@ impl Gaussians {
 /// Writes `gaussians` to `path` atomically.
 ///
 /// # Errors
-/// [`Error::Output`] where the file cannot be written.
+/// [`Error::Output`] if the file cannot be written.
 pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
     save_with_comments(gaussians, path, &[""; 0])
 }
 
-/// As [`save`], with comments in the header.
+/// [`save`] with comments in the header.
 ///
 /// # Errors
-/// As there.
+/// Those of [`save`].
 pub fn save_with_comments(
     gaussians: &Gaussians,
     path: impl AsRef<Path>,
@@ -133,14 +133,14 @@ fn write(gaussians: &Gaussians, path: &Path, comments: &[impl AsRef<str>]) -> st
         }
     }
     let file = file.into_inner().map_err(std::io::IntoInnerError::into_error)?;
-    // A pipe has no disk to wait for.
+    // A pipe cannot be synchronised.
     if file.metadata()?.is_file() { file.sync_all() } else { Ok(()) }
 }
 
 /// Reads Gaussians from a binary little-endian PLY; unknown properties are skipped.
 ///
 /// # Errors
-/// [`Error::Input`] where the file is missing, of another format, truncated, longer than its header says, or where a
+/// [`Error::Input`] if the file is missing, of another format, truncated or longer than its header states, or if a
 /// required property is missing or not finite.
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
@@ -162,13 +162,13 @@ fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
     }
     if body.len() > expected && !header.more_elements {
         return Err(format!(
-            "holds {} bytes more than its {} vertices need",
+            "has {} bytes more than its {} vertices need",
             body.len() - expected,
             header.count
         ));
     }
 
-    // Before allocation: vertices without properties take no bytes of the file, however many there are.
+    // Before allocation: vertices without properties take no bytes of the file, whatever their number.
     let shape = header.shape()?;
     let offset_of = |property: Property| Ok((header.offset(&property.name)?, property));
     let properties =
@@ -283,7 +283,7 @@ impl Header {
             }
         }
         if !format_is_known {
-            return Err("does not say its format".to_owned());
+            return Err("does not state its format".to_owned());
         }
         if !in_vertices {
             return Err("has no vertices: `element vertex` is missing".to_owned());
@@ -300,7 +300,7 @@ impl Header {
             _ => return Err(format!("property `{name}` has the unknown type `{kind}`")),
         };
         if self.properties.insert(name.to_owned(), (self.stride, kind.to_owned())).is_some() {
-            return Err(format!("property `{name}` is there twice"));
+            return Err(format!("property `{name}` occurs twice"));
         }
         self.stride += size;
         Ok(())

@@ -14,15 +14,15 @@ pub struct RadixSort {
     spine: Pipeline<sort_spine::Kernel>,
     downsweep: Pipeline<sort_downsweep::Kernel>,
     partition_size: u32,
-    /// With more partitions, the spine is a pass of its own.
+    /// With more partitions, the spine is a separate pass.
     folded_partitions: u32,
     /// Workgroups of an upsweep that are done; 0 between upsweeps.
     arrivals: Buffer<u32>,
     scratch: Scratch,
 }
 
-/// Up to this number of partitions, one subgroup scans them faster than a pass of its own would. A CPU has no idle
-/// lanes that would do so at the same time.
+/// Up to this number of partitions, one subgroup scans them faster than a separate pass would. A CPU has no idle lanes
+/// for it.
 const FOLDED_PARTITIONS_ON_A_GPU: u32 = 16;
 const FOLDED_PARTITIONS_ON_A_CPU: u32 = 1024;
 
@@ -68,9 +68,9 @@ impl RadixSort {
         })
     }
 
-    /// Records the sort of the first `count` pairs by the lowest `bits` bits of their keys (32 at most); it is stable.
-    /// Afterwards `keys` and `values` hold the result, whatever the number of passes, because they are swapped with the
-    /// scratch memory: their elements beyond the count are lost. A count beyond the buffers' common length is clamped
+    /// Records the sort of the first `count` pairs by the lowest `bits` bits of their keys (at most 32); it is stable.
+    /// Afterwards `keys` and `values` contain the result for any number of passes, since they are swapped with the
+    /// scratch memory; their elements beyond the count are lost. A count beyond the buffers' common length is clamped
     /// to it.
     ///
     /// # Errors
