@@ -220,7 +220,7 @@ fn what_does_not_fit_is_refused() {
         (192, whole([9, 8]), "9 x 8"),
         (190, whole([8, 8]), "holds 190 values, the view has 192"),
         (30_000, whole([100, 100]), "100 x 100"),
-        (192, (UVec2::splat(8), outside), "interior"),
+        (192, (UVec2::splat(8), outside), "loss region"),
     ] {
         let image = gpu.zeros("image", len).unwrap();
         let [mut d_denoised, mut d_render] = [0; 2].map(|_| gpu.zeros("d", len).unwrap());

@@ -123,6 +123,6 @@ fn a_window_beyond_the_view_or_its_buffers_is_refused() {
         gathered.unwrap_err().to_string()
     };
     let beyond = PaddedCrop { origin: UVec2::ONE, ..PaddedCrop::whole(view) };
-    assert!(problem(beyond, 0..3).contains("does not lie"));
+    assert!(problem(beyond, 0..3).contains("is not inside"));
     assert!(problem(PaddedCrop::whole(view), 1..4).contains("`image` holds 192"));
 }

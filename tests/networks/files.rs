@@ -107,7 +107,7 @@ fn damaged_files_are_told_from_whole_ones() {
     let whole = std::fs::read(&path).unwrap();
     for cut in [0, 7, 100, whole.len() - 4] {
         std::fs::write(&path, &whole[..cut]).unwrap();
-        refused(&mut all, "no whole safetensors file");
+        refused(&mut all, "not an intact safetensors file");
     }
     let mut poisoned = whole;
     let last = poisoned.len() - 4;

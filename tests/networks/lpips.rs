@@ -107,7 +107,7 @@ fn weights_of_another_network_are_named() {
     };
     refused(&["cannot be read"]);
     std::fs::write(&path, "no weights").unwrap();
-    refused(&["no whole safetensors file"]);
+    refused(&["not an intact safetensors file"]);
     write(Network::Alex, &path, |name, shape, values| {
         if name == "net.slice1.0.weight" {
             *shape = vec![64, 3, 3, 3];

@@ -427,7 +427,7 @@ fn misuse_is_told_in_one_line() {
             let again = gpu.run("n", |pass| {
                 $network.backward(pass, size, &image, &image, &image, d_first, d_second)
             });
-            told("a forward pass of its own", again);
+            told("its own preceding forward pass", again);
         };
     }
     check!(denoiser);
