@@ -1,7 +1,7 @@
-//! A host application with a Vulkan device of its own: `cargo run --release --example embed -- OUT.png`.
+//! A host application with its own Vulkan device: `cargo run --release --example embed -- OUT.png`.
 //!
-//! The host lends its device, lets the renderer record into its command buffer, and submits that itself. What a host in
-//! C++ would do is the same: every handle is passed as the number that it is.
+//! The host lends its device, lets the renderer record into its command buffer, and submits that itself. A host in C++
+//! would do the same: every handle is passed as a number.
 
 #![expect(unsafe_code, reason = "plays a host application, which calls Vulkan itself")]
 
@@ -26,7 +26,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         // SAFETY: the handles are the host's own and outlive `gpu`; no other thread uses the queue meanwhile.
         let gpu = unsafe { Gpu::from_host(host.lend()) }?;
         render(&host, &gpu)?.save_png8(out)?;
-        // What the library made goes before the device does.
+        // The library's objects are dropped before the device.
     }
     host.destroy();
     Ok(())
@@ -38,7 +38,7 @@ fn render(host: &Host, gpu: &Gpu) -> Result<Image, Box<dyn Error>> {
     let on_device = gaussians.upload(gpu)?;
     let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
     let mut renderer = Renderer::new(gpu, settings)?;
-    // Memory is taken before anything is recorded.
+    // Memory is allocated before anything is recorded.
     renderer.reserve(gaussians.count, [&camera])?;
     loop {
         host.submit(|commands| {
@@ -49,9 +49,9 @@ fn render(host: &Host, gpu: &Gpu) -> Result<Image, Box<dyn Error>> {
                     renderer.forward(pass, &on_device, &camera, &OPTIONS)
                 })
             }
-            // The host goes on here: `renderer.render().handle()` is a buffer that its own shaders can bind.
+            // The host continues here: `renderer.render().handle()` is a buffer that its own shaders can bind.
         })?;
-        // Where the view had more intersections than there was room for, nothing was rendered.
+        // If the view had more intersections than the capacity, nothing was rendered.
         let status = Status::from_words(&gpu.read(renderer.status())?);
         if !status.overflowed {
             break;
@@ -94,7 +94,7 @@ struct Host {
 }
 
 impl Host {
-    /// The first device, with what the library asks for beside what a host would need itself.
+    /// The first device, with the features that the library requires in addition to the host's own.
     fn new() -> Result<Self, Box<dyn Error>> {
         // SAFETY: every create info points at live locals; the entry is kept as long as the instance.
         unsafe {
@@ -146,11 +146,11 @@ impl Host {
         let allocate = vk::CommandBufferAllocateInfo::default()
             .command_pool(self.pool)
             .command_buffer_count(1);
-        // SAFETY: all objects are live and used by this thread alone, until the queue is idle.
+        // SAFETY: all objects are live and used only by this thread, until the queue is idle.
         unsafe {
             let commands = device.allocate_command_buffers(&allocate)?;
             device.begin_command_buffer(commands[0], &vk::CommandBufferBeginInfo::default())?;
-            // What it binds stays until the queue is idle.
+            // The bound objects stay alive until the queue is idle.
             let _held = record(commands[0])?;
             device.end_command_buffer(commands[0])?;
             let submit = [vk::SubmitInfo::default().command_buffers(&commands)];
@@ -162,7 +162,7 @@ impl Host {
     }
 
     fn destroy(self) {
-        // SAFETY: nothing is in flight, and nothing made from the device is left.
+        // SAFETY: nothing is in flight, and no object of the device is left.
         unsafe {
             self.device.destroy_command_pool(self.pool, None);
             self.device.destroy_device(None);

@@ -53,7 +53,7 @@ fn log(run: &Path) -> Vec<String> {
 fn a_signal_saves_and_stops_and_the_run_goes_on_to_the_same_bits() {
     let place = Place::new();
     succeed(&place.train("straight", "--steps 400"));
-    for (signal, code, message) in [("-INT", 130, "interrupted"), ("-TERM", 143, "told to end")] {
+    for (signal, code, message) in [("-INT", 130, "interrupted"), ("-TERM", 143, "terminated")] {
         let name = format!("stopped{signal}");
         let mut child = begun(&place.train(&name, "--steps 400"));
         send(signal, &child);
