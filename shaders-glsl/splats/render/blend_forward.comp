@@ -17,7 +17,7 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(push_constant, scalar) uniform Params {
     uvec2 size;
     uint tile_columns;
-    uint longest_run;  // splats of a tile that this device follows
+    uint longest_run;  // the most splats of a tile that this device can process
     float background[MAX_CHANNELS];
 };
 
