@@ -81,7 +81,7 @@ pub struct Gpu {
     shared: Arc<Shared>,
 }
 
-/// What a device is and what it can hold.
+/// The identity of a device and its limits.
 #[derive(Clone, Debug)]
 pub struct Properties {
     /// The device's name, as the driver gives it.
@@ -165,7 +165,7 @@ struct Queue {
     family: u32,
 }
 
-/// Progress of recording and submission. Unlike the queue, it is held for moments only.
+/// Progress of recording and submission. Unlike the queue, it is locked only briefly.
 #[derive(Default)]
 struct Progress {
     /// The thread that records, and under which label.
@@ -205,7 +205,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Gpu {
-    /// What the device is.
+    /// The device's identity and limits.
     pub fn properties(&self) -> &Properties {
         &self.shared.properties
     }
@@ -315,7 +315,7 @@ impl Shared {
 impl Drop for Shared {
     fn drop(&mut self) {
         let submitted = lock(&self.progress).submitted;
-        // A lost device still has to be torn down.
+        // A lost device must still be destroyed.
         let _ = self.wait(submitted);
         self.collect(u64::MAX);
         // The allocator returns its memory blocks to the device before the device goes.
@@ -340,7 +340,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lost_device_names_what_it_was_at() {
+    fn a_lost_device_names_its_submission() {
         let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
         let lost = || gpu.shared.error("vkQueueSubmit2", vk::Result::ERROR_DEVICE_LOST).to_string();
         assert!(lost().contains("`vkQueueSubmit2`"), "{}", lost());
