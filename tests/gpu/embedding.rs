@@ -1,4 +1,4 @@
-//! A host application that has its own Vulkan lends us its device, and gets it back as it was.
+//! A host application with its own Vulkan lends its device, and gets it back unchanged.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 #![expect(unsafe_code, reason = "plays a host application, which calls Vulkan itself")]
@@ -18,8 +18,8 @@ use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::Gaussians;
 
 #[test]
-fn a_borrowed_device_renders_the_same_and_comes_back_alive_and_clean() {
-    // A device without the extension has its descriptors in sets, and the bits are the same.
+fn a_borrowed_device_renders_the_same_and_is_returned_unchanged() {
+    // A device without the extension has its descriptors in sets; the bits are the same.
     lend_and_take_back(&[]);
     if gpu().properties().has_push_descriptors {
         lend_and_take_back(&[khr::push_descriptor::NAME]);
@@ -46,13 +46,13 @@ fn lend_and_take_back(extensions: &[&CStr]) {
     host.fill(&memory, 0x1234_5678);
     assert_eq!(host.read(&memory), vec![0x1234_5678; own.data.len()], "the device is not alive");
     host.free(memory);
-    // Objects that we did not destroy would be reported when the host destroys its device.
+    // Objects that the library did not destroy would be reported when the host destroys its device.
     let messages = host.destroy();
     assert!(messages.is_empty(), "validation: {messages:#?}");
 }
 
 #[test]
-fn a_host_without_a_loader_function_is_told_so() {
+fn a_host_without_a_loader_function_is_refused() {
     let host = HostDevice {
         get_instance_proc_addr: std::ptr::null(),
         instance: 0,
@@ -89,7 +89,7 @@ fn camera() -> Camera {
     }
 }
 
-/// Some two hundred in front of the camera.
+/// About two hundred in front of the camera.
 fn gaussians() -> Gaussians {
     let mut gaussians = Gaussians::zeros(200, 0);
     let count = gaussians.count;
@@ -121,14 +121,14 @@ fn render(gpu: &Gpu) -> Image {
 /// Renders within a command buffer that the host begins, continues with a copy to its memory, and submits.
 fn render_into(host: &Host, gpu: &Gpu, memory: &mut Memory) {
     let on_device = gaussians().upload(gpu).unwrap();
-    // A renderer of its own, so that no earlier render can pass for this one.
+    // A separate renderer, so that no earlier render is mistaken for this one.
     let mut renderer = renderer(gpu);
     let mut held = None;
     host.submit(|commands| {
-        // SAFETY: the command buffer is recording; what it uses lives until the host has waited for it.
+        // SAFETY: the command buffer is recording; all objects used live until the host has waited for it.
         let recorded = unsafe {
             gpu.record_into(commands.as_raw(), |pass| {
-                // Nothing of ours would know when the copy is there.
+                // The library cannot tell when the copy is done.
                 let message = pass.download(&on_device.parameters).unwrap_err().to_string();
                 assert!(message.contains("`parameters`"), "{message}");
                 renderer.forward(pass, &on_device, &camera(), &OPTIONS)
@@ -275,7 +275,7 @@ impl Host {
         let allocate = vk::CommandBufferAllocateInfo::default()
             .command_pool(self.pool)
             .command_buffer_count(1);
-        // SAFETY: all objects are live and used by this thread alone, until the fence says that they are done.
+        // SAFETY: all objects are live and used only by this thread, until the fence is signalled.
         unsafe {
             let commands = device.allocate_command_buffers(&allocate).unwrap();
             device.begin_command_buffer(commands[0], &Default::default()).unwrap();
@@ -296,7 +296,7 @@ impl Host {
         }
     }
 
-    /// Takes everything down; what validation had to say, to the very end.
+    /// Destroys everything; returns all validation messages.
     fn destroy(self) -> Vec<String> {
         // SAFETY: nothing is in flight, and the host's own objects are destroyed before their parents.
         unsafe {
@@ -326,7 +326,7 @@ unsafe fn instance(
         .enabled_extension_names(&extensions)
         .push_next(&mut features)
         .push_next(&mut messenger_info);
-    // SAFETY: `info` points at live locals, and the rest is as the caller promises.
+    // SAFETY: `info` points at live locals, and the caller guarantees the rest.
     unsafe { entry.create_instance(&info, None) }.unwrap()
 }
 

@@ -1,4 +1,4 @@
-//! The house: what the compiler does not check, and what is installed.
+//! House rules that the compiler does not check, and installed files.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 

@@ -1,5 +1,4 @@
-//! Properties that hold for whatever numbers come: curves, cameras, lenses, sort and scan, and files that are written and
-//! read again.
+//! Properties for arbitrary input: curves, cameras, lenses, sort and scan, and files that are written and read back.
 #![cfg(feature = "io")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -18,7 +17,7 @@ use proptest::test_runner::RngSeed;
 
 use crate::formats::synthetic::{self, Model, SIZE};
 
-/// The same cases in every run; what fails prints its numbers.
+/// The same cases in every run; a failure prints its input.
 fn cases(cases: u32) -> ProptestConfig {
     let (failure_persistence, rng_seed) = (None, RngSeed::Fixed(7));
     ProptestConfig { cases, failure_persistence, rng_seed, ..ProptestConfig::default() }
@@ -94,7 +93,7 @@ proptest! {
         let ray = (pixel - camera.principal_point) / camera.focal;
         let point = camera.view_from_world.inverse().transform_point3((ray * depth).extend(depth));
         let back = camera.project(point);
-        // Rounding of the point, as far away as it is, seen from so near.
+        // Rounding of a distant point that is seen from close by.
         let bound = 1e-12 * (1.0 + point.length() / depth) * (camera.focal.max_element() + pixel.length()) * 16.0;
         prop_assert!(back.is_some_and(|back| back.distance(pixel) <= bound), "{back:?}, not {pixel}");
         let half = camera.resized(2 * camera.width, 2 * camera.height);

@@ -1,4 +1,4 @@
-//! Model files: what a run begins with, and what is shown, scored and exported without a run.
+//! Model files: as initial models, and rendered, scored and exported without a run.
 
 use std::fs;
 use std::path::Path;
@@ -10,14 +10,14 @@ use crate::common::command::{refused, run, succeed};
 use crate::common::place::Place;
 
 #[test]
-fn a_run_begins_with_a_model_and_its_highest_sh_degree() {
+fn a_run_starts_from_a_model_and_its_highest_sh_degree() {
     let place = Place::new();
     succeed(&place.train("first", "--steps 30"));
     let model = place.path("first/model.ply");
     succeed(&place.train("second", &format!("--steps 1 --init {}", model.display())));
     let [first, second] =
         ["first", "second"].map(|run| ply::load(place.path(run).join("model.ply")).unwrap());
-    // The first had not come to use more, the second does from its first step.
+    // The first run has not reached a higher degree; the second uses it from its first step.
     assert_eq!([&first, &second].map(|model| model.shape.sh_degree), [0, 1]);
     assert_eq!(first.count, second.count);
     let moved = first.means().iter().zip(second.means()).map(|(a, b)| a.distance(*b));
@@ -25,14 +25,14 @@ fn a_run_begins_with_a_model_and_its_highest_sh_degree() {
     let config = fs::read_to_string(place.path("second/config.toml")).unwrap();
     assert!(config.contains("first/model.ply"), "{config}");
 
-    // Of another program: without our features, with properties of its own, of a lower degree.
+    // From another program: without our features, with additional properties, of a lower degree.
     let bytes = with_property(&fs::read(&model).unwrap());
     fs::write(place.path("foreign.ply"), bytes).unwrap();
     let foreign = place.path("foreign.ply");
     succeed(&place.train("third", &format!("--steps 1 --init {}", foreign.display())));
 }
 
-/// A binary PLY with one more float of every vertex.
+/// A binary PLY with an additional float in every vertex.
 fn with_property(bytes: &[u8]) -> Vec<u8> {
     let end = b"end_header\n";
     let at = bytes.windows(end.len()).position(|window| window == end).unwrap();
@@ -47,12 +47,12 @@ fn with_property(bytes: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn a_model_that_a_run_cannot_begin_with_is_one_line_that_names_file_and_rule() {
+fn an_unsuitable_initial_model_is_refused_in_one_line_with_file_and_rule() {
     let place = Place::new();
     let file = |name: &str, bytes: &[u8]| {
         fs::write(place.path(name), bytes).unwrap();
     };
-    // All zeros: the file is text.
+    // All zeros; the file is text.
     ply::save(&Gaussians::zeros(2, 2), place.path("degree.ply")).unwrap();
     let whole = String::from_utf8(place.read("degree.ply")).unwrap();
     let header = |from: &str, to: &str| whole.replacen(from, to, 1).into_bytes();
@@ -74,7 +74,7 @@ fn a_model_that_a_run_cannot_begin_with_is_one_line_that_names_file_and_rule() {
 }
 
 #[test]
-fn a_model_file_is_scored_shown_and_exported_without_its_run() {
+fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
     let place = Place::new();
     succeed(&place.train("run", "--steps 40"));
     let (model, set) = (place.path("copy.ply"), place.path("set"));

@@ -11,7 +11,7 @@ use super::synthetic::*;
 use super::{load, view};
 use crate::common::command::{refused, run};
 
-/// Puts a chunk in front of the pixels of a PNG.
+/// Inserts a chunk before the pixels of a PNG.
 fn put_chunk(path: &Path, name: &[u8; 4], data: &[u8]) {
     let mut file = fs::read(path).unwrap();
     let body = [&name[..], data].concat();
@@ -19,12 +19,12 @@ fn put_chunk(path: &Path, name: &[u8; 4], data: &[u8]) {
         (0..8).fold(crc ^ u32::from(byte), |crc, _| (crc >> 1) ^ (0xEDB8_8320 * (crc & 1)))
     });
     let chunk = [&(data.len() as u32).to_be_bytes()[..], &body, &crc.to_be_bytes()].concat();
-    // Behind the signature and IHDR.
+    // After the signature and IHDR.
     file.splice(33..33, chunk);
     fs::write(path, file).unwrap();
 }
 
-/// Says that every picture of a folder is linear light.
+/// Marks every image of a folder as linear light.
 fn mark_linear(folder: &Path) {
     for entry in fs::read_dir(folder).unwrap() {
         put_chunk(&entry.unwrap().path(), b"gAMA", &100_000_u32.to_be_bytes());
@@ -43,7 +43,7 @@ fn photographs_and_references_become_srgb_and_masks_do_not() {
     let before = load(root);
     mark_linear(&root.join("low"));
     mark_linear(&root.join("high"));
-    // A mask of 0.4 hides; as linear light it would be 0.66 and show.
+    // A mask of 0.4 masks; as linear light it would be 0.66 and count.
     fs::create_dir(root.join("masks")).unwrap();
     let mask = root.join("masks/v03.png");
     Image::from_fn(SIZE.0, SIZE.1, |x, _| [if x < 4 { 0.4 } else { 1.0 }; 3])
@@ -82,7 +82,7 @@ fn a_profile_that_cannot_be_used_is_named_once_for_the_dataset() {
     assert_eq!(lines.len(), 1, "{message}");
 }
 
-/// The photographs of a dataset under the light of a lamp.
+/// The photographs of a dataset under a lamp.
 fn lamp_lit(root: &Path) {
     lom(root, 10, &[2, 5]);
     for entry in fs::read_dir(root.join("low")).unwrap() {
@@ -94,7 +94,7 @@ fn lamp_lit(root: &Path) {
 }
 
 #[test]
-fn one_grey_card_balances_every_photograph_kept_or_read_anew() {
+fn one_grey_card_balances_every_photograph_cached_or_not() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     lamp_lit(root);
@@ -118,7 +118,7 @@ fn one_grey_card_balances_every_photograph_kept_or_read_anew() {
 }
 
 #[test]
-fn a_white_balance_that_cannot_be_is_refused_in_a_line() {
+fn an_invalid_white_balance_is_refused_in_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     lamp_lit(root);
