@@ -1,7 +1,7 @@
 //! Compiles every kernel in `shaders-glsl/` and writes its Rust side.
 //!
-//! A kernel is declared once, in GLSL. Its SPIR-V tells us the parameters, buffers, constants and workgroup size, from
-//! which `$OUT_DIR/kernels.rs` gets one typed module per kernel: host code that disagrees with a shader does not compile.
+//! A kernel is declared once, in GLSL. Its parameters, buffers, constants and workgroup size are read from its SPIR-V;
+//! `$OUT_DIR/kernels.rs` gets one typed module per kernel, so host code that disagrees with a shader does not compile.
 //!
 //! - `build/attributes.rs`: the table of attributes to GLSL
 //! - `build/compiler.rs`: GLSL to SPIR-V
@@ -58,8 +58,9 @@ fn main() {
     fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");
 }
 
-/// The source with `restrict` on every buffer, so that drivers may move loads across stores. It holds: a pass binds `Slice`s
-/// and `SliceMut`s, which borrow their buffer as `&` and `&mut` do, and the parts of one `SliceMut` are checked to be disjoint.
+/// The source with `restrict` on every buffer, so that drivers may move loads across stores. This is sound: a pass
+/// binds `Slice`s and `SliceMut`s, which borrow their buffer as `&` and `&mut` do, and the parts of one `SliceMut` are
+/// checked to be disjoint.
 fn restricted(source: &str) -> String {
     let line = |line: &str| match line.starts_with("layout(binding") {
         true => line.replacen(" buffer ", " restrict buffer ", 1) + "\n",

@@ -242,7 +242,8 @@ impl Trainer {
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
         if until > self.step && self.step < self.config.steps && self.has_ended() {
             return Err(Error::Usage(format!(
-                "the run has ended at step {}, before step {until}: the held-out views have converged (`Trainer::has_ended`)",
+                "the run has ended at step {}, before step {until}: the held-out views have converged \
+                 (`Trainer::has_ended`)",
                 self.step
             )));
         }

@@ -46,8 +46,8 @@ const GAINS: std::ops::RangeInclusive<f64> = 1e-3..=1e3;
 
 impl WhiteBalance {
     /// The syntax of a white balance.
-    pub(crate) const FORM: &'static str = "R,G,B of 0.001 to 1000, a colour temperature of 2000 to 25000 (kelvin), VIEW,x,y,w,h of a \
-                                    neutral area in whole pixels, or VIEW,x1,y1,..,x4,y4, the corners of a colour chart";
+    pub(crate) const FORM: &'static str = "R,G,B of 0.001 to 1000, a colour temperature of 2000 to 25000 (kelvin), \
+        VIEW,x,y,w,h of a neutral area in whole pixels, or VIEW,x1,y1,..,x4,y4, the corners of a colour chart";
 
     /// The gains, measured in one of the named photographs of `root` if necessary.
     ///

@@ -44,8 +44,8 @@ impl ReferenceKind {
         match self {
             Self::References => None,
             Self::PseudoGt => Some(
-                "against their own pseudo-GT, as there are no reference images: how well the model reproduces its targets, not how \
-                 right these are; runs of different curves do not compare",
+                "against their own pseudo-GT, as there are no reference images: how well the model reproduces its \
+                 targets, not how right these are; runs of different curves do not compare",
             ),
             Self::Photographs => Some(
                 "against the photographs themselves, as there are no reference images and no curve",

@@ -96,7 +96,8 @@ pub struct TrainConfig {
     patch_pixels: Option<u64> = None, "the most that the device can bind"
         => Rule::at_least(MIN_PATCH), in "pixels", "--patch-pixels N";
     /// Use every Nth view by name as a test view, instead of the dataset's split; 0: no test views.
-    test_every: Option<usize> = None, "the dataset's split, else every 8th" => Rule::COUNT, in "views", "--test-every N";
+    test_every: Option<usize> = None, "the dataset's split, else every 8th"
+        => Rule::COUNT, in "views", "--test-every N";
     /// Memory for photographs on the device and on the host, such as 4G; the rest is kept on disk, which takes time but
     /// changes no result.
     cache: Option<CacheSize> = None, "a quarter of each memory" => MEMORY, in "bytes", "--cache SIZE";
@@ -378,8 +379,8 @@ impl TrainConfig {
             });
         }
         if self.exposure.learn == OnOff::On && self.model.tonemapper {
-            let rule = "off with a tonemapper, which fits the dark photographs: a gain of the targets does not describe \
-                        their exposures";
+            let rule = "off with a tonemapper, which fits the dark photographs: a gain of the targets does not \
+                        describe their exposures";
             let (key, value) = ("exposure.learn".to_owned(), "on".to_owned());
             return Err(Error::Setting { key, value, rule: rule.to_owned() });
         }

@@ -211,13 +211,15 @@ fn an_output_that_cannot_be_written_is_refused_before_anything_is_read() {
 }
 
 #[test]
-fn the_number_of_steps_has_short_forms() {
+fn the_number_of_steps_has_short_forms_and_the_alias_iterations() {
     let folder = tempfile::tempdir().unwrap();
     let train = format!("train {} --out {}", fixture().set(), folder.path().join("run").display());
-    for (steps, line) in [("1e4", "steps = 10000  (--steps)"), ("5k", "steps = 5000  (--steps)")] {
-        let (message, _) = run(&format!("{train} --explain --steps {steps}"), 0);
-        assert!(message.contains(line), "{message}");
+    for (option, steps) in [("--steps 1e4", 10_000), ("--steps 5k", 5000), ("--iterations 7", 7)] {
+        let (message, _) = run(&format!("{train} --explain {option}"), 0);
+        assert!(message.contains(&format!("steps = {steps}  (--steps)")), "{option}: {message}");
     }
+    let twice = format!("{train} --steps 5 --iterations 7");
+    refused(&twice, 2, &["--steps", "more than once"]);
 }
 
 #[test]

@@ -73,7 +73,7 @@ fn every_device_is_found_by_its_uuid() {
 
 #[test]
 fn a_validation_message_fails_the_process_and_names_the_test() {
-    const NAME: &str = "gpu::what_validation_says_fails_the_process_and_names_the_test";
+    const NAME: &str = "gpu::a_validation_message_fails_the_process_and_names_the_test";
     // The test runs itself again in a separate process, and then misuses the device.
     if std::env::var_os("MISUSE_THE_DEVICE").is_some() {
         return misuse(&gpu());

@@ -183,7 +183,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     }
     assert!(gradients[..WIDTH].iter().chain(&gradients[2 * WIDTH..]).all(|&d| d == 0.0));
 
-    // With respect to the Gaussians: the chain applied to the gradient behind the exposure, against differences of the
+    // With respect to the Gaussians: the chain applied to the gradient after the exposure, against differences of the
     // whole.
     let mut downstream = Chain::new(&setup);
     downstream.d_render = d_render;

@@ -66,7 +66,8 @@ fn a_configuration_contains_the_whole_curve() {
 
 #[test]
 fn configurations_of_earlier_versions_load() {
-    let text = "steps = 7\n[tone]\ncurve = \"ase\"\ngain_c = 3.0\ntheta = 0.49\nalpha = 0.12\nbeta = 2.5\nbase_gain = 1.0\n";
+    let text = "steps = 7\n[tone]\ncurve = \"ase\"\ngain_c = 3.0\ntheta = 0.49\nalpha = 0.12\nbeta = 2.5\n\
+                base_gain = 1.0\n";
     let config: TrainConfig = toml::from_str(text).unwrap();
     assert_eq!(config.tone, ToneSettings::new(ToneCurve::Ase));
 }

@@ -182,7 +182,7 @@ proptest! {
     }
 
     #[test]
-    fn a_configuration_survives_its_toml(
+    fn a_configuration_is_read_back_from_its_toml(
         steps in 1..u64::from(u32::MAX), seed in 0..i64::MAX as u64, near in 1e-6..1.0_f64, rate in 0.0..1.0_f64,
         max_gaussians in 1..1_000_000_000_usize, vram in 1..1_u64 << 50,
     ) {
@@ -195,7 +195,10 @@ proptest! {
     }
 
     #[test]
-    fn poses_and_points_survive_every_layout(poses in prop::collection::vec(pose(), 1..5), points in prop::collection::vec(position(1e4), 1..8)) {
+    fn poses_and_points_survive_every_layout(
+        poses in prop::collection::vec(pose(), 1..5),
+        points in prop::collection::vec(position(1e4), 1..8),
+    ) {
         let folder = tempfile::tempdir().unwrap();
         let parameters = vec![35.5, 36.25, 18.0, 16.0];
         let image = |(index, pose): (usize, &DAffine3)| (index as u32 + 7, *pose, 3, format!("v{index}.png"));
@@ -205,7 +208,9 @@ proptest! {
             points: (0..).zip(&points).map(|(id, &at)| (id, at, vec![7])).collect(),
         };
         let json = folder.path().join("json");
-        let frames = poses.iter().enumerate().map(|(index, pose)| synthetic::frame_of(pose, &format!("images/v{index}.png")));
+        let file = |index| format!("images/v{index}.png");
+        let frames =
+            poses.iter().enumerate().map(|(index, pose)| synthetic::frame_of(pose, &file(index)));
         let roots = [folder.path().join("binary"), folder.path().join("text"), json];
         for root in &roots {
             for index in 0..poses.len() {

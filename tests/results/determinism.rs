@@ -146,7 +146,8 @@ fn tiny_run() -> (tempfile::TempDir, PathBuf) {
     succeed(&format!(
         "train {} --out {} --plan none --model plain --curve ap3 --steps 60 --hash-every 20 --set tile=[16,8] \
          --set schedule.densify_after=10 --set schedule.densify_interval=10 --max-gaussians 2000 --background black \
-         --set density.depth_seeding=0 --set precision.rest=32 --set precision.moments=32 --set schedule.cooldown_steps=0",
+         --set density.depth_seeding=0 --set precision.rest=32 --set precision.moments=32 \
+         --set schedule.cooldown_steps=0",
         set.display(),
         run.display()
     ));

@@ -285,7 +285,7 @@ fn a_refused_view_names_a_longest_side_that_fits() {
     }
 }
 
-/// `count` faint splats, one behind the other, on one pixel.
+/// `count` faint splats on one pixel, at increasing depths.
 fn splats_per_tile(count: usize) -> Setup {
     let mut setup = Setup::new(count, [16, 8], 0, 5);
     let size = setup.camera().size;

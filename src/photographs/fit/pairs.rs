@@ -156,7 +156,8 @@ fn subfolders(folder: &Path) -> Result<(PathBuf, PathBuf)> {
         |names: &[&str]| names.iter().map(|name| folder.join(name)).find(|path| path.is_dir());
     first(&DARK_FOLDERS).zip(first(&NORMAL_FOLDERS)).ok_or_else(|| {
         let problem = if folder.is_dir() {
-            "contains no pairs: it needs folders `low` and `high` (or `normal`, or `images`), or a folder of normal-light photographs named with --normal"
+            "contains no pairs: it requires folders `low` and `high` (or `normal`, or `images`), or a \
+             folder of normal-light photographs named with --normal"
         } else {
             "is not a folder; name the folder of the pairs"
         };

@@ -371,8 +371,8 @@ pub fn cross_validate_profile(
             if count < 2 {
                 let pairs = scene.pairs.len();
                 return Err(Error::Usage(format!(
-                    "{pairs} pairs in {folds} folds leave none to fit to or none to validate on; use at least two pairs in \
-                     two folds"
+                    "{pairs} pairs in {folds} folds leave none to fit to or none to validate on; use at least two \
+                     pairs in two folds"
                 )));
             }
             let fold = |index: usize| {

@@ -71,7 +71,8 @@ fn split(scenes: &[FitScene], folds: usize) -> Result<Vec<(String, Vec<&Pair>)>>
         let count = scene.pairs.len().min(folds);
         if count < 2 {
             return Err(Error::Usage(format!(
-                "{} pairs in {folds} folds leave none to fit to or none to validate on; use at least two pairs in two folds",
+                "{} pairs in {folds} folds leave none to fit to or none to validate on; use at least two \
+                 pairs in two folds",
                 scene.pairs.len()
             )));
         }

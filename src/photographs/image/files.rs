@@ -30,7 +30,8 @@ pub(super) fn is_raw(path: &Path) -> bool {
 /// Extensions of files from phones, which other programs convert.
 const HEIC: [&str; 2] = ["heic", "heif"];
 /// The programs that convert them.
-pub(super) const HEIC_REMEDY: &str = "convert it first, `heif-convert IN.heic OUT.png` of libheif, or on macOS `sips -s format png IN.heic --out OUT.png`";
+pub(super) const HEIC_REMEDY: &str = "convert it first, `heif-convert IN.heic OUT.png` of libheif, or on macOS \
+     `sips -s format png IN.heic --out OUT.png`";
 
 /// A photograph's name: the file name without an image's extension.
 pub(crate) fn stem(listed: &str) -> &str {

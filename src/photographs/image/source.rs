@@ -7,7 +7,7 @@ use ::image::ImageReader;
 
 use crate::Error;
 
-/// A file or memory behind one type: decoders are compiled for each type that they read from.
+/// A file or memory as one type: decoders are compiled for each type that they read from.
 pub(super) trait Source: BufRead + Seek {}
 
 impl<T: BufRead + Seek> Source for T {}

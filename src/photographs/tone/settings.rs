@@ -83,7 +83,8 @@ impl ToneSettings {
     /// A row for each setting.
     pub(crate) const SETTINGS: &'static [Setting] = settings::settings! { rows "tone."
         /// The tone curve: a name that `nightsplat tone list` lists.
-        curve => Rule::Text("a curve that `nightsplat tone list` lists", |name| name.parse::<ToneCurve>().is_ok()), "--curve NAME|FILE";
+        curve => Rule::Text("a curve that `nightsplat tone list` lists", |name| name.parse::<ToneCurve>().is_ok()),
+           "--curve NAME|FILE";
         /// c: the gain per mean luminance of the photograph.
         gain_c, "the curve's" => Rule::from_to(0.0, MOST), "--gain C|auto";
         /// Target mean of the curve linear over all channels, before clipping.

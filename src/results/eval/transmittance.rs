@@ -74,8 +74,8 @@ pub fn hole_warning<'a>(
         Background::Random => "no photograph shows this area; take some that do",
     };
     Some(format!(
-        "view {name}: {:.0} % of the background shows through the model (above {:.0} % in {} of {} views): {cause}, or mask what \
-         is to stay empty",
+        "view {name}: {:.0} % of the background shows through the model (above {:.0} % in {} of {} views): {cause}, or \
+         mask what is to stay empty",
         100.0 * worst.mean,
         100.0 * MAX_RESIDUAL_TRANSMITTANCE,
         open.count(),

@@ -35,7 +35,8 @@ pub fn bars(value_name: &str, digits: usize, bars: &[Bar]) -> String {
     let zero = axis.place(0.0);
 
     let mut svg = format!(
-        "<svg class=\"half\" viewBox=\"0 0 {WIDTH} {}\" role=\"img\" aria-label=\"{name}\" font-size=\"12\" fill=\"var(--quiet)\">\n\
+        "<svg class=\"half\" viewBox=\"0 0 {WIDTH} {}\" role=\"img\" aria-label=\"{name}\" font-size=\"12\" \
+         fill=\"var(--quiet)\">\n\
          <text x=\"{left}\" y=\"14\">{name}</text>\n",
         TOP + ROW * bars.len() as f64,
         name = escape(value_name)
@@ -67,7 +68,8 @@ pub fn bars(value_name: &str, digits: usize, bars: &[Bar]) -> String {
                 let (low, high, y) = (axis.place(low), axis.place(high), y + ROW / 2.0 - 0.5);
                 let _ = write!(
                     svg,
-                    "<line class=\"spread\" x1=\"{low:.1}\" x2=\"{high:.1}\" y1=\"{y}\" y2=\"{y}\" stroke=\"var(--text)\" stroke-width=\"2\"/>"
+                    "<line class=\"spread\" x1=\"{low:.1}\" x2=\"{high:.1}\" y1=\"{y}\" y2=\"{y}\" \
+                     stroke=\"var(--text)\" stroke-width=\"2\"/>"
                 );
             }
         }

@@ -78,7 +78,8 @@ pub fn plot_in_groups(
         let whole = HEIGHT + above;
         let _ = writeln!(
             panels,
-            "<svg y=\"{height}\" overflow=\"visible\" width=\"{WIDTH}\" height=\"{whole}\" viewBox=\"0 {} {WIDTH} {whole}\">\n{panel}</svg>",
+            "<svg y=\"{height}\" overflow=\"visible\" width=\"{WIDTH}\" height=\"{whole}\" \
+             viewBox=\"0 {} {WIDTH} {whole}\">\n{panel}</svg>",
             0.0 - above
         );
         height += whole + GAP;
@@ -169,7 +170,8 @@ fn panel(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> 
         let (bottom, below) = (HEIGHT - BOTTOM, TOP + 12.0);
         let _ = writeln!(
             svg,
-            "<line x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{TOP}\" y2=\"{bottom}\" stroke=\"var(--quiet)\" stroke-dasharray=\"4 3\"/>\
+            "<line x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{TOP}\" y2=\"{bottom}\" stroke=\"var(--quiet)\" \
+             stroke-dasharray=\"4 3\"/>\
              <text x=\"{:.1}\" y=\"{below}\">{}</text>",
             x + 4.0,
             escape(name)
@@ -187,8 +189,10 @@ fn panel(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> 
         let _ = writeln!(
             svg,
             "<g class=\"series\"><title>{name}</title>\
-             <polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"2\"{dashes} stroke-linejoin=\"round\" points=\"{}\"/>\
-             <line class=\"sample\" x1=\"{sample_x}\" x2=\"{}\" y1=\"{sample_y}\" y2=\"{sample_y}\" stroke=\"{color}\" stroke-width=\"2\"{dashes}/>\
+             <polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"2\"{dashes} stroke-linejoin=\"round\" \
+             points=\"{}\"/>\
+             <line class=\"sample\" x1=\"{sample_x}\" x2=\"{}\" y1=\"{sample_y}\" y2=\"{sample_y}\" stroke=\"{color}\" \
+             stroke-width=\"2\"{dashes}/>\
              <text x=\"{}\" y=\"{text_y}\" fill=\"var(--text)\">{name}</text>",
             points.collect::<Vec<_>>().join(" "),
             sample_x + SAMPLE,
@@ -199,7 +203,8 @@ fn panel(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> 
                 let (x, low, high) = (x_axis.place(x), y_axis.place(low), y_axis.place(high));
                 let _ = writeln!(
                     svg,
-                    "<line class=\"spread\" x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{low:.1}\" y2=\"{high:.1}\" stroke=\"{color}\" stroke-width=\"1.5\"/>"
+                    "<line class=\"spread\" x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{low:.1}\" y2=\"{high:.1}\" \
+                     stroke=\"{color}\" stroke-width=\"1.5\"/>"
                 );
             }
         }
@@ -251,7 +256,8 @@ pub fn svg_file(plot: &str) -> String {
     let style = include_str!("style.css");
     // The custom properties come before the first other rule.
     let colors = style.split("* {").next().unwrap_or_default();
-    let begin = "<svg xmlns=\"http://www.w3.org/2000/svg\" style=\"background: var(--ground)\" font-family=\"sans-serif\" ";
+    let begin = "<svg xmlns=\"http://www.w3.org/2000/svg\" style=\"background: var(--ground)\" \
+                 font-family=\"sans-serif\" ";
     let whole = plot.replacen("<svg ", begin, 1);
     whole.replacen(">\n", &format!(">\n<style>\n{colors}</style>\n"), 1)
 }

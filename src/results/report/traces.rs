@@ -97,7 +97,8 @@ fn steps(svg: &mut String, front: &[(f64, f64)]) {
     let end = (WIDTH - RIGHT).max(last.0);
     let _ = writeln!(
         svg,
-        "<path d=\"{path}H{end:.1}\" fill=\"none\" stroke=\"var(--quiet)\" stroke-width=\"1.5\" stroke-dasharray=\"2 3\"/>"
+        "<path d=\"{path}H{end:.1}\" fill=\"none\" stroke=\"var(--quiet)\" stroke-width=\"1.5\" \
+         stroke-dasharray=\"2 3\"/>"
     );
 }
 
@@ -111,7 +112,8 @@ fn draw(svg: &mut String, trace: &Trace, line: &[(f64, f64)], labels: &mut Label
         let points: Vec<String> = line.iter().map(|(x, y)| format!("{x:.1},{y:.1}")).collect();
         let _ = writeln!(
             svg,
-            "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"{width}\" stroke-linejoin=\"round\" points=\"{}\"/>",
+            "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"{width}\" stroke-linejoin=\"round\" \
+             points=\"{}\"/>",
             points.join(" ")
         );
     }

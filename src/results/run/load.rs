@@ -67,8 +67,8 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
 pub fn load_model(run: &Path, raw_colors: bool) -> Result<Gaussians> {
     let path = run.join("model.ply");
     if !path.is_file() {
-        let problem = "has no model.ply: the run neither finished nor reached a checkpoint; train it again, or continue with \
-                       --resume";
+        let problem = "has no model.ply: the run neither finished nor reached a checkpoint; train it again, or \
+                       continue with --resume";
         return Err(Error::input(run, problem));
     }
     let mut gaussians = ply::load(path)?;

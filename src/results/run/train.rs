@@ -143,7 +143,8 @@ fn warn_of_memory(gpu: &Gpu, memory: &MemoryEstimate) {
     if memory.peak_device > left {
         let mebibytes = |bytes: u64| bytes >> 20;
         tracing::warn!(
-            "{} Gaussians may take {} MiB of the device, {} MiB are free: max_vram or max_gaussians stops growth in time",
+            "{} Gaussians may take {} MiB of the device, {} MiB are free: max_vram or max_gaussians stops growth \
+             in time",
             memory.peak_gaussians,
             mebibytes(memory.peak_device),
             mebibytes(left)

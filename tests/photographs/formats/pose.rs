@@ -18,7 +18,23 @@ use crate::common::{not_run, shared};
 pub(super) fn stub(folder: &Path, cases: &str) -> PathBuf {
     let path = folder.join("colmap-stub");
     let lines = format!(
-        "command=$1; shift\nif [ \"$1\" = -h ]; then\n [ $command = mapper ] && echo '  --Mapper.init_min_tri_angle arg (=16)'\n exit 0\nfi\nwhile [ $# -gt 0 ]; do\n case $1 in\n  --image_path) images=$2;;\n  --output_path) output=$2;;\n  --image_list_path) list=$2;;\n  --Mapper.init_min_tri_angle) angle=$2;;\n esac\n shift\ndone\ncase $command in\n{cases}\nesac\n"
+        "command=$1; shift\n\
+         if [ \"$1\" = -h ]; then\n\
+         [ $command = mapper ] && echo '  --Mapper.init_min_tri_angle arg (=16)'\n\
+         exit 0\n\
+         fi\n\
+         while [ $# -gt 0 ]; do\n\
+         case $1 in\n\
+         --image_path) images=$2;;\n\
+         --output_path) output=$2;;\n\
+         --image_list_path) list=$2;;\n\
+         --Mapper.init_min_tri_angle) angle=$2;;\n\
+         esac\n\
+         shift\n\
+         done\n\
+         case $command in\n\
+         {cases}\n\
+         esac\n"
     );
     script(&path, &lines);
     path

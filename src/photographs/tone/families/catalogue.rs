@@ -433,7 +433,8 @@ families! {
         "delta0 + A ((1 - a) (1 - exp(-g t)) + a t), A such that t = 1 maps as with ASE",
         [a = 0.1 in 0.0..1.0] {
             aliases: &["v4_floor", "adaptive_softexp_v4_floor"],
-            source: "adaptive tone curves for 3DGS, a mode of its code; the share a of the straight line is our choice, 0 is ASE",
+            source: "adaptive tone curves for 3DGS, a mode of its code; the share a of the straight line is our \
+                 choice, 0 is ASE",
             law: OffsetMode::Rescaled,
             alpha: 0.12,
             gain_c: 3.0,
