@@ -219,7 +219,7 @@ fn the_number_of_steps_has_short_forms_and_the_alias_iterations() {
         assert!(message.contains(&format!("steps = {steps}  (--steps)")), "{option}: {message}");
     }
     let twice = format!("{train} --steps 5 --iterations 7");
-    refused(&twice, 2, &["--steps", "more than once"]);
+    refused(&twice, 2, &["--steps", "multiple times"]);
 }
 
 #[test]
