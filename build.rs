@@ -1,85 +1,43 @@
-//! Compiles every kernel in `shaders-glsl/` and writes its Rust side.
+//! Compiles every kernel in `shaders-glsl/` and writes its Rust side, or takes what a packaged crate has of both.
 //!
 //! A kernel is declared once, in GLSL. Its parameters, buffers, constants and workgroup size are read from its SPIR-V;
 //! `$OUT_DIR/kernels.rs` gets one typed module per kernel, so host code that disagrees with a shader does not compile.
 //!
+//! - `build/precompiled.rs`: kernels that were compiled before
+//! - `build/kernels.rs`: compiles and reflects every kernel
 //! - `build/attributes.rs`: the table of attributes to GLSL
 //! - `build/compiler.rs`: GLSL to SPIR-V
 //! - `build/glsl.rs`: what GLSL says beside that: constants and comments
 //! - `build/reflection.rs`: SPIR-V to a description
 //! - `build/rust.rs`: a description to Rust
 
-#[path = "build/attributes.rs"]
-mod attributes;
-#[path = "build/compiler.rs"]
-mod compiler;
-#[path = "build/glsl.rs"]
-mod glsl;
-#[path = "build/reflection.rs"]
-mod reflection;
-#[path = "build/rust.rs"]
-mod rust;
+#[cfg(any(feature = "glslang", feature = "shaderc"))]
+#[path = "build/kernels.rs"]
+mod kernels;
+#[path = "build/precompiled.rs"]
+#[allow(dead_code, reason = "a build compiles the kernels, or takes those that were compiled before")]
+mod precompiled;
 
-use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
-use std::{env, fs};
-
-use glsl::Text;
-use reflection::{Kernel, Structs};
+use std::env;
+use std::path::PathBuf;
 
 const SHADERS: &str = "shaders-glsl";
 
 fn main() {
-    println!("cargo:rerun-if-changed={SHADERS}");
-    println!("cargo:rerun-if-changed=build.rs");
-    println!("cargo:rerun-if-changed=build");
-    println!("cargo:rerun-if-changed=src/splats/attributes.rs");
-    let out_dir = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
-
-    let mut structs = Structs::default();
-    let mut text = Text::default();
-    let mut kernels = String::new();
-    let mut names = BTreeSet::new();
-    for path in kernel_paths(Path::new(SHADERS)) {
-        let source = fs::read_to_string(&path).expect("a listed file can be read");
-        let compiled = compiler::compile(&path, &restricted(&source));
-        let kernel = Kernel::reflect(&path, &source, &compiled.reflected, &mut structs);
-        assert!(names.insert(kernel.name.clone()), "two kernels are called {}", kernel.name);
-        let bytes: Vec<u8> = compiled.shipped.iter().flat_map(|word| word.to_le_bytes()).collect();
-        fs::write(out_dir.join(&kernel.name).with_extension("spv"), bytes)
-            .expect("OUT_DIR is ours");
-        let says = Text::read_with_includes(&source);
-        kernel.write(&says, &mut kernels);
-        text.add_comments(says);
+    for source in precompiled::SOURCES {
+        println!("cargo::rerun-if-changed={source}");
     }
-    let names: Vec<&String> = names.iter().collect();
-    let all = format!("/// Every kernel, by name.\npub const NAMES: &[&str] = &{names:?};\n");
-    let kernels = structs.write(&text) + &glsl::include_modules() + &all + &kernels;
-    fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");
-}
-
-/// The source with `restrict` on every buffer, so that drivers may move loads across stores. This is sound: a pass
-/// binds `Slice`s and `SliceMut`s, which borrow their buffer as `&` and `&mut` do, and the parts of one `SliceMut` are
-/// checked to be disjoint.
-fn restricted(source: &str) -> String {
-    let line = |line: &str| match line.starts_with("layout(binding") {
-        true => line.replacen(" buffer ", " restrict buffer ", 1) + "\n",
-        false => line.to_owned() + "\n",
-    };
-    source.lines().map(line).collect()
-}
-
-/// Every `.comp` below `dir`, in a stable order.
-fn kernel_paths(dir: &Path) -> Vec<PathBuf> {
-    let mut paths = vec![];
-    for entry in fs::read_dir(dir).expect("the shader folder exists") {
-        let path = entry.expect("a folder can be listed").path();
-        if path.is_dir() {
-            paths.extend(kernel_paths(&path));
-        } else if path.extension().is_some_and(|extension| extension == "comp") {
-            paths.push(path);
+    let out_dir = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
+    #[cfg(any(feature = "glslang", feature = "shaderc"))]
+    {
+        kernels::compile(&out_dir);
+        precompiled::write_hash(&out_dir);
+    }
+    #[cfg(not(any(feature = "glslang", feature = "shaderc")))]
+    {
+        println!("cargo::rerun-if-changed={}", precompiled::FOLDER);
+        if let Err(problem) = precompiled::copy(&out_dir) {
+            println!("cargo::error={problem}");
         }
     }
-    paths.sort();
-    paths
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::compiler;
+use super::compiler;
 
 /// The block that the arrays of all buffers are members of.
 pub(crate) const BUFFER: &str = "buffer";

@@ -2,8 +2,8 @@
 
 use std::fmt::Write as _;
 
-use crate::glsl::{self, Text};
-use crate::reflection::{Buffer, Constant, Field, Kernel, Struct, Structs};
+use super::glsl::{self, Text};
+use super::reflection::{Buffer, Constant, Field, Kernel, Struct, Structs};
 
 impl Structs {
     /// The structs that kernels share, with what `text` says of them.

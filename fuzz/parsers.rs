@@ -9,6 +9,7 @@ use nightsplat::Result;
 use nightsplat::photographs::dataset::{Dataset, LoadOptions};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::tone::{Profile, ToneSettings};
+use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::ply;
 use nightsplat::train::{TrainConfig, check_checkpoint};
 
@@ -16,7 +17,7 @@ use nightsplat::train::{TrainConfig, check_checkpoint};
 pub(crate) type Parser = (&'static str, fn(&[u8]));
 
 /// All of them.
-pub(crate) const PARSERS: [Parser; 15] = [
+pub(crate) const PARSERS: [Parser; 17] = [
     ("colmap_cameras_bin", |bytes| dataset("colmap/binary", "sparse/0/cameras.bin", bytes)),
     ("colmap_images_bin", |bytes| dataset("colmap/binary", "sparse/0/images.bin", bytes)),
     ("colmap_points_bin", |bytes| dataset("colmap/binary", "sparse/0/points3D.bin", bytes)),
@@ -31,6 +32,8 @@ pub(crate) const PARSERS: [Parser; 15] = [
             Ok(())
         });
     }),
+    ("spz", |bytes| file("spz", bytes, model)),
+    ("sog", |bytes| file("sog", bytes, model)),
     ("checkpoint", |bytes| file("safetensors", bytes, check_checkpoint)),
     ("config_toml", |bytes| file("toml", bytes, |path| TrainConfig::load(path)?.check())),
     ("curve_toml", |bytes| file("toml", bytes, curve)),
@@ -39,6 +42,12 @@ pub(crate) const PARSERS: [Parser; 15] = [
     ("exr", |bytes| file("exr", bytes, image)),
     ("jpeg", |bytes| file("jpg", bytes, image)),
 ];
+
+fn model(path: &Path) -> Result<()> {
+    let Model { gaussians, near, .. } = Model::load(path)?;
+    assert!(gaussians.parameters.iter().all(|value| value.is_finite()) && near > 0.0);
+    Ok(())
+}
 
 fn curve(path: &Path) -> Result<()> {
     if path.extension().is_some_and(|extension| extension == "toml") {

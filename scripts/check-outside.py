@@ -22,7 +22,7 @@ edition = "2024"
 publish = false
 
 [dependencies]
-nightsplat = {{ path = "{root}", default-features = false, features = ["io"] }}
+nightsplat = {{ path = "{root}", default-features = false, features = ["glslang", "io"] }}
 
 [workspace]
 

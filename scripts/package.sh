@@ -12,6 +12,10 @@ name=nightsplat-$version-$target
 rm -rf "dist/$name"
 mkdir -p "dist/$name/completions"
 cp "$binary" README.md CHANGELOG.md LICENSE-APACHE LICENSE-MIT "dist/$name/"
+# The linkers of the other systems strip where the profile says so.
+case $target in
+*-linux-*) strip "dist/$name/${binary##*/}" ;;
+esac
 "$binary" man "dist/$name/man/man1"
 for shell in bash elvish fish powershell zsh; do
     "$binary" completions "$shell" > "dist/$name/completions/nightsplat.$shell"

@@ -3,7 +3,7 @@
 //! The only module that speaks Vulkan, and the only one with `unsafe`. It rests on four rules:
 //!
 //! - one queue, one timeline semaphore, one `u64` per submission; nothing waits for the whole device;
-//! - a dropped buffer or pipeline is freed once the timeline has passed every submission that may use it;
+//! - a dropped buffer or pipeline is freed once every submission, ours or a host's, that may use it is done;
 //! - barriers follow from what a kernel declares it reads and writes, never from the caller;
 //! - a borrowed device ([`Gpu::from_host`]) keeps everything that it had: we destroy what we created and nothing else.
 
@@ -22,6 +22,8 @@ mod device_report;
 mod download;
 #[cfg(feature = "testing")]
 mod faults;
+mod host;
+mod image;
 mod instance;
 mod kernel;
 mod limits;
@@ -31,6 +33,7 @@ mod pipeline;
 mod reconvergence;
 mod recorder;
 mod requirements;
+mod ring;
 mod slice;
 mod statistics;
 mod subgroups;
@@ -55,17 +58,19 @@ pub use check::{CheckReport, CheckedPass, Difference, Tolerance};
 pub use choice::DeviceChoice;
 pub(crate) use choice::SchedulerVariables;
 pub use cooperative::CooperativeMatrix;
-pub use device::HostDevice;
 pub use device_report::{DeviceLimits, DeviceReport, RequirementReport, devices};
 pub use download::Download;
+pub use host::{HostAllocation, HostDevice, HostFrame, MemoryFunctions, QueueLock};
+pub use image::{HostImage, ImageFormat, ImageState};
 pub use kernel::{Binding, Bound, Interface, Kernel, Recordable};
 #[cfg(feature = "check")]
 pub use kernel::{OnHost, Reference};
 pub use memory::MemoryBudget;
 pub use pci::PciAddress;
 pub use pipeline::Pipeline;
-pub use recorder::{HostRecording, Recorder, Threads};
+pub use recorder::{Recorder, Threads};
 pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
+pub(crate) use ring::Ring;
 pub use slice::{Slice, SliceMut};
 pub use statistics::Statistic;
 pub use subgroups::SUBGROUP_VARIABLE;
@@ -128,18 +133,25 @@ struct Shared {
     labels: Option<ext::debug_utils::Device>,
     /// Statistics of compiled kernels; absent where the device has none.
     executables: Option<khr::pipeline_executable_properties::Device>,
-    allocator: Mutex<Option<gpu_allocator::vulkan::Allocator>>,
+    /// Taken when the device is torn down.
+    memory: Mutex<Option<allocated::MemorySource>>,
+    /// The host's allocator of what the driver allocates on the host; absent: the driver's own.
+    callbacks: Option<vk::AllocationCallbacks<'static>>,
+    /// The host that lends the device.
+    host: Option<host::Host>,
     queue: Mutex<Queue>,
+    /// The family of the queue.
+    family: u32,
     progress: Mutex<Progress>,
     timeline: vk::Semaphore,
-    /// The timeline value after which a resource that is dropped now is unused.
-    last_use: AtomicU64,
+    /// The timeline value of our last submission that may use a resource that is dropped now.
+    last_submission: AtomicU64,
     usage: memory::MemoryUsage,
     /// Memory that other processes take of the device; absent where the driver does not report it.
     budget: Option<memory::BudgetQuery>,
     #[cfg(feature = "testing")]
     faults: faults::Faults,
-    retired: Mutex<Vec<(u64, Retired)>>,
+    retired: Mutex<Vec<(LastUse, Retired)>>,
     recorded: Recorded,
     /// The threads whose submissions are checked.
     #[cfg(feature = "check")]
@@ -162,7 +174,6 @@ struct Recorded {
 #[derive(Debug)]
 struct Queue {
     raw: vk::Queue,
-    family: u32,
 }
 
 /// Progress of recording and submission. Unlike the queue, it is locked only briefly.
@@ -184,9 +195,16 @@ impl Progress {
     }
 }
 
+/// The last submission of ours and the last frame of a host's that may use an object; 0: none.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct LastUse {
+    submission: u64,
+    frame: u64,
+}
+
 /// A Vulkan object whose owner is gone.
 enum Retired {
-    Buffer(vk::Buffer, gpu_allocator::vulkan::Allocation),
+    Buffer(vk::Buffer, allocated::Allocation),
     Pipeline(vk::Pipeline, vk::PipelineLayout, vk::DescriptorSetLayout),
     Commands(vk::CommandPool),
     Descriptors(vk::DescriptorPool),
@@ -222,6 +240,10 @@ impl Shared {
             }
             _ => Error::Vulkan { call, device, result },
         }
+    }
+
+    fn callbacks(&self) -> Option<&vk::AllocationCallbacks<'static>> {
+        self.callbacks.as_ref()
     }
 
     /// The value that the timeline has reached.
@@ -268,16 +290,28 @@ impl Shared {
     }
 
     fn retire(&self, retired: Retired) {
-        lock(&self.retired).push((self.last_use.load(Ordering::Acquire), retired));
+        lock(&self.retired).push((self.last_use(), retired));
     }
 
-    /// Frees every retired object whose last submission is `reached` or earlier; command buffers before the objects
-    /// that they name. One thread at a time: validation layers have crashed where two threads free objects that belong
+    /// The last use of an object that is dropped now.
+    fn last_use(&self) -> LastUse {
+        let submission = self.last_submission.load(Ordering::Acquire);
+        LastUse { submission, frame: self.last_frame() }
+    }
+
+    /// Frees every retired object that no submission of ours after `reached` and no unfinished frame of the host's
+    /// uses; command buffers before the objects that they name. One thread at a time: validation layers have crashed where two threads free objects that belong
     /// together.
     fn collect(&self, reached: u64) {
+        self.collect_within(LastUse { submission: reached, frame: self.frames_reached() });
+    }
+
+    fn collect_within(&self, done: LastUse) {
+        let is_done = |(last_use, _): &mut (LastUse, Retired)| {
+            last_use.submission <= done.submission && last_use.frame <= done.frame
+        };
         let mut retired = lock(&self.retired);
-        let mut done: Vec<_> =
-            retired.extract_if(.., |(last_use, _)| *last_use <= reached).collect();
+        let mut done: Vec<_> = retired.extract_if(.., is_done).collect();
         done.sort_by_key(|(_, retired)| !matches!(retired, Retired::Commands(_)));
         for (_, retired) in done {
             // SAFETY: the timeline has passed the object's last use, and its owner is gone.
@@ -288,25 +322,25 @@ impl Shared {
     /// # Safety
     /// No submission uses the object any more, and it is destroyed once.
     unsafe fn destroy(&self, retired: Retired) {
+        let callbacks = self.callbacks();
         // SAFETY: as the caller promises.
         unsafe {
             match retired {
                 Retired::Buffer(raw, allocation) => {
-                    self.device.destroy_buffer(raw, None);
+                    self.device.destroy_buffer(raw, callbacks);
                     self.usage.subtract(allocation.size());
-                    if let Some(allocator) = lock(&self.allocator).as_mut() {
-                        // Freeing can only fail for an allocation of another allocator.
-                        allocator.free(allocation).unwrap_or_default();
+                    if let Some(memory) = lock(&self.memory).as_mut() {
+                        memory.free(allocation);
                     }
                 }
                 Retired::Pipeline(raw, layout, set_layout) => {
-                    self.device.destroy_pipeline(raw, None);
-                    self.device.destroy_pipeline_layout(layout, None);
-                    self.device.destroy_descriptor_set_layout(set_layout, None);
+                    self.device.destroy_pipeline(raw, callbacks);
+                    self.device.destroy_pipeline_layout(layout, callbacks);
+                    self.device.destroy_descriptor_set_layout(set_layout, callbacks);
                 }
-                Retired::Commands(pool) => self.device.destroy_command_pool(pool, None),
-                Retired::Descriptors(pool) => self.device.destroy_descriptor_pool(pool, None),
-                Retired::Queries(pool) => self.device.destroy_query_pool(pool, None),
+                Retired::Commands(pool) => self.device.destroy_command_pool(pool, callbacks),
+                Retired::Descriptors(pool) => self.device.destroy_descriptor_pool(pool, callbacks),
+                Retired::Queries(pool) => self.device.destroy_query_pool(pool, callbacks),
             }
         }
     }
@@ -317,16 +351,19 @@ impl Drop for Shared {
         let submitted = lock(&self.progress).submitted;
         // A lost device must still be destroyed.
         let _ = self.wait(submitted);
-        self.collect(u64::MAX);
+        // A host destroys its device once all its frames are done.
+        self.collect_within(LastUse { submission: u64::MAX, frame: u64::MAX });
         // The allocator returns its memory blocks to the device before the device goes.
-        drop(lock(&self.allocator).take());
+        drop(lock(&self.memory).take());
         if let Some(owned) = &self.owned {
             owned.save_pipeline_cache(&self.device, self.pipeline_cache);
         }
         // SAFETY: every object below was created here and nothing uses it any more.
         unsafe {
-            self.device.destroy_pipeline_cache(self.pipeline_cache, None);
-            self.device.destroy_semaphore(self.timeline, None);
+            if !self.host.as_ref().is_some_and(|host| host.owns_pipeline_cache) {
+                self.device.destroy_pipeline_cache(self.pipeline_cache, self.callbacks());
+            }
+            self.device.destroy_semaphore(self.timeline, self.callbacks());
             if let Some(owned) = &self.owned {
                 self.device.destroy_device(None);
                 owned.destroy();

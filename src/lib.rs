@@ -3,28 +3,29 @@
 //! | to | begin with |
 //! |---|---|
 //! | open a device, or lend one | [`Gpu::new`], [`Gpu::from_host`], [`devices`] |
-//! | read and write models | [`Gaussians::open`], [`Gaussians::save`] |
+//! | read and write models | [`Model::load`], [`Model::save`] |
 //! | draw | [`Renderer`], [`Camera`] |
 //! | read photographs | [`Dataset::load`], [`Preset::load_options`] |
 //! | train | [`Trainer::planned`], [`TrainConfig`] |
 //! | train into a directory with log, checkpoints and scores | [`run::train`] |
 //! | handle errors | [`Error`]: one line that names the object and the remedy |
 //!
-//! Without default features, the crate is only the renderer, forward and backward. Feature `io` adds files, datasets
-//! and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command.
+//! Without default features there is the renderer, forward and backward, and nothing else. Feature `io` adds files,
+//! datasets and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command. `glslang` compiles
+//! the kernels, which a checkout needs and a packaged crate does not.
 //!
 //! # Render a model
 //!
 //! ```no_run
 //! use nightsplat::glam::{DAffine3, DVec3};
-//! use nightsplat::{Camera, DeviceChoice, Gaussians, Gpu, RenderOptions, RenderSettings, Renderer};
+//! use nightsplat::{Camera, DeviceChoice, Gpu, Model, RenderOptions, Renderer};
 //!
 //! let gpu = Gpu::new(&DeviceChoice::Best)?;
-//! let gaussians = Gaussians::open("model.ply")?;
+//! let model = Model::load("model.ply")?;
+//! let gaussians = &model.gaussians;
 //! let on_device = gaussians.upload(&gpu)?;
 //!
-//! let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
-//! let mut renderer = Renderer::new(&gpu, settings)?;
+//! let mut renderer = Renderer::new(&gpu, model.render_settings())?;
 //! let options = RenderOptions { sh_degree: gaussians.shape.sh_degree, background: [0.0; 3] };
 //! for frame in 0..60 {
 //!     let view_from_world = DAffine3::from_translation(DVec3::new(0.0, 0.0, 3.0))
@@ -37,9 +38,10 @@
 //! # Ok::<(), nightsplat::Error>(())
 //! ```
 //!
-//! A host with its own Vulkan device lends it ([`Gpu::from_host`]), records [`Renderer::forward`] into its own command
-//! buffers ([`Gpu::record_into`]) and binds the resulting buffers; `examples/embed.rs` is such a host. Without default
-//! features this is the whole API; feature `io` adds files, datasets and training.
+//! A host with a Vulkan device of its own lends it ([`Gpu::from_host`]) and has [`Renderer::draw`] record into its own
+//! command buffers ([`Gpu::record_into`]) and images; `docs/embedding.md` is the contract, `examples/embed.rs` and
+//! `examples/c/embed.c` are such hosts. Without default features this is the whole API; feature `io` adds files,
+//! datasets and training.
 //!
 //! # Train as the command does
 //!
@@ -59,7 +61,7 @@
 //!     shown.output().save_png8("now.png")?;
 //! }
 //! println!("{}", trainer.end()?);
-//! trainer.gaussians()?.save("model.spz")?;
+//! trainer.model()?.save("model.spz")?;
 //! # Ok::<(), nightsplat::Error>(())
 //! ```
 //!
@@ -167,9 +169,10 @@ pub use error::{Error, Result, Stop};
 
 // The device.
 pub use gpu::{
-    Buffer, CooperativeMatrix, DeviceChoice, DeviceLimits, DeviceReport, Gpu, HostDevice,
-    HostRecording, MemoryBudget, PassTime, PciAddress, Properties, Recorder, Requirement,
-    RequirementReport, Slice, Tile, devices, required_device_features,
+    Buffer, CooperativeMatrix, DeviceChoice, DeviceLimits, DeviceReport, Gpu, HostAllocation,
+    HostDevice, HostFrame, HostImage, ImageFormat, ImageState, MemoryBudget, MemoryFunctions,
+    PassTime, PciAddress, Properties, QueueLock, Recorder, Requirement, RequirementReport, Slice,
+    Tile, devices, required_device_features,
 };
 #[cfg(feature = "check")]
 pub use gpu::{CheckReport, CheckedPass, Difference, Tolerance};
@@ -177,9 +180,11 @@ pub use gpu::{CheckReport, CheckedPass, Difference, Tolerance};
 // Cameras, Gaussians, and the renderer.
 pub use camera::{Camera, CameraModel, CameraPath, KannalaBrandt};
 pub use photographs::image::Image;
+pub use splats::model::Model;
 pub use splats::packed_sh::StorageFormat;
 pub use splats::render::{
-    Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status, Viewpoint,
+    Damping, DepthConvention, DepthKind, Drawn, Gradients, Purpose, RenderOptions, RenderSettings,
+    Renderer, SceneDepth, Status, Target, Viewpoint,
 };
 pub use splats::scene::{DeviceGaussians, Features, GaussianSlice, Gaussians, Layout, Shape};
 
@@ -229,7 +234,7 @@ pub mod run {
         ModelRenderer, ReferenceKind, RenderLayer, ResidualTransmittance, ViewScore, means,
     };
     pub use crate::results::run::{
-        Event, IfExists, ResourceUsage, RunSummary, load_config, load_model, load_networks, train,
+        Event, IfExists, ResourceUsage, RunSummary, load_config, load_networks, train,
     };
     pub use crate::train::Networks;
 }

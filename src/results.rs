@@ -8,6 +8,7 @@
 //! - [`report`]: tables and plots in one self-contained page
 //! - [`diagnosis`]: a diagnosis of photographs as a table and a page
 //! - [`evaluation`]: scores as a table, and the page of a run
+//! - [`models`]: model files and run directories, read
 //! - [`finished_run`]: a finished run or a model file, opened for rendering
 //! - [`view_exposures`]: renders at the exposure of their targets
 //! - [`video`]: frames as a video
@@ -18,6 +19,7 @@ pub mod eval;
 pub mod evaluation;
 pub mod export;
 pub mod finished_run;
+pub mod models;
 pub mod report;
 pub mod run;
 pub mod run_facts;

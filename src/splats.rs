@@ -8,6 +8,7 @@
 //! - [`harmonics`]: the SH basis on the host, and its rotation
 //! - [`batches`]: buffers of Gaussians that exceed one binding
 //! - [`scene`]: Gaussians on the host and on the device, PLY
+//! - [`model`]: a model with what a renderer must know of it
 //! - [`sort`]: scan and radix sort on the device
 //! - [`optimizer`]: Adam, learned parameters other than the Gaussians, and learning-rate schedules
 //! - [`render`]: the differentiable rasteriser
@@ -19,6 +20,7 @@ pub mod batches;
 pub mod densify;
 #[cfg(any(feature = "io", feature = "check"))]
 pub mod harmonics;
+pub mod model;
 #[cfg(feature = "io")]
 pub mod optimizer;
 pub mod packed_sh;

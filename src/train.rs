@@ -47,7 +47,7 @@ use crate::photographs::dataset::{Dataset, Fingerprint};
 use crate::splats::optimizer::{Adam, FiniteCheck, LearningRates};
 use crate::splats::render::{Damping, Gradients, RenderOptions, Renderer};
 use crate::splats::scene::Gaussians;
-use crate::{Error, Result};
+use crate::{Error, Result, splats};
 
 pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
@@ -126,7 +126,7 @@ impl StepReport {
 ///         println!("step {}: loss {:.4}", report.step, report.loss);
 ///     }
 /// }
-/// trainer.gaussians()?.save("model.ply")?;
+/// trainer.model()?.save("model.ply")?;
 /// # Ok::<(), nightsplat::Error>(())
 /// ```
 #[derive(Debug)]
@@ -200,6 +200,20 @@ impl Trainer {
     /// The device was lost.
     pub fn gaussians(&self) -> Result<Gaussians> {
         Ok(self.gaussians_in_frame()?.to_world(&self.frame))
+    }
+
+    /// The Gaussians with what a renderer must know of them.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub fn model(&self) -> Result<splats::model::Model> {
+        Ok(self.model_of(&self.gaussians_in_frame()?))
+    }
+
+    /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world.
+    pub(crate) fn model_of(&self, in_frame: &Gaussians) -> splats::model::Model {
+        let facts = self.config.facts(&self.frame);
+        splats::model::Model::of(in_frame.to_world(&self.frame), &facts)
     }
 
     /// The Gaussians in [`Trainer::frame`], bit for bit as trained.

@@ -27,7 +27,7 @@ use crate::train::OnOff;
 /// background no score tells a hole from a dark surface; a mean above 0.1 prints a warning.
 #[derive(Clone, Debug, clap::Args)]
 pub struct EvalArgs {
-    /// Run directory, or a PLY of Gaussians with --dataset
+    /// Run directory, or a model with --dataset: PLY, SPZ or SOG
     pub run: PathBuf,
     /// Print JSON, as in metrics.json, instead of a table
     #[arg(long)]

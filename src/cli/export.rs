@@ -16,8 +16,10 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::results::export::page::{Bookmark, Page};
 use crate::results::export::{Format, Provenance, spz};
-use crate::results::finished_run::{FinishedRun, is_model, load_model, needs_photographs};
-use crate::splats::scene::{Gaussians, MAX_SH_DEGREE};
+use crate::results::finished_run::{FinishedRun, config_of_file, is_model, needs_photographs};
+use crate::results::models;
+use crate::splats::render::RenderSettings;
+use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE};
 use crate::train::TrainConfig;
 use crate::{Error, results::run};
 
@@ -27,7 +29,7 @@ pub use up::Up;
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct ExportArgs {
-    /// Run directory, or a PLY of Gaussians
+    /// Run directory, or a model: PLY, SPZ or SOG
     pub run: PathBuf,
     /// Format
     #[arg(long = "format", alias = "to", value_enum, value_name = "FORMAT")]
@@ -104,7 +106,8 @@ pub fn run(args: &ExportArgs) -> Result<()> {
 /// Writes the file, and returns its path and a line on its contents.
 pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     check_ending(args)?;
-    let (gaussians, config, own) = opened(args)?;
+    let (gaussians, facts, config) = opened(args)?;
+    let own = own_file(args);
     let out = args.out.as_ref().unwrap_or(&own);
     if args.to == To::Ply && is_same_file(out, &own) {
         let problem = "is the model itself; name another file with --out";
@@ -118,7 +121,7 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     }
     let (rotation, turned) = args.rotation(&config).unwrap_or_default();
     let gaussians = up::turned(gaussians, rotation);
-    let provenance = Provenance { rotation, ..provenance(args, &config) };
+    let provenance = Provenance { rotation, facts, ..provenance(args, &config) };
     let format = match args.to {
         To::Ply => Some(Format::Ply),
         To::Spz if args.spz == 3 => Some(Format::Spz(spz::Version::V3)),
@@ -158,19 +161,29 @@ fn check_ending(args: &ExportArgs) -> crate::Result<()> {
     check_writable(out)
 }
 
-/// The model as stored, its settings, and the default output file.
-fn opened(args: &ExportArgs) -> crate::Result<(Gaussians, TrainConfig, PathBuf)> {
-    let (from, extension) = (&args.run, args.to.extension());
-    if is_model(from) {
-        if args.to == To::Html && args.dataset.is_none() {
-            return Err(needs_photographs(from));
-        }
-        let (gaussians, config) = load_model(from, args.dataset.as_deref())?;
-        return Ok((gaussians, config, from.with_extension(extension)));
+/// The model as stored, what is stated of it, and its settings.
+fn opened(args: &ExportArgs) -> crate::Result<(Gaussians, Facts, TrainConfig)> {
+    let from = &args.run;
+    if !is_model(from) {
+        let config = run::load_config(from)?;
+        let (gaussians, facts) = models::read(from)?;
+        return Ok((gaussians, facts, config));
     }
-    let config = run::load_config(from)?;
-    let gaussians = run::load_model(from, false)?;
-    Ok((gaussians, config, from.join(format!("model.{extension}"))))
+    if args.to == To::Html && args.dataset.is_none() {
+        return Err(needs_photographs(from));
+    }
+    let (gaussians, facts) = models::read(from)?;
+    let config = config_of_file(&gaussians, &facts, args.dataset.as_deref());
+    Ok((gaussians, facts, config))
+}
+
+/// The default output file.
+fn own_file(args: &ExportArgs) -> PathBuf {
+    let (from, extension) = (&args.run, args.to.extension());
+    match is_model(from) {
+        true => from.with_extension(extension),
+        false => from.join(format!("model.{extension}")),
+    }
 }
 
 fn has_networks(config: &TrainConfig) -> bool {
@@ -233,7 +246,8 @@ fn page(
         let bookmarks = bookmarks(args, gaussians.origin, &dataset, |_| Ok(None))?;
         (bookmarks, up.unwrap_or_else(|| dataset.up()))
     };
-    let near = f64::from(config.render_settings().near) / frame.scale;
+    let near = provenance.facts.near.or(config.facts(&frame).near);
+    let near = near.unwrap_or_else(|| RenderSettings::default().near).into();
     Ok(Page { title, gaussians, provenance, bookmarks, near, up }.html()?)
 }
 

@@ -25,7 +25,7 @@ use crate::train::TrainConfig;
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct RenderArgs {
-    /// Run directory, or a PLY of Gaussians with --dataset
+    /// Run directory, or a model with --dataset: PLY, SPZ or SOG
     pub run: PathBuf,
     /// Cameras of this split of the dataset
     #[arg(long, value_enum, required_unless_present = "path", conflicts_with = "path")]

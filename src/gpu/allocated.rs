@@ -1,14 +1,17 @@
-//! Vulkan buffers and their memory.
+//! Vulkan buffers and their memory: pieces of our own blocks, or what the host's allocator gives.
 
+use std::ffi::CString;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 
 use ash::vk;
-use gpu_allocator::vulkan::{Allocation, AllocationCreateDesc, AllocationScheme};
+use gpu_allocator::vulkan::{
+    Allocation as Piece, AllocationCreateDesc, AllocationScheme, Allocator,
+};
 use gpu_allocator::{AllocationError, MemoryLocation};
 
+use super::host::{HostAllocation, MemoryFunctions};
 use super::limits::whole_quads;
-use super::{Bound, Retired, Shared, lock};
+use super::{Bound, LastUse, Retired, Shared, lock};
 use crate::{Error, Result};
 
 /// A Vulkan buffer and its memory.
@@ -17,8 +20,153 @@ pub(super) struct DeviceMemory {
     pub(super) shared: Arc<Shared>,
     pub(super) raw: vk::Buffer,
     /// Taken when the buffer retires.
-    pub(super) allocation: Option<Allocation>,
+    allocation: Option<Allocation>,
     name: String,
+}
+
+/// Memory of one buffer.
+#[derive(Debug)]
+pub(super) enum Allocation {
+    Ours(Piece),
+    Hosts(HostPiece),
+}
+
+/// Memory of one buffer that the host allocated.
+#[derive(Debug)]
+pub(super) struct HostPiece {
+    allocation: HostAllocation,
+    size: u64,
+}
+
+// SAFETY: a piece is memory and a cookie that any thread may give back, as the host promises.
+unsafe impl Send for HostPiece {}
+// SAFETY: as above; its bytes are reached through the one `DeviceMemory` that has it.
+unsafe impl Sync for HostPiece {}
+
+/// What memory of buffers comes from.
+pub(super) enum MemorySource {
+    Ours(Box<Allocator>),
+    Hosts(MemoryFunctions),
+}
+
+// SAFETY: the host promises that its functions may be called from any thread.
+unsafe impl Send for MemorySource {}
+
+/// The host's allocator failed.
+#[derive(Debug, thiserror::Error)]
+enum HostMemoryError {
+    #[error("the host's allocator returned {0:?}")]
+    Refused(vk::Result),
+    #[error("the host's allocator returned offset {offset}, which is no multiple of {alignment}")]
+    Misaligned { offset: u64, alignment: u64 },
+    #[error("the host's allocator returned no mapped address")]
+    Unmapped,
+}
+
+impl MemorySource {
+    fn allocate(
+        &mut self,
+        name: &str,
+        requirements: vk::MemoryRequirements,
+        location: MemoryLocation,
+    ) -> Result<Allocation, Box<dyn std::error::Error + Send + Sync>> {
+        match self {
+            Self::Ours(allocator) => {
+                let desc = AllocationCreateDesc {
+                    name,
+                    requirements,
+                    location,
+                    linear: true,
+                    allocation_scheme: AllocationScheme::GpuAllocatorManaged,
+                };
+                Ok(Allocation::Ours(allocator.allocate(&desc)?))
+            }
+            Self::Hosts(functions) => {
+                let piece = host_piece(functions, name, &requirements, location)?;
+                Ok(Allocation::Hosts(piece))
+            }
+        }
+    }
+
+    pub(super) fn free(&mut self, allocation: Allocation) {
+        match (self, allocation) {
+            // Freeing can only fail for an allocation of another allocator.
+            (Self::Ours(allocator), Allocation::Ours(piece)) => {
+                allocator.free(piece).unwrap_or_default();
+            }
+            (Self::Hosts(MemoryFunctions { free, user, .. }), Allocation::Hosts(piece)) => {
+                // SAFETY: the host's function gets what the host's function gave, once.
+                unsafe { free(*user, &piece.allocation) }
+            }
+            _ => {}
+        }
+    }
+}
+
+fn host_piece(
+    functions: &MemoryFunctions,
+    name: &str,
+    requirements: &vk::MemoryRequirements,
+    location: MemoryLocation,
+) -> Result<HostPiece, HostMemoryError> {
+    type Properties = vk::MemoryPropertyFlags;
+    let mapped = Properties::HOST_VISIBLE | Properties::HOST_COHERENT;
+    let (required, preferred) = match location {
+        MemoryLocation::CpuToGpu => (mapped, Properties::empty()),
+        MemoryLocation::GpuToCpu => (mapped, Properties::HOST_CACHED),
+        _ => (Properties::empty(), Properties::DEVICE_LOCAL),
+    };
+    let name = CString::new(name).unwrap_or_default();
+    let mut allocation = HostAllocation {
+        memory: vk::DeviceMemory::null(),
+        offset: 0,
+        mapped: std::ptr::null_mut(),
+        cookie: std::ptr::null_mut(),
+    };
+    let MemoryFunctions { allocate, free, user } = *functions;
+    // SAFETY: every pointer is to a live local; the function is the host's.
+    let result = unsafe {
+        allocate(user, requirements, required, preferred, name.as_ptr(), &raw mut allocation)
+    };
+    let vk::MemoryRequirements { alignment, size, .. } = *requirements;
+    let offset = allocation.offset;
+    let problem = match result {
+        vk::Result::SUCCESS if !offset.is_multiple_of(alignment.max(1)) => {
+            HostMemoryError::Misaligned { offset, alignment }
+        }
+        vk::Result::SUCCESS if !required.is_empty() && allocation.mapped.is_null() => {
+            HostMemoryError::Unmapped
+        }
+        vk::Result::SUCCESS => return Ok(HostPiece { allocation, size }),
+        result => return Err(HostMemoryError::Refused(result)),
+    };
+    // SAFETY: the host's function gets what it just gave.
+    unsafe { free(user, &allocation) };
+    Err(problem)
+}
+
+impl Allocation {
+    pub(super) fn size(&self) -> u64 {
+        match self {
+            Self::Ours(piece) => piece.size(),
+            Self::Hosts(piece) => piece.size,
+        }
+    }
+
+    fn place(&self) -> (vk::DeviceMemory, u64) {
+        match self {
+            // SAFETY: the memory is bound to a buffer and not freed by hand.
+            Self::Ours(piece) => (unsafe { piece.memory() }, piece.offset()),
+            Self::Hosts(HostPiece { allocation, .. }) => (allocation.memory, allocation.offset),
+        }
+    }
+}
+
+fn out_of_memory<E>(name: &str, bytes: u64) -> impl Fn(E) -> Error
+where
+    E: Into<Box<dyn std::error::Error + Send + Sync>>,
+{
+    move |cause| Error::OutOfMemory { buffer: name.to_owned(), bytes, source: cause.into() }
 }
 
 impl DeviceMemory {
@@ -33,47 +181,21 @@ impl DeviceMemory {
             | vk::BufferUsageFlags::TRANSFER_DST;
         let size = whole_quads(bytes);
         let info = vk::BufferCreateInfo::default().size(size).usage(usage);
-        fn out_of_memory<E>(name: &str, bytes: u64) -> impl Fn(E) -> Error
-        where
-            E: std::error::Error + Send + Sync + 'static,
-        {
-            move |cause| Error::OutOfMemory { buffer: name.to_owned(), bytes, source: cause.into() }
-        }
+        let callbacks = shared.callbacks();
         // SAFETY: the device is live; the buffer is bound once to memory that satisfies its requirements.
         unsafe {
             let raw =
-                shared.device.create_buffer(&info, None).map_err(out_of_memory(name, size))?;
+                shared.device.create_buffer(&info, callbacks).map_err(out_of_memory(name, size))?;
             let requirements = shared.device.get_buffer_memory_requirements(raw);
-            #[cfg(feature = "testing")]
-            if shared.faults.fails_allocation(name) {
-                shared.device.destroy_buffer(raw, None);
-                return Err(out_of_memory(name, size)(AllocationError::OutOfMemory));
-            }
-            let admitted = shared.usage.admit(requirements.size).or_else(|_| {
-                shared.collect(shared.reached());
-                shared.usage.admit(requirements.size)
-            });
-            if let Err(refused) = admitted {
-                shared.device.destroy_buffer(raw, None);
-                return Err(out_of_memory(name, size)(refused));
-            }
-            let desc = AllocationCreateDesc {
-                name,
-                requirements,
-                location,
-                linear: true,
-                allocation_scheme: AllocationScheme::GpuAllocatorManaged,
+            let allocation = match allocation(shared, name, requirements, location) {
+                Ok(allocation) => allocation,
+                Err(cause) => {
+                    shared.device.destroy_buffer(raw, callbacks);
+                    return Err(out_of_memory(name, size)(cause));
+                }
             };
-            let allocated = match lock(&shared.allocator).as_mut() {
-                Some(allocator) => allocator.allocate(&desc),
-                None => Err(AllocationError::OutOfMemory),
-            };
-            let allocation = allocated.map_err(|error| {
-                shared.device.destroy_buffer(raw, None);
-                out_of_memory(name, size)(error)
-            })?;
-            let bound =
-                shared.device.bind_buffer_memory(raw, allocation.memory(), allocation.offset());
+            let (memory, offset) = allocation.place();
+            let bound = shared.device.bind_buffer_memory(raw, memory, offset);
             shared.usage.add(allocation.size());
             let shared = Arc::clone(shared);
             let memory = Self { shared, raw, allocation: Some(allocation), name: name.to_owned() };
@@ -94,14 +216,62 @@ impl DeviceMemory {
     pub(super) fn bound(&self) -> Bound {
         Bound { raw: self.raw, offset: 0, size: vk::WHOLE_SIZE }
     }
+
+    /// Its bytes; `None` where it is not host-visible.
+    pub(super) fn mapped(&self) -> Option<&[u8]> {
+        match self.allocation.as_ref()? {
+            Allocation::Ours(piece) => piece.mapped_slice(),
+            // SAFETY: the host mapped this many bytes, which nothing else writes while they are borrowed.
+            Allocation::Hosts(HostPiece { allocation, size }) => unsafe {
+                let mapped = std::ptr::NonNull::new(allocation.mapped)?.cast().as_ptr();
+                Some(std::slice::from_raw_parts(mapped, *size as usize))
+            },
+        }
+    }
+
+    /// Its bytes, to write.
+    pub(super) fn mapped_mut(&mut self) -> Option<&mut [u8]> {
+        match self.allocation.as_mut()? {
+            Allocation::Ours(piece) => piece.mapped_slice_mut(),
+            // SAFETY: as above, and the borrow is exclusive.
+            Allocation::Hosts(HostPiece { allocation, size }) => unsafe {
+                let mapped = std::ptr::NonNull::new(allocation.mapped)?.cast().as_ptr();
+                Some(std::slice::from_raw_parts_mut(mapped, *size as usize))
+            },
+        }
+    }
+}
+
+/// Memory within the limit of ours.
+fn allocation(
+    shared: &Shared,
+    name: &str,
+    requirements: vk::MemoryRequirements,
+    location: MemoryLocation,
+) -> Result<Allocation, Box<dyn std::error::Error + Send + Sync>> {
+    #[cfg(feature = "testing")]
+    if shared.faults.fails_allocation(name) {
+        return Err(AllocationError::OutOfMemory.into());
+    }
+    shared.usage.admit(requirements.size).or_else(|_| {
+        shared.collect(shared.reached());
+        shared.usage.admit(requirements.size)
+    })?;
+    match lock(&shared.memory).as_mut() {
+        Some(source) => source.allocate(name, requirements, location),
+        None => Err(AllocationError::OutOfMemory.into()),
+    }
 }
 
 impl Drop for DeviceMemory {
     fn drop(&mut self) {
         if let Some(allocation) = self.allocation.take() {
+            if let Some(host) = &self.shared.host {
+                host.forget(self.raw);
+            }
             self.shared.retire(Retired::Buffer(self.raw, allocation));
             // Without work in flight nothing else would free it.
-            if self.shared.last_use.load(Ordering::Acquire) == 0 {
+            if self.shared.last_use() == LastUse::default() {
                 self.shared.collect(0);
             }
         }

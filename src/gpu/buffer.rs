@@ -4,9 +4,9 @@ use std::marker::PhantomData;
 
 use ash::vk::Handle as _;
 use gpu_allocator::MemoryLocation;
-use gpu_allocator::vulkan::Allocation;
 
 use super::allocated::DeviceMemory;
+use super::host::Upload;
 use super::{Bound, Gpu, Properties, Slice, SliceMut};
 use crate::{Error, Result};
 
@@ -112,12 +112,10 @@ impl Gpu {
     ///
     /// # Errors
     /// The device was lost.
-    pub(crate) fn zeroed<T: bytemuck::Pod>(&self, mut buffer: Buffer<T>) -> Result<Buffer<T>> {
-        let name = buffer.name().to_owned();
-        self.run(&name, |pass| {
-            pass.fill(&mut buffer, 0);
-            Ok(())
-        })?;
+    pub(crate) fn zeroed<T: bytemuck::Pod>(&self, buffer: Buffer<T>) -> Result<Buffer<T>> {
+        if !buffer.is_empty() {
+            self.upload(buffer.name(), Upload::Fill { target: buffer.bound(), word: 0 })?;
+        }
         Ok(buffer)
     }
 
@@ -131,7 +129,8 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// Overwrites the first elements of a buffer, or of a slice of one, with `data`; blocks until that is done.
+    /// Overwrites the first elements of a buffer, or of a slice of one, with `data`; blocks until that is done. On a
+    /// device that a host lends, the next recording begins with it instead.
     ///
     /// # Errors
     /// `data` is longer than the buffer, or the device is out of memory or lost.
@@ -157,13 +156,10 @@ impl Gpu {
             bytes.len() as u64,
             MemoryLocation::CpuToGpu,
         )?;
-        if let Some(mapped) = staging.allocation.as_mut().and_then(Allocation::mapped_slice_mut) {
+        if let Some(mapped) = staging.mapped_mut() {
             mapped[..bytes.len()].copy_from_slice(bytes);
         }
-        self.run("write", |pass| {
-            pass.copy_raw(staging.bound(), buffer.bound(), bytes.len() as u64);
-            Ok(())
-        })?;
-        Ok(())
+        let (target, bytes) = (buffer.bound(), bytes.len() as u64);
+        self.upload("write", Upload::Copy { staging, target, bytes })
     }
 }

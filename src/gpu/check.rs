@@ -22,6 +22,8 @@ pub enum Tolerance {
     Each(Vec<f64>),
     /// Two 16-bit floats in a word, each equal to the reference's or adjacent to it.
     Halves,
+    /// Four bytes in a word, each equal to the reference's or adjacent to it.
+    Bytes,
     /// One partial sum per workgroup, of which only the total counts: the device chooses the partition.
     Sum(f64),
 }
@@ -158,14 +160,18 @@ impl Versions<'_> {
             if self.device[i] == expected {
                 continue;
             }
-            if let Tolerance::Halves = tolerance {
-                let (device, reference) = farthest_halves(self.device[i], expected);
+            let packed = match tolerance {
+                Tolerance::Halves => Some(farthest_halves(self.device[i], expected)),
+                Tolerance::Bytes => Some(farthest_bytes(self.device[i], expected)),
+                _ => None,
+            };
+            if let Some((device, reference)) = packed {
                 comparison.add(i, device, reference, 1.0);
                 continue;
             }
             let (device, reference) = (number(self.device[i]), number(expected));
             let bound = match tolerance {
-                Tolerance::Exact | Tolerance::Sum(_) | Tolerance::Halves => 0.0,
+                Tolerance::Exact | Tolerance::Sum(_) | Tolerance::Halves | Tolerance::Bytes => 0.0,
                 Tolerance::Roundings(n) => n * ROUNDING * reference.abs() + flushed(1),
                 Tolerance::Each(bounds) => bounds
                     .get(i)
@@ -175,6 +181,13 @@ impl Versions<'_> {
         }
         comparison
     }
+}
+
+/// Of two words with four bytes each, the pair of bytes that is farther apart.
+fn farthest_bytes(device: u32, reference: u32) -> (f64, f64) {
+    let pairs = device.to_le_bytes().into_iter().zip(reference.to_le_bytes());
+    let farthest = pairs.max_by_key(|(device, reference)| device.abs_diff(*reference));
+    farthest.map_or((0.0, 0.0), |(device, reference)| (device.into(), reference.into()))
 }
 
 /// Of two words with two halves each, the pair of halves that is farther apart, by index among all halves.

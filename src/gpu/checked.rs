@@ -116,7 +116,7 @@ impl Checked<'_> {
     fn run(&mut self, shared: &Arc<Shared>, value: u64, record: Record<'_>) -> Result<u64> {
         let mut recorder = Recorder::new(shared, shared.begin(self.pool)?, value, None);
         recorder.observer = Some(self);
-        record(&mut recorder)?;
+        shared.with_uploads(&mut recorder, record)?;
         if let Some(observer) = recorder.observer.take() {
             observer.run_recorded(&mut recorder, "copies")?;
         }
@@ -181,7 +181,7 @@ impl PassObserver for Checked<'_> {
         shared.wait(recorder.value)?;
         recorder.commands = shared.begin(self.pool)?;
         recorder.value += 1;
-        shared.last_use.store(recorder.value, Ordering::Release);
+        shared.last_submission.store(recorder.value, Ordering::Release);
         recorder.barrier();
         Ok(())
     }

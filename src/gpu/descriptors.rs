@@ -114,7 +114,7 @@ impl Sets {
             let info =
                 vk::DescriptorPoolCreateInfo::default().max_sets(SETS_OF_A_POOL).pool_sizes(&sizes);
             // SAFETY: the device is live; the pool is retired with this recording.
-            let pool = unsafe { shared.device.create_descriptor_pool(&info, None) }
+            let pool = unsafe { shared.device.create_descriptor_pool(&info, shared.callbacks()) }
                 .map_err(|result| shared.error("vkCreateDescriptorPool", result))?;
             self.pools.push(pool);
             self.left = SETS_OF_A_POOL;

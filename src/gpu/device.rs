@@ -9,6 +9,7 @@ use ash::vk::Handle as _;
 use ash::{ext, khr, vk};
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
 
+use super::allocated::MemorySource;
 #[cfg(feature = "check")]
 use super::checked::Checks;
 use super::choice::SelectedDevice;
@@ -17,6 +18,7 @@ use super::descriptors::Descriptors;
 use super::device_report::{device_memory, report};
 #[cfg(feature = "testing")]
 use super::faults::Faults;
+use super::host::Host;
 use super::instance::{
     OwnedInstance, instance, loader_error, physical_devices, validation_is_installed,
     validation_version,
@@ -27,31 +29,10 @@ use super::requirements::required_device_features;
 use super::supported::{OPTIONAL_EXTENSIONS, Supported};
 use super::validation::FIRST_SAFE_WITH_LABELS;
 use super::{
-    DeviceChoice, DeviceReport, Gpu, Properties, Queue, SchedulerVariables, Shared, address_space,
-    reconvergence, statistics, tuning,
+    DeviceChoice, DeviceReport, Gpu, HostDevice, Properties, Queue, SchedulerVariables, Shared,
+    address_space, reconvergence, statistics, tuning,
 };
 use crate::{Error, Result};
-
-/// A device that a host application lends, as raw handles, so that C++ hosts and other Vulkan bindings work.
-///
-/// The host must have enabled [`required_device_features`] on the device. It should enable `VK_KHR_push_descriptor`
-/// where that is supported, which makes recording faster. It keeps device, instance and queue alive for as long as the
-/// [`Gpu`] and everything made with it.
-#[derive(Clone, Copy, Debug)]
-pub struct HostDevice {
-    /// The address of `vkGetInstanceProcAddr` of the host's loader.
-    pub get_instance_proc_addr: *const c_void,
-    /// `VkInstance`.
-    pub instance: u64,
-    /// `VkPhysicalDevice`.
-    pub physical_device: u64,
-    /// `VkDevice`.
-    pub device: u64,
-    /// `VkQueue` of the family below, with compute.
-    pub queue: u64,
-    /// Its family's index.
-    pub queue_family: u32,
-}
 
 impl Gpu {
     /// Opens a device. Debug builds turn on validation where the layer is installed.
@@ -103,13 +84,20 @@ impl Gpu {
                 has_pipeline_statistics: has_pipeline_statistics(&supported),
                 ..properties(instance, physical, &supported)?
             };
-            create_device(instance, physical, &supported, &properties)
-                .map(|(device, queue)| (physical, properties, device, queue))
+            create_device(instance, physical, &supported, &properties).map(
+                |(device, queue, family)| DeviceParts {
+                    physical,
+                    properties,
+                    device,
+                    queue,
+                    family,
+                },
+            )
         });
         match opened {
-            Ok((physical, properties, device, queue)) => {
+            Ok(parts) => {
                 let instance = owned.instance.clone();
-                Self::assemble(&instance, physical, properties, device, queue, Some(owned))
+                Self::assemble(&instance, parts, Owner::Ours(owned))
             }
             Err(error) => {
                 // SAFETY: no device was created from the instance.
@@ -126,7 +114,8 @@ impl Gpu {
     ///
     /// # Safety
     /// The handles are valid and stay so for as long as the `Gpu` and everything made with it; the required features
-    /// and extensions are enabled; no other thread uses the queue while a `Gpu` method submits to it.
+    /// and extensions are enabled; without [`HostDevice::queue_lock`] no other thread uses the queue while a `Gpu`
+    /// method submits to it; every frame of the host's is done when the `Gpu` and everything made with it is dropped.
     pub unsafe fn from_host(host: HostDevice) -> Result<Self> {
         // SAFETY: the caller says that the address is this function's; null becomes `None`.
         let get_instance_proc_addr = unsafe {
@@ -148,52 +137,29 @@ impl Gpu {
         };
         let supported = Supported::gather(&instance, physical).map_err(loader_error)?;
         supported.check()?;
-        let queue = Queue { raw: vk::Queue::from_raw(host.queue), family: host.queue_family };
-        let properties = properties(&instance, physical, &supported)?;
-        Self::assemble(&instance, physical, properties, device, queue, None)
+        let (queue, family) = (vk::Queue::from_raw(host.queue), host.queue_family);
+        let own = properties(&instance, physical, &supported)?;
+        let has_push_descriptors = own.has_push_descriptors && host.has_push_descriptors;
+        let properties = Properties { has_push_descriptors, ..own };
+        let parts = DeviceParts { physical, properties, device, queue, family };
+        Self::assemble(&instance, parts, Owner::Host(&host))
     }
 
-    fn assemble(
-        instance: &ash::Instance,
-        physical: vk::PhysicalDevice,
-        properties: Properties,
-        device: ash::Device,
-        queue: Queue,
-        owned: Option<OwnedInstance>,
-    ) -> Result<Self> {
+    fn assemble(instance: &ash::Instance, parts: DeviceParts, owner: Owner<'_>) -> Result<Self> {
         #[cfg(feature = "testing")]
         let faults = Faults::from_environment()?;
-        let name = properties.name.clone();
-        let fail = |call| move |result| Error::Vulkan { call, device: name.clone(), result };
-        let allocator = Allocator::new(&AllocatorCreateDesc {
-            instance: instance.clone(),
-            device: device.clone(),
-            physical_device: physical,
-            debug_settings: Default::default(),
-            buffer_device_address: false,
-            allocation_sizes: super::memory::block_sizes(),
-        })
-        .map_err(|error| Error::NoDevice(format!("{}: {error}", properties.name)))?;
-        let mut kind =
-            vk::SemaphoreTypeCreateInfo::default().semaphore_type(vk::SemaphoreType::TIMELINE);
-        let semaphore = vk::SemaphoreCreateInfo::default().push_next(&mut kind);
-        let path = owned.as_ref().and_then(|owned| owned.cache_path.as_ref());
-        let cached = path.and_then(|path| std::fs::read(path).ok()).unwrap_or_default();
-        let cache = vk::PipelineCacheCreateInfo::default().initial_data(&cached);
-        // SAFETY: the device is live; a driver ignores cached data that is not its own.
-        let (timeline, pipeline_cache) = unsafe {
-            let timeline = device
-                .create_semaphore(&semaphore, None)
-                .map_err(fail.clone()("vkCreateSemaphore"))?;
-            let cache = device
-                .create_pipeline_cache(&cache, None)
-                .map_err(fail("vkCreatePipelineCache"))?;
-            (timeline, cache)
+        let memory = memory_source(instance, &parts, &owner)?;
+        let DeviceParts { physical, properties, device, queue, family } = parts;
+        // SAFETY: the host says that its callbacks outlive the device.
+        let callbacks = unsafe { owner.callbacks() };
+        let (timeline, pipeline_cache) =
+            timeline_and_cache(&device, &properties.name, &owner, callbacks.as_ref())?;
+        let debug = owner.names_objects().then(|| ext::debug_utils::Device::new(instance, &device));
+        let has_labels = owner.takes_labels();
+        let (owned, host) = match owner {
+            Owner::Ours(owned) => (Some(owned), None),
+            Owner::Host(lent) => (None, Some(Host::new(lent))),
         };
-        let debug = owned.as_ref().and_then(|owned| owned.messenger.as_ref());
-        let debug = debug.map(|_| ext::debug_utils::Device::new(instance, &device));
-        let layer = owned.as_ref().and_then(|owned| validation_version(&owned.entry));
-        let has_labels = layer.is_some_and(|version| version >= FIRST_SAFE_WITH_LABELS);
         let executables = properties
             .has_pipeline_statistics
             .then(|| khr::pipeline_executable_properties::Device::new(instance, &device));
@@ -206,11 +172,14 @@ impl Gpu {
                 executables,
                 tuned_tiles: OnceLock::new(),
                 device,
-                allocator: Mutex::new(Some(allocator)),
-                queue: Mutex::new(queue),
+                memory: Mutex::new(Some(memory)),
+                callbacks,
+                host,
+                family,
+                queue: Mutex::new(Queue { raw: queue }),
                 progress: Mutex::default(),
                 timeline,
-                last_use: AtomicU64::new(0),
+                last_submission: AtomicU64::new(0),
                 usage: MemoryUsage::default(),
                 budget: BudgetQuery::of(instance, physical),
                 #[cfg(feature = "testing")]
@@ -224,6 +193,105 @@ impl Gpu {
             }),
         })
     }
+}
+
+/// A device before it is a [`Gpu`].
+struct DeviceParts {
+    physical: vk::PhysicalDevice,
+    properties: Properties,
+    device: ash::Device,
+    queue: vk::Queue,
+    family: u32,
+}
+
+/// Who created the device.
+enum Owner<'a> {
+    Ours(OwnedInstance),
+    Host(&'a HostDevice),
+}
+
+impl Owner<'_> {
+    fn names_objects(&self) -> bool {
+        match self {
+            Self::Ours(owned) => owned.messenger.is_some(),
+            Self::Host(lent) => lent.names_objects,
+        }
+    }
+
+    /// Whether passes are labelled; a host answers for its own layers.
+    fn takes_labels(&self) -> bool {
+        match self {
+            Self::Ours(owned) => validation_version(&owned.entry)
+                .is_some_and(|version| version >= FIRST_SAFE_WITH_LABELS),
+            Self::Host(lent) => lent.names_objects,
+        }
+    }
+
+    /// # Safety
+    /// The host's callbacks are null, or valid for as long as what is created with them.
+    unsafe fn callbacks(&self) -> Option<vk::AllocationCallbacks<'static>> {
+        match self {
+            Self::Ours(_) => None,
+            // SAFETY: as the caller promises.
+            Self::Host(lent) => {
+                unsafe { lent.host_memory.cast::<vk::AllocationCallbacks<'_>>().as_ref() }.copied()
+            }
+        }
+    }
+}
+
+fn memory_source(
+    instance: &ash::Instance,
+    parts: &DeviceParts,
+    owner: &Owner<'_>,
+) -> Result<MemorySource> {
+    if let Owner::Host(HostDevice { device_memory: Some(functions), .. }) = owner {
+        return Ok(MemorySource::Hosts(*functions));
+    }
+    let allocator = Allocator::new(&AllocatorCreateDesc {
+        instance: instance.clone(),
+        device: parts.device.clone(),
+        physical_device: parts.physical,
+        debug_settings: Default::default(),
+        buffer_device_address: false,
+        allocation_sizes: super::memory::block_sizes(),
+    });
+    match allocator {
+        Ok(allocator) => Ok(MemorySource::Ours(Box::new(allocator))),
+        Err(error) => Err(Error::NoDevice(format!("{}: {error}", parts.properties.name))),
+    }
+}
+
+/// Our timeline semaphore, and the pipeline cache: the host's, or one of ours that begins with what was saved.
+fn timeline_and_cache(
+    device: &ash::Device,
+    name: &str,
+    owner: &Owner<'_>,
+    callbacks: Option<&vk::AllocationCallbacks<'_>>,
+) -> Result<(vk::Semaphore, vk::PipelineCache)> {
+    let fail = |call| move |result| Error::Vulkan { call, device: name.to_owned(), result };
+    let mut kind =
+        vk::SemaphoreTypeCreateInfo::default().semaphore_type(vk::SemaphoreType::TIMELINE);
+    let semaphore = vk::SemaphoreCreateInfo::default().push_next(&mut kind);
+    // SAFETY: the device is live.
+    let timeline = unsafe { device.create_semaphore(&semaphore, callbacks) }
+        .map_err(fail("vkCreateSemaphore"))?;
+    let path = match owner {
+        Owner::Host(lent) if lent.pipeline_cache != 0 => {
+            return Ok((timeline, vk::PipelineCache::from_raw(lent.pipeline_cache)));
+        }
+        Owner::Host(_) => None,
+        Owner::Ours(owned) => owned.cache_path.as_ref(),
+    };
+    let cached = path.and_then(|path| std::fs::read(path).ok()).unwrap_or_default();
+    let cache = vk::PipelineCacheCreateInfo::default().initial_data(&cached);
+    // SAFETY: the device is live; a driver ignores cached data that is not its own.
+    let cache = unsafe { device.create_pipeline_cache(&cache, callbacks) }.map_err(|result| {
+        // SAFETY: just created, and used by nothing.
+        unsafe { device.destroy_semaphore(timeline, callbacks) };
+        fail("vkCreatePipelineCache")(result)
+    })?;
+    Ok((timeline, cache))
 }
 
 // ---------------------------------------------------------------------------
@@ -295,7 +363,7 @@ fn create_device(
     physical: vk::PhysicalDevice,
     supported: &Supported,
     properties: &Properties,
-) -> Result<(ash::Device, Queue)> {
+) -> Result<(ash::Device, vk::Queue, u32)> {
     let family = supported.compute_family.unwrap_or_default();
     let priorities = [1.0];
     let queues = [vk::DeviceQueueCreateInfo::default()
@@ -342,8 +410,8 @@ fn create_device(
         let device = instance
             .create_device(physical, &info, None)
             .map_err(|result| Error::Vulkan { call: "vkCreateDevice", device, result })?;
-        let raw = device.get_device_queue(family, 0);
-        Ok((device, Queue { raw, family }))
+        let queue = device.get_device_queue(family, 0);
+        Ok((device, queue, family))
     }
 }
 

@@ -3,7 +3,6 @@
 use std::marker::PhantomData;
 
 use gpu_allocator::MemoryLocation;
-use gpu_allocator::vulkan::Allocation;
 
 use super::allocated::DeviceMemory;
 use super::recorder::HOST_SUBMITS;
@@ -79,7 +78,7 @@ impl<T: bytemuck::Pod> Download<T> {
         self.host.shared.wait(self.value)?;
         let bytes = self.len * size_of::<T>();
         let mut data = vec![T::zeroed(); self.len];
-        if let Some(mapped) = self.host.allocation.as_ref().and_then(Allocation::mapped_slice) {
+        if let Some(mapped) = self.host.mapped() {
             bytemuck::cast_slice_mut(&mut data).copy_from_slice(&mapped[..bytes]);
         }
         Ok(data)

@@ -48,10 +48,10 @@ impl Gpu {
         unsafe {
             let set_layout =
                 set_layout(shared, interface).map_err(fail("vkCreateDescriptorSetLayout"))?;
-            let layout = match pipeline_layout(&shared.device, interface, set_layout) {
+            let layout = match pipeline_layout(shared, interface, set_layout) {
                 Ok(layout) => layout,
                 Err(result) => {
-                    shared.device.destroy_descriptor_set_layout(set_layout, None);
+                    shared.device.destroy_descriptor_set_layout(set_layout, shared.callbacks());
                     return Err(shared.error("vkCreatePipelineLayout", result));
                 }
             };
@@ -62,8 +62,8 @@ impl Gpu {
                     Ok(Objects { interface, raw, layout, set_layout, shared })
                 }
                 Err(result) => {
-                    shared.device.destroy_pipeline_layout(layout, None);
-                    shared.device.destroy_descriptor_set_layout(set_layout, None);
+                    shared.device.destroy_pipeline_layout(layout, shared.callbacks());
+                    shared.device.destroy_descriptor_set_layout(set_layout, shared.callbacks());
                     tracing::error!("kernel {} was refused", interface.name);
                     Err(shared.error("vkCreateComputePipelines", result))
                 }
@@ -93,13 +93,13 @@ unsafe fn set_layout(
         .flags(shared.descriptors.set_layout_flags())
         .bindings(&bindings);
     // SAFETY: `info` points at live locals.
-    unsafe { shared.device.create_descriptor_set_layout(&info, None) }
+    unsafe { shared.device.create_descriptor_set_layout(&info, shared.callbacks()) }
 }
 
 /// # Safety
 /// The device and the set layout are live.
 unsafe fn pipeline_layout(
-    device: &ash::Device,
+    shared: &Shared,
     interface: &Interface,
     set_layout: vk::DescriptorSetLayout,
 ) -> Result<vk::PipelineLayout, vk::Result> {
@@ -112,7 +112,7 @@ unsafe fn pipeline_layout(
         .set_layouts(&set_layouts)
         .push_constant_ranges(ranges);
     // SAFETY: `info` points at live locals.
-    unsafe { device.create_pipeline_layout(&info, None) }
+    unsafe { shared.device.create_pipeline_layout(&info, shared.callbacks()) }
 }
 
 /// # Safety
@@ -159,14 +159,17 @@ pub(super) unsafe fn raw_pipeline(
     let info = vk::ShaderModuleCreateInfo::default().code(&code);
     // SAFETY: the create infos point at live locals; the module is not needed after the call.
     unsafe {
-        let module = shared.device.create_shader_module(&info, None)?;
+        let module = shared.device.create_shader_module(&info, shared.callbacks())?;
         let info = vk::ComputePipelineCreateInfo::default()
             .stage(stage.module(module))
             .layout(layout)
             .flags(flags);
-        let pipelines =
-            shared.device.create_compute_pipelines(shared.pipeline_cache, &[info], None);
-        shared.device.destroy_shader_module(module, None);
+        let pipelines = shared.device.create_compute_pipelines(
+            shared.pipeline_cache,
+            &[info],
+            shared.callbacks(),
+        );
+        shared.device.destroy_shader_module(module, shared.callbacks());
         pipelines.map(|pipelines| pipelines[0]).map_err(|(_, result)| result)
     }
 }

@@ -12,7 +12,9 @@ use ash::vk::Handle as _;
 use super::Tolerance;
 use super::descriptors::Sets;
 use super::pipeline::Objects;
-use super::{Binding, Bound, Buffer, Gpu, Interface, Pipeline, Properties, Recordable, Shared};
+use super::{
+    Binding, Bound, Buffer, HostFrame, Interface, Pipeline, Properties, Recordable, Shared,
+};
 use crate::{Error, Result};
 
 /// The invocations of a dispatch; the kernel knows its workgroup size.
@@ -38,16 +40,11 @@ pub struct Recorder<'g> {
     pub(super) labels: Vec<&'static str>,
     /// Buffers accessed since the last barrier; true if written.
     pending: HashMap<vk::Buffer, bool>,
+    /// The stages outside this recording that read our buffers, before it or after it.
+    readers: vk::PipelineStageFlags2,
     /// Runs each pass alone and compares it with its reference instead of recording it.
     #[cfg(feature = "check")]
     pub(super) observer: Option<&'g mut (dyn PassObserver + 'g)>,
-}
-
-/// The descriptor sets of a host's recording; empty on a device with `VK_KHR_push_descriptor`.
-#[derive(Debug)]
-#[must_use = "it stays until the host's submission is done"]
-pub struct HostRecording {
-    _sets: Sets,
 }
 
 /// Runs passes in its own way instead of recording them.
@@ -86,11 +83,17 @@ pub(super) const HOST_SUBMITS: u64 = 0;
 /// Timestamps of one recording; later passes are not timed.
 pub(super) const MAX_TIMESTAMPS: u32 = 4096;
 
+/// The stages of everything that we record.
+pub(super) const OUR_STAGES: vk::PipelineStageFlags2 = vk::PipelineStageFlags2::from_raw(
+    vk::PipelineStageFlags2::COMPUTE_SHADER.as_raw()
+        | vk::PipelineStageFlags2::ALL_TRANSFER.as_raw(),
+);
+
 /// The most that `vkCmdUpdateBuffer` takes, in bytes.
 const MAX_UPDATE: usize = 65_536;
 
 impl<'g> Recorder<'g> {
-    /// Starts with a barrier after everything submitted before.
+    /// Starts with a barrier after everything submitted before; the host reads once it is done.
     pub(super) fn new(
         shared: &'g Arc<Shared>,
         commands: vk::CommandBuffer,
@@ -98,19 +101,42 @@ impl<'g> Recorder<'g> {
         queries: Option<vk::QueryPool>,
     ) -> Self {
         let mut recorder = Self {
-            shared,
-            sets: Sets::new(shared),
-            commands,
             value,
             queries,
-            labels: vec![],
-            pending: HashMap::new(),
-            #[cfg(feature = "check")]
-            observer: None,
+            ..Self::unstarted(shared, commands, vk::PipelineStageFlags2::HOST)
         };
         recorder.barrier();
         recorder.timestamp();
         recorder
+    }
+
+    /// Starts with a barrier after everything before it in the host's queue, and ends with one for what the host's own
+    /// commands read.
+    pub(super) fn for_host(shared: &'g Arc<Shared>, frame: &HostFrame) -> Self {
+        let commands = vk::CommandBuffer::from_raw(frame.commands);
+        let readers = vk::PipelineStageFlags2::from_raw(frame.readers);
+        let mut recorder = Self::unstarted(shared, commands, readers);
+        recorder.barrier_after(readers);
+        recorder
+    }
+
+    fn unstarted(
+        shared: &'g Arc<Shared>,
+        commands: vk::CommandBuffer,
+        readers: vk::PipelineStageFlags2,
+    ) -> Self {
+        Self {
+            shared,
+            sets: Sets::new(shared),
+            commands,
+            value: HOST_SUBMITS,
+            queries: None,
+            labels: vec![],
+            pending: HashMap::new(),
+            readers,
+            #[cfg(feature = "check")]
+            observer: None,
+        }
     }
 
     pub(super) fn shared(&self) -> &'g Arc<Shared> {
@@ -119,6 +145,16 @@ impl<'g> Recorder<'g> {
 
     pub(super) fn value(&self) -> u64 {
         self.value
+    }
+
+    /// The family of the queue that runs the recording.
+    pub(super) fn family(&self) -> u32 {
+        self.shared.family
+    }
+
+    /// What was recorded so far is read on the host once the recording is done.
+    pub(super) fn leave_for_host(&mut self) {
+        self.readers |= vk::PipelineStageFlags2::HOST;
     }
 
     /// Records one pass: label, barrier if a hazard requires it, bindings, parameters, dispatch, timestamp.
@@ -185,7 +221,10 @@ impl<'g> Recorder<'g> {
         if buffer.is_empty() {
             return;
         }
-        let Bound { raw, offset, size } = buffer.bound();
+        self.fill_raw(buffer.bound(), word);
+    }
+
+    pub(super) fn fill_raw(&mut self, Bound { raw, offset, size }: Bound, word: u32) {
         self.synchronize([(raw, true)].into_iter());
         // SAFETY: recording; the buffer is live. Sizes of our element types are multiples of four.
         unsafe {
@@ -237,15 +276,16 @@ impl<'g> Recorder<'g> {
         }
     }
 
-    /// Makes everything recorded so far visible to the host and to whatever the host records next.
+    /// Makes everything recorded so far visible to the stages that read it. Our own recordings begin with a barrier.
     pub(super) fn finish(&mut self) {
-        let stages =
-            vk::PipelineStageFlags2::COMPUTE_SHADER | vk::PipelineStageFlags2::ALL_TRANSFER;
+        if self.readers.is_empty() {
+            return;
+        }
         let barrier = [vk::MemoryBarrier2::default()
-            .src_stage_mask(stages)
+            .src_stage_mask(OUR_STAGES)
             .src_access_mask(vk::AccessFlags2::SHADER_WRITE | vk::AccessFlags2::TRANSFER_WRITE)
-            .dst_stage_mask(vk::PipelineStageFlags2::HOST | vk::PipelineStageFlags2::ALL_COMMANDS)
-            .dst_access_mask(vk::AccessFlags2::HOST_READ | vk::AccessFlags2::MEMORY_READ)];
+            .dst_stage_mask(self.readers)
+            .dst_access_mask(vk::AccessFlags2::MEMORY_READ)];
         let info = vk::DependencyInfo::default().memory_barriers(&barrier);
         // SAFETY: recording.
         unsafe { self.shared.device.cmd_pipeline_barrier2(self.commands, &info) };
@@ -253,7 +293,7 @@ impl<'g> Recorder<'g> {
 
     /// Records one full barrier if a buffer in `uses` was written since the last barrier, or is written now and was
     /// read.
-    fn synchronize(&mut self, uses: impl Iterator<Item = (vk::Buffer, bool)> + Clone) {
+    pub(super) fn synchronize(&mut self, uses: impl Iterator<Item = (vk::Buffer, bool)> + Clone) {
         let hazard = uses
             .clone()
             .any(|(raw, writes)| self.pending.get(&raw).is_some_and(|&written| written || writes));
@@ -266,13 +306,16 @@ impl<'g> Recorder<'g> {
     }
 
     pub(super) fn barrier(&mut self) {
+        self.barrier_after(vk::PipelineStageFlags2::empty());
+    }
+
+    /// A barrier after our own stages and the host's `readers`, whose reads no later write overtakes.
+    fn barrier_after(&mut self, readers: vk::PipelineStageFlags2) {
         self.shared.recorded.barriers.fetch_add(1, Ordering::Relaxed);
-        let stages =
-            vk::PipelineStageFlags2::COMPUTE_SHADER | vk::PipelineStageFlags2::ALL_TRANSFER;
         let barrier = [vk::MemoryBarrier2::default()
-            .src_stage_mask(stages)
+            .src_stage_mask(OUR_STAGES | readers)
             .src_access_mask(vk::AccessFlags2::SHADER_WRITE | vk::AccessFlags2::TRANSFER_WRITE)
-            .dst_stage_mask(stages)
+            .dst_stage_mask(OUR_STAGES)
             .dst_access_mask(
                 vk::AccessFlags2::SHADER_READ
                     | vk::AccessFlags2::SHADER_WRITE
@@ -349,27 +392,5 @@ impl<'g> Recorder<'g> {
                 self.shared.device.cmd_write_timestamp2(self.commands, stage, queries, index);
             }
         }
-    }
-}
-
-impl Gpu {
-    /// Records into `commands`, a `VkCommandBuffer` of the host application, which submits it when it likes.
-    ///
-    /// # Errors
-    /// What `record` returns.
-    ///
-    /// # Safety
-    /// `commands` is recording on this device's queue family, outside a render pass, and every buffer and pipeline used
-    /// stays alive until the host's submission is done; so does what is returned.
-    pub unsafe fn record_into(
-        &self,
-        commands: u64,
-        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
-    ) -> Result<HostRecording> {
-        let commands = vk::CommandBuffer::from_raw(commands);
-        let mut recorder = Recorder::new(&self.shared, commands, HOST_SUBMITS, None);
-        record(&mut recorder)?;
-        recorder.finish();
-        Ok(HostRecording { _sets: recorder.sets })
     }
 }

@@ -47,11 +47,24 @@ struct Recording<'a> {
 }
 
 impl Shared {
-    /// Locks the queue; refuses where this thread has it already, which would deadlock.
-    fn begin_recording(&self, label: &str) -> Result<Recording<'_>> {
-        if let Some(outer) = lock(&self.progress).recorded_here() {
-            return Err(Error::Usage(format!(
+    /// # Errors
+    /// This thread is recording already.
+    pub(super) fn refuse_nested(&self, label: &str) -> Result<()> {
+        match lock(&self.progress).recorded_here() {
+            Some(outer) => Err(Error::Usage(format!(
                 "`{label}` cannot be submitted while `{outer}` is recorded; do it before or after that"
+            ))),
+            None => Ok(()),
+        }
+    }
+
+    /// Locks the queue; refuses where this thread has it already, which would deadlock, and on a device that only
+    /// records.
+    fn begin_recording(&self, label: &str) -> Result<Recording<'_>> {
+        self.refuse_nested(label)?;
+        if self.host.as_ref().is_some_and(|host| host.is_record_only) {
+            return Err(Error::Usage(format!(
+                "`{label}` needs a submission, which a record-only device does not make; lend the queue with a lock"
             )));
         }
         let queue = lock(&self.queue);
@@ -116,7 +129,7 @@ impl Gpu {
             .query_type(vk::QueryType::TIMESTAMP)
             .query_count(MAX_TIMESTAMPS);
         // SAFETY: the device is live; the pool is retired below whatever happens.
-        let queries = unsafe { shared.device.create_query_pool(&info, None) }
+        let queries = unsafe { shared.device.create_query_pool(&info, shared.callbacks()) }
             .map_err(|result| shared.error("vkCreateQueryPool", result))?;
         // SAFETY: the pool was just created.
         unsafe { shared.device.reset_query_pool(queries, 0, MAX_TIMESTAMPS) };
@@ -156,13 +169,13 @@ impl Gpu {
         let fail = |call| move |result| shared.error(call, result);
         let pool_info = vk::CommandPoolCreateInfo::default()
             .flags(vk::CommandPoolCreateFlags::TRANSIENT)
-            .queue_family_index(recording.queue.family);
+            .queue_family_index(shared.family);
         // SAFETY: the device is live; the pool is retired when this function ends, after its last submission.
-        let pool = unsafe { shared.device.create_command_pool(&pool_info, None) }
+        let pool = unsafe { shared.device.create_command_pool(&pool_info, shared.callbacks()) }
             .map_err(fail("vkCreateCommandPool"))?;
         let value = lock(&shared.progress).submitted + 1;
         // From here on, a dropped object may be in this recording.
-        shared.last_use.store(value, Ordering::Release);
+        shared.last_submission.store(value, Ordering::Release);
         let queue = &recording.queue;
         let submitted = self.record_with(queue, pool, value, label, queries, record);
         // Where nothing was submitted, objects dropped meanwhile wait for the next submission, which has the same
@@ -188,7 +201,7 @@ impl Gpu {
             return Ok((last, vec![]));
         }
         let mut recorder = Recorder::new(shared, shared.begin(pool)?, value, queries);
-        record(&mut recorder)?;
+        shared.with_uploads(&mut recorder, record)?;
         recorder.finish();
         shared.submit(queue, recorder.commands, value, label)?;
         tracing::trace!(label, value, "submitted");
@@ -241,8 +254,12 @@ impl Shared {
             .command_buffer_infos(&commands)
             .signal_semaphore_infos(&signal)];
         // SAFETY: the queue is locked, the command buffer recorded and not touched again.
-        unsafe { self.device.queue_submit2(queue.raw, &info, vk::Fence::null()) }
-            .map_err(fail("vkQueueSubmit2"))?;
+        let submit = || unsafe { self.device.queue_submit2(queue.raw, &info, vk::Fence::null()) };
+        match &self.host {
+            Some(host) => host.with_queue(queue.raw, submit),
+            None => submit(),
+        }
+        .map_err(fail("vkQueueSubmit2"))?;
         let mut progress = lock(&self.progress);
         progress.submitted = value;
         progress.labels.insert(value, label.to_owned());

@@ -3,10 +3,10 @@
 use glam::{DVec2, UVec2, Vec3};
 
 use super::blending::PixelModel;
-use super::splat::{Splat, fragments, stored_color};
+use super::splat::{Fragment, Splat, fragments, stored_color};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
-use crate::kernels::blend_forward::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::blend_forward::{Constants, Kernel, NO_DEPTH, Params, Slices, Tolerances};
 use crate::kernels::status::STATUS_TILE_LIMIT;
 
 /// One pixel's channels and transmittance, from splats front to back with colours (splats, channels).
@@ -58,6 +58,12 @@ impl TileList {
         }
     }
 
+    /// The last channel of a splat, which is its depth in the view.
+    fn depth(&self, index: usize) -> f64 {
+        let channels = self.colors.len() / self.splats.len();
+        self.colors[channels * index + channels - 1]
+    }
+
     /// The largest magnitude of a colour, at least 1.
     pub(super) fn largest_color(&self, background: &[f64]) -> f64 {
         self.colors.iter().chain(background).fold(1.0, |largest: f64, c| largest.max(c.abs()))
@@ -96,8 +102,42 @@ fn for_each_tile(
     }
 }
 
+/// The depths of a pixel, where the last channel is the depth in the view.
+struct Depths<'a> {
+    params: &'a Params,
+    limits: &'a [f32],
+}
+
+impl<'a> Depths<'a> {
+    fn of(params: &'a Params, constants: &Constants, limits: &'a [f32]) -> Option<Self> {
+        (constants.view_depths != 0).then_some(Self { params, limits })
+    }
+
+    fn takes_median(&self) -> bool {
+        self.params.takes_median != 0
+    }
+
+    /// The splats of a list that are seen at pixel `at`: those before the first beyond its limit.
+    fn seen(&self, list: &TileList, at: usize) -> usize {
+        let limit = match self.params.has_limits != 0 {
+            true => f64::from(self.limits[at]),
+            false => NO_DEPTH,
+        };
+        (0..list.splats.len()).take_while(|&i| !(list.depth(i) > limit)).count()
+    }
+
+    /// The depth at which the transmittance passes 1/2, and whether a rounding of it decides.
+    fn median(&self, list: &TileList, fragments: &[Fragment], error: f64) -> (f64, bool) {
+        let after = |fragment: &Fragment| fragment.before * (1.0 - fragment.alpha);
+        let passing = fragments.iter().find(|&fragment| after(fragment) <= 0.5);
+        let is_fragile = fragments.iter().any(|own| (after(own) - 0.5).abs() <= error);
+        (passing.map_or(NO_DEPTH, |fragment| list.depth(fragment.index)), is_fragile)
+    }
+}
+
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
+        let depths = Depths::of(params, constants, slices.limits);
         let background = background(params, constants);
         let pixels = params.size.element_product() as usize;
         for (tile, (run, count)) in tile_runs(params, constants, &slices).into_iter().enumerate() {
@@ -113,9 +153,16 @@ impl Reference for Kernel {
         for_each_tile(params, constants, &slices, |list, tile| {
             for pixel in tile {
                 let (center, alpha_max) = (pixel.as_dvec2() + 0.5, constants.alpha_max.into());
-                let (values, transmittance) =
-                    blend_pixel(&list.splats, &list.colors, &background, center, alpha_max);
                 let at = (pixel.y * params.size.x + pixel.x) as usize;
+                let all = list.splats.len();
+                let seen = &list.splats[..depths.as_ref().map_or(all, |own| own.seen(list, at))];
+                let (mut values, transmittance) =
+                    blend_pixel(seen, &list.colors, &background, center, alpha_max);
+                if let Some(depths) = depths.as_ref().filter(|depths| depths.takes_median()) {
+                    let (fragments, _) = fragments(seen, center, alpha_max);
+                    let last = values.len() - 1;
+                    values[last] = depths.median(list, &fragments, 0.0).0;
+                }
                 transmittances[at] = transmittance as f32;
                 for (c, value) in values.into_iter().enumerate() {
                     render[c * pixels + at] = value as f32;
@@ -127,20 +174,33 @@ impl Reference for Kernel {
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let background = background(params, constants);
         let pixels = params.size.element_product() as usize;
+        let depths = Depths::of(params, constants, slices.limits);
         let mut errors = vec![0.0; pixels];
         let mut largest_colors = vec![0.0; pixels];
+        let mut medians = vec![0.0; pixels];
         let tile_size = UVec2::new(constants.tile_width, constants.tile_height);
         for_each_tile(params, constants, &slices, |list, tile| {
             let largest = list.largest_color(&background);
             for pixel in tile {
                 let (center, alpha_max) = (pixel.as_dvec2() + 0.5, constants.alpha_max.into());
                 let at = (pixel.y * params.size.x + pixel.x) as usize;
-                errors[at] = PixelModel::new(&list.splats, center, alpha_max, tile_size).error;
+                let all = list.splats.len();
+                let seen = &list.splats[..depths.as_ref().map_or(all, |own| own.seen(list, at))];
+                errors[at] = PixelModel::new(seen, center, alpha_max, tile_size).error;
                 largest_colors[at] = largest;
+                if let Some(depths) = depths.as_ref().filter(|depths| depths.takes_median()) {
+                    let (fragments, _) = fragments(seen, center, alpha_max);
+                    let (_, is_fragile) = depths.median(list, &fragments, errors[at]);
+                    medians[at] = if is_fragile { f64::INFINITY } else { 0.0 };
+                }
             }
         });
         let of_channel = errors.iter().zip(largest_colors).map(|(error, color)| error * color);
-        let render = of_channel.cycle().take(constants.channels as usize * pixels).collect();
+        let mut render: Vec<f64> =
+            of_channel.cycle().take(constants.channels as usize * pixels).collect();
+        if depths.is_some_and(|depths| depths.takes_median()) {
+            render.splice(render.len() - pixels.., medians);
+        }
         Tolerances {
             render: Tolerance::Each(render),
             transmittances: Tolerance::Each(errors),

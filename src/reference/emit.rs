@@ -17,31 +17,31 @@ fn covered(params: &Params, constants: &Constants, splat: &ProjectedSplat) -> Ve
     (top..bottom).flat_map(row).collect()
 }
 
-/// The Gaussian of every rank, with its intersections.
+/// The Gaussian of every rank with its slots, and whether all of them fit the memory.
 fn reserved(
     params: &Params,
     constants: &Constants,
     slices: &Slices<'_>,
-) -> Vec<(u32, std::ops::Range<u32>)> {
+) -> Vec<(u32, std::ops::Range<u32>, bool)> {
     let ranks = 0..params.gaussian_count as usize;
     let one = |rank: usize| {
         let id = slices.sorted_ids[rank];
         let before = slices.sums[rank / constants.partition_size as usize];
         let first = before.wrapping_add(slices.intersection_offsets[rank]);
         let end = first.wrapping_add(slices.tile_counts[id as usize]);
-        let is_counted = first <= end && end <= slices.counts[0];
-        (id, first..if is_counted { end } else { first })
+        let is_whole = first <= end && end <= slices.counts[0];
+        (id, first..if is_whole { end } else { first.max(slices.counts[0]) }, is_whole)
     };
     ranks.map(one).collect()
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        for (id, reserved) in reserved(params, constants, &slices) {
+        for (id, reserved, is_whole) in reserved(params, constants, &slices) {
             let first = reserved.start;
-            let covered = match reserved.is_empty() {
-                true => vec![],
-                false => covered(params, constants, &slices.splats[id as usize]),
+            let covered = match is_whole && !reserved.is_empty() {
+                true => covered(params, constants, &slices.splats[id as usize]),
+                false => vec![],
             };
             let count = reserved.len().min(covered.len()) as u32;
             slices.intersection_ranges[id as usize] = UVec2::new(first, first + count);
@@ -58,8 +58,8 @@ impl Reference for Kernel {
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let mut tiles = vec![0.0; slices.tiles.len()];
         let mut intersection_ranges = vec![0.0; 2 * slices.intersection_ranges.len()];
-        for (id, reserved) in reserved(params, constants, &slices) {
-            if reserved.is_empty() {
+        for (id, reserved, is_whole) in reserved(params, constants, &slices) {
+            if reserved.is_empty() || !is_whole {
                 continue;
             }
             let splat = &slices.splats[id as usize];

@@ -20,10 +20,16 @@ impl Reference for Kernel {
             before = before.wrapping_add(count);
             total += u64::from(count);
         }
-        let total = u32::try_from(total).unwrap_or(u32::MAX);
+        let whole = u32::try_from(total);
+        let total = whole.unwrap_or(u32::MAX);
         let fits = total <= params.capacity;
-        counts[0] = if fits { total } else { 0 };
-        if !fits {
+        let truncates = params.truncates != 0;
+        counts[0] = match (fits, truncates, whole) {
+            (true, ..) => total,
+            (false, true, Ok(_)) => params.capacity,
+            _ => 0,
+        };
+        if !fits && !truncates {
             status[0] |= STATUS_OVERFLOWED;
         }
         status[1] = status[1].max(total);

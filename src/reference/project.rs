@@ -120,8 +120,8 @@ struct ProjectionInputs<'a> {
 
 impl<'a> ProjectionInputs<'a> {
     fn new(params: &'a Params, constants: &'a Constants, cameras: &[kernels::Camera]) -> Self {
-        let Constants { channels, sh_degree, .. } = *constants;
-        let planes = Planes::of(params.gaussian_count, channels, sh_degree);
+        let Constants { channels, sh_degree, view_depths, .. } = *constants;
+        let planes = Planes::of(params.gaussian_count, channels - view_depths, sh_degree);
         let camera = &cameras[params.camera_index as usize];
         let (size, camera) = (camera.size, Camera::from(camera));
         Self { params, constants, size, camera, planes }
@@ -234,8 +234,9 @@ impl Reference for Kernel {
             let gaussian = scene.planes.load(&parameters, i);
             let Some(projection) = scene.project(&gaussian) else { continue };
             splats[i] = projection.stored();
+            let depth = (constants.view_depths != 0).then_some(projection.depth);
             let values = projection.color.to_array().into_iter().chain(gaussian.features);
-            let values = values.chain(std::iter::repeat(0.0));
+            let values = values.chain(depth).chain(std::iter::repeat(0.0));
             for (color, value) in colors[stored * i..][..stored].iter_mut().zip(values) {
                 *color = value as f32;
             }
@@ -264,6 +265,9 @@ impl Reference for Kernel {
             let Some(projection) = scene.project(&gaussian) else { continue };
             splats[8 * i..][..8].copy_from_slice(&errors[..8]);
             colors[stored * i..][..3].copy_from_slice(&errors[8..11]);
+            if constants.view_depths != 0 {
+                colors[stored * i + constants.channels as usize - 1] = errors[11];
+            }
             let splat = projection.stored();
             let count = tile_count(scene.size, constants, &splat);
             let [fewest, most] = scene.tile_counts(&splat, &errors);

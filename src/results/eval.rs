@@ -16,7 +16,8 @@ use crate::photographs::image::Image;
 use crate::photographs::metrics::{self, Scores};
 use crate::photographs::tone::{SceneTone, ToneCurve, ToneSettings};
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
-use crate::splats::scene::{DeviceGaussians, Feature, Gaussians, Shape};
+use crate::splats::model::Model;
+use crate::splats::scene::{DeviceGaussians, Feature, Shape};
 use crate::train::{Networks, Rendered, TestTargets, TrainConfig};
 use crate::{Error, Result};
 
@@ -222,26 +223,26 @@ pub struct ModelRenderer {
 }
 
 impl ModelRenderer {
-    /// Uploads `gaussians` and their `networks`, from a run of `config`: in the coordinates of `model.ply`, but with
-    /// the model's raw colours. The run's tile size is used if the device supports it.
+    /// Uploads the model of a run of `config`; `networks` belong to it. The run's tile is taken where it suits the device.
     ///
     /// # Errors
     /// The device is out of memory or lost.
     pub fn new(
         gpu: &Gpu,
-        gaussians: &Gaussians,
+        model: &Model,
         config: &TrainConfig,
         networks: Option<Networks>,
     ) -> Result<Self> {
-        let shape = gaussians.shape;
-        let own = config.render_settings();
-        let tile = own.tile.filter(|&tile| gpu.properties().suits_tile(tile));
-        let settings = RenderSettings { shape, tile, ..own };
         let frame = config.frame.unwrap_or_default();
-        let gaussians = gaussians.to_frame(&frame);
+        let settings = RenderSettings {
+            tile: config.tile.filter(|&tile| gpu.properties().suits_tile(tile)),
+            patch_pixels: config.patch_pixels,
+            near: (f64::from(model.near) * frame.scale) as f32,
+            ..model.render_settings()
+        };
         Ok(Self {
             frame,
-            gaussians: gaussians.upload(gpu)?,
+            gaussians: model.gaussians.to_frame(&frame).upload(gpu)?,
             renderer: Renderer::new(gpu, settings)?,
             networks,
         })

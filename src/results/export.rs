@@ -17,7 +17,8 @@ use flate2::{Compression, GzBuilder};
 use glam::{DMat3, DQuat, DVec3, Vec3};
 
 use crate::base::output::write_whole;
-use crate::splats::scene::{Gaussians, ply};
+use crate::splats::model::Model;
+use crate::splats::scene::{Facts, Gaussians, ply};
 use crate::{Error, Result};
 
 /// Model file formats.
@@ -52,7 +53,7 @@ impl Format {
         }
     }
 
-    /// Writes a model; the file appears under its name only once it is complete.
+    /// Writes Gaussians in the colours that viewers show; the file appears under its name only once it is complete.
     pub(crate) fn write(
         self,
         gaussians: &Gaussians,
@@ -66,6 +67,8 @@ impl Format {
                 let turned = provenance.rotation != DQuat::IDENTITY;
                 let line = provenance.world_line(gaussians, false).filter(|_| turned);
                 lines.extend(line.map(|line| format!("dataset's {line}")));
+                // The origin has a line of its own.
+                lines.extend(Facts { origin: DVec3::ZERO, ..provenance.facts }.lines());
                 return ply::save_with_comments(gaussians, path, &lines);
             }
             Self::Spz(version) => spz::encode(gaussians, provenance, version)?,
@@ -76,8 +79,29 @@ impl Format {
     }
 }
 
+impl Model {
+    /// Writes the model in the format that the file's extension names: `.ply`, `.spz`, `.glb` or `.sog`. The file states
+    /// the near plane, the alpha limit, the colours and the origin.
+    ///
+    /// # Errors
+    /// As [`Gaussians::save`].
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
+        let path = path.as_ref();
+        self.save_as(path, Format::of(path)?)
+    }
+
+    /// Writes the model in a format, whatever the file is called.
+    ///
+    /// # Errors
+    /// As [`Gaussians::save`].
+    pub fn save_as(&self, path: impl AsRef<Path>, format: Format) -> Result<()> {
+        let provenance = Provenance { facts: self.facts(), ..Provenance::default() };
+        format.write(&self.shown(), &provenance, path.as_ref())
+    }
+}
+
 impl Gaussians {
-    /// Writes the model in the format that the file's extension names: `.ply`, `.spz`, `.glb` or `.sog`.
+    /// Writes the Gaussians in the format that the file's extension names: `.ply`, `.spz`, `.glb` or `.sog`.
     ///
     /// # Errors
     /// The extension names none, the model does not fit the format, or the file cannot be written; no partial file is
@@ -107,6 +131,8 @@ pub struct Provenance {
     pub exposure: String,
     /// The rotation that was applied by [`Gaussians::rotated`].
     pub rotation: DQuat,
+    /// What a renderer must know; the origin is that of the Gaussians.
+    pub facts: Facts,
 }
 
 /// The program, as files name it.
@@ -130,8 +156,13 @@ impl Provenance {
 }
 
 impl Provenance {
-    /// A header line that maps the file's positions to the dataset's world, if they differ. `half_turned`: the file's
-    /// axes are those of OpenGL.
+    /// What a renderer must know, with the origin.
+    fn facts_of(&self, gaussians: &Gaussians) -> Facts {
+        Facts { origin: gaussians.origin, ..self.facts }
+    }
+
+    /// What a file's positions are in the dataset's world, where they are not the same: a line for a header. `half_turned`: the
+    /// file's axes are those of OpenGL.
     fn world_line(&self, gaussians: &Gaussians, half_turned: bool) -> Option<String> {
         let back = self.rotation.inverse();
         let position = if self.rotation != DQuat::IDENTITY {
@@ -187,6 +218,13 @@ fn unit([w, x, y, z]: [f32; 4]) -> [f32; 4] {
 
 fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
+}
+
+/// The opacity before the sigmoid that a byte of 255 times the opacity stands for; finite at both ends.
+fn raw_opacity(byte: u8) -> f32 {
+    // The middle of what is rounded to 0, and to 255.
+    let opacity = f32::from(byte).clamp(0.25, 254.75) / 255.0;
+    (opacity / (1.0 - opacity)).ln()
 }
 
 fn gzip(bytes: &[u8]) -> Result<Vec<u8>> {

@@ -1,13 +1,15 @@
 //! A run, finished or interrupted, or a model file, opened for rendering by `eval`, `render` and others.
 
+use std::ffi::OsStr;
 use std::path::Path;
 
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::photographs::tone::{ToneCurve, ToneSettings};
 use crate::results::eval::ModelRenderer;
-use crate::results::run;
-use crate::splats::scene::{Gaussians, ply};
+use crate::results::{models, run};
+use crate::splats::model::Model;
+use crate::splats::scene::{Facts, Gaussians};
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
@@ -52,8 +54,8 @@ impl FinishedRun {
             config.move_dataset(dataset);
         }
         change(&mut config);
-        let raw_colors = config.model.raw_colors;
-        let gaussians = run::load_model(folder, raw_colors)?;
+        let facts = config.facts(&config.frame.unwrap_or_default());
+        let model = Model::of_shown(run::load_gaussians(folder)?, &facts);
         if !config.dataset.is_dir() {
             let problem = format!(
                 "names the dataset {}, which does not exist; pass --dataset, or correct `dataset` in this file",
@@ -74,31 +76,36 @@ impl FinishedRun {
         }
         Ok(Self {
             dataset,
-            gaussian_count: gaussians.count,
+            gaussian_count: model.gaussians.count,
             model_renderer: ModelRenderer::new(
                 &gpu,
-                &gaussians,
+                &model,
                 &config,
-                run::load_networks(&gpu, folder, &config.model, gaussians.shape.features)?,
+                run::load_networks(&gpu, folder, &config.model, model.gaussians.shape.features)?,
             )?,
             config,
             gpu,
         })
     }
 
-    /// Opens a model file, which has no settings of its training.
+    /// Opens a model file, which holds few settings of its training.
     fn open_model(
         path: &Path,
         dataset: Option<&Path>,
         device: Option<&DeviceChoice>,
     ) -> Result<Self> {
         let dataset = dataset.ok_or_else(|| needs_photographs(path))?;
-        let (gaussians, mut config) = load_model(path, Some(dataset))?;
+        let (gaussians, facts) = models::read(path)?;
+        let mut config = config_of_file(&gaussians, &facts, Some(dataset));
         let gpu = Gpu::new(device.unwrap_or(&DeviceChoice::Best))?;
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
-        config.frame = Some(dataset.frame());
-        let model_renderer = ModelRenderer::new(&gpu, &gaussians, &config, None)?;
-        Ok(Self { gpu, config, dataset, gaussian_count: gaussians.count, model_renderer })
+        let frame = dataset.frame();
+        config.frame = Some(frame);
+        // The default is relative to the extent of the scene.
+        let near = facts.near.or(config.facts(&frame).near);
+        let model = Model::of_shown(gaussians, &Facts { near, ..facts });
+        let model_renderer = ModelRenderer::new(&gpu, &model, &config, None)?;
+        Ok(Self { gpu, config, dataset, gaussian_count: model.gaussians.count, model_renderer })
     }
 }
 
@@ -109,25 +116,23 @@ pub(crate) fn needs_photographs(path: &Path) -> Error {
 
 /// Whether a path names a model file instead of a run.
 pub(crate) fn is_model(path: &Path) -> bool {
-    path.is_file() || (!path.is_dir() && path.extension().is_some_and(|name| name == "ply"))
+    let is_named = |name: &OsStr| ["ply", "spz", "sog"].iter().any(|known| name == *known);
+    path.is_file() || (!path.is_dir() && path.extension().is_some_and(is_named))
 }
 
-/// Loads the Gaussians of a model file with default rendering settings, and warns about that.
-///
-/// # Errors
-/// The file is not a model.
-pub(crate) fn load_model(path: &Path, dataset: Option<&Path>) -> Result<(Gaussians, TrainConfig)> {
-    let gaussians = ply::load(path)?;
-    let config = TrainConfig {
+/// The settings to render a model file with; those of its training are unknown, but for what it states.
+pub(crate) fn config_of_file(
+    gaussians: &Gaussians,
+    facts: &Facts,
+    dataset: Option<&Path>,
+) -> TrainConfig {
+    let mut config = TrainConfig {
         dataset: dataset.unwrap_or(Path::new("")).to_owned(),
         sh_degree: gaussians.shape.sh_degree,
         // Without reference images, renders are compared with the photographs.
         tone: ToneSettings::new(ToneCurve::None),
         ..TrainConfig::default()
     };
-    tracing::warn!(
-        "{}: the settings of its training are unknown; rendering with the default near plane",
-        path.display()
-    );
-    Ok((gaussians, config))
+    config.model.raw_colors = facts.raw_colors.unwrap_or(config.model.raw_colors);
+    config
 }

@@ -11,9 +11,11 @@
 mod buffers;
 mod cameras;
 mod capacity;
+mod draw;
 mod images;
 mod limits;
 mod settings;
+mod target;
 
 use std::collections::BTreeMap;
 
@@ -37,8 +39,11 @@ use buffers::{RANKS_PER_PARTITION, color_vectors};
 #[cfg(feature = "testing")]
 pub use cameras::CameraGradient;
 pub use cameras::{Viewpoint, Viewpoints};
+pub use draw::Drawn;
+use draw::HostTargets;
 use limits::{longest_run, splats_per_turn};
-pub use settings::RenderSettings;
+pub use settings::{Purpose, RenderSettings};
+pub use target::{DepthConvention, DepthKind, SceneDepth, Target};
 
 /// Parameters of one render.
 #[derive(Clone, Copy, Debug)]
@@ -77,15 +82,31 @@ pub struct Renderer {
     tile: Tile,
     /// The most splats of one tile that the blending kernels can process.
     longest_run: u32,
-    /// By camera model; those of the pinhole are built at once, others on first use.
-    projections: BTreeMap<u32, Projections>,
+    /// By camera model and whether the last channel is the depth; those of the pinhole without depth are built at once,
+    /// others on first use.
+    projections: BTreeMap<(u32, bool), Projections>,
     order_counts: Pipeline<order_counts::Kernel>,
     emit: Pipeline<emit::Kernel>,
     blend_forward: Pipeline<blend_forward::Kernel>,
-    blend_backward: Pipeline<blend_backward::Kernel>,
+    /// With the depth as the last channel; built on first use.
+    blend_depths: Option<Pipeline<blend_forward::Kernel>>,
+    /// Absent where the purpose is to show.
+    blend_backward: Option<Pipeline<blend_backward::Kernel>>,
     depth_sort: RadixSort,
     tile_sort: RadixSort,
     frame: RenderBuffers,
+    /// (H, W): the depths beyond which nothing is seen, where a draw has such.
+    limits: Buffer<f32>,
+    host_targets: Option<HostTargets>,
+}
+
+/// How the last channel of a render keeps the depth in the view.
+#[derive(Clone, Copy, Debug)]
+struct DepthChannel {
+    /// The median instead of the weighted sum.
+    takes_median: bool,
+    /// Nothing beyond the limits is seen.
+    has_limits: bool,
 }
 
 impl Renderer {
@@ -98,16 +119,25 @@ impl Renderer {
         let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
-        let pinhole = CameraModel::Pinhole.number();
+        let pinhole = (CameraModel::Pinhole.number(), false);
         let projections = Projections::new(gpu, &settings, tile.size, pinhole)?;
         let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
-        // Specialization constants of all kernels that include `splat.glsl`, and those that some have in addition.
-        macro_rules! constants {
-            ($kernel:ident $(, $own:ident)*) => {
-                $kernel::Constants { alpha_max, channels, tile_width, tile_height, $($own,)* }
-            };
-        }
+        let blend_backward = match settings.purpose {
+            Purpose::Show => None,
+            Purpose::Train => Some(gpu.pipeline(&blend_backward::Constants {
+                alpha_max,
+                channels,
+                tile_width,
+                tile_height,
+                shaping_channels,
+                skips_groups,
+                splats_per_turn,
+                subgroups_per_tile,
+            })?),
+        };
+        let depth_sort = RadixSort::new(gpu, 0)?;
+        let tile_sort = depth_sort.another()?;
         Ok(Self {
             gpu: gpu.clone(),
             settings,
@@ -115,24 +145,40 @@ impl Renderer {
             longest_run: longest_run(gpu),
             projections: BTreeMap::from([(pinhole, projections)]),
             order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
-            emit: gpu.pipeline(&constants!(emit, partition_size))?,
-            blend_forward: gpu.pipeline(&constants!(
-                blend_forward,
-                skips_groups,
-                splats_per_turn,
-                subgroups_per_tile
-            ))?,
-            blend_backward: gpu.pipeline(&constants!(
-                blend_backward,
-                shaping_channels,
-                skips_groups,
-                splats_per_turn,
-                subgroups_per_tile
-            ))?,
-            depth_sort: RadixSort::new(gpu, 0)?,
-            tile_sort: RadixSort::new(gpu, 0)?,
-            frame: RenderBuffers::new(gpu, settings.channels())?,
+            emit: gpu.pipeline(&emit::Constants {
+                alpha_max,
+                channels,
+                tile_width,
+                tile_height,
+                partition_size,
+            })?,
+            blend_forward: blending(gpu, &settings, tile, false)?,
+            blend_depths: None,
+            blend_backward,
+            depth_sort,
+            tile_sort,
+            frame: RenderBuffers::new(gpu, settings.channels(), settings.purpose)?,
+            limits: gpu.uninit("limits", 1)?,
+            host_targets: None,
         })
+    }
+
+    /// Builds the kernels for a camera model where they are not there yet.
+    fn build_projections(&mut self, model: u32, view_depths: bool) -> Result<()> {
+        let key = (model, view_depths);
+        if !self.projections.contains_key(&key) {
+            let own = Projections::new(&self.gpu, &self.settings, self.tile.size, key)?;
+            self.projections.insert(key, own);
+        }
+        Ok(())
+    }
+
+    /// Builds the blending kernel that keeps depths where it is needed and not there yet.
+    fn build_blending(&mut self, view_depths: bool) -> Result<()> {
+        if view_depths && self.blend_depths.is_none() {
+            self.blend_depths = Some(blending(&self.gpu, &self.settings, self.tile, true)?);
+        }
+        Ok(())
     }
 
     /// Switches to another SH degree.
@@ -145,8 +191,8 @@ impl Renderer {
         }
         let shape = Shape { sh_degree, ..self.settings.shape };
         let settings = RenderSettings { shape, ..self.settings };
-        let own = |&model: &u32| {
-            Ok((model, Projections::new(&self.gpu, &settings, self.tile.size, model)?))
+        let own = |&key: &(u32, bool)| {
+            Ok((key, Projections::new(&self.gpu, &settings, self.tile.size, key)?))
         };
         self.projections = self.projections.keys().map(own).collect::<Result<_>>()?;
         self.settings = settings;
@@ -178,7 +224,11 @@ impl Renderer {
     /// The driver refuses a kernel.
     pub(crate) fn blend_statistics(&self) -> Result<Option<[Vec<Statistic>; 2]>> {
         let forward = self.blend_forward.statistics()?;
-        Ok(forward.zip(self.blend_backward.statistics()?).map(<[_; 2]>::from))
+        let backward = match &self.blend_backward {
+            Some(backward) => backward.statistics()?,
+            None => None,
+        };
+        Ok(forward.zip(backward).map(<[_; 2]>::from))
     }
 
     /// The intermediate buffers of the last render.
@@ -223,25 +273,42 @@ impl Renderer {
         viewpoint: impl Into<Viewpoint<'a>>,
         options: &RenderOptions,
     ) -> Result<()> {
-        let (gaussians, viewpoint) = (gaussians.into(), viewpoint.into());
+        self.record_forward(pass, gaussians.into(), viewpoint, options, None, None)
+    }
+
+    /// Records a render. `depths`: the last channel is the depth in the view. `capacity`: intersections beyond it are
+    /// left out, the farthest first; without it they are an overflow.
+    fn record_forward<'a>(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussians: GaussianSlice<'_>,
+        viewpoint: impl Into<Viewpoint<'a>>,
+        options: &RenderOptions,
+        depths: Option<DepthChannel>,
+        capacity: Option<u32>,
+    ) -> Result<()> {
+        let viewpoint = viewpoint.into();
         self.check(&gaussians.layout)?;
-        let view = self.view(&viewpoint)?;
+        let view = self.view(&viewpoint, depths.is_some())?;
         let gaussian_count = gaussians.layout.count as u32;
         pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
         if viewpoint.on_device.is_none() {
             pass.update(&mut self.frame.camera, &[(&viewpoint.patch).into()])?;
         }
         self.record_project(pass, gaussians, &view, options.sh_degree)?;
-        self.record_bins(pass, gaussian_count, &view)?;
+        self.record_bins(pass, gaussian_count, &view, capacity)?;
         let mut background = [0.0; MAX_CHANNELS as usize];
         background[..3].copy_from_slice(&options.background);
         let frame = &mut self.frame;
+        let with_depths = self.blend_depths.as_ref().filter(|_| depths.is_some());
         pass.dispatch(
-            &self.blend_forward,
+            with_depths.unwrap_or(&self.blend_forward),
             &blend_forward::Params {
                 size: view.size,
                 tile_columns: view.tiles.x,
                 longest_run: self.longest_run,
+                has_limits: depths.is_some_and(|own| own.has_limits).into(),
+                takes_median: depths.is_some_and(|own| own.takes_median).into(),
                 background,
             },
             blend_forward::Buffers {
@@ -255,6 +322,7 @@ impl Renderer {
                 sorted_tiles: frame.tiles.slice(),
                 tile_ranges: frame.tile_ranges.slice_mut(),
                 status: frame.status.slice_mut(),
+                limits: self.limits.slice(),
             },
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )
@@ -264,7 +332,8 @@ impl Renderer {
     /// render, which must be of the same viewpoint.
     ///
     /// # Errors
-    /// The Gaussians are of another shape than the settings say, or a pass exceeds what the device can launch.
+    /// The Gaussians are of another shape than the settings say, the renderer was made to show, or a pass exceeds what
+    /// the device can launch.
     #[expect(clippy::too_many_arguments, reason = "what the forward pass takes, and its gradient")]
     pub fn backward<'a>(
         &mut self,
@@ -276,12 +345,20 @@ impl Renderer {
         d_render: &Buffer<f32>,
         gradients: Gradients<'_>,
     ) -> Result<()> {
-        let (gaussians, view) = (gaussians.into(), self.view(&viewpoint.into())?);
+        let (gaussians, view) = (gaussians.into(), self.view(&viewpoint.into(), false)?);
         self.check(&gaussians.layout)?;
+        let project_backward = self.projections[&(view.model, false)].backward.as_ref();
+        let (Some(blend_backward), Some(project_backward)) =
+            (&self.blend_backward, project_backward)
+        else {
+            let problem =
+                "a renderer with Purpose::Show has no gradients; make it with Purpose::Train";
+            return Err(Error::Usage(problem.to_owned()));
+        };
         let color_vectors = color_vectors(self.settings.channels());
         let frame = &mut self.frame;
         pass.dispatch(
-            &self.blend_backward,
+            blend_backward,
             &blend_backward::Params { size: view.size, tile_columns: view.tiles.x },
             blend_backward::Buffers {
                 tile_ranges: frame.tile_ranges.slice(),
@@ -296,7 +373,6 @@ impl Renderer {
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )?;
         let GaussianSlice { layout, parameters } = gaussians;
-        let project_backward = &self.projections[&view.model].backward;
         for batch in layout.batches(&self.gpu).iter() {
             let gaussian_count = batch.gaussian_count();
             pass.dispatch(
@@ -335,9 +411,9 @@ impl Renderer {
         view: &View<'_>,
         sh_degree: u32,
     ) -> Result<()> {
-        let color_vectors = color_vectors(self.settings.channels());
+        let color_vectors = color_vectors(view.channels);
         let frame = &mut self.frame;
-        let project = &self.projections[&view.model].forward;
+        let project = &self.projections[&(view.model, view.view_depths)].forward;
         layout.batches(&self.gpu).iter().try_for_each(|batch| {
             pass.dispatch(
                 project,
@@ -364,8 +440,19 @@ impl Renderer {
 
     /// Refuses Gaussians in another layout than the kernels read, or more than there is memory for.
     fn check(&self, layout: &Layout) -> Result<()> {
+        self.check_layout(layout)?;
+        let (count, reserved) = (layout.count, self.frame.splats.len());
+        if count > reserved {
+            let problem =
+                format!("{count} Gaussians exceed the {reserved} that the renderer reserved");
+            return Err(Error::Usage(problem));
+        }
+        Ok(())
+    }
+
+    /// Refuses Gaussians in another layout than the kernels read.
+    fn check_layout(&self, layout: &Layout) -> Result<()> {
         let RenderSettings { shape, rest, .. } = self.settings;
-        let reserved = self.frame.splats.len();
         let problem = if layout.shape != shape {
             let [own, made_for] = [layout.shape, shape];
             format!("Gaussians of {own} cannot be rendered by a renderer made for {made_for}")
@@ -374,9 +461,6 @@ impl Renderer {
             format!(
                 "Gaussians with SH coefficients as {own:?} cannot be rendered by a renderer made for {made_for:?}"
             )
-        } else if layout.count > reserved {
-            let count = layout.count;
-            format!("{count} Gaussians exceed the {reserved} that the renderer reserved")
         } else {
             return Ok(());
         };
@@ -389,13 +473,18 @@ impl Renderer {
         pass: &mut Recorder<'_>,
         gaussian_count: u32,
         view: &View<'_>,
+        capacity: Option<u32>,
     ) -> Result<()> {
         let frame = &mut self.frame;
         let all = Count { counts: &frame.gaussian_counts, index: 0 };
         self.depth_sort.record(pass, all, &mut frame.depth_keys, &mut frame.ids, DEPTH_BITS)?;
         pass.dispatch(
             &self.order_counts,
-            &order_counts::Params { gaussian_count, capacity: frame.intersection_capacity() },
+            &order_counts::Params {
+                gaussian_count,
+                capacity: capacity.unwrap_or(frame.intersection_capacity()),
+                truncates: capacity.is_some().into(),
+            },
             order_counts::Buffers {
                 sorted_ids: frame.ids.slice(),
                 tile_counts: frame.tile_counts.slice(),
@@ -442,10 +531,11 @@ impl Renderer {
         (size + tile - 1) / tile
     }
 
-    fn view<'a>(&mut self, viewpoint: &Viewpoint<'a>) -> Result<View<'a>> {
+    fn view<'a>(&mut self, viewpoint: &Viewpoint<'a>, view_depths: bool) -> Result<View<'a>> {
         let Viewpoint { patch, on_device } = viewpoint;
         let tiles = self.tiles(patch.size);
-        if self.settings.channels() * patch.pixel_count() > self.frame.render.len()
+        let channels = self.settings.channels() + usize::from(view_depths);
+        if channels * patch.pixel_count() > self.frame.render.len()
             || (tiles.x * tiles.y) as usize > self.frame.tile_ranges.len()
         {
             let UVec2 { x: width, y: height } = patch.size;
@@ -453,14 +543,11 @@ impl Renderer {
             return Err(Error::Usage(what));
         }
         let model = patch.camera.model.number();
-        if !self.projections.contains_key(&model) {
-            let own = Projections::new(&self.gpu, &self.settings, self.tile.size, model)?;
-            self.projections.insert(model, own);
-        }
+        self.build_projections(model, view_depths)?;
         let (cameras, camera_index) = on_device.unzip();
         let camera_index = camera_index.unwrap_or_default();
         let (size, half_view) = (patch.size, patch.half_view());
-        Ok(View { model, cameras, camera_index, size, half_view, tiles })
+        Ok(View { model, view_depths, channels, cameras, camera_index, size, half_view, tiles })
     }
 }
 
@@ -468,7 +555,8 @@ impl Renderer {
 #[derive(Debug)]
 struct Projections {
     forward: Pipeline<project::Kernel>,
-    backward: Pipeline<project_backward::Kernel>,
+    /// Absent where the purpose is to show, and with depths.
+    backward: Option<Pipeline<project_backward::Kernel>>,
 }
 
 impl Projections {
@@ -476,13 +564,14 @@ impl Projections {
         gpu: &Gpu,
         settings: &RenderSettings,
         [tile_width, tile_height]: [u32; 2],
-        camera_model: u32,
+        (camera_model, has_depths): (u32, bool),
     ) -> Result<Self> {
-        let (channels, alpha_max) = (settings.channels() as u32, settings.max_alpha);
+        let (view_depths, alpha_max) = (u32::from(has_depths), settings.max_alpha);
+        let channels = settings.channels() as u32 + view_depths;
         let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
         let half_rest = settings.rest == StorageFormat::Half;
         macro_rules! pipeline {
-            ($kernel:ident) => {
+            ($kernel:ident $(, $own:ident)*) => {
                 gpu.pipeline(&$kernel::Constants {
                     channels,
                     alpha_max,
@@ -492,16 +581,42 @@ impl Projections {
                     raw_colors,
                     half_rest,
                     camera_model,
+                    $($own,)*
                 })?
             };
         }
-        Ok(Self { forward: pipeline!(project), backward: pipeline!(project_backward) })
+        let has_gradients = settings.purpose == Purpose::Train && !has_depths;
+        let backward = if has_gradients { Some(pipeline!(project_backward)) } else { None };
+        Ok(Self { forward: pipeline!(project, view_depths), backward })
     }
+}
+
+/// The blending kernel, with or without the depth as the last channel.
+fn blending(
+    gpu: &Gpu,
+    settings: &RenderSettings,
+    Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile }: Tile,
+    has_depths: bool,
+) -> Result<Pipeline<blend_forward::Kernel>> {
+    let view_depths = u32::from(has_depths);
+    gpu.pipeline(&blend_forward::Constants {
+        alpha_max: settings.max_alpha,
+        channels: settings.channels() as u32 + view_depths,
+        tile_width,
+        tile_height,
+        skips_groups: !gpu.properties().is_cpu,
+        splats_per_turn: splats_per_turn(gpu),
+        subgroups_per_tile,
+        view_depths,
+    })
 }
 
 /// A viewpoint as the kernels take it, and the columns and rows of tiles of its image.
 struct View<'a> {
     model: u32,
+    view_depths: bool,
+    /// Values per pixel.
+    channels: usize,
     /// `None`: the renderer's own.
     cameras: Option<&'a Buffer<kernels::Camera>>,
     camera_index: u32,

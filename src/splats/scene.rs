@@ -10,6 +10,7 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 mod device;
+mod facts;
 mod features;
 #[cfg(feature = "io")]
 pub mod init;
@@ -24,6 +25,7 @@ use crate::splats::attributes::{column_count, planes};
 #[cfg(feature = "io")]
 use crate::splats::harmonics::HarmonicRotation;
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
+pub use facts::Facts;
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
 
 pub use crate::kernels::sh::MAX_SH_DEGREE;

@@ -271,8 +271,14 @@ fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
     let pipeline = gpu.pipeline::<blend_forward::Kernel>(&constants).unwrap();
     let mut background = [0.0; 11];
     background[..3].copy_from_slice(&[0.25, 0.5, 0.75]);
-    let params =
-        blend_forward::Params { size, tile_columns: COLUMNS, longest_run: u32::MAX, background };
+    let params = blend_forward::Params {
+        size,
+        tile_columns: COLUMNS,
+        longest_run: u32::MAX,
+        has_limits: 0,
+        takes_median: 0,
+        background,
+    };
     let pixels = size.element_product() as usize;
     let mut tile_ranges = gpu.zeros("tile_ranges", (ROWS * COLUMNS) as usize).unwrap();
     let (counts, sorted_tiles) =
@@ -283,6 +289,7 @@ fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
     let (splats, colors) = (gpu.zeros("splats", 0).unwrap(), gpu.zeros("colors", 0).unwrap());
     let mut render = gpu.zeros("render", 3 * pixels).unwrap();
     let mut transmittances = gpu.zeros("transmittances", pixels).unwrap();
+    let limits = gpu.zeros("limits", 1).unwrap();
     gpu.run("fold", |pass| {
         let buffers = blend_forward::Buffers {
             counts: counts.slice(),
@@ -295,6 +302,7 @@ fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
             colors: colors.slice(),
             render: render.slice_mut(),
             transmittances: transmittances.slice_mut(),
+            limits: limits.slice(),
         };
         pass.dispatch(&pipeline, &params, buffers, Threads::Workgroups([ROWS * COLUMNS, 1, 1]))
     })

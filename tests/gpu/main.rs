@@ -3,9 +3,12 @@
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
 #[path = "../common/mod.rs"]
+#[macro_use]
 mod common;
 
 mod descriptors;
 mod embedding;
 mod faults;
 mod gpu;
+mod host;
+mod images;

@@ -85,6 +85,7 @@ fn file(name: &str) -> String {
 #[test]
 fn archives_are_stripped_and_the_container_has_the_programs_of_pose_and_of_videos() {
     assert!(file(".github/workflows/release.yml").contains("CARGO_PROFILE_RELEASE_STRIP: symbols"));
+    assert!(file("scripts/package.sh").contains("*-linux-*) strip "));
     let container = file("Containerfile");
     let (_, packages) = container.split_once("no-install-recommends \\\n").unwrap();
     let packages = packages.lines().next().unwrap();

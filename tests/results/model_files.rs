@@ -4,7 +4,10 @@ use std::fs;
 use std::path::Path;
 
 use glam::DVec3;
+use nightsplat::results::run::load_config;
+use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::{Gaussians, ply};
+use nightsplat::Error;
 
 use crate::common::command::{refused, run, succeed};
 use crate::common::place::Place;
@@ -82,7 +85,7 @@ fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
     let (model, set) = (model.display(), set.display());
 
     let (scores, message) = run(&format!("eval {model} --dataset {set} --json"), 0);
-    assert!(message.contains("training are unknown"), "{message}");
+    assert!(!message.contains("near plane"), "{message}");
     let psnr = |json: &str| {
         let json: serde_json::Value = serde_json::from_str(json).unwrap();
         json["mean"]["psnr"].as_f64().unwrap()
@@ -96,11 +99,133 @@ fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
     assert!(fs::read_dir(pictures).unwrap().count() > 0);
 
     for to in ["spz", "glb", "sog"] {
-        succeed(&format!("export {model} --to {to}"));
+        succeed(&format!("export {model} --to {to} --up none"));
         assert!(place.path(&format!("copy.{to}")).is_file(), "{to}");
+    }
+    for (file, loss) in [("copy.spz", 0.5), ("copy.sog", 0.5)] {
+        let packed = place.path(file);
+        let shown = succeed(&format!("eval {} --dataset {set} --json", packed.display()));
+        assert!((psnr(&shown) - psnr(&own)).abs() < loss, "{file}: {shown} {own}");
     }
     succeed(&format!("export {model} --to html --dataset {set}"));
     refused(&format!("export {model} --to html"), 3, &["copy.ply", "--dataset"]);
+}
+
+/// Removes what the file states of its model.
+fn without_facts(path: &Path) {
+    let bytes = fs::read(path).unwrap();
+    let mut rest = &bytes[..];
+    let mut kept = vec![];
+    while let Some(end) = rest.iter().position(|&byte| byte == b'\n') {
+        let (line, after) = rest.split_at(end + 1);
+        if !line.starts_with(b"comment nightsplat ") {
+            kept.extend(line);
+        }
+        rest = after;
+        if line == b"end_header\n" {
+            break;
+        }
+    }
+    kept.extend(rest);
+    fs::write(path, kept).unwrap();
+}
+
+#[test]
+fn a_model_is_loaded_with_what_its_run_or_its_file_states_and_a_silent_file_with_the_defaults() {
+    let place = Place::new();
+    succeed(&place.train("run", "--steps 5 --near 0.05 --raw-colors on"));
+    let own = place.path("run");
+    let scale = load_config(&own).unwrap().frame.unwrap_or_default().scale;
+    let model = Model::load(&own).unwrap();
+    assert!((f64::from(model.near) * scale - 0.1).abs() < 1e-6, "{}", model.near);
+    assert_eq!((model.max_alpha, model.raw_colors), (0.99, true));
+    let settings = model.render_settings();
+    assert_eq!((settings.near, settings.shape), (model.near, model.gaussians.shape));
+
+    // The file by itself, and the exports, state the same.
+    let file = own.join("model.ply");
+    let header = String::from_utf8_lossy(&fs::read(&file).unwrap()[..300]).into_owned();
+    for line in ["max_alpha 0.99", "raw_colors true"] {
+        assert!(header.contains(&format!("comment nightsplat {line}\n")), "{header}");
+    }
+    assert_eq!(Model::load(&file).unwrap(), model);
+    for name in ["a.ply", "a.spz", "a.sog", "saved.ply", "saved.spz", "saved.sog"] {
+        let path = place.path(name);
+        match name.strip_prefix("a.") {
+            Some(format) => {
+                let out = path.display();
+                succeed(&format!("export {} --to {format} --out {out} --up none", own.display()));
+            }
+            None => model.save(&path).unwrap(),
+        }
+        let back = Model::load(&path).unwrap();
+        let facts = |model: &Model| (model.near, model.max_alpha, model.raw_colors);
+        assert_eq!(facts(&back), facts(&model), "{name}");
+        assert_eq!(back.gaussians.count, model.gaussians.count, "{name}");
+    }
+    let glb = place.path("saved.glb");
+    model.save(&glb).unwrap();
+    let glb = fs::read(glb).unwrap();
+    let length = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
+    let json: serde_json::Value = serde_json::from_slice(&glb[20..20 + length]).unwrap();
+    let stated = &json["asset"]["extras"]["nightsplat"];
+    assert_eq!(stated["near"].to_string(), model.near.to_string());
+    assert_eq!(stated["raw_colors"], true);
+
+    // A run from before files stated anything has its configuration.
+    let shown = Gaussians::open(&file).unwrap();
+    without_facts(&file);
+    assert_eq!(Model::load(&own).unwrap(), model);
+    assert_eq!(Model::load(&file).unwrap(), Model::from(shown));
+    let set = place.path("set");
+    let silent = format!("eval {} --dataset {}", file.display(), set.display());
+    let (_, message) = run(&silent, 0);
+    assert!(message.contains("model.ply: does not state its near plane"), "{message}");
+}
+
+#[test]
+fn what_a_file_states_is_one_line_of_an_error_where_it_is_nonsense() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.ply");
+    let problem = |comment: &str| {
+        Model::from(Gaussians::zeros(2, 0)).save(&path).unwrap();
+        // All zeros: the file is text.
+        let text = fs::read_to_string(&path).unwrap();
+        fs::write(&path, text.replacen("element", &format!("comment {comment}\nelement"), 1)).unwrap();
+        let error = Model::load(&path).map(|model| model.near).unwrap_err();
+        assert!(matches!(error, Error::Input { .. }), "{error:?}");
+        let error = error.to_string();
+        let (_, problem) = error.split_once("model.ply: ").unwrap();
+        problem.to_owned()
+    };
+    for near in ["x", "-1", "0", "NaN", "inf", ""] {
+        let stated = problem(&format!("nightsplat near {near}"));
+        let expected = format!("line 6 states near `{near}`, which is not a finite number above 0");
+        assert_eq!(stated, expected);
+    }
+    assert_eq!(
+        problem("nightsplat max_alpha 1"),
+        "line 6 states max_alpha `1`, which is not a finite number between 0 and 1"
+    );
+    assert_eq!(
+        problem("nightsplat raw_colors on"),
+        "line 6 states raw_colors `on`, which is neither true nor false"
+    );
+    assert_eq!(
+        problem("world = position + 1 2"),
+        "line 6 names the origin `1 2`, which is not three finite numbers"
+    );
+    // What a later version states is skipped.
+    Model::from(Gaussians::zeros(2, 0)).save(&path).unwrap();
+    let text = fs::read_to_string(&path).unwrap();
+    fs::write(&path, text.replacen("element", "comment nightsplat later 1 2\nelement", 1)).unwrap();
+    assert_eq!(Model::load(&path).unwrap().near, 0.2);
+
+    fs::write(&path, "solid cube").unwrap();
+    let error = Model::load(&path).unwrap_err().to_string();
+    assert!(error.ends_with("model.ply: is no model: it is not PLY, SPZ or SOG"), "{error}");
+    let error = Model::load(folder.path()).unwrap_err().to_string();
+    assert!(error.contains("no config.toml"), "{error}");
 }
 
 #[test]

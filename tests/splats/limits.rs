@@ -41,7 +41,7 @@ fn more_intersections_than_can_be_counted_are_an_overflow() {
         let (_, _, counts, after, arrivals) = run_kernel!(
             order_counts,
             constants,
-            order_counts::Params { gaussian_count, capacity: 5 },
+            order_counts::Params { gaussian_count, capacity: 5, truncates: 0 },
             Threads::Workgroups([3, 1, 1]),
             [sorted_ids, tile_counts],
             [intersection_offsets, sums, counts, status, arrivals]
@@ -50,6 +50,56 @@ fn more_intersections_than_can_be_counted_are_an_overflow() {
         assert_eq!(after, [before[0] | flag, before[1].max(total), 0]);
         assert_eq!(arrivals, [0]);
     }
+}
+
+/// The number of intersections that `order_counts` keeps where it truncates, and the status.
+fn truncated(tile_counts: Vec<u32>, capacity: u32) -> (u32, Vec<u32>) {
+    let constants = order_counts::Constants { partition_size: 2 };
+    let gaussian_count = tile_counts.len() as u32;
+    let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
+    let (intersection_offsets, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
+    let (counts, status) = (vec![7], vec![0, 1, 0]);
+    let (_, _, counts, status, _) = run_kernel!(
+        order_counts,
+        constants,
+        order_counts::Params { gaussian_count, capacity, truncates: 1 },
+        Threads::Workgroups([2, 1, 1]),
+        [sorted_ids, tile_counts],
+        [intersection_offsets, sums, counts, status, arrivals]
+    );
+    (counts[0], status)
+}
+
+#[test]
+fn what_exceeds_the_memory_is_left_out_without_a_flag() {
+    for (capacity, kept) in [(5, 5), (9, 9), (12, 9)] {
+        assert_eq!(truncated(vec![4, 3, 2], capacity), (kept, vec![0, 9, 0]));
+    }
+    // Where the sum wraps around, so do the offsets.
+    let (kept, status) = truncated(vec![1 << 31, 1 << 31, 3], 5);
+    assert_eq!((kept, status[1]), (0, u32::MAX));
+}
+
+#[test]
+fn the_gaussian_across_the_end_of_the_memory_covers_no_tile() {
+    let setup = Setup::new(3, [32, 32], 0, 1);
+    let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
+    let (counts, sorted_ids, tile_counts) = (vec![6], vec![0, 1, 2], vec![4, 4, 4]);
+    let (sums, intersection_offsets) = (vec![0], vec![0, 4, 8]);
+    let [tiles, intersection_ids, gaussian_ids] = [0; 3].map(|_| vec![7u32; 16]);
+    let intersection_ranges = vec![UVec2::splat(7); 3];
+    let (tiles, ids, _, ranges) = run_kernel!(
+        emit,
+        emit::Constants { partition_size: 256, ..Default::default() },
+        emit::Params { size: UVec2::new(32, 32), gaussian_count: 3, tile_columns: 2 },
+        Threads::Exactly([3, 1, 1]),
+        [counts, sorted_ids, intersection_offsets, sums, splats, tile_counts],
+        [tiles, intersection_ids, gaussian_ids, intersection_ranges]
+    );
+    assert!(tiles[4..6].iter().all(|&tile| tile == u32::MAX), "{tiles:?}");
+    assert_eq!(ids[..6], [0, 1, 2, 3, 4, 5]);
+    assert!(ids[6..].iter().chain(&tiles[6..]).all(|&slot| slot == 7));
+    assert!(ranges[1].x == ranges[1].y && ranges[2].x == ranges[2].y, "{ranges:?}");
 }
 
 #[test]
@@ -76,15 +126,21 @@ fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>, Vec<u32>)
         (vec![count], (0..count).collect::<Vec<_>>(), vec![0; count as usize]);
     let (colors, pixels) = (vec![Vec3::splat(0.5)], size.element_product() as usize);
     let (render, transmittances) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
-    let (tile_ranges, status) = (vec![UVec2::ONE; 120], vec![0; 3]);
-    let params =
-        blend_forward::Params { size, tile_columns: 5, longest_run, background: [0.0; 11] };
+    let (tile_ranges, status, limits) = (vec![UVec2::ONE; 120], vec![0; 3], vec![0.0f32]);
+    let params = blend_forward::Params {
+        size,
+        tile_columns: 5,
+        longest_run,
+        has_limits: 0,
+        takes_median: 0,
+        background: [0.0; 11],
+    };
     let (_, _, ranges, status) = run_kernel!(
         blend_forward,
         blend_forward::Constants::default(),
         params,
         Threads::Workgroups([120, 1, 1]),
-        [counts, sorted_intersections, gaussian_ids, splats, colors, sorted_tiles],
+        [counts, sorted_intersections, gaussian_ids, splats, colors, sorted_tiles, limits],
         [render, transmittances, tile_ranges, status]
     );
     (ranges, status)

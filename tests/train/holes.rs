@@ -145,8 +145,8 @@ fn a_denoiser_and_patches_do_not_change_the_transmittances() {
     let view = dataset.test_views().next().unwrap();
     let rendered = trainer.render(&view.camera).unwrap();
     assert!(rendered.denoised.is_some());
-    let (gaussians, plain) = (trainer.gaussians().unwrap(), TrainConfig::bare());
-    let mut model_renderer = ModelRenderer::new(&gpu(), &gaussians, &plain, None).unwrap();
+    let (model, plain) = (trainer.model().unwrap(), TrainConfig::bare());
+    let mut model_renderer = ModelRenderer::new(&gpu(), &model, &plain, None).unwrap();
     let whole = model_renderer.render(view).unwrap();
     let [in_parts, whole] = [rendered, whole].map(|own| own.transmittances.unwrap());
     assert_eq!(in_parts.len(), 64 * 48);

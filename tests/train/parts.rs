@@ -12,6 +12,8 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::attributes::{ATTRIBUTES, Attribute, AttributeSpec};
+use nightsplat::splats::model::Model;
+use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{Part, Rendered, StepReport, TrainConfig, Trainer};
 
 use crate::common::command::{refused, succeed};
@@ -288,12 +290,18 @@ fn raw_colors_train_and_are_saved_as_viewers_show_them() {
     make_set(folder.path(), false);
     let mut config = TrainConfig { steps: 20, ..config(&[]) };
     config.model.raw_colors = true;
-    let (reports, mut gaussians) = train(&config, &load(folder.path(), &config));
+    let (reports, gaussians) = train(&config, &load(folder.path(), &config));
     let [begin, end] = fall(&reports, Term::L1);
     assert!(end < begin, "L1 went from {begin} to {end}");
     let before = gaussians.dc()[0].x;
-    gaussians.shift_colors(-0.5);
-    assert!((gaussians.dc()[0].x - (before - 0.5 / 0.282_094_8)).abs() < 1e-5);
+    let model = Model { raw_colors: true, ..Model::from(gaussians) };
+    let path = folder.path().join("raw.ply");
+    model.save(&path).unwrap();
+    let shown = Gaussians::open(&path).unwrap().dc()[0].x;
+    assert!((shown - (before - 0.5 / 0.282_094_8)).abs() < 1e-5);
+    let back = Model::load(&path).unwrap();
+    assert!(back.raw_colors && back.render_settings().raw_colors);
+    assert!((back.gaussians.dc()[0].x - before).abs() < 1e-6);
 }
 
 // ---------------------------------------------------------------------------

@@ -13,6 +13,7 @@ use nightsplat::gpu::{DeviceChoice, Gpu};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::metrics::Scores;
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::splats::model::Model;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::{Gaussians, Shape};
 use nightsplat::train::{Background, StepReport, TrainConfig, Trainer};
@@ -35,8 +36,9 @@ fn config() -> TrainConfig {
 }
 
 fn mean_psnr(dataset: &Dataset, gaussians: &Gaussians) -> f64 {
+    let model = Model::from(gaussians.clone());
     let mut model_renderer =
-        ModelRenderer::new(&gpu(), gaussians, &TrainConfig::bare(), None).unwrap();
+        ModelRenderer::new(&gpu(), &model, &TrainConfig::bare(), None).unwrap();
     let scored = eval::score(dataset, |view| model_renderer.render(view)).unwrap();
     let scores: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
     Scores::mean(&scores).unwrap().psnr
@@ -333,8 +335,8 @@ fn a_render_shows_the_scene_that_its_model_was_trained_on() {
     advance(&mut trainer, 60);
     let view = &dataset.views[0];
     let in_training = trainer.render(&view.camera).unwrap();
+    let model = trainer.model().unwrap();
     let mut model_renderer =
-        ModelRenderer::new(&gpu(), &trainer.gaussians().unwrap(), &TrainConfig::bare(), None)
-            .unwrap();
+        ModelRenderer::new(&gpu(), &model, &TrainConfig::bare(), None).unwrap();
     assert_eq!(in_training.colors.data, model_renderer.render(view).unwrap().colors.data);
 }

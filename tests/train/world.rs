@@ -9,6 +9,7 @@ use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::metrics::Scores;
 use nightsplat::results::eval::{self, ModelRenderer, ViewScore};
 use nightsplat::results::run::{self, IfExists};
+use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::ply;
 use nightsplat::train::{TrainConfig, Trainer};
 
@@ -73,8 +74,12 @@ fn a_run_in_any_world_is_scored_as_trained_and_its_model_is_in_that_world() {
         let recorded = run::load_config(&out).unwrap();
         let frame = recorded.frame.unwrap();
         assert_ne!(frame, TrainingFrame::WORLD);
-        let gaussians = run::load_model(&out, false).unwrap();
-        let mut model_renderer = ModelRenderer::new(&gpu(), &gaussians, &recorded, None).unwrap();
+        let model = Model::load(&out).unwrap();
+        let mut model_renderer = ModelRenderer::new(&gpu(), &model, &recorded, None).unwrap();
+        let stated = format!("comment nightsplat near {}\n", model.near);
+        // A tenth of the frame's extent.
+        assert!((f64::from(model.near) * frame.scale - 0.2).abs() < 1e-6, "{stated}");
+        let gaussians = model.gaussians;
         let scored = eval::score(&there, |view| model_renderer.render(view)).unwrap();
         let (again, then) = (mean_psnr(&scored), mean_psnr(&trained.scored));
         assert!((again - then).abs() < 0.01, "{scale} at {offset}: {again}, not {then}");
@@ -82,6 +87,7 @@ fn a_run_in_any_world_is_scored_as_trained_and_its_model_is_in_that_world() {
         // Other programs see positions in the world, relative to the origin in the header.
         let header = std::fs::read(out.join("model.ply")).unwrap();
         let header = String::from_utf8_lossy(&header[..400]).into_owned();
+        assert!(header.contains(&stated), "{header}");
         let origin = frame.file_origin();
         assert_eq!(
             header.contains("comment world = position + "),

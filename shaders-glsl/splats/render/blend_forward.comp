@@ -13,11 +13,16 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //! C = sum_i c_i alpha_i T_i + T background, T_i = prod_{j < i} (1 - alpha_j). Each lane loads one splat of a batch and
 //! finds the groups of pixels that its ellipse meets; the batch is then broadcast splat by splat. The tile's state
 //! stays in registers: no shared memory, no barrier.
+//!
+//! With VIEW_DEPTHS the last channel is the depth in the view: a splat beyond a pixel's limit ends it, as the order is
+//! front to back, and the channel is the sum of the weighted depths, or the depth at which the transmittance passes 1/2.
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;
     uint tile_columns;
-    uint longest_run;  // the most splats of a tile that this device can process
+    uint longest_run;  // splats of a tile that this device follows
+    uint has_limits;   // 1: `limits` holds a depth for each pixel
+    uint takes_median; // 1: the last channel is the median depth
     float background[MAX_CHANNELS];
 };
 
@@ -31,6 +36,11 @@ layout(binding = 6) writeonly buffer Transmittances { float transmittances[]; };
 layout(binding = 7) readonly  buffer Tiles      { uint sorted_tiles[]; };
 layout(binding = 8) writeonly buffer Ranges { uvec2 tile_ranges[]; };  // (tiles) first intersection, one past the last
 layout(binding = 9)           buffer Status     { uint status[]; };
+layout(binding = 10) readonly buffer Limits     { float limits[]; };  // (H, W) depth beyond which nothing is seen
+
+layout(constant_id = 11) const uint VIEW_DEPTHS = 0;  // 1: the last channel is the depth
+// The depth of a pixel without a limit, and of one where nothing is seen.
+const float NO_DEPTH = 3.4e38;
 
 #include "tile_run.glsl"
 
@@ -46,7 +56,13 @@ void main() [[subgroup_uniform_control_flow]] {
     // Negative once the pixel is done; the magnitude is the transmittance.
     float transmittance[GROUPS];
     float color[GROUPS][CHANNELS];
+    float limit[GROUPS], median[GROUPS];
     [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+        if (VIEW_DEPTHS != 0) {
+            uvec2 pixel = min(first_pixel + group_offset(g), size - 1);
+            limit[g] = has_limits != 0 ? limits[pixel.y * size.x + pixel.x] : NO_DEPTH;
+            median[g] = NO_DEPTH;
+        }
         // A pixel outside the image is done from the start.
         transmittance[g] = all(lessThan(first_pixel + group_offset(g), size)) ? 1.0 : -1.0;
         [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] = 0.0;
@@ -90,6 +106,11 @@ void main() [[subgroup_uniform_control_flow]] {
                     alpha = counts ? alpha : 0.0;
                     float after = before * (1.0 - alpha);
                     bool is_done = after < TRANSMITTANCE_MIN;
+                    if (VIEW_DEPTHS != 0) {
+                        float depth = splat_color[CHANNELS - 1];
+                        is_done = is_done || depth > limit[g];
+                        if (before > 0.5 && after <= 0.5 && !is_done) median[g] = depth;
+                    }
                     transmittance[g] = is_done ? -abs(before) : after;
                     float weight = is_done ? 0.0 : alpha * before;
                     [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] += weight * splat_color[c];
@@ -108,6 +129,9 @@ void main() [[subgroup_uniform_control_flow]] {
             transmittances[at] = last;
             [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
                 render[c * size.x * size.y + at] = color[g][c] + last * background[c];
+            }
+            if (VIEW_DEPTHS != 0 && takes_median != 0) {
+                render[(CHANNELS - 1) * size.x * size.y + at] = median[g];
             }
         }
     }

@@ -54,10 +54,12 @@ void main() {
     uint begin = is_rank ? sums[rank / PARTITION_SIZE] + intersection_offsets[rank] : 0;
     // No slot beyond those that were counted is ever written, not even where the sum of all counts wrapped around.
     uint end = begin + (is_rank ? tile_counts[id] : 0);
-    if (end > counts[0] || end < begin) end = begin;
+    bool is_whole = end <= counts[0] && end >= begin;
+    // The Gaussian across the end of the memory covers no tile: its slots before the end are padding.
+    if (!is_whole) end = max(begin, counts[0]);
     ProjectedSplat splat = splats[id];
-    uvec2 rows = end > begin ? splat_tile_rows(splat, size.y) : uvec2(0);
-    bool is_shared = end - begin > SHARED_INTERSECTIONS;
+    uvec2 rows = is_whole && end > begin ? splat_tile_rows(splat, size.y) : uvec2(0);
+    bool is_shared = is_whole && end - begin > SHARED_INTERSECTIONS;
     uvec4 sharing = subgroupBallot(is_shared);
 
     // First every lane its own splat, then all together those that are shared, a row for each: in one loop, for a

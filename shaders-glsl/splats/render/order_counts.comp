@@ -6,9 +6,10 @@
 
 //! Order counts: the number of slots before those of each depth rank within its partition, and before each partition.
 //!
-//! One subgroup per partition; the last to finish computes prefix sums of the partitions' sums, and the total. More
-//! intersections than the buffers hold set a sticky flag: the step then renders and updates nothing; the host grows the
-//! buffers, clears the flag and repeats it.
+//! One subgroup per partition; the last of them to be done makes prefix sums of the partitions' sums and knows the
+//! total. More intersections than the buffers hold raise a flag that stays: the step then renders nothing and updates
+//! nothing; the host grows the buffers, lowers the flag and redoes it. A renderer that truncates keeps those that fit,
+//! the nearest, and raises no flag.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -16,7 +17,8 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(push_constant) uniform Params {
     uint gaussian_count;
-    uint capacity;  // intersections
+    uint capacity;   // intersections
+    uint truncates;  // 1: those that fit are kept
 };
 
 layout(binding = 0) readonly  buffer Ids        { uint sorted_ids[]; };   // by depth
@@ -62,8 +64,10 @@ void main() {
     if (wraps) total = 0xffffffffu;
     if (subgroupElect()) {
         bool fits = total <= capacity;
-        counts[0] = fits ? total : 0;
-        if (!fits) status[0] |= STATUS_OVERFLOWED;
+        // Where the sum wrapped around, the offsets did too.
+        uint kept = truncates != 0 && !wraps ? capacity : 0;
+        counts[0] = fits ? total : kept;
+        if (!fits && truncates == 0) status[0] |= STATUS_OVERFLOWED;
         status[1] = max(status[1], total);
     }
 }

@@ -12,7 +12,7 @@
 //! EWA: cov2d = U U^T + 0.3 I with U = J W R S, where J is the camera's Jacobian at the mean, so it is positive
 //! definite by construction, and its determinant is
 //! |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel. Colour is max(SH + 0.5, 0), what every viewer shows, or
-//! the bare SH sum of LITA-GS; features are taken as they are.
+//! the bare SH sum of LITA-GS; features are taken as they are. The last channel can be the depth in the view.
 //! A culled Gaussian gets the last depth key and covers no tile.
 
 layout(local_size_x = 64) in;
@@ -40,7 +40,8 @@ layout(binding = 6) readonly  buffer Cameras    { Camera cameras[]; };
 // A depth key is how many sixteenfold roundings the depth is beyond `near`: 2e-6 of the depth each, over 32 octaves.
 const uint DEPTH_BITS = 24;
 const uint CULLED = (1u << DEPTH_BITS) - 1;  // the depth key of what is not seen: it sorts last
-const uint FEATURE_COUNT = CHANNELS - 3;
+layout(constant_id = 11) const uint VIEW_DEPTHS = 0;  // 1: the last channel is the depth, not a feature
+const uint FEATURE_COUNT = CHANNELS - 3 - VIEW_DEPTHS;
 
 #include "rest.glsl"
 
@@ -108,6 +109,7 @@ void main() {
         [[unroll]] for (uint c = 0; c < 3; c++) {
             uint feature = 3 * (k - 1) + c;
             if (feature < FEATURE_COUNT) three[c] = parameters[features + feature];
+            else if (VIEW_DEPTHS != 0 && feature == FEATURE_COUNT) three[c] = depth;
         }
         colors[COLOR_VECTORS * i + k] = three;
     }

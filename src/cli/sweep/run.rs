@@ -13,6 +13,7 @@ use crate::photographs::dataset::View;
 use crate::photographs::image::Image;
 use crate::results::eval::ModelRenderer;
 use crate::results::run;
+use crate::splats::model::Model;
 use crate::train::TrainConfig;
 use crate::train::diagnose::Plan;
 use crate::{Error, Result};
@@ -88,10 +89,10 @@ impl Run {
     /// Its model cannot be read, or the device is lost.
     pub(super) fn render(&self, gpu: &Gpu, view: &View) -> Result<Image> {
         let config = run::load_config(&self.folder)?;
-        let gaussians = run::load_model(&self.folder, config.model.raw_colors)?;
+        let model = Model::load(&self.folder)?;
         let networks =
-            run::load_networks(gpu, &self.folder, &config.model, gaussians.shape.features)?;
-        let mut model_renderer = ModelRenderer::new(gpu, &gaussians, &config, networks)?;
+            run::load_networks(gpu, &self.folder, &config.model, model.gaussians.shape.features)?;
+        let mut model_renderer = ModelRenderer::new(gpu, &model, &config, networks)?;
         Ok(model_renderer.render(view)?.output().clone())
     }
 

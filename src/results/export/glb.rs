@@ -103,8 +103,12 @@ fn description(gaussians: &Gaussians, planes: &[Plane], provenance: &Provenance)
     accessors[0]["max"] = json!(bound(f32::NEG_INFINITY, f32::max));
     let mut lines = provenance.lines();
     lines.extend(provenance.world_line(gaussians, true));
+    let facts = provenance.facts_of(gaussians).json();
     json!({
-        "asset": { "version": "2.0", "generator": GENERATOR, "extras": { "provenance": lines } },
+        "asset": {
+            "version": "2.0", "generator": GENERATOR,
+            "extras": { "provenance": lines, "nightsplat": facts },
+        },
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{ "nodes": [0] }],

@@ -69,13 +69,15 @@ impl Page<'_> {
             "up": up.to_array(),
             "views": bookmarks.iter().map(view).collect::<Vec<_>>(),
         });
+        let stated = provenance.facts.max_alpha;
+        let max_alpha = stated.unwrap_or_else(|| RenderSettings::default().max_alpha);
         let parts = [
             ("@TITLE@", escape(title)),
             ("@STYLE@", include_str!("viewer/style.css").to_owned()),
             // No `<` in the data may end its script element.
             ("@SCENE@", scene.to_string().replace('<', "\\u003c")),
-            ("@VERTEX@", shader(include_str!("viewer/splat.vert"))),
-            ("@FRAGMENT@", shader(include_str!("viewer/splat.frag"))),
+            ("@VERTEX@", shader(include_str!("viewer/splat.vert"), max_alpha)),
+            ("@FRAGMENT@", shader(include_str!("viewer/splat.frag"), max_alpha)),
             ("@VIEWER@", include_str!("viewer/viewer.js").to_owned()),
             ("@MODEL@", base64(&gzip(&model(gaussians))?)),
         ];
@@ -94,11 +96,11 @@ impl Page<'_> {
     }
 }
 
-/// A shader of the page, with the constants and functions that it shares with the kernels.
-fn shader(text: &str) -> String {
+/// The shader with what it has in common with the kernels.
+fn shader(text: &str, max_alpha: f32) -> String {
     let constants = [
         ("ALPHA_MIN", ALPHA_MIN),
-        ("ALPHA_MAX", RenderSettings::default().max_alpha.into()),
+        ("ALPHA_MAX", max_alpha.into()),
         ("DILATION", DILATION),
         ("JACOBIAN_MARGIN", JACOBIAN_MARGIN),
     ];

@@ -4,15 +4,18 @@
 //! The axes are those of a PLY. Positions are 16 bits of their signed logarithm, scales and colours 8-bit indices of
 //! codebooks, rotations three bytes, and the higher coefficients an index of at most 65 536 vectors.
 
-use std::io::{Cursor, Write as _};
+use std::io::{Cursor, Read as _, Write as _};
 
-use image::{ExtendedColorType, codecs::webp::WebPEncoder};
-use serde_json::json;
+use glam::Vec3;
+use image::{ExtendedColorType, ImageFormat, codecs::webp::WebPEncoder};
+use serde::Deserialize;
+use serde_json::{Value, json};
+use zip::ZipArchive;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
 use super::palette::{codebook, nearest, vectors};
-use super::{GENERATOR, Provenance, sigmoid, unit};
-use crate::splats::scene::{Gaussians, rest_coefficients};
+use super::{GENERATOR, Provenance, raw_opacity, sigmoid, unit};
+use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE, rest_coefficients};
 use crate::{Error, Result};
 
 /// Vectors of coefficients per row of their image.
@@ -51,7 +54,10 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
     lines.extend(provenance.world_line(gaussians, false));
     let mut meta = json!({
         "version": 2,
-        "asset": { "generator": GENERATOR, "provenance": lines },
+        "asset": {
+            "generator": GENERATOR, "provenance": lines,
+            "nightsplat": provenance.facts_of(gaussians).json(),
+        },
         "count": gaussians.count,
         "antialias": false,
         "means": { "mins": bounds[0], "maxs": bounds[1], "files": ["means_l.webp", "means_u.webp"] },
@@ -169,59 +175,239 @@ fn archive(meta: &str, files: &[(&str, [usize; 2], Vec<u8>)]) -> Result<Vec<u8>>
     Ok(zip.finish().map_err(|error| failed(&error))?.into_inner())
 }
 
+/// `meta.json`, as far as it is read.
+#[derive(Deserialize)]
+struct Meta {
+    version: u32,
+    count: usize,
+    #[serde(default)]
+    asset: Value,
+    means: Means,
+    scales: Coded,
+    quats: Coded,
+    sh0: Coded,
+    #[serde(rename = "shN")]
+    rest: Option<Rest>,
+}
+
+#[derive(Deserialize)]
+struct Means {
+    mins: [f32; 3],
+    maxs: [f32; 3],
+    files: [String; 2],
+}
+
+#[derive(Deserialize)]
+struct Coded {
+    #[serde(default)]
+    codebook: Vec<f32>,
+    files: [String; 1],
+}
+
+#[derive(Deserialize)]
+struct Rest {
+    bands: u32,
+    codebook: Vec<f32>,
+    files: [String; 2],
+}
+
+/// The most bytes of a file in the archive.
+const MOST: u64 = 1 << 30;
+
+/// The Gaussians of a file of version 2, and what it states of them.
+///
+/// # Errors
+/// The problem: another format or version, cut short, or nonsense in what it states.
+pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
+    let mut zip = ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is no SOG: {error}"))?;
+    let meta = bytes_of(&mut zip, "meta.json")?;
+    let meta: Value = serde_json::from_slice(&meta).map_err(|error| format!("meta.json: {error}"))?;
+    if meta["version"] != 2 {
+        return Err(format!("is SOG of version {}; version 2 is read", meta["version"]));
+    }
+    let meta: Meta = serde_json::from_value(meta).map_err(|error| format!("meta.json: {error}"))?;
+    let Meta { count, means, scales, quats, sh0, .. } = &meta;
+    let [low, high] = [&means.files[0], &means.files[1]];
+    let [low, high] = [image_of(&mut zip, low, *count)?, image_of(&mut zip, high, *count)?];
+    let [scale_codes, quat_bytes, color_codes] = [
+        image_of(&mut zip, &scales.files[0], *count)?,
+        image_of(&mut zip, &quats.files[0], *count)?,
+        image_of(&mut zip, &sh0.files[0], *count)?,
+    ];
+    let degree = meta.rest.as_ref().map_or(0, |rest| rest.bands);
+    if degree > MAX_SH_DEGREE {
+        return Err(format!("has SH degree {degree}; {MAX_SH_DEGREE} is the highest"));
+    }
+    let mut gaussians = Gaussians::zeros(*count, degree);
+    for (i, mean) in gaussians.means_mut().iter_mut().enumerate() {
+        *mean = Vec3::from_array([0, 1, 2].map(|axis| {
+            let share = f32::from(u16::from_le_bytes([low[i][axis], high[i][axis]])) / 65_535.0;
+            let log = means.mins[axis] + (means.maxs[axis] - means.mins[axis]) * share;
+            log.abs().exp_m1().copysign(log)
+        }));
+    }
+    for (scale, codes) in gaussians.log_scales_mut().iter_mut().zip(&scale_codes.0) {
+        *scale = decoded(&scales.codebook, *codes)?;
+    }
+    for (quat, bytes) in gaussians.quats_mut().iter_mut().zip(&quat_bytes.0) {
+        *quat = of_rotation(*bytes);
+    }
+    for (dc, codes) in gaussians.dc_mut().iter_mut().zip(&color_codes.0) {
+        *dc = decoded(&sh0.codebook, *codes)?;
+    }
+    for (opacity, [.., byte]) in gaussians.raw_opacities_mut().iter_mut().zip(&color_codes.0) {
+        *opacity = raw_opacity(*byte);
+    }
+    if let Some(rest) = &meta.rest {
+        decode_rest(&mut zip, rest, &mut gaussians)?;
+    }
+    if let Some(place) = gaussians.parameters.iter().position(|value| !value.is_finite()) {
+        return Err(format!("number {place} is not finite"));
+    }
+    let facts = Facts::of_json(&meta.asset["nightsplat"])?;
+    gaussians.origin = facts.origin;
+    Ok((gaussians, facts))
+}
+
+/// The higher coefficients.
+fn decode_rest(zip: &mut Archive<'_>, rest: &Rest, gaussians: &mut Gaussians) -> Result<(), String> {
+    let coefficients = rest_coefficients(rest.bands);
+    let [sets, labels] = &rest.files;
+    let labels = image_of(zip, labels, gaussians.count)?;
+    let sets = image_of(zip, sets, 0)?;
+    let per_row = SETS_PER_ROW * coefficients;
+    if coefficients > 0 && sets.1 != per_row {
+        return Err(format!("{} is {} pixels wide, not {per_row}", rest.files[0], sets.1));
+    }
+    let rows = gaussians.rest_mut().chunks_exact_mut(coefficients.max(1));
+    for (values, [a, b, ..]) in rows.zip(&labels.0) {
+        let first = coefficients * usize::from(u16::from_le_bytes([*a, *b]));
+        for (value, place) in values.iter_mut().zip(first..) {
+            let codes = sets.0.get(place).ok_or("names coefficients that it does not hold")?;
+            *value = decoded(&rest.codebook, *codes)?;
+        }
+    }
+    Ok(())
+}
+
+type Archive<'a> = ZipArchive<Cursor<&'a [u8]>>;
+
+fn bytes_of(zip: &mut Archive<'_>, name: &str) -> Result<Vec<u8>, String> {
+    let file = zip.by_name(name).map_err(|error| format!("is no SOG: {name}: {error}"))?;
+    let mut bytes = vec![];
+    file.take(MOST).read_to_end(&mut bytes).map_err(|error| format!("{name}: {error}"))?;
+    Ok(bytes)
+}
+
+/// Pixels, and their number in a row.
+struct Pixels(Vec<[u8; 4]>, usize);
+
+impl std::ops::Index<usize> for Pixels {
+    type Output = [u8; 4];
+
+    fn index(&self, pixel: usize) -> &[u8; 4] {
+        &self.0[pixel]
+    }
+}
+
+/// An image of at least `count` pixels.
+fn image_of(zip: &mut Archive<'_>, name: &str, count: usize) -> Result<Pixels, String> {
+    let image = image::load_from_memory_with_format(&bytes_of(zip, name)?, ImageFormat::WebP);
+    let image = image.map_err(|error| format!("{name}: {error}"))?.to_rgba8();
+    let (pixels, _) = image.as_raw().as_chunks();
+    if pixels.len() < count {
+        return Err(format!("{name} has {} pixels for {count} Gaussians", pixels.len()));
+    }
+    Ok(Pixels(pixels.to_vec(), image.width() as usize))
+}
+
+/// The three numbers that a pixel stands for.
+fn decoded(codebook: &[f32], [a, b, c, _]: [u8; 4]) -> Result<Vec3, String> {
+    let number = |code: u8| codebook.get(usize::from(code)).copied();
+    let numbers = number(a).zip(number(b)).zip(number(c));
+    let numbers = numbers.ok_or("names a code that its codebook does not have")?;
+    Ok(Vec3::new(numbers.0.0, numbers.0.1, numbers.1))
+}
+
+/// The inverse of [`rotation`].
+fn of_rotation([a, b, c, largest]: [u8; 4]) -> [f32; 4] {
+    let part = |byte: u8| (f32::from(byte) / 255.0 - 0.5) * std::f32::consts::SQRT_2;
+    let largest = usize::from(largest.saturating_sub(252)).min(3);
+    let mut parts = [0.0_f32; 4];
+    for (i, byte) in (0..4).filter(|&i| i != largest).zip([a, b, c]) {
+        parts[i] = part(byte);
+    }
+    parts[largest] = (1.0 - parts.iter().map(|part| part * part).sum::<f32>()).max(0.0).sqrt();
+    parts
+}
+
 #[cfg(test)]
 mod tests {
-    use std::io::Read as _;
-
     use super::*;
     use crate::results::export::tests::drawn;
 
     #[test]
-    fn the_images_hold_the_model_within_their_precision() {
-        let model = drawn(300, 2);
-        let file = encode(&model, &Provenance::default()).unwrap();
-        let mut zip = zip::ZipArchive::new(Cursor::new(file)).unwrap();
-        let mut read = |name: &str| {
-            let mut bytes = vec![];
-            zip.by_name(name).unwrap().read_to_end(&mut bytes).unwrap();
-            bytes
-        };
-        let meta: serde_json::Value = serde_json::from_slice(&read("meta.json")).unwrap();
-        assert_eq!([&meta["version"], &meta["count"], &meta["shN"]["bands"]], [2, 300, 2]);
-        let mut image = |name: &str| {
-            let image = image::load_from_memory(&read(name)).unwrap().to_rgba8();
-            image.pixels().map(|pixel| pixel.0).collect::<Vec<_>>()
-        };
-        let [low, high] = ["means_l.webp", "means_u.webp"].map(&mut image);
-        let (scales, colors) = (image("scales.webp"), image("sh0.webp"));
-        let number = |value: &serde_json::Value| value.as_f64().unwrap();
-        let mut errors = [0.0_f64; 3];
-        for i in 0..model.count {
-            let position = [0, 1, 2].map(|axis| {
-                let [least, most] = ["mins", "maxs"].map(|key| number(&meta["means"][key][axis]));
-                let share = f64::from(u16::from_le_bytes([low[i][axis], high[i][axis]])) / 65_535.0;
-                let log = least + (most - least) * share;
-                (log.abs().exp_m1()).copysign(log)
-            });
-            let distance = |mean: &glam::Vec3| mean.as_dvec3().distance(position.into());
-            let near = |a: &glam::Vec3, b: &glam::Vec3| distance(a).total_cmp(&distance(b));
-            let own = model.means().iter().min_by(|a, b| near(a, b)).unwrap();
-            let index = model.means().iter().position(|mean| mean == own).unwrap();
-            let code = |key: &str, place: u8| number(&meta[key]["codebook"][usize::from(place)]);
-            let error = [
-                distance(own),
-                (code("scales", scales[i][0]) - f64::from(model.log_scales()[index].x)).abs(),
-                (code("sh0", colors[i][1]) - f64::from(model.dc()[index].y)).abs(),
-            ];
-            errors = [0, 1, 2].map(|e| errors[e].max(error[e]));
+    fn a_model_comes_back_within_its_bits_with_what_is_stated_of_it() {
+        for degree in [0, 2] {
+            let mut model = drawn(300, degree);
+            model.origin = glam::DVec3::new(4_499_999.6, -519_997.7, 10_001.8);
+            let facts = Facts {
+                near: Some(0.1),
+                max_alpha: Some(0.999),
+                raw_colors: Some(true),
+                origin: model.origin,
+            };
+            let provenance = Provenance { facts, ..Provenance::default() };
+            let (back, stated) = decode(&encode(&model, &provenance).unwrap()).unwrap();
+            assert_eq!((stated, back.origin, back.shape), (facts, model.origin, model.shape));
+            let mut errors = [0.0_f32; 5];
+            for i in 0..model.count {
+                let distance = |j: &usize| back.means()[*j].distance(model.means()[i]);
+                let nearest = (0..back.count).min_by(|a, b| distance(a).total_cmp(&distance(b)));
+                let j = nearest.unwrap();
+                let [own, other] = [unit(model.quats()[i]), back.quats()[j]];
+                let dot: f32 = own.iter().zip(other).map(|(a, b)| a * b).sum();
+                let error = [
+                    distance(&j),
+                    (back.log_scales()[j] - model.log_scales()[i]).abs().max_element(),
+                    (back.dc()[j] - model.dc()[i]).abs().max_element(),
+                    1.0 - dot.abs(),
+                    (back.raw_opacities()[j] - model.raw_opacities()[i]).abs(),
+                ];
+                errors = [0, 1, 2, 3, 4].map(|e| errors[e].max(error[e]));
+            }
+            let most = [3e-4, 0.03, 0.02, 1e-4, 0.14];
+            assert!(errors.iter().zip(most).all(|(error, most)| *error < most), "{errors:?}");
+            // As many sets as Gaussians: each has its own.
+            let sum = |model: &Gaussians| model.rest().iter().sum::<Vec3>();
+            assert!((sum(&back) - sum(&model)).abs().max_element() < 0.5, "{degree}");
         }
-        assert!(errors[0] < 3e-4 && errors[1] < 0.03 && errors[2] < 0.02, "{errors:?}");
+        let (_, nothing) = decode(&encode(&drawn(3, 0), &Provenance::default()).unwrap()).unwrap();
+        assert_eq!(nothing, Facts::default());
+    }
+
+    #[test]
+    fn a_file_that_is_cut_short_or_edited_is_an_error_and_no_panic() {
+        let file = encode(&drawn(40, 1), &Provenance::default()).unwrap();
+        for length in (0..file.len()).step_by(7) {
+            assert!(decode(&file[..length]).is_err(), "{length} bytes");
+        }
+        for place in (0..file.len()).step_by(3) {
+            let mut edited = file.clone();
+            edited[place] ^= 0x41;
+            drop(decode(&edited));
+        }
+        let problem = |meta: &str| decode(&archive(meta, &[]).unwrap()).unwrap_err();
+        assert_eq!(problem(r#"{"version":1}"#), "is SOG of version 1; version 2 is read");
+        assert!(problem(r#"{"version":2,"count":1}"#).contains("missing field `means`"));
+        assert!(problem("{").starts_with("meta.json: "));
     }
 
     #[test]
     fn models_of_no_gaussian_and_of_one_are_encoded() {
         for count in [0, 1] {
-            assert!(!encode(&drawn(count, 1), &Provenance::default()).unwrap().is_empty());
+            let file = encode(&drawn(count, 1), &Provenance::default()).unwrap();
+            assert_eq!(decode(&file).unwrap().0.count, count);
         }
     }
 }

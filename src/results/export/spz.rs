@@ -1,13 +1,19 @@
 //! SPZ: fixed-point positions and 8 bits for everything else, about a tenth of a PLY. Source: the specification of the
 //! format.
 //!
-//! Version 4 has a plain header, a table and a Zstandard stream per attribute; version 3, which more readers support,
-//! is one gzip stream of a shorter header and the same bytes. The axes are those of OpenGL.
+//! Version 4 has a plain header, a table and a Zstandard stream for each attribute; version 3, which more readers know, one
+//! gzip stream of a shorter header and the same bytes. Axes are those of OpenGL. What a renderer must know, and where the
+//! origin lies, is text where readers do not look: the comment of the gzip header, or the end of the file.
 
+use std::io::Read;
+
+use flate2::read::GzDecoder;
+use glam::Vec3;
+use ruzstd::decoding::StreamingDecoder;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 
-use super::{Provenance, gzip_with, half_turn, sigmoid, unit};
-use crate::splats::scene::{Gaussians, rest_coefficients};
+use super::{Provenance, gzip_with, half_turn, raw_opacity, sigmoid, unit};
+use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE, rest_coefficients};
 use crate::{Error, Result};
 
 const MAGIC: u32 = 0x5053_474e;
@@ -45,6 +51,9 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) 
         bytes(floats(gaussians.rest()), |&value| 128.0 * (value + 1.0)),
     ];
     let streams = &streams[..if rest_coefficients(degree.into()) > 0 { 6 } else { 5 }];
+    let mut lines: Vec<String> = provenance.world_line(&gaussians, true).into_iter().collect();
+    lines.extend(provenance.facts_of(&gaussians).lines());
+    let text = lines.join("\n");
     let mut file = vec![];
     for word in [MAGIC, if version == Version::V4 { 4 } else { 3 }, count] {
         file.extend(word.to_le_bytes());
@@ -53,7 +62,7 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) 
         Version::V3 => {
             file.extend([degree, fraction, 0, 0]);
             streams.iter().for_each(|stream| file.extend(stream));
-            gzip_with(&file, provenance.world_line(&gaussians, true))
+            gzip_with(&file, Some(text).filter(|text| !text.is_empty()))
         }
         Version::V4 => {
             const HEADER: u32 = 32;
@@ -69,14 +78,178 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) 
                 file.extend((stream.len() as u64).to_le_bytes());
             }
             compressed.iter().for_each(|stream| file.extend(stream));
-            // After everything that the table lists, where readers do not look.
-            file.extend(provenance.world_line(&gaussians, true).unwrap_or_default().bytes());
+            // Behind all that the table names, where a reader does not look.
+            file.extend(text.bytes());
             Ok(file)
         }
     }
 }
 
-/// The most fractional bits that represent the farthest position.
+/// The Gaussians of a file of version 2, 3 or 4, and what it states of them.
+///
+/// # Errors
+/// The problem: another format or version, cut short, or nonsense in the text.
+pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
+    let (header, streams, text) = match file {
+        [0x1f, 0x8b, ..] => unzipped(file)?,
+        _ => unpacked(file)?,
+    };
+    let [positions, opacities, colors, scales, rotations, rest] = &streams;
+    let mut gaussians = Gaussians::zeros(header.count, header.degree);
+    let fixed = |bytes: &[u8]| i32::from_le_bytes([0, bytes[0], bytes[1], bytes[2]]) >> 8;
+    let unit_of_positions = (-f32::from(header.fraction)).exp2();
+    for (mean, bytes) in gaussians.means_mut().iter_mut().zip(positions.chunks_exact(9)) {
+        *mean = Vec3::from_array([0, 3, 6].map(|at| fixed(&bytes[at..]) as f32)) * unit_of_positions;
+    }
+    for (opacity, &byte) in gaussians.raw_opacities_mut().iter_mut().zip(opacities) {
+        *opacity = raw_opacity(byte);
+    }
+    vectors(gaussians.dc_mut(), colors, |byte| (byte / 255.0 - 0.5) / COLOR_SCALE);
+    vectors(gaussians.log_scales_mut(), scales, |byte| byte / 16.0 - 10.0);
+    vectors(gaussians.rest_mut(), rest, |byte| byte / 128.0 - 1.0);
+    let width = header.rotation_width();
+    for (quat, bytes) in gaussians.quats_mut().iter_mut().zip(rotations.chunks_exact(width)) {
+        *quat = match *bytes {
+            [a, b, c, d] => of_smallest_three(u32::from_le_bytes([a, b, c, d])),
+            _ => of_first_three([0, 1, 2].map(|at| f32::from(bytes[at]))),
+        };
+    }
+    let mut gaussians = half_turn(&gaussians);
+    let mut facts = Facts::default();
+    String::from_utf8_lossy(&text).lines().try_for_each(|line| facts.set_line(line))?;
+    gaussians.origin = facts.origin;
+    Ok((gaussians, facts))
+}
+
+/// The words that all versions begin with.
+struct Header {
+    version: u32,
+    count: usize,
+    degree: u32,
+    fraction: u8,
+}
+
+/// Positions, opacities, colours, scales, rotations, higher coefficients.
+type Streams = [Vec<u8>; 6];
+
+const CUT_SHORT: &str = "is cut short";
+
+impl Header {
+    fn parse(bytes: &[u8]) -> Result<Self, String> {
+        let word = |at| word(bytes, at);
+        if word(0)? != MAGIC {
+            return Err("is no SPZ".to_owned());
+        }
+        let [degree, fraction, ..] = word(12)?.to_le_bytes();
+        if u32::from(degree) > MAX_SH_DEGREE {
+            return Err(format!("has SH degree {degree}; {MAX_SH_DEGREE} is the highest"));
+        }
+        let count = word(8)? as usize;
+        Ok(Self { version: word(4)?, count, degree: degree.into(), fraction })
+    }
+
+    fn rotation_width(&self) -> usize {
+        if self.version == 2 { 3 } else { 4 }
+    }
+
+    /// The bytes of each stream.
+    fn lengths(&self) -> [usize; 6] {
+        let rest = 3 * rest_coefficients(self.degree);
+        [9, 1, 3, 3, self.rotation_width(), rest].map(|width| width * self.count)
+    }
+
+    fn refused(&self) -> String {
+        format!("is SPZ of version {}; versions 2 to 4 are read", self.version)
+    }
+}
+
+fn word(bytes: &[u8], at: usize) -> Result<u32, String> {
+    let word = bytes.get(at..at + 4).and_then(|word| word.try_into().ok());
+    word.map(u32::from_le_bytes).ok_or_else(|| CUT_SHORT.to_owned())
+}
+
+/// Exactly `length` bytes of a decoder.
+fn exactly(decoder: &mut impl Read, length: usize) -> Result<Vec<u8>, String> {
+    let mut bytes = vec![];
+    let read = decoder.take(length as u64).read_to_end(&mut bytes);
+    read.map_err(|error| format!("cannot be unpacked: {error}"))?;
+    if bytes.len() == length { Ok(bytes) } else { Err(CUT_SHORT.to_owned()) }
+}
+
+/// Header, streams and comment of version 2 or 3.
+fn unzipped(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
+    let mut decoder = GzDecoder::new(file);
+    let header = Header::parse(&exactly(&mut decoder, 16)?)?;
+    if !(2..=3).contains(&header.version) {
+        return Err(header.refused());
+    }
+    let mut streams = Streams::default();
+    for (stream, length) in streams.iter_mut().zip(header.lengths()) {
+        *stream = exactly(&mut decoder, length)?;
+    }
+    // The end has the checksum.
+    match decoder.read(&mut [0]) {
+        Ok(0) => {}
+        Ok(_) => return Err(format!("holds more than its {} Gaussians", header.count)),
+        Err(error) => return Err(format!("cannot be unpacked: {error}")),
+    }
+    let comment = decoder.header().and_then(flate2::GzHeader::comment).unwrap_or_default();
+    Ok((header, streams, comment.to_vec()))
+}
+
+/// Header, streams and what follows them, of version 4.
+fn unpacked(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
+    let header = Header::parse(file)?;
+    if header.version != 4 {
+        return Err(header.refused());
+    }
+    let stream_count = usize::from(word(file, 12)?.to_le_bytes()[3]);
+    let table = word(file, 16)? as usize;
+    let mut rest = file.get(table..).and_then(|table| table.get(16 * stream_count..));
+    let mut streams = Streams::default();
+    let lengths = header.lengths();
+    for place in 0..stream_count {
+        let length = word(file, table + 16 * place)? as usize;
+        let (stream, after) = rest.and_then(|rest| rest.split_at_checked(length)).ok_or(CUT_SHORT)?;
+        rest = Some(after);
+        if let Some(own) = streams.get_mut(place) {
+            let decoder = StreamingDecoder::new(stream);
+            let mut decoder = decoder.map_err(|error| format!("cannot be unpacked: {error}"))?;
+            *own = exactly(&mut decoder, lengths[place])?;
+        }
+    }
+    match streams.iter().zip(lengths).all(|(stream, length)| stream.len() == length) {
+        true => Ok((header, streams, rest.unwrap_or_default().to_vec())),
+        false => Err(format!("has {stream_count} streams of attributes, which are too few")),
+    }
+}
+
+fn vectors(vectors: &mut [Vec3], bytes: &[u8], value: impl Fn(f32) -> f32) {
+    let numbers: &mut [f32] = bytemuck::cast_slice_mut(vectors);
+    numbers.iter_mut().zip(bytes).for_each(|(number, &byte)| *number = value(byte.into()));
+}
+
+/// The inverse of [`smallest_three`], as (w, x, y, z).
+fn of_smallest_three(code: u32) -> [f32; 4] {
+    let largest = (code >> 30) as usize;
+    let mut parts = [0.0_f32; 4];
+    for (place, i) in (0..4).filter(|&i| i != largest).enumerate() {
+        let bits = code >> (10 * (2 - place));
+        let magnitude = (bits & 511) as f32 / 511.0 * std::f32::consts::FRAC_1_SQRT_2;
+        parts[i] = if bits & 512 == 0 { magnitude } else { -magnitude };
+    }
+    parts[largest] = (1.0 - parts.iter().map(|part| part * part).sum::<f32>()).max(0.0).sqrt();
+    let [x, y, z, w] = parts;
+    [w, x, y, z]
+}
+
+/// Version 2: x, y and z in a byte each, and w is positive.
+fn of_first_three(bytes: [f32; 3]) -> [f32; 4] {
+    let [x, y, z] = bytes.map(|byte| byte / 127.5 - 1.0);
+    [(1.0 - x * x - y * y - z * z).max(0.0).sqrt(), x, y, z]
+}
+
+/// As many as leave room for the farthest position.
 fn fractional_bits(gaussians: &Gaussians) -> Result<u8> {
     let farthest =
         floats(gaussians.means()).iter().fold(0.0_f32, |most, value| most.max(value.abs()));
@@ -96,7 +269,7 @@ fn positions(gaussians: &Gaussians, fraction: u8) -> Vec<u8> {
     fixed.flat_map(|fixed| fixed.to_le_bytes().into_iter().take(3)).collect()
 }
 
-fn floats(vectors: &[glam::Vec3]) -> &[f32] {
+fn floats(vectors: &[Vec3]) -> &[f32] {
     bytemuck::cast_slice(vectors)
 }
 
@@ -121,8 +294,6 @@ fn smallest_three([w, x, y, z]: [f32; 4]) -> u32 {
 
 #[cfg(test)]
 mod tests {
-    use std::io::Read as _;
-
     use super::*;
     use crate::results::export::tests::drawn;
 
@@ -135,7 +306,7 @@ mod tests {
         let word = |at: usize| u64::from_le_bytes(file[at..at + 8].try_into().unwrap()) as usize;
         if file.starts_with(&[0x1f, 0x8b]) {
             let mut all = vec![];
-            flate2::read::GzDecoder::new(file).read_to_end(&mut all).unwrap();
+            GzDecoder::new(file).read_to_end(&mut all).unwrap();
             return all[16..].to_vec();
         }
         let streams = usize::from(file[15]);
@@ -145,7 +316,7 @@ mod tests {
             let [compressed, whole] = [0, 8].map(|field| word(32 + 16 * stream + field));
             let mut bytes = vec![];
             let mut decoder =
-                ruzstd::decoding::StreamingDecoder::new(&file[begin..begin + compressed]).unwrap();
+                StreamingDecoder::new(&file[begin..begin + compressed]).unwrap();
             decoder.read_to_end(&mut bytes).unwrap();
             assert_eq!(bytes.len(), whole);
             all.extend(bytes);
@@ -187,19 +358,71 @@ mod tests {
     #[test]
     fn a_rotation_is_decoded_within_the_precision_of_ten_bits() {
         for quat in drawn(200, 0).quats() {
-            let code = smallest_three(*quat);
-            let largest = (code >> 30) as usize;
-            let mut parts = [0.0_f32; 4];
-            let others: Vec<usize> = (0..4).filter(|&i| i != largest).collect();
-            for (place, &i) in others.iter().enumerate() {
-                let bits = code >> (10 * (2 - place));
-                let magnitude = (bits & 511) as f32 / 511.0 * std::f32::consts::FRAC_1_SQRT_2;
-                parts[i] = if bits & 512 == 0 { magnitude } else { -magnitude };
-            }
-            parts[largest] = (1.0 - parts.iter().map(|part| part * part).sum::<f32>()).sqrt();
-            let [w, x, y, z] = unit(*quat);
-            let dot: f32 = [x, y, z, w].iter().zip(parts).map(|(a, b)| a * b).sum();
+            let own = unit(*quat);
+            let back = of_smallest_three(smallest_three(*quat));
+            let dot: f32 = own.iter().zip(back).map(|(a, b)| a * b).sum();
             assert!(dot.abs() > 1.0 - 5e-6, "{quat:?}: {dot}");
         }
+        let back = of_first_three([127.5, 255.0, 127.5]);
+        assert_eq!(back, [0.0, 0.0, 1.0, 0.0]);
+    }
+
+    #[test]
+    fn a_model_comes_back_within_its_bits_with_what_is_stated_of_it() {
+        let mut model = drawn(37, 3);
+        model.origin = glam::DVec3::new(4_499_999.6, -519_997.7, 10_001.8);
+        let facts = Facts {
+            near: Some(0.1),
+            max_alpha: Some(0.999),
+            raw_colors: Some(true),
+            origin: model.origin,
+        };
+        let provenance = Provenance { facts, ..Provenance::default() };
+        for version in [Version::V3, Version::V4] {
+            let (back, stated) = decode(&encode(&model, &provenance, version).unwrap()).unwrap();
+            assert_eq!((stated, back.origin, back.shape), (facts, model.origin, model.shape));
+            let error = |own: &[f32], back: &[f32]| {
+                own.iter().zip(back).fold(0.0_f32, |most, (a, b)| most.max((a - b).abs()))
+            };
+            let pairs = [
+                (error(floats(model.means()), floats(back.means())), 1e-6),
+                (error(floats(model.dc()), floats(back.dc())), 0.014),
+                (error(floats(model.log_scales()), floats(back.log_scales())), 0.032),
+                (error(floats(model.rest()), floats(back.rest())), 0.004),
+                (error(model.raw_opacities(), back.raw_opacities()), 0.14),
+            ];
+            assert!(pairs.iter().all(|(error, most)| error <= most), "{pairs:?}");
+            // What it holds comes back to the bit.
+            let again = decode(&encode(&back, &provenance, version).unwrap()).unwrap().0;
+            assert_eq!((again.means(), again.dc()), (back.means(), back.dc()), "{version:?}");
+        }
+        let (_, nothing) = decode(&encode_alone(&drawn(3, 0), Version::V4)).unwrap();
+        assert_eq!(nothing, Facts::default());
+    }
+
+    #[test]
+    fn a_file_that_is_cut_short_or_edited_is_an_error_and_no_panic() {
+        let facts = Facts { near: Some(0.1), ..Facts::default() };
+        let provenance = Provenance { facts, ..Provenance::default() };
+        for version in [Version::V3, Version::V4] {
+            let file = encode(&drawn(5, 1), &provenance, version).unwrap();
+            // The text ends the file of version 4, and no text is a text.
+            let end = file.len() - if version == Version::V4 { "nightsplat near 0.1".len() } else { 0 };
+            for length in 0..end {
+                assert!(decode(&file[..length]).is_err(), "{version:?}: {length} bytes");
+            }
+            for place in 0..file.len() {
+                let mut edited = file.clone();
+                edited[place] ^= 0x41;
+                drop(decode(&edited));
+            }
+        }
+        let mut file = encode(&drawn(5, 1), &provenance, Version::V4).unwrap();
+        let place = file.len() - 3;
+        file[place] = b'x';
+        let problem = decode(&file).unwrap_err();
+        assert_eq!(problem, "states near `x.1`, which is not a finite number above 0");
+        file[4] = 9;
+        assert_eq!(decode(&file).unwrap_err(), "is SPZ of version 9; versions 2 to 4 are read");
     }
 }

@@ -38,7 +38,7 @@ use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, Split, View};
-use crate::splats::scene::{Gaussians, ply};
+use crate::splats::scene::Gaussians;
 use crate::train::diagnose::Plan;
 use crate::train::{Networks, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
@@ -52,8 +52,7 @@ pub struct RunDirectory {
     terms: Vec<Term>,
     /// Seconds of the steps that the log already contained.
     seconds_before: f64,
-    raw_colors: bool,
-    /// Whether the run that it replaces still exists.
+    /// Whether what it replaces is still there.
     is_new: bool,
     /// The previous run; restored if this is dropped before [`RunDirectory::settle`].
     backup: Backup,
@@ -181,9 +180,8 @@ impl RunDirectory {
         let file = File::options().append(true).open(&log_path);
         let file = BufWriter::new(file.map_err(|error| unwritable(&log_path, &error))?);
         let terms = config.loss().terms();
-        let (raw_colors, is_new) = (config.model.raw_colors, log.is_empty());
-        let path = path.to_owned();
-        Ok(Self { path, log: file, terms, seconds_before, raw_colors, is_new, backup, _lock: lock })
+        let (path, is_new) = (path.to_owned(), log.is_empty());
+        Ok(Self { path, log: file, terms, seconds_before, is_new, backup, _lock: lock })
     }
 
     /// Writes the scores of the held-out views: step, PSNR in dB.
@@ -327,11 +325,7 @@ impl RunDirectory {
         self.flush_log()?;
         let in_frame = trainer.gaussians_in_frame()?;
         trainer.refuse_not_finite(&in_frame)?;
-        let mut gaussians = in_frame.to_world(trainer.frame());
-        if self.raw_colors {
-            gaussians.shift_colors(-0.5);
-        }
-        ply::save(&gaussians, self.path.join("model.ply"))
+        trainer.model_of(&in_frame).save(self.path.join("model.ply"))
     }
 
     /// Writes the weights of the networks.
@@ -416,7 +410,7 @@ fn remove_events(run: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::results::run::{load_config, load_model};
+    use crate::results::run::{load_config, load_gaussians};
 
     fn create(path: &Path, config: &TrainConfig, overwrite: bool) -> Result<RunDirectory> {
         RunDirectory::check(path, overwrite)?;
@@ -441,9 +435,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         assert!(load_config(folder.path()).unwrap_err().to_string().contains("config.toml"));
         drop(create(folder.path(), &TrainConfig::default(), false).unwrap());
-        assert!(
-            load_model(folder.path(), false).unwrap_err().to_string().contains("neither finished")
-        );
+        let refused = load_gaussians(folder.path()).unwrap_err().to_string();
+        assert!(refused.contains("did not finish"), "{refused}");
     }
 
     #[test]

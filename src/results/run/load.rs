@@ -60,22 +60,18 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
     serde_json::from_str::<serde_json::Value>(note).ok()?["step"].as_u64()
 }
 
-/// The trained Gaussians of a run.
+/// The trained Gaussians of a run, in the colours that viewers show.
 ///
 /// # Errors
-/// The run has not finished or reached a checkpoint, or the file is truncated.
-pub fn load_model(run: &Path, raw_colors: bool) -> Result<Gaussians> {
+/// The run has not been trained to its end or a checkpoint, or the file is cut short.
+pub fn load_gaussians(run: &Path) -> Result<Gaussians> {
     let path = run.join("model.ply");
     if !path.is_file() {
         let problem = "has no model.ply: the run neither finished nor reached a checkpoint; train it again, or \
                        continue with --resume";
         return Err(Error::input(run, problem));
     }
-    let mut gaussians = ply::load(path)?;
-    if raw_colors {
-        gaussians.shift_colors(0.5);
-    }
-    Ok(gaussians)
+    ply::load(path)
 }
 
 /// The trained networks of a run; `None` if its model has none. `features` are those of its Gaussians: a part without

@@ -2,6 +2,7 @@
 
 use glam::{UVec2, Vec3};
 
+use super::Purpose;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 use crate::kernels::splat::RECORD_HEAD;
@@ -51,6 +52,7 @@ impl Status {
 pub struct RenderBuffers {
     /// Values per pixel.
     channels: usize,
+    purpose: Purpose,
     // Gaussians
     /// `[0]`: the number of rendered Gaussians
     pub gaussian_counts: Buffer<u32>,
@@ -83,9 +85,10 @@ pub struct RenderBuffers {
 
 impl RenderBuffers {
     /// Empty but for the single numbers.
-    pub(super) fn new(gpu: &Gpu, channels: usize) -> Result<Self> {
+    pub(super) fn new(gpu: &Gpu, channels: usize, purpose: Purpose) -> Result<Self> {
         Ok(Self {
             channels,
+            purpose,
             gaussian_counts: gpu.zeros("gaussian_counts", 1)?,
             splats: gpu.uninit("splats", 0)?,
             colors: gpu.uninit("colors", 0)?,
@@ -107,6 +110,21 @@ impl RenderBuffers {
             status: gpu.zeros("status", STATUS_WORDS as usize)?,
             arrivals: gpu.zeros("arrivals", 1)?,
         })
+    }
+
+    /// Values per pixel; they only grow.
+    pub(super) fn set_channels(&mut self, gpu: &Gpu, channels: usize) -> Result<()> {
+        if channels <= self.channels {
+            return Ok(());
+        }
+        let pixels = self.render.len() / self.channels;
+        let colors = color_vectors(channels) * self.splats.len();
+        if self.colors.len() < colors {
+            self.colors = gpu.uninit("colors", colors)?;
+        }
+        self.render = gpu.uninit("render", channels * pixels)?;
+        self.channels = channels;
+        Ok(())
     }
 
     /// Lengths only grow: to `capacity` where they do not suffice for `count` Gaussians; intersections start with an
@@ -145,6 +163,18 @@ impl RenderBuffers {
         Ok(())
     }
 
+    /// Grows the capacity while earlier renders may be in flight; where memory is out, it is as it was.
+    pub(super) fn grow_intersections(&mut self, gpu: &Gpu, capacity: u32) -> Result<()> {
+        let capacity = capacity as usize;
+        let records = gpu.uninit("gradient_records", self.record_vectors() * capacity)?;
+        let tiles = gpu.uninit("tiles", capacity)?;
+        let intersection_ids = gpu.uninit("intersection_ids", capacity)?;
+        self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
+        (self.tiles, self.intersection_ids) = (tiles, intersection_ids);
+        self.gradient_records = records;
+        Ok(())
+    }
+
     pub(super) fn set_intersection_capacity(&mut self, gpu: &Gpu, capacity: u32) -> Result<()> {
         let capacity = capacity as usize;
         if capacity != self.tiles.len() {
@@ -175,14 +205,17 @@ impl RenderBuffers {
         3 * size_of::<u32>() + self.record_vectors() * size_of::<Vec3>()
     }
 
-    /// The vectors of a gradient record.
+    /// The vectors of a gradient record; 0 without gradients.
     pub(super) fn record_vectors(&self) -> usize {
-        (RECORD_HEAD as usize + self.channels).div_ceil(3)
+        match self.purpose {
+            Purpose::Train => (RECORD_HEAD as usize + self.channels).div_ceil(3),
+            Purpose::Show => 0,
+        }
     }
 
-    /// The number of intersections whose records fit one binding.
+    /// The number of intersections whose records, or ids, fit one binding.
     pub(super) fn max_intersections(&self, gpu: &Gpu) -> u32 {
-        let record = (self.record_vectors() * size_of::<Vec3>()) as u64;
+        let record = (self.record_vectors() * size_of::<Vec3>()).max(size_of::<u32>()) as u64;
         (gpu.properties().max_storage_buffer_range / record).min(u32::MAX.into()) as u32
     }
 
@@ -224,7 +257,7 @@ mod tests {
     fn gaussians_and_intersections_take_the_bytes_that_are_foreseen() {
         let gpu = Gpu::new(&crate::gpu::DeviceChoice::Best).unwrap();
         for channels in [3, 11] {
-            let mut frame = RenderBuffers::new(&gpu, channels).unwrap();
+            let mut frame = RenderBuffers::new(&gpu, channels, Purpose::Train).unwrap();
             let before = gpu.memory_in_use();
             let (gaussians, intersections) = (100_000, 30_000);
             frame.reserve(&gpu, gaussians, gaussians, 0, 0).unwrap();

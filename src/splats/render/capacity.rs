@@ -96,6 +96,15 @@ impl Renderer {
         self.frame.set_intersection_capacity(&self.gpu, intersections)
     }
 
+    /// Takes the memory of the sorts ahead of a recording.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub(super) fn reserve_sorts(&mut self) -> Result<()> {
+        self.depth_sort.reserve(self.frame.depth_keys.len())?;
+        self.tile_sort.reserve(self.frame.tiles.len())
+    }
+
     fn too_many_tiles(&self, size: UVec2) -> Error {
         let (UVec2 { x: width, y: height }, [tile_width, tile_height]) = (size, self.tile.size);
         let (count, most) = (self.tiles(size).element_product(), max_tiles(&self.gpu));

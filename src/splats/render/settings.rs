@@ -23,10 +23,21 @@ pub struct RenderSettings {
     /// Stop-gradient: the noise and illumination channels do not affect means, scales, rotations and opacities; depth
     /// and structure, which exist to do so, do.
     pub detach_geometry: bool,
+    /// What the renderer is for.
+    pub purpose: Purpose,
     /// The tile of a workgroup; `None`: the fastest on the device.
     pub tile: Option<Tile>,
     /// The most pixels that are rendered at once; `None`: as many as the device can bind.
     pub patch_pixels: Option<u64>,
+}
+
+/// What a renderer is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// Renders and gradients.
+    Train,
+    /// Renders alone: kernels and memory for gradients are not made.
+    Show,
 }
 
 impl Default for RenderSettings {
@@ -38,6 +49,7 @@ impl Default for RenderSettings {
             raw_colors: false,
             rest: StorageFormat::Single,
             detach_geometry: false,
+            purpose: Purpose::Train,
             tile: None,
             patch_pixels: None,
         }

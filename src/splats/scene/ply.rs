@@ -1,19 +1,18 @@
 //! Gaussians as a PLY file in the INRIA layout, which splat viewers open.
 //!
 //! Binary little-endian, one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`.
-//! Positions far from the world's origin are relative to another origin, given in a comment: `world = position + X Y
-//! Z`. Features, if any, are between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`, which
-//! viewers skip. Normals are zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before
-//! the sigmoid, scales are logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
+//! Positions far from the world's origin are relative to another one, which a comment gives: `world = position + X Y
+//! Z`. Others state what a renderer must know, `nightsplat near 0.1`: [`Facts`]. Features, where the scene has any, are
+//! between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`, which viewers skip. Normals are
+//! zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid, scales are
+//! logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
 
 use std::collections::HashMap;
 use std::fs;
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
 
-use glam::DVec3;
-
-use super::{FEATURES, Feature, Features, Gaussians, MAX_SH_DEGREE, Shape, width};
+use super::{FEATURES, Facts, Feature, Features, Gaussians, MAX_SH_DEGREE, Shape, width};
 use crate::base::input;
 use crate::base::output::write_whole_with;
 use crate::splats::attributes::{
@@ -102,7 +101,7 @@ fn write(gaussians: &Gaussians, path: &Path, comments: &[impl AsRef<str>]) -> st
     let (means, others) = properties.split_at(3);
     let mut file = BufWriter::new(fs::File::create(path)?);
     writeln!(file, "ply\nformat binary_little_endian 1.0")?;
-    if gaussians.origin != DVec3::ZERO {
+    if gaussians.origin != glam::DVec3::ZERO {
         let [x, y, z] = gaussians.origin.to_array();
         writeln!(file, "comment {ORIGIN}{x} {y} {z}")?;
     }
@@ -145,10 +144,15 @@ fn write(gaussians: &Gaussians, path: &Path, comments: &[impl AsRef<str>]) -> st
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
     let bytes = input::bytes(path)?;
-    parse(&bytes).map_err(|problem| Error::input(path, problem))
+    let (gaussians, _) = parse(&bytes).map_err(|problem| Error::input(path, problem))?;
+    Ok(gaussians)
 }
 
-fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
+/// The Gaussians of a file, and what it states of them.
+///
+/// # Errors
+/// The problem, as [`load`] has it.
+pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
     let header = Header::parse(bytes)?;
     let body = &bytes[header.length..];
     let expected = header.count.checked_mul(header.stride).ok_or("the vertex count is absurd")?;
@@ -174,7 +178,7 @@ fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
     let properties =
         properties(shape).into_iter().map(offset_of).collect::<Result<Vec<_>, String>>()?;
     let mut gaussians = Gaussians::zeros(header.count, shape);
-    gaussians.origin = header.origin;
+    gaussians.origin = header.facts.origin;
     for (offset, property) in properties {
         let (begin, stride) = property.address(&gaussians);
         for (gaussian, vertex) in body[..expected].chunks_exact(header.stride).enumerate() {
@@ -189,22 +193,7 @@ fn parse(bytes: &[u8]) -> Result<Gaussians, String> {
             gaussians.parameters[begin + stride * gaussian] = value;
         }
     }
-    Ok(gaussians)
-}
-
-/// Three finite numbers.
-fn parse_origin(numbers: &str) -> Result<DVec3, String> {
-    let parsed: Vec<f64> = numbers.split_whitespace().filter_map(|n| n.parse().ok()).collect();
-    match *parsed {
-        [x, y, z]
-            if numbers.split_whitespace().count() == 3 && parsed.iter().all(|n| n.is_finite()) =>
-        {
-            Ok(DVec3::new(x, y, z))
-        }
-        _ => {
-            Err(format!("names the origin `{}`, which is not three finite numbers", numbers.trim()))
-        }
-    }
+    Ok((gaussians, header.facts))
 }
 
 /// The vertices according to the header.
@@ -219,8 +208,8 @@ struct Header {
     properties: HashMap<String, (usize, String)>,
     /// Whether other elements follow the vertices.
     more_elements: bool,
-    /// The world position that the positions are relative to.
-    origin: DVec3,
+    /// What the comments state.
+    facts: Facts,
 }
 
 impl Header {
@@ -245,14 +234,16 @@ impl Header {
             stride: 0,
             properties: HashMap::new(),
             more_elements: false,
-            origin: DVec3::ZERO,
+            facts: Facts::default(),
         };
         let (mut format_is_known, mut in_vertices) = (false, false);
-        for line in text.lines() {
-            if let Some(origin) = line.trim_start().strip_prefix("comment ") {
-                if let Some(numbers) = origin.trim_start().strip_prefix(ORIGIN) {
-                    header.origin = parse_origin(numbers)?;
-                }
+        for (number, line) in (1..).zip(text.lines()) {
+            if let Some(comment) = line.trim_start().strip_prefix("comment ") {
+                let stated = match comment.trim_start().strip_prefix(ORIGIN) {
+                    Some(numbers) => header.facts.set("origin", numbers),
+                    None => header.facts.set_line(comment),
+                };
+                stated.map_err(|problem| format!("line {number} {problem}"))?;
                 continue;
             }
             match *line.split_whitespace().collect::<Vec<_>>() {

@@ -1,5 +1,7 @@
 //! The radix sort: least significant digit first, up to 8 bits per pass.
 
+use std::sync::Arc;
+
 use super::{Count, common_len};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -10,9 +12,7 @@ use crate::kernels::{sort_downsweep, sort_spine, sort_upsweep};
 #[derive(Debug)]
 pub struct RadixSort {
     gpu: Gpu,
-    upsweep: Pipeline<sort_upsweep::Kernel>,
-    spine: Pipeline<sort_spine::Kernel>,
-    downsweep: Pipeline<sort_downsweep::Kernel>,
+    kernels: Arc<Kernels>,
     partition_size: u32,
     /// With more partitions, the spine is a separate pass.
     folded_partitions: u32,
@@ -21,8 +21,16 @@ pub struct RadixSort {
     scratch: Scratch,
 }
 
-/// Up to this number of partitions, one subgroup scans them faster than a separate pass would. A CPU has no idle lanes
-/// for it.
+/// The kernels, which sorts on one device share.
+#[derive(Debug)]
+struct Kernels {
+    upsweep: Pipeline<sort_upsweep::Kernel>,
+    spine: Pipeline<sort_spine::Kernel>,
+    downsweep: Pipeline<sort_downsweep::Kernel>,
+}
+
+/// Up to this number of partitions, one subgroup scans them faster than a pass of its own would. A CPU has no idle
+/// lanes that would do so at the same time.
 const FOLDED_PARTITIONS_ON_A_GPU: u32 = 16;
 const FOLDED_PARTITIONS_ON_A_CPU: u32 = 1024;
 
@@ -53,10 +61,12 @@ impl RadixSort {
         let rank_by_ballot = gpu.properties().subgroup_size > MAX_DIGIT_BITS;
         Ok(Self {
             gpu: gpu.clone(),
-            upsweep: gpu.pipeline(&sort_upsweep::Constants { partition_size })?,
-            spine: gpu.pipeline(&sort_spine::Constants { partition_size })?,
-            downsweep: gpu
-                .pipeline(&sort_downsweep::Constants { partition_size, rank_by_ballot })?,
+            kernels: Arc::new(Kernels {
+                upsweep: gpu.pipeline(&sort_upsweep::Constants { partition_size })?,
+                spine: gpu.pipeline(&sort_spine::Constants { partition_size })?,
+                downsweep: gpu
+                    .pipeline(&sort_downsweep::Constants { partition_size, rank_by_ballot })?,
+            }),
             partition_size,
             folded_partitions: if gpu.properties().is_cpu {
                 FOLDED_PARTITIONS_ON_A_CPU
@@ -68,9 +78,35 @@ impl RadixSort {
         })
     }
 
-    /// Records the sort of the first `count` pairs by the lowest `bits` bits of their keys (at most 32); it is stable.
-    /// Afterwards `keys` and `values` contain the result for any number of passes, since they are swapped with the
-    /// scratch memory; their elements beyond the count are lost. A count beyond the buffers' common length is clamped
+    /// Another sort with the same kernels and memory of its own, none yet.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(crate) fn another(&self) -> Result<Self> {
+        Ok(Self {
+            gpu: self.gpu.clone(),
+            kernels: Arc::clone(&self.kernels),
+            arrivals: self.gpu.zeros("sort_arrivals", 1)?,
+            scratch: Scratch::new(&self.gpu, 0, self.partition_size)?,
+            ..*self
+        })
+    }
+
+    /// Takes memory to sort buffers of `capacity` pairs, so that recording takes none.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub(crate) fn reserve(&mut self, capacity: usize) -> Result<()> {
+        if self.scratch.keys.len() != capacity {
+            let capacity = common_len("sort", &[capacity])?;
+            self.scratch = Scratch::new(&self.gpu, capacity, self.partition_size)?;
+        }
+        Ok(())
+    }
+
+    /// Records the sort of the first `count` pairs by the lowest `bits` bits of their keys (32 at most); it is stable.
+    /// Afterwards `keys` and `values` hold the result, whatever the number of passes, because they are swapped with the
+    /// scratch memory: their elements beyond the count are lost. A count beyond the buffers' common length is clamped
     /// to it.
     ///
     /// # Errors
@@ -84,10 +120,8 @@ impl RadixSort {
         bits: u32,
     ) -> Result<()> {
         count.check()?;
-        let capacity = common_len("sort", &[keys.len(), values.len()])?;
-        if self.scratch.keys.len() != keys.len() {
-            self.scratch = Scratch::new(&self.gpu, capacity, self.partition_size)?;
-        }
+        common_len("sort", &[keys.len(), values.len()])?;
+        self.reserve(keys.len())?;
         for (shift, digit_bits) in digits(bits) {
             self.record_pass(pass, count, keys, values, shift, digit_bits)?;
             std::mem::swap(keys, &mut self.scratch.keys);
@@ -113,7 +147,7 @@ impl RadixSort {
         let partitions = capacity.div_ceil(self.partition_size);
         let folds_spine = partitions <= self.folded_partitions;
         pass.dispatch(
-            &self.upsweep,
+            &self.kernels.upsweep,
             &sort_upsweep::Params {
                 count_index,
                 capacity,
@@ -132,7 +166,7 @@ impl RadixSort {
         )?;
         if !folds_spine {
             pass.dispatch(
-                &self.spine,
+                &self.kernels.spine,
                 &sort_spine::Params { count_index, capacity, digit_bits },
                 sort_spine::Buffers {
                     counts: counts.slice(),
@@ -143,7 +177,7 @@ impl RadixSort {
             )?;
         }
         pass.dispatch(
-            &self.downsweep,
+            &self.kernels.downsweep,
             &sort_downsweep::Params { count_index, capacity, shift, digit_bits },
             sort_downsweep::Buffers {
                 counts: counts.slice(),

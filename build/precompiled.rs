@@ -1,0 +1,84 @@
+//! Kernels that were compiled before: a packaged crate has them in `precompiled/`, where `scripts/precompile.sh` wrote
+//! them. A host that builds such a crate compiles no C++.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+#[path = "../src/base/hash.rs"]
+#[allow(dead_code, unreachable_pub, reason = "the crate sees more of the module than the build")]
+mod hash;
+
+pub(crate) const FOLDER: &str = "precompiled";
+
+/// What the compiled kernels depend on: the shaders, the table that they include, and what compiles them.
+pub(crate) const SOURCES: [&str; 5] =
+    [crate::SHADERS, "build.rs", "build", "src/splats/attributes.rs", "Cargo.lock"];
+
+/// The packages in `Cargo.lock` whose version decides what is compiled.
+const COMPILERS: [&str; 3] = ["glslang", "glslang-sys", "spirq"];
+
+/// The file with the hash of the sources, beside what was compiled from them.
+const HASH: &str = "sources.hash";
+
+/// Writes the hash of the sources, behind everything else that belongs to them.
+pub(crate) fn write_hash(out_dir: &Path) {
+    fs::write(out_dir.join(HASH), hash_of_sources()).expect("OUT_DIR is ours");
+}
+
+/// Copies `kernels.rs` and the SPIR-V to `out_dir`.
+///
+/// # Errors
+/// The kernels were not compiled before, or the sources have changed since.
+pub(crate) fn copy(out_dir: &Path) -> Result<(), String> {
+    const REMEDY: &str =
+        "build with --features glslang, which needs a C++ compiler, or from a packaged crate";
+    let folder = Path::new(FOLDER);
+    let Ok(hash) = fs::read_to_string(folder.join(HASH)) else {
+        return Err(format!("the kernels are not compiled: there is no {FOLDER}/{HASH}; {REMEDY}"));
+    };
+    if hash != hash_of_sources() {
+        let sources = SOURCES.join(", ");
+        return Err(format!("the kernels in {FOLDER}/ are not those of {sources}; {REMEDY}"));
+    }
+    for path in files(folder) {
+        let name = path.file_name().expect("a file has a name");
+        fs::copy(&path, out_dir.join(name))
+            .map_err(|error| format!("{} cannot be copied: {error}", path.display()))?;
+    }
+    Ok(())
+}
+
+fn hash_of_sources() -> String {
+    let mut hasher = hash::Hasher::default();
+    for source in SOURCES {
+        for path in files(Path::new(source)) {
+            let bytes = fs::read(&path).unwrap_or_default();
+            // Windows writes paths and lines otherwise.
+            hasher.write(path.to_string_lossy().replace('\\', "/").as_bytes());
+            match source {
+                "Cargo.lock" => hasher.write(compilers(&String::from_utf8_lossy(&bytes)).as_bytes()),
+                _ => hasher.write(String::from_utf8_lossy(&bytes).replace("\r\n", "\n").as_bytes()),
+            }
+        }
+    }
+    hash::text(hasher.finish())
+}
+
+/// The names and versions of the packages that compile.
+fn compilers(lock: &str) -> String {
+    let lock = lock.replace("\r\n", "\n");
+    let is_compiler = |package: &&str| {
+        COMPILERS.iter().any(|name| package.starts_with(&format!("\nname = \"{name}\"\n")))
+    };
+    let packages = lock.split("[[package]]").filter(is_compiler);
+    packages.flat_map(|package| package.lines().skip(1).take(2)).collect()
+}
+
+/// The files below a folder, in a stable order; of a file, itself.
+fn files(path: &Path) -> Vec<PathBuf> {
+    let Ok(folder) = fs::read_dir(path) else { return vec![path.to_owned()] };
+    let mut paths: Vec<_> =
+        folder.map(|entry| entry.expect("a folder can be listed").path()).collect();
+    paths.sort();
+    paths.iter().flat_map(|path| files(path)).collect()
+}

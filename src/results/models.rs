@@ -1,0 +1,48 @@
+//! Reads a model from a file of any format, or from a run directory.
+
+use std::path::Path;
+
+use crate::Result;
+use crate::base::input;
+use crate::error::Error;
+use crate::results::export::{sog, spz};
+use crate::results::run;
+use crate::splats::model::{FileKind, Model};
+use crate::splats::scene::{Facts, Gaussians, ply};
+
+impl Model {
+    /// Reads a model: a PLY in the INRIA layout, of any trainer, SPZ, SOG, or a run directory. A file is recognised by its
+    /// content, not by its name.
+    ///
+    /// The near plane, the alpha limit and the colours are those that the file states (`comment nightsplat near 0.1`), or
+    /// the configuration of the run, and else those of [`RenderSettings::default`](crate::RenderSettings::default).
+    ///
+    /// # Errors
+    /// [`Error::Input`] where the file is missing, no model, cut short or not finite, or states nonsense; the run has not been
+    /// trained to its end or a checkpoint.
+    pub fn load(path: impl AsRef<Path>) -> Result<Self> {
+        let (gaussians, facts) = read(path.as_ref())?;
+        Ok(Self::of_shown(gaussians, &facts))
+    }
+}
+
+/// The Gaussians in the colours that viewers show, and what the file or the configuration of the run states of them. Warns
+/// where that does not include the near plane.
+pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
+    if path.is_dir() {
+        let config = run::load_config(path)?;
+        return Ok((run::load_gaussians(path)?, config.facts(&config.frame.unwrap_or_default())));
+    }
+    let bytes = input::bytes(path)?;
+    let parsed = match FileKind::of(&bytes) {
+        Some(FileKind::Ply) => ply::parse(&bytes),
+        Some(FileKind::Spz) => spz::decode(&bytes),
+        Some(FileKind::Sog) => sog::decode(&bytes),
+        None => Err("is no model: it is not PLY, SPZ or SOG".to_owned()),
+    };
+    let (gaussians, facts) = parsed.map_err(|problem| Error::input(path, problem))?;
+    if facts.near.is_none() {
+        tracing::warn!("{}: does not state its near plane; the default is taken", path.display());
+    }
+    Ok((gaussians, facts))
+}

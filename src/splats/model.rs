@@ -1,0 +1,174 @@
+//! A model with what a renderer must know of it.
+
+use std::borrow::Cow;
+
+#[cfg(any(test, not(feature = "io")))]
+use crate::base::input;
+use crate::splats::render::RenderSettings;
+#[cfg(any(test, not(feature = "io")))]
+use crate::splats::scene::ply;
+use crate::splats::scene::{Facts, Gaussians};
+#[cfg(any(test, not(feature = "io")))]
+use crate::{Error, Result};
+
+/// A model with what a renderer must know of it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Model {
+    /// In the world of their dataset, relative to their origin. Their colours are those that `raw_colors` is about.
+    pub gaussians: Gaussians,
+    /// The near plane, in world units.
+    pub near: f32,
+    /// The largest alpha of a splat on a pixel; below 1.
+    pub max_alpha: f32,
+    /// Colours are the raw SH sum, which can be negative, instead of max(SH + 0.5, 0).
+    pub raw_colors: bool,
+}
+
+/// With the near plane, the alpha limit and the colours that a file has which does not state them.
+impl From<Gaussians> for Model {
+    fn from(gaussians: Gaussians) -> Self {
+        let RenderSettings { near, max_alpha, raw_colors, .. } = RenderSettings::default();
+        Self { gaussians, near, max_alpha, raw_colors }
+    }
+}
+
+impl Model {
+    /// Gaussians in their own colours, and what is stated of them.
+    pub(crate) fn of(gaussians: Gaussians, facts: &Facts) -> Self {
+        let defaults = Self::from(gaussians);
+        Self {
+            near: facts.near.unwrap_or(defaults.near),
+            max_alpha: facts.max_alpha.unwrap_or(defaults.max_alpha),
+            raw_colors: facts.raw_colors.unwrap_or(defaults.raw_colors),
+            ..defaults
+        }
+    }
+
+    /// As [`Model::of`], of Gaussians in the colours that viewers show, as files hold them.
+    pub(crate) fn of_shown(gaussians: Gaussians, facts: &Facts) -> Self {
+        let mut model = Self::of(gaussians, facts);
+        if model.raw_colors {
+            model.gaussians.shift_colors(0.5);
+        }
+        model
+    }
+
+    /// The settings of a renderer that shows the model as it was trained.
+    ///
+    /// ```no_run
+    /// use nightsplat::{DeviceChoice, Gpu, Model, Renderer};
+    ///
+    /// let gpu = Gpu::new(&DeviceChoice::Best)?;
+    /// let model = Model::load("model.ply")?;
+    /// let renderer = Renderer::new(&gpu, model.render_settings())?;
+    /// # Ok::<(), nightsplat::Error>(())
+    /// ```
+    pub fn render_settings(&self) -> RenderSettings {
+        let Self { gaussians, near, max_alpha, raw_colors } = self;
+        RenderSettings {
+            near: *near,
+            max_alpha: *max_alpha,
+            raw_colors: *raw_colors,
+            shape: gaussians.shape,
+            ..RenderSettings::default()
+        }
+    }
+
+    /// The Gaussians in the colours that viewers show, as files hold them.
+    pub(crate) fn shown(&self) -> Cow<'_, Gaussians> {
+        let mut shown = Cow::Borrowed(&self.gaussians);
+        if self.raw_colors {
+            shown.to_mut().shift_colors(-0.5);
+        }
+        shown
+    }
+
+    /// What a file states of the model.
+    pub(crate) fn facts(&self) -> Facts {
+        Facts {
+            near: Some(self.near),
+            max_alpha: Some(self.max_alpha),
+            raw_colors: Some(self.raw_colors),
+            origin: self.gaussians.origin,
+        }
+    }
+
+    /// Reads a model: a PLY in the INRIA layout, recognised by its content. A build with the feature `io` reads SPZ, SOG
+    /// and run directories as well.
+    ///
+    /// The near plane, the alpha limit and the colours are those that the file states (`comment nightsplat near 0.1`),
+    /// and else those of [`RenderSettings::default`].
+    ///
+    /// # Errors
+    /// [`Error::Input`] where the file is missing, no model, cut short or not finite, or needs the feature `io`.
+    #[cfg(not(feature = "io"))]
+    pub fn load(path: impl AsRef<std::path::Path>) -> Result<Self> {
+        load_ply(path.as_ref())
+    }
+}
+
+/// What a build without the feature `io` reads.
+#[cfg(any(test, not(feature = "io")))]
+fn load_ply(path: &std::path::Path) -> Result<Model> {
+    const REMEDY: &str = "is read by a build with the feature `io`; export it to PLY";
+    if path.is_dir() {
+        return Err(Error::input(path, format!("is a folder; a run directory {REMEDY}")));
+    }
+    let bytes = input::bytes(path)?;
+    match FileKind::of(&bytes) {
+        Some(kind @ (FileKind::Spz | FileKind::Sog)) => {
+            let name = format!("{kind:?}").to_uppercase();
+            Err(Error::input(path, format!("{name} {REMEDY}")))
+        }
+        _ => {
+            let (gaussians, facts) =
+                ply::parse(&bytes).map_err(|problem| Error::input(path, problem))?;
+            Ok(Model::of_shown(gaussians, &facts))
+        }
+    }
+}
+
+/// The formats of model files.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum FileKind {
+    Ply,
+    Spz,
+    Sog,
+}
+
+impl FileKind {
+    /// By the first bytes.
+    pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
+        match bytes {
+            [b'p', b'l', b'y', ..] => Some(Self::Ply),
+            [b'N', b'G', b'S', b'P', ..] | [0x1f, 0x8b, ..] => Some(Self::Spz),
+            [b'P', b'K', ..] => Some(Self::Sog),
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn without_files_a_ply_is_read_and_the_rest_names_the_feature() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model");
+        let model = Model { near: 0.05, max_alpha: 0.5, ..Gaussians::zeros(3, 1).into() };
+        let comments = model.facts().lines();
+        ply::save_with_comments(&model.gaussians, &path, &comments).unwrap();
+        assert_eq!(load_ply(&path).unwrap(), model);
+        let refused = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).unwrap();
+            load_ply(&path).unwrap_err().to_string()
+        };
+        let remedy = "is read by a build with the feature `io`; export it to PLY";
+        assert!(refused(b"NGSP").ends_with(&format!("model: SPZ {remedy}")));
+        assert!(refused(b"PK\x03\x04").ends_with(&format!("model: SOG {remedy}")));
+        assert!(refused(b"solid").contains("is not a PLY file"));
+        let folder = load_ply(folder.path()).unwrap_err().to_string();
+        assert!(folder.ends_with(&format!("is a folder; a run directory {remedy}")), "{folder}");
+    }
+}

@@ -1,0 +1,278 @@
+//! Drawing into the images of a host: nothing is submitted, read back or waited for.
+//!
+//! Where a view has more intersections than memory, the nearest are drawn and the memory grows before a later draw, as
+//! soon as the frame that overflowed is done.
+
+use super::target::Target;
+use super::{DepthChannel, RenderOptions, Renderer};
+use crate::Result;
+use crate::camera::{Camera, Patch};
+use crate::gpu::{Buffer, Gpu, HostImage, ImageState, Pipeline, Recorder, Ring, Threads};
+use crate::kernels::status::STATUS_WORDS;
+use crate::kernels::{depth_limits, pack_pixels};
+use crate::splats::scene::{GaussianSlice, Layout};
+
+/// How the newest draw that is done went.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Drawn {
+    /// The number of its frame; 0 for a submission of our own.
+    pub frame: u64,
+    /// The intersections of its view with the most.
+    pub intersections: u32,
+    /// The intersections that memory and budget allowed.
+    pub capacity: u32,
+    /// Splats of the tile with the most, where the device cannot follow them all and the tile is empty; else 0.
+    pub splats_per_tile: u32,
+}
+
+impl Drawn {
+    /// The intersections that were left out, the farthest.
+    pub fn left_out(&self) -> u32 {
+        self.intersections.saturating_sub(self.capacity)
+    }
+}
+
+/// Kernels and memory between a render and the images of a host.
+#[derive(Debug)]
+pub(super) struct HostTargets {
+    pack: Pipeline<pack_pixels::Kernel>,
+    limits: Pipeline<depth_limits::Kernel>,
+    pixels: Buffer<u32>,
+    under: Buffer<u32>,
+    depths: Buffer<f32>,
+    scene_words: Buffer<u32>,
+    ring: Ring,
+    /// The draw whose intersections the memory was last grown for.
+    grown_for: Option<u64>,
+}
+
+impl HostTargets {
+    fn new(gpu: &Gpu) -> Result<Self> {
+        Ok(Self {
+            pack: gpu.pipeline(&pack_pixels::Constants {})?,
+            limits: gpu.pipeline(&depth_limits::Constants {})?,
+            pixels: gpu.uninit("pixels", 0)?,
+            under: gpu.uninit("pixels under", 0)?,
+            depths: gpu.uninit("depths", 0)?,
+            scene_words: gpu.uninit("scene depth", 0)?,
+            ring: gpu.ring("drawn", STATUS_WORDS as usize)?,
+            grown_for: None,
+        })
+    }
+
+    /// Memory for images of `pixels` pixels; it only grows.
+    fn reserve(&mut self, gpu: &Gpu, pixels: usize, target: &Target<'_>) -> Result<()> {
+        let words = |image: &HostImage| (pixels * image.format.bytes()).div_ceil(4);
+        let color = target.color.map_or(0, words);
+        grow(gpu, &mut self.pixels, color)?;
+        grow(gpu, &mut self.under, if target.is_over { color } else { 0 })?;
+        grow(gpu, &mut self.depths, target.depth.map_or(0, |_| pixels))?;
+        grow(gpu, &mut self.scene_words, target.scene.map_or(0, |scene| words(scene.image)))
+    }
+}
+
+fn grow<T: bytemuck::Pod>(gpu: &Gpu, buffer: &mut Buffer<T>, len: usize) -> Result<()> {
+    if buffer.len() < len {
+        *buffer = gpu.uninit(&buffer.name().to_owned(), len)?;
+    }
+    Ok(())
+}
+
+impl Renderer {
+    /// Records the render of `gaussians` from each camera into the layers of the target's images. Takes each image
+    /// from its state `before` and leaves it in its state `after`. Binds compute pipelines, descriptor set 0 and push
+    /// constants, and restores none of them.
+    ///
+    /// # Errors
+    /// [`crate::Error::Usage`] where target, cameras or Gaussians do not fit; the device is out of memory. Nothing is
+    /// recorded then.
+    pub fn draw<'a>(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussians: impl Into<GaussianSlice<'a>>,
+        cameras: &[Camera],
+        options: &RenderOptions,
+        target: &Target<'_>,
+    ) -> Result<()> {
+        let gaussians = gaussians.into();
+        self.prepare_draw(&gaussians.layout, cameras, target)?;
+        self.clear_status(pass);
+        for (layer, camera) in (0..).zip(cameras) {
+            self.draw_layer(pass, gaussians, camera, layer, options, target)?;
+        }
+        let capacity = self.drawn_capacity(target);
+        let Self { frame, host_targets, .. } = self;
+        if let Some(own) = host_targets {
+            pass.copy_to_ring(&frame.status, &mut own.ring, capacity);
+        }
+        Ok(())
+    }
+
+    /// How the newest draw that is done went; `None` before there is one. Waits for nothing.
+    pub fn drawn(&self) -> Option<Drawn> {
+        let newest = self.host_targets.as_ref()?.ring.newest()?;
+        let status = super::Status::from_words(&newest.words);
+        Some(Drawn {
+            frame: newest.frame,
+            intersections: status.intersections,
+            capacity: newest.tag,
+            splats_per_tile: status.splats_per_tile,
+        })
+    }
+
+    /// Does everything about a draw that can fail: checks, kernels, memory. A draw does it itself; done ahead of time,
+    /// its first recording takes no longer than the others.
+    ///
+    /// # Errors
+    /// As [`Renderer::draw`].
+    pub fn prepare_draw(
+        &mut self,
+        layout: &Layout,
+        cameras: &[Camera],
+        target: &Target<'_>,
+    ) -> Result<()> {
+        target.check(cameras)?;
+        self.check_layout(layout)?;
+        let pixels = |camera: &Camera| Patch::from(camera).pixel_count();
+        let pixels = cameras.iter().map(pixels).max().unwrap_or_default();
+        if target.needs_depths() {
+            self.frame.set_channels(&self.gpu, self.settings.channels() + 1)?;
+        }
+        let size = |camera: &Camera| Patch::from(camera).size;
+        self.reserve_sizes(layout.count, layout.capacity, cameras.iter().map(size))?;
+        for camera in cameras {
+            self.build_projections(camera.model.number(), target.needs_depths())?;
+        }
+        self.build_blending(target.needs_depths())?;
+        if target.scene.is_some() && self.limits.len() < pixels {
+            self.limits = self.gpu.uninit("limits", pixels)?;
+        }
+        if self.host_targets.is_none() {
+            self.host_targets = Some(HostTargets::new(&self.gpu)?);
+        }
+        if let Some(own) = &mut self.host_targets {
+            own.reserve(&self.gpu, pixels, target)?;
+        }
+        self.grow_as_drawn();
+        self.reserve_sorts()
+    }
+
+    /// Grows the memory where the newest draw that is done had more intersections. Where memory is out, draws go on
+    /// with what there is.
+    fn grow_as_drawn(&mut self) {
+        let Some(own) = &mut self.host_targets else { return };
+        let Some(newest) = own.ring.newest() else { return };
+        if own.grown_for.replace(newest.number) == Some(newest.number) {
+            return;
+        }
+        let wanted = super::Status::from_words(&newest.words).intersections;
+        if wanted <= self.frame.intersection_capacity() {
+            return;
+        }
+        let most = self.max_intersections();
+        let grown = wanted.saturating_add(wanted / 2).min(most);
+        if let Err(error) = self.frame.grow_intersections(&self.gpu, grown) {
+            tracing::warn!("{wanted} intersections do not fit, the farthest are left out: {error}");
+        }
+    }
+
+    fn drawn_capacity(&self, target: &Target<'_>) -> u32 {
+        let capacity = self.frame.intersection_capacity();
+        if target.budget == 0 { capacity } else { capacity.min(target.budget) }
+    }
+
+    fn draw_layer(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        gaussians: GaussianSlice<'_>,
+        camera: &Camera,
+        layer: u32,
+        options: &RenderOptions,
+        target: &Target<'_>,
+    ) -> Result<()> {
+        let size = [camera.width, camera.height];
+        let pixel_count = Patch::from(camera).pixel_count() as u32;
+        let [color, depth] = [target.color, target.depth]
+            .map(|image| image.map(|image| HostImage { layer: image.layer + layer, ..*image }));
+        if let Some(scene) = target.scene {
+            let image = HostImage { layer: scene.image.layer + layer, ..*scene.image };
+            self.record_limits(pass, &image, scene.code(), size)?;
+        }
+        let depths = target.needs_depths().then_some(DepthChannel {
+            takes_median: target.depth_kind == super::DepthKind::Median,
+            has_limits: target.scene.is_some(),
+        });
+        let capacity = self.drawn_capacity(target);
+        // The background is mixed in as the image counts colours.
+        let before_black = RenderOptions { background: [0.0; 3], ..*options };
+        self.record_forward(pass, gaussians, camera, &before_black, depths, Some(capacity))?;
+        let plane = if target.depth.is_some() { self.settings.channels() as u32 } else { 0 };
+        let Self { frame, host_targets, .. } = self;
+        let Some(own) = host_targets else { return Ok(()) };
+        if let Some(image) = color.as_ref().filter(|_| target.is_over) {
+            let taken = HostImage { after: ImageState::TRANSFER_TARGET, ..*image };
+            pass.take_image(&taken, size, &mut own.under);
+        }
+        let (encoding, swaps) = target.encoding();
+        let params = pack_pixels::Params {
+            pixel_count,
+            encoding,
+            swaps: swaps.into(),
+            is_over: target.is_over.into(),
+            exposure: target.exposure,
+            background: options.background.into(),
+            depth_plane: plane,
+            is_mean: (target.depth_kind == super::DepthKind::Expected).into(),
+            has_color: color.is_some().into(),
+        };
+        pass.dispatch(
+            &own.pack,
+            &params,
+            pack_pixels::Buffers {
+                render: frame.render.slice(),
+                transmittances: frame.transmittances.slice(),
+                under: own.under.slice(),
+                pixels: own.pixels.slice_mut(),
+                depths: own.depths.slice_mut(),
+            },
+            Threads::Exactly([pixel_count, 1, 1]),
+        )?;
+        if let Some(mut image) = color {
+            if target.is_over {
+                image.before = ImageState::TRANSFER_TARGET;
+            }
+            pass.give_image(&own.pixels, &image, size);
+        }
+        if let Some(image) = depth {
+            pass.give_image(&own.depths, &image, size);
+        }
+        Ok(())
+    }
+
+    /// Records the depths beyond which nothing is seen.
+    fn record_limits(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        image: &HostImage,
+        (format, is_reversed, is_linear, near, far): (u32, bool, bool, f32, f32),
+        size: [u32; 2],
+    ) -> Result<()> {
+        let Self { limits, host_targets, .. } = self;
+        let Some(own) = host_targets else { return Ok(()) };
+        pass.take_image(image, size, &mut own.scene_words);
+        let pixel_count = size[0] * size[1];
+        pass.dispatch(
+            &own.limits,
+            &depth_limits::Params {
+                pixel_count,
+                format,
+                is_reversed: is_reversed.into(),
+                is_linear: is_linear.into(),
+                near,
+                far,
+            },
+            depth_limits::Buffers { words: own.scene_words.slice(), limits: limits.slice_mut() },
+            Threads::Exactly([pixel_count, 1, 1]),
+        )
+    }
+}

@@ -1,0 +1,250 @@
+//! What a draw goes into: images of a host, and what each of their formats means.
+
+use std::fmt::Debug;
+
+use crate::camera::Camera;
+use crate::gpu::{HostImage, ImageFormat};
+use crate::kernels::pixels::{
+    DEPTH_16, DEPTH_24, DEPTH_FLOAT, PIXELS_DISPLAY_HALF, PIXELS_LINEAR_HALF, PIXELS_SRGB,
+    PIXELS_UNORM,
+};
+use crate::{Error, Result};
+
+/// The images of a draw. Camera `i` is drawn into layer `layer + i` of each.
+///
+/// The format of the colour image says what its values are: linear light in [`ImageFormat::Rgba16Float`] and in formats
+/// with an sRGB encoding, the display-referred values of the model in `Unorm` formats. Colour is premultiplied by
+/// alpha, which is one minus the transmittance.
+#[derive(Clone, Copy, Debug)]
+pub struct Target<'a> {
+    /// RGBA16F, or RGBA8 or BGRA8 as `Unorm` or `Srgb`.
+    pub color: Option<&'a HostImage>,
+    /// R32F: depth in the view, world units; infinite where nothing is seen.
+    pub depth: Option<&'a HostImage>,
+    /// What of `depth` is stored.
+    pub depth_kind: DepthKind,
+    /// The host's depth, beyond which nothing is drawn.
+    pub scene: Option<SceneDepth<'a>>,
+    /// Over what the colour image holds, instead of replacing it.
+    pub is_over: bool,
+    /// A float image gets display-referred values, as they were trained.
+    pub is_display_referred: bool,
+    /// The factor on linear light.
+    pub exposure: f32,
+    /// The most intersections; 0: as memory allows. The farthest are left out first.
+    pub budget: u32,
+}
+
+impl Default for Target<'_> {
+    fn default() -> Self {
+        Self {
+            color: None,
+            depth: None,
+            depth_kind: DepthKind::Median,
+            scene: None,
+            is_over: false,
+            is_display_referred: false,
+            exposure: 1.0,
+            budget: 0,
+        }
+    }
+}
+
+/// The depth of a pixel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DepthKind {
+    /// Where the transmittance passes 1/2.
+    Median,
+    /// The mean of what is seen, by its weights.
+    Expected,
+}
+
+/// A depth image of the host's.
+#[derive(Clone, Copy, Debug)]
+pub struct SceneDepth<'a> {
+    /// D32, D24 or D16, with or without stencil; or R32F.
+    pub image: &'a HostImage,
+    /// What its numbers mean.
+    pub convention: DepthConvention,
+}
+
+/// The meaning of depth values; distances in world units.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum DepthConvention {
+    /// 0 at the near plane, 1 at the far plane or, without one, at infinity.
+    Forward {
+        /// The near plane.
+        near: f32,
+        /// The far plane.
+        far: Option<f32>,
+    },
+    /// 1 at the near plane, 0 at the far plane or, without one, at infinity.
+    Reversed {
+        /// The near plane.
+        near: f32,
+        /// The far plane.
+        far: Option<f32>,
+    },
+    /// The depth in the view itself.
+    Linear,
+}
+
+const COLOR_FORMATS: &[ImageFormat] = &[
+    ImageFormat::Rgba16Float,
+    ImageFormat::Rgba8Unorm,
+    ImageFormat::Rgba8Srgb,
+    ImageFormat::Bgra8Unorm,
+    ImageFormat::Bgra8Srgb,
+];
+const SCENE_FORMATS: &[ImageFormat] = &[
+    ImageFormat::D32Float,
+    ImageFormat::D32FloatS8,
+    ImageFormat::D24UnormX8,
+    ImageFormat::D24UnormS8,
+    ImageFormat::D16Unorm,
+    ImageFormat::R32Float,
+];
+
+fn refused<T>(problem: String) -> Result<T> {
+    Err(Error::Usage(problem))
+}
+
+impl Target<'_> {
+    /// Whether the kernels keep the depth in the view.
+    pub(super) fn needs_depths(&self) -> bool {
+        self.depth.is_some() || self.scene.is_some()
+    }
+
+    /// # Errors
+    /// [`Error::Usage`] names the member and the remedy.
+    pub(super) fn check(&self, cameras: &[Camera]) -> Result<()> {
+        if cameras.is_empty() {
+            return refused("no camera: pass at least one".to_owned());
+        }
+        for (index, camera) in cameras.iter().enumerate() {
+            check_camera(index, camera)?;
+        }
+        if self.color.is_none() && self.depth.is_none() {
+            return refused("no target: pass a color or a depth image".to_owned());
+        }
+        if !(self.exposure.is_finite() && self.exposure >= 0.0) {
+            let exposure = self.exposure;
+            return refused(format!("exposure is {exposure}; it is a factor of 0 or more"));
+        }
+        check_image("color", self.color, COLOR_FORMATS, cameras)?;
+        check_image("depth", self.depth, &[ImageFormat::R32Float], cameras)?;
+        let Some(scene) = &self.scene else { return Ok(()) };
+        check_image("scene depth", Some(scene.image), SCENE_FORMATS, cameras)?;
+        scene.check()
+    }
+}
+
+fn check_image(
+    name: &str,
+    image: Option<&HostImage>,
+    formats: &[ImageFormat],
+    cameras: &[Camera],
+) -> Result<()> {
+    let Some(image) = image else { return Ok(()) };
+    if image.handle == 0 {
+        return refused(format!("the {name} image is null; pass a VkImage"));
+    }
+    if !formats.contains(&image.format) {
+        let (format, list) = (image.format, names(formats));
+        return refused(format!("the {name} image has format {format:?}; take one of {list}"));
+    }
+    let [width, height] = image.size;
+    match cameras.iter().find(|camera| camera.width > width || camera.height > height) {
+        Some(camera) => refused(format!(
+            "the {name} image of {width}x{height} is smaller than the camera's {}x{}",
+            camera.width, camera.height
+        )),
+        None => Ok(()),
+    }
+}
+
+fn names<T: Debug>(all: &[T]) -> String {
+    all.iter().map(|own| format!("{own:?}")).collect::<Vec<_>>().join(", ")
+}
+
+/// How far a rotation may be from rigid, in each entry of its product with its transpose.
+const RIGID: f64 = 1e-3;
+
+fn check_camera(index: usize, camera: &Camera) -> Result<()> {
+    let Camera { width, height, focal, principal_point, view_from_world: pose, .. } = camera;
+    if *width == 0 || *height == 0 {
+        return refused(format!("camera {index} is {width}x{height}; it needs at least one pixel"));
+    }
+    if !(focal.is_finite() && focal.min_element() > 0.0) {
+        return refused(format!("camera {index} has focal length {focal}; it is positive"));
+    }
+    if !(principal_point.is_finite() && pose.is_finite()) {
+        return refused(format!("camera {index} has a number that is not finite"));
+    }
+    let product = pose.matrix3 * pose.matrix3.transpose() - glam::DMat3::IDENTITY;
+    let off = product.to_cols_array().into_iter().fold(0.0, |most: f64, x| most.max(x.abs()));
+    if off > RIGID || pose.matrix3.determinant() < 0.0 {
+        return refused(format!(
+            "camera {index} has a pose that is not rigid, by {off:.4}; take scale and reflection out"
+        ));
+    }
+    Ok(())
+}
+
+impl SceneDepth<'_> {
+    fn check(&self) -> Result<()> {
+        let is_float = |format| {
+            matches!(
+                format,
+                ImageFormat::R32Float | ImageFormat::D32Float | ImageFormat::D32FloatS8
+            )
+        };
+        match self.convention {
+            DepthConvention::Linear if !is_float(self.image.format) => {
+                refused(format!("linear depth in {:?}; take D32 or R32F", self.image.format))
+            }
+            DepthConvention::Linear => Ok(()),
+            DepthConvention::Forward { near, far } | DepthConvention::Reversed { near, far } => {
+                let is_beyond = far.is_none_or(|far| far.is_finite() && far > near);
+                if near.is_finite() && near > 0.0 && is_beyond {
+                    return Ok(());
+                }
+                refused(format!(
+                    "the scene's near plane is {near} and its far plane {far:?}; 0 < near < far"
+                ))
+            }
+        }
+    }
+
+    /// How the kernel reads it: format, reversed, linear, near, far.
+    pub(super) fn code(&self) -> (u32, bool, bool, f32, f32) {
+        let format = match self.image.format {
+            ImageFormat::D16Unorm => DEPTH_16,
+            ImageFormat::D24UnormX8 | ImageFormat::D24UnormS8 => DEPTH_24,
+            _ => DEPTH_FLOAT,
+        };
+        match self.convention {
+            DepthConvention::Linear => (format, false, true, 1.0, 0.0),
+            DepthConvention::Forward { near, far } => {
+                (format, false, false, near, far.unwrap_or_default())
+            }
+            DepthConvention::Reversed { near, far } => {
+                (format, true, false, near, far.unwrap_or_default())
+            }
+        }
+    }
+}
+
+impl Target<'_> {
+    /// The encoding of the colour image, and whether blue comes first.
+    pub(super) fn encoding(&self) -> (u32, bool) {
+        let format = self.color.map_or(ImageFormat::Rgba16Float, |image| image.format);
+        let encoding = match format {
+            ImageFormat::Rgba8Unorm | ImageFormat::Bgra8Unorm => PIXELS_UNORM,
+            ImageFormat::Rgba8Srgb | ImageFormat::Bgra8Srgb => PIXELS_SRGB,
+            _ if self.is_display_referred => PIXELS_DISPLAY_HALF,
+            _ => PIXELS_LINEAR_HALF,
+        };
+        (encoding, matches!(format, ImageFormat::Bgra8Unorm | ImageFormat::Bgra8Srgb))
+    }
+}

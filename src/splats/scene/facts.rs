@@ -1,0 +1,124 @@
+//! What the file of a model states beside its Gaussians.
+
+use std::fmt::Display;
+use std::str::FromStr;
+
+use glam::DVec3;
+use serde_json::{Map, Value};
+
+/// What a file states of its model beside the Gaussians: a key and a value each, such as `near 0.1`.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Facts {
+    /// The near plane, in world units.
+    pub near: Option<f32>,
+    /// The largest alpha of a splat on a pixel.
+    pub max_alpha: Option<f32>,
+    /// Whether colours are the raw SH sum. Files hold the colours that viewers show, 0.5 below.
+    pub raw_colors: Option<bool>,
+    /// The world position that positions are relative to.
+    pub origin: DVec3,
+}
+
+impl Facts {
+    /// What a line of text begins with that states a fact.
+    pub(crate) const PREFIX: &str = "nightsplat ";
+
+    /// Keys and values; without the origin where it is the world's.
+    fn entries(&self) -> Vec<(&'static str, String)> {
+        let Self { near, max_alpha, raw_colors, origin: DVec3 { x, y, z } } = self;
+        let entry = |key, value: Option<&dyn Display>| Some((key, value?.to_string()));
+        let entries = [
+            entry("near", near.as_ref().map(|value| value as _)),
+            entry("max_alpha", max_alpha.as_ref().map(|value| value as _)),
+            entry("raw_colors", raw_colors.as_ref().map(|value| value as _)),
+            (self.origin != DVec3::ZERO).then(|| ("origin", format!("{x} {y} {z}"))),
+        ];
+        entries.into_iter().flatten().collect()
+    }
+
+    /// As lines of text.
+    pub(crate) fn lines(&self) -> Vec<String> {
+        let line = |(key, value)| format!("{}{key} {value}", Self::PREFIX);
+        self.entries().into_iter().map(line).collect()
+    }
+
+    /// As an object of JSON.
+    pub(crate) fn json(&self) -> Value {
+        let value = |text: &str| {
+            let mut words = text.split(' ').map(|word| word.parse().unwrap_or_default());
+            match words.clone().count() {
+                1 => words.next().unwrap_or_default(),
+                _ => words.collect(),
+            }
+        };
+        let entries = self.entries().into_iter();
+        entries.map(|(key, text)| (key.to_owned(), value(&text))).collect::<Map<_, _>>().into()
+    }
+
+    /// The facts of an object of JSON; of anything else, none.
+    ///
+    /// # Errors
+    /// As [`Facts::set`].
+    pub(crate) fn of_json(json: &Value) -> Result<Self, String> {
+        let mut facts = Self::default();
+        for (key, value) in json.as_object().into_iter().flatten() {
+            let words = value.as_array().map(|words| words.iter().map(Value::to_string));
+            let text = words.map(|words| words.collect::<Vec<_>>().join(" "));
+            facts.set(key, &text.unwrap_or_else(|| value.to_string()))?;
+        }
+        Ok(facts)
+    }
+
+    /// Takes what a file states; a key of a later version is skipped.
+    ///
+    /// # Errors
+    /// The value is none of the key's.
+    pub(crate) fn set(&mut self, key: &str, value: &str) -> Result<(), String> {
+        match key {
+            "near" => self.near = Some(number(key, value, "above 0", |near| near > 0.0)?),
+            "max_alpha" => {
+                let is_valid = |alpha| 0.0 < alpha && alpha < 1.0;
+                self.max_alpha = Some(number(key, value, "between 0 and 1", is_valid)?);
+            }
+            "raw_colors" => {
+                let refused =
+                    |_| format!("states {key} `{}`, which is neither true nor false", value.trim());
+                self.raw_colors = Some(value.trim().parse().map_err(refused)?);
+            }
+            "origin" => self.origin = origin(value)?,
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Takes a line of text, if it states a fact.
+    ///
+    /// # Errors
+    /// As [`Facts::set`].
+    pub(crate) fn set_line(&mut self, line: &str) -> Result<(), String> {
+        let Some(fact) = line.trim().strip_prefix(Self::PREFIX) else { return Ok(()) };
+        let (key, value) = fact.split_once(' ').unwrap_or((fact, ""));
+        self.set(key, value)
+    }
+}
+
+/// A finite number for which the rule holds.
+fn number(key: &str, text: &str, rule: &str, holds: impl Fn(f32) -> bool) -> Result<f32, String> {
+    let number = f32::from_str(text.trim()).ok();
+    number.filter(|number| number.is_finite() && holds(*number)).ok_or_else(|| {
+        format!("states {key} `{}`, which is not a finite number {rule}", text.trim())
+    })
+}
+
+/// Three finite numbers.
+fn origin(text: &str) -> Result<DVec3, String> {
+    let numbers: Result<Vec<f64>, _> = text.split_whitespace().map(f64::from_str).collect();
+    match numbers.as_deref() {
+        Ok(&[x, y, z]) if [x, y, z].iter().all(|number| number.is_finite()) => {
+            Ok(DVec3::new(x, y, z))
+        }
+        _ => {
+            Err(format!("names the origin `{}`, which is not three finite numbers", text.trim()))
+        }
+    }
+}

@@ -1,0 +1,677 @@
+//! Drawing into a host's images, with its depth, from a device that only records.
+
+#![expect(unsafe_code, reason = "plays a host application, which calls Vulkan itself")]
+
+use ash::vk::Handle as _;
+use glam::{DAffine3, DVec2, DVec3, Vec3};
+use half::f16;
+use nightsplat::base::random::Stream;
+use nightsplat::camera::{Camera, CameraModel};
+use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::{
+    Gpu, HostFrame, HostImage, ImageFormat, ImageState, Reference as _, Threads,
+};
+use nightsplat::kernels::{depth_limits, pack_pixels, pixels};
+use nightsplat::splats::render::{
+    DepthConvention, DepthKind, Purpose, RenderOptions, RenderSettings, Renderer, SceneDepth,
+    Target,
+};
+use nightsplat::splats::scene::{DeviceGaussians, Gaussians};
+
+use crate::common::Random;
+use crate::host::{Host, Picture, usual_extensions};
+
+const SIZE: [u32; 2] = [48, 40];
+const PIXELS: usize = 48 * 40;
+const OPTIONS: RenderOptions = RenderOptions { sh_degree: 0, background: [0.1, 0.2, 0.3] };
+
+// ---------------------------------------------------------------------------
+// Kernels
+
+#[test]
+fn pixels_of_every_encoding_agree_with_their_reference() {
+    let mut random = Random::new(3);
+    let count = 500;
+    for encoding in 0..4 {
+        for flags in 0..8 {
+            let [swaps, is_over, is_mean] = [0, 1, 2].map(|bit| flags >> bit & 1);
+            let render: Vec<f32> =
+                (0..4 * count).map(|_| random.between(-0.1, 1.4) as f32).collect();
+            let mut transmittances: Vec<f32> =
+                (0..count).map(|_| random.between(0.0, 1.0) as f32).collect();
+            transmittances[..2].copy_from_slice(&[1.0, 1e-4]);
+            let under: Vec<u32> = match encoding {
+                0 | 1 => (0..2 * count).map(|_| halves(&mut random)).collect(),
+                _ => (0..count).map(|_| random.between(0.0, 4e9) as u32).collect(),
+            };
+            let (pixels, depths) = (vec![7u32; under.len()], vec![7.0f32; count]);
+            let params = pack_pixels::Params {
+                pixel_count: count as u32,
+                encoding,
+                swaps,
+                is_over,
+                exposure: 1.7,
+                background: Vec3::new(0.1, 0.5, 0.02),
+                depth_plane: 3,
+                is_mean,
+                has_color: 1,
+            };
+            let (_, depths) = run_kernel!(
+                pack_pixels,
+                pack_pixels::Constants {},
+                params,
+                Threads::Exactly([count as u32, 1, 1]),
+                [render, transmittances, under],
+                [pixels, depths]
+            );
+            assert_eq!(depths[0].is_infinite(), is_mean == 1, "nothing is seen at pixel 0");
+        }
+    }
+}
+
+fn halves(random: &mut Random) -> u32 {
+    let half = |x: f64| u32::from(f16::from_f64(x).to_bits());
+    half(random.between(0.0, 2.0)) | half(random.between(0.0, 1.0)) << 16
+}
+
+#[test]
+fn depths_of_every_format_and_convention_agree_with_their_reference() {
+    let mut random = Random::new(4);
+    let count = 600;
+    for format in [pixels::DEPTH_FLOAT, pixels::DEPTH_24, pixels::DEPTH_16] {
+        for (is_reversed, far) in [(0, 0.0), (1, 0.0), (0, 50.0), (1, 50.0)] {
+            let word = |i: usize, random: &mut Random| match (format, i) {
+                (pixels::DEPTH_FLOAT, 0) => 0.0f32.to_bits(),
+                (pixels::DEPTH_FLOAT, 1) => 1.0f32.to_bits(),
+                (pixels::DEPTH_FLOAT, 2) => f32::NAN.to_bits(),
+                (pixels::DEPTH_FLOAT, _) => (random.between(0.0, 1.0) as f32).to_bits(),
+                (_, 0) => 0,
+                (_, 1) => u32::MAX,
+                _ => random.between(0.0, 4e9) as u32,
+            };
+            let words: Vec<u32> = (0..count).map(|i| word(i, &mut random)).collect();
+            let limits = vec![7.0f32; count];
+            let (is_linear, near) = (0, 0.1);
+            let params = depth_limits::Params {
+                pixel_count: count as u32,
+                format,
+                is_reversed,
+                is_linear,
+                near,
+                far,
+            };
+            let limits = run_kernel!(
+                depth_limits,
+                depth_limits::Constants {},
+                params,
+                Threads::Exactly([count as u32, 1, 1]),
+                [words],
+                [limits]
+            );
+            // What the host cleared hides nothing; its near plane is the near plane.
+            let (cleared, nearest) = if is_reversed == 1 { (0, 1) } else { (1, 0) };
+            if format == pixels::DEPTH_FLOAT {
+                assert!(limits[cleared] > 3e38 && limits[2] > 3e38, "{limits:?}");
+            }
+            if format != pixels::DEPTH_16 {
+                assert!((limits[nearest] - near).abs() < 1e-6, "{}", limits[nearest]);
+            }
+        }
+    }
+}
+
+// ---------------------------------------------------------------------------
+// What is drawn
+
+/// Two views, one for each layer.
+fn cameras() -> [Camera; 2] {
+    [0.0, 0.3].map(|shift| Camera {
+        width: SIZE[0],
+        height: SIZE[1],
+        focal: DVec2::splat(40.0),
+        principal_point: DVec2::new(24.0, 20.0),
+        model: CameraModel::Pinhole,
+        view_from_world: DAffine3::from_translation(DVec3::new(shift, 0.0, 0.0)),
+    })
+}
+
+/// Some three hundred in front of the cameras, 2 to 3 away.
+fn gaussians() -> Gaussians {
+    let mut gaussians = Gaussians::zeros(300, 0);
+    let count = gaussians.count;
+    for (i, value) in gaussians.parameters.iter_mut().enumerate() {
+        let uniform = Stream::new(1, 0).uniform(i as u64) as f32;
+        *value = match i / count {
+            // Means lie in a plane of their own, three numbers each.
+            0..3 if i % 3 == 2 => 2.0 + uniform,
+            0..3 => 2.0 * uniform - 1.0,
+            3..7 => uniform + 0.1,
+            7..10 => -3.0 + uniform,
+            10 => 3.0 * uniform - 1.0,
+            _ => 2.0 * uniform,
+        };
+    }
+    gaussians
+}
+
+fn show_settings() -> RenderSettings {
+    RenderSettings { shape: 0.into(), purpose: Purpose::Show, ..RenderSettings::default() }
+}
+
+/// The Gaussians on a host's device, and a renderer that shows them.
+struct Shown<'a> {
+    host: &'a Host,
+    gpu: &'a Gpu,
+    on_device: DeviceGaussians,
+    renderer: Renderer,
+}
+
+impl<'a> Shown<'a> {
+    fn new(host: &'a Host, gpu: &'a Gpu) -> Self {
+        let on_device = gaussians().upload(gpu).unwrap();
+        Self { host, gpu, on_device, renderer: Renderer::new(gpu, show_settings()).unwrap() }
+    }
+}
+
+/// Draws one frame into `target` and waits for it.
+fn draw(shown: &mut Shown<'_>, frame: u64, target: &Target<'_>) {
+    let Shown { host, gpu, on_device, renderer } = shown;
+    let commands = host.begin();
+    record(gpu, commands.as_raw(), frame, renderer, on_device, target);
+    host.submit_frame(commands, frame);
+    host.wait_frame(frame);
+}
+
+fn record(
+    gpu: &Gpu,
+    commands: u64,
+    number: u64,
+    renderer: &mut Renderer,
+    on_device: &DeviceGaussians,
+    target: &Target<'_>,
+) {
+    let frame = HostFrame { commands, number, readers: 0 };
+    // SAFETY: the command buffer is recording, outside a render pass.
+    let recorded = unsafe {
+        gpu.record_into(&frame, |pass| renderer.draw(pass, on_device, &cameras(), &OPTIONS, target))
+    };
+    recorded.unwrap();
+}
+
+/// The planes of a view and its transmittances before black, by our own device.
+fn planes(camera: &Camera) -> (Vec<f32>, Vec<f32>) {
+    let gpu = gpu();
+    let on_device = gaussians().upload(&gpu).unwrap();
+    let settings = RenderSettings { purpose: Purpose::Train, ..show_settings() };
+    let mut renderer = Renderer::new(&gpu, settings).unwrap();
+    renderer.reserve(on_device.layout.count, [camera]).unwrap();
+    let black = RenderOptions { background: [0.0; 3], ..OPTIONS };
+    let mut planes = renderer.render_planes(&on_device, camera, &black).unwrap();
+    let transmittances = planes.split_off(3 * PIXELS);
+    (planes, transmittances)
+}
+
+/// What an image should hold, by the reference of the kernel that packs pixels.
+fn expected(camera: &Camera, encoding: u32, swaps: u32, under: Option<&[u32]>) -> Vec<u32> {
+    let (render, transmittances) = planes(camera);
+    let words = if encoding <= pixels::PIXELS_DISPLAY_HALF { 2 * PIXELS } else { PIXELS };
+    let (mut pixels, mut depths) = (vec![0; words], vec![0.0; PIXELS]);
+    let params = pack_pixels::Params {
+        pixel_count: PIXELS as u32,
+        encoding,
+        swaps,
+        is_over: under.is_some().into(),
+        exposure: 1.5,
+        background: OPTIONS.background.into(),
+        depth_plane: 0,
+        is_mean: 0,
+        has_color: 1,
+    };
+    let slices = pack_pixels::Slices {
+        render: &render,
+        transmittances: &transmittances,
+        under: under.unwrap_or_default(),
+        pixels: &mut pixels,
+        depths: &mut depths,
+    };
+    pack_pixels::Kernel::run(&params, &pack_pixels::Constants {}, slices);
+    pixels
+}
+
+/// The largest difference of two images in levels of their format.
+fn levels(a: &[u32], b: &[u32], is_half: bool) -> u32 {
+    let of = |(&a, &b): (&u32, &u32)| match is_half {
+        true => [0, 16]
+            .map(|shift| (a >> shift & 0x7fff).abs_diff(b >> shift & 0x7fff))
+            .into_iter()
+            .max(),
+        false => {
+            a.to_le_bytes().iter().zip(b.to_le_bytes()).map(|(a, b)| u32::from(a.abs_diff(b))).max()
+        }
+    };
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(b).filter_map(of).max().unwrap_or_default()
+}
+
+/// Runs `test` on a host and its record-only device, and fails on any validation message.
+fn with_host(test: impl FnOnce(&Host, &Gpu)) {
+    let host = Host::new(usual_extensions());
+    {
+        // SAFETY: the handles are the host's own and outlive `gpu`.
+        let gpu = unsafe { Gpu::from_host(host.lend_to_record()) }.unwrap();
+        test(&host, &gpu);
+    }
+    let messages = host.destroy();
+    assert!(messages.is_empty(), "validation: {messages:#?}");
+}
+
+fn words(format: ImageFormat) -> usize {
+    if format == ImageFormat::Rgba16Float { 2 * PIXELS } else { PIXELS }
+}
+
+const COLOR_FORMATS: [(ImageFormat, u32, u32); 5] = [
+    (ImageFormat::Rgba16Float, pixels::PIXELS_LINEAR_HALF, 0),
+    (ImageFormat::Rgba8Unorm, pixels::PIXELS_UNORM, 0),
+    (ImageFormat::Rgba8Srgb, pixels::PIXELS_SRGB, 0),
+    (ImageFormat::Bgra8Unorm, pixels::PIXELS_UNORM, 1),
+    (ImageFormat::Bgra8Srgb, pixels::PIXELS_SRGB, 1),
+];
+
+#[test]
+fn every_colour_format_gets_our_own_render_to_a_level_in_each_layer() {
+    with_host(|host, gpu| {
+        let mut shown = Shown::new(host, gpu);
+        for (frame, (format, encoding, swaps)) in (1..).zip(COLOR_FORMATS) {
+            let picture = host.picture(format, SIZE).unwrap();
+            let image = picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE);
+            let target = Target { color: Some(&image), exposure: 1.5, ..Target::default() };
+            draw(&mut shown, frame, &target);
+            let layers = host.read_picture(&picture, words(format));
+            for (camera, pixels) in cameras().iter().zip(&layers) {
+                let own = expected(camera, encoding, swaps, None);
+                let off = levels(pixels, &own, encoding == pixels::PIXELS_LINEAR_HALF);
+                assert!(off <= 1, "{format:?}: {off} levels");
+            }
+            assert_ne!(layers[0], layers[1], "both layers show one view");
+            host.free_picture(picture);
+        }
+    });
+}
+
+#[test]
+fn a_picture_is_blended_over_and_keeps_what_is_not_covered() {
+    with_host(|host, gpu| {
+        let mut shown = Shown::new(host, gpu);
+        for (frame, (format, encoding, swaps)) in (1..).zip(COLOR_FORMATS) {
+            let mut random = Random::new(frame);
+            let word = |random: &mut Random| match format {
+                ImageFormat::Rgba16Float => halves(random),
+                _ => random.between(0.0, 4e9) as u32,
+            };
+            let under =
+                [0, 1].map(|_| (0..words(format)).map(|_| word(&mut random)).collect::<Vec<_>>());
+            let picture = host.picture(format, SIZE).unwrap();
+            host.fill_picture(&picture, [&under[0], &under[1]], ImageState::SAMPLED);
+            let image = picture.lent(ImageState::SAMPLED, ImageState::TRANSFER_SOURCE);
+            let target =
+                Target { color: Some(&image), is_over: true, exposure: 1.5, ..Target::default() };
+            draw(&mut shown, frame, &target);
+            let layers = host.read_picture(&picture, words(format));
+            for ((camera, pixels), under) in cameras().iter().zip(&layers).zip(&under) {
+                let own = expected(camera, encoding, swaps, Some(under));
+                let off = levels(pixels, &own, encoding == pixels::PIXELS_LINEAR_HALF);
+                assert!(off <= 1, "{format:?}: {off} levels");
+            }
+            host.free_picture(picture);
+        }
+    });
+}
+
+// ---------------------------------------------------------------------------
+// Depth
+
+/// A scene's depth image whose pixels all have one depth, or no depth in the right half.
+fn scene(host: &Host, format: ImageFormat, word: impl Fn(u32) -> u32) -> Option<Picture> {
+    let picture = host.picture(format, SIZE)?;
+    let words: Vec<u32> = match format {
+        ImageFormat::D16Unorm => {
+            (0..PIXELS as u32 / 2).map(|pair| word(2 * pair) | word(2 * pair + 1) << 16).collect()
+        }
+        _ => (0..PIXELS as u32).map(word).collect(),
+    };
+    host.fill_picture(&picture, [&words, &words], scene_state(format));
+    Some(picture)
+}
+
+/// The state of a scene's depth before and after a draw.
+fn scene_state(format: ImageFormat) -> ImageState {
+    match format {
+        ImageFormat::R32Float => ImageState::SAMPLED,
+        _ => ImageState::DEPTH_ATTACHMENT,
+    }
+}
+
+/// The alphas of layer 0 with this depth image, as halves.
+fn alphas(
+    shown: &mut Shown<'_>,
+    frame: u64,
+    scene: Option<(&Picture, DepthConvention)>,
+) -> Vec<f32> {
+    let host = shown.host;
+    let picture = host.picture(ImageFormat::Rgba16Float, SIZE).unwrap();
+    let image = picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE);
+    let lent = scene.map(|(picture, convention)| {
+        let state = scene_state(picture.format);
+        (picture.lent(state, state), convention)
+    });
+    let scene =
+        lent.as_ref().map(|(image, convention)| SceneDepth { image, convention: *convention });
+    draw(shown, frame, &Target { color: Some(&image), scene, ..Target::default() });
+    let [layer, _] = host.read_picture(&picture, 2 * PIXELS);
+    host.free_picture(picture);
+    layer.chunks(2).map(|pixel| f16::from_bits((pixel[1] >> 16) as u16).to_f32()).collect()
+}
+
+#[test]
+fn the_hosts_depth_hides_what_is_beyond_it_in_every_format_and_convention() {
+    let (near, far) = (0.1f32, Some(40.0f32));
+    // The depth value of a distance.
+    let value = |z: f32, convention| match convention {
+        DepthConvention::Linear => z,
+        DepthConvention::Reversed { far: None, .. } => near / z,
+        DepthConvention::Forward { far: None, .. } => 1.0 - near / z,
+        DepthConvention::Reversed { far: Some(far), .. } => near * (far - z) / (z * (far - near)),
+        DepthConvention::Forward { far: Some(far), .. } => far * (z - near) / (z * (far - near)),
+    };
+    with_host(|host, gpu| {
+        let mut shown = Shown::new(host, gpu);
+        let untested = alphas(&mut shown, 1, None);
+        assert!(untested.iter().any(|&alpha| alpha > 0.5));
+        let mut frame = 1;
+        for format in [
+            ImageFormat::D32Float,
+            ImageFormat::R32Float,
+            ImageFormat::D16Unorm,
+            ImageFormat::D24UnormX8,
+            ImageFormat::D32FloatS8,
+            ImageFormat::D24UnormS8,
+        ] {
+            let bits = |depth: f32| match format {
+                ImageFormat::D16Unorm => (depth * 65_535.0).round() as u32,
+                ImageFormat::D24UnormX8 | ImageFormat::D24UnormS8 => {
+                    (depth * 16_777_215.0).round() as u32
+                }
+                _ => depth.to_bits(),
+            };
+            let mut conventions = vec![
+                DepthConvention::Forward { near, far },
+                DepthConvention::Reversed { near, far },
+                DepthConvention::Forward { near, far: None },
+                DepthConvention::Reversed { near, far: None },
+            ];
+            if matches!(format, ImageFormat::D32Float | ImageFormat::R32Float) {
+                conventions.push(DepthConvention::Linear);
+            }
+            for convention in conventions {
+                frame += 3;
+                // A wall beyond everything, one before everything, and one before the left half.
+                let wall = |z: f32| bits(value(z, convention));
+                let Some(beyond) = scene(host, format, |_| wall(35.0)) else {
+                    eprintln!("not run: this device has no {format:?} images to copy");
+                    break;
+                };
+                let seen = alphas(&mut shown, frame, Some((&beyond, convention)));
+                assert_eq!(seen, untested, "{format:?}, {convention:?}: far away");
+                let before = scene(host, format, |_| wall(0.5)).unwrap();
+                let seen = alphas(&mut shown, frame + 1, Some((&before, convention)));
+                assert!(seen.iter().all(|&alpha| alpha == 0.0), "{format:?}, {convention:?}");
+                let half =
+                    |at: u32| if at % SIZE[0] < SIZE[0] / 2 { wall(0.5) } else { wall(35.0) };
+                let half = scene(host, format, half).unwrap();
+                let seen = alphas(&mut shown, frame + 2, Some((&half, convention)));
+                for (at, (seen, untested)) in seen.into_iter().zip(&untested).enumerate() {
+                    let is_hidden = at as u32 % SIZE[0] < SIZE[0] / 2;
+                    assert_eq!(seen, if is_hidden { 0.0 } else { *untested }, "{format:?} {at}");
+                }
+                [beyond, before, half].into_iter().for_each(|own| host.free_picture(own));
+            }
+        }
+    });
+}
+
+/// Every pass of a draw with depths in and out, on a device that submits, against the references.
+#[test]
+fn a_draw_with_depths_agrees_with_the_references_and_with_a_composite() {
+    let host = Host::new(usual_extensions());
+    {
+        // SAFETY: the handles are the host's own and outlive `gpu`; nothing else uses the queue meanwhile.
+        let gpu = unsafe { Gpu::from_host(host.lend()) }.unwrap();
+        let wall = scene(&host, ImageFormat::D32Float, |_| (0.1f32 / 2.5).to_bits()).unwrap();
+        let lent = wall.lent(ImageState::DEPTH_ATTACHMENT, ImageState::DEPTH_ATTACHMENT);
+        let convention = DepthConvention::Reversed { near: 0.1, far: None };
+        let on_device = gaussians().upload(&gpu).unwrap();
+        let mut renderer = Renderer::new(&gpu, show_settings()).unwrap();
+        for depth_kind in [DepthKind::Median, DepthKind::Expected] {
+            let color = host.picture(ImageFormat::Rgba16Float, SIZE).unwrap();
+            let depth = host.picture(ImageFormat::R32Float, SIZE).unwrap();
+            let [color_image, depth_image]: [HostImage; 2] = [&color, &depth]
+                .map(|picture| picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE));
+            let target = Target {
+                color: Some(&color_image),
+                depth: Some(&depth_image),
+                depth_kind,
+                scene: Some(SceneDepth { image: &lent, convention }),
+                ..Target::default()
+            };
+            let (done, report) = gpu.checked(|| {
+                gpu.run("draw", |pass| {
+                    renderer.draw(pass, &on_device, &cameras(), &OPTIONS, &target)
+                })
+            });
+            done.unwrap();
+            report.agree().unwrap();
+            let names: Vec<&str> = report.kernels().iter().map(|(name, ..)| *name).collect();
+            assert!(names.contains(&"depth_limits") && names.contains(&"pack_pixels"), "{names:?}");
+            let [pixels, _] = host.read_picture(&color, 2 * PIXELS);
+            let [depths, _] = host.read_picture(&depth, PIXELS);
+            let mut seen = 0;
+            for (pixel, depth) in pixels.chunks(2).zip(depths) {
+                let alpha = f16::from_bits((pixel[1] >> 16) as u16).to_f32();
+                let depth = f32::from_bits(depth);
+                if alpha > 0.6 {
+                    seen += 1;
+                    assert!((1.9..=2.5).contains(&depth), "{depth} at alpha {alpha}");
+                } else if alpha == 0.0 {
+                    assert!(depth.is_infinite());
+                }
+            }
+            assert!(seen > 20, "{seen} pixels are covered");
+            [color, depth].into_iter().for_each(|own| host.free_picture(own));
+        }
+        host.free_picture(wall);
+    }
+    let messages = host.destroy();
+    assert!(messages.is_empty(), "validation: {messages:#?}");
+}
+
+// ---------------------------------------------------------------------------
+// Frames
+
+#[test]
+fn a_view_beyond_the_memory_is_never_blank_and_soon_exact() {
+    with_host(|host, gpu| {
+        let picture = host.picture(ImageFormat::Rgba8Unorm, SIZE).unwrap();
+        let image = picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE);
+        let target = Target { color: Some(&image), exposure: 1.5, ..Target::default() };
+        let on_device = gaussians().upload(gpu).unwrap();
+        let mut renderer = Renderer::new(gpu, show_settings()).unwrap();
+        renderer.prepare_draw(&on_device.layout, &cameras(), &target).unwrap();
+        renderer.set_intersection_capacity(200).unwrap();
+        let own = expected(&cameras()[0], pixels::PIXELS_UNORM, 0, None);
+        assert!(renderer.drawn().is_none());
+        for frame in 1..=3 {
+            let commands = host.begin();
+            record(gpu, commands.as_raw(), frame, &mut renderer, &on_device, &target);
+            host.submit_frame(commands, frame);
+            host.wait_frame(frame);
+            let drawn = renderer.drawn().unwrap();
+            let [pixels, _] = host.read_picture(&picture, PIXELS);
+            assert_eq!(drawn.frame, frame);
+            if frame == 1 {
+                assert!(drawn.left_out() > 0 && drawn.capacity == 200, "{drawn:?}");
+                assert!(pixels.iter().any(|pixel| pixel >> 24 > 100), "blank");
+            } else {
+                assert_eq!(drawn.left_out(), 0, "{drawn:?}");
+                assert!(levels(&pixels, &own, false) <= 1);
+            }
+        }
+        // A budget leaves out the farthest whatever the memory.
+        let commands = host.begin();
+        let thrifty = Target { budget: 150, ..target };
+        record(gpu, commands.as_raw(), 4, &mut renderer, &on_device, &thrifty);
+        host.submit_frame(commands, 4);
+        host.wait_frame(4);
+        assert_eq!(renderer.drawn().unwrap().capacity, 150);
+        host.free_picture(picture);
+    });
+}
+
+#[test]
+fn with_frames_in_flight_everything_may_grow_and_go() {
+    with_host(|host, gpu| {
+        let pictures = [0, 1, 2].map(|_| host.picture(ImageFormat::Bgra8Srgb, SIZE).unwrap());
+        let mut random = Random::new(9);
+        let mut on_device = gaussians().upload(gpu).unwrap();
+        let mut renderer = Renderer::new(gpu, show_settings()).unwrap();
+        let mut used = vec![];
+        for frame in 1..=24 {
+            if frame > 3 {
+                host.wait_frame(frame - 3);
+            }
+            let picture = &pictures[frame as usize % 3];
+            let image = picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE);
+            let target = Target { color: Some(&image), ..Target::default() };
+            let commands = host.begin();
+            record(gpu, commands.as_raw(), frame, &mut renderer, &on_device, &target);
+            host.submit_frame(commands, frame);
+            // Each of these frees what the frame uses.
+            match random.between(0.0, 4.0) as u32 {
+                0 => renderer = Renderer::new(gpu, show_settings()).unwrap(),
+                1 => on_device = gaussians().upload(gpu).unwrap(),
+                2 => renderer.set_intersection_capacity(100 + 40 * frame as u32).unwrap(),
+                _ => (),
+            }
+            used.push(gpu.memory_in_use());
+        }
+        drop((renderer, on_device));
+        host.wait_frame(24);
+        gpu.frames_done(24);
+        assert_eq!(gpu.memory_in_use(), 0, "of {used:?}");
+        pictures.into_iter().for_each(|own| host.free_picture(own));
+    });
+}
+
+#[test]
+fn a_device_that_only_records_submits_nothing_and_says_so() {
+    with_host(|_, gpu| {
+        let on_device = gaussians().upload(gpu).unwrap();
+        let message = gpu.read(&on_device.parameters).unwrap_err().to_string();
+        assert!(message.contains("record-only"), "{message}");
+    });
+}
+
+#[test]
+fn frame_numbers_that_fall_are_refused() {
+    with_host(|host, gpu| {
+        let commands = host.begin();
+        for (number, is_refused) in [(5, false), (5, false), (4, true)] {
+            let frame = HostFrame { commands: commands.as_raw(), number, readers: 0 };
+            // SAFETY: the command buffer is recording.
+            let recorded = unsafe { gpu.record_into(&frame, |_| Ok(())) };
+            assert_eq!(recorded.is_err(), is_refused);
+        }
+        host.submit_frame(commands, 5);
+        host.wait_frame(5);
+    });
+}
+
+#[test]
+fn what_does_not_fit_is_refused_by_name_before_anything_is_recorded() {
+    with_host(|host, gpu| {
+        let picture = host.picture(ImageFormat::Rgba8Unorm, SIZE).unwrap();
+        let image = picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE);
+        let on_device = gaussians().upload(gpu).unwrap();
+        let mut renderer = Renderer::new(gpu, show_settings()).unwrap();
+        let good = Target { color: Some(&image), ..Target::default() };
+        let mut refused = |cameras: &[Camera], target: &Target<'_>, named: &[&str]| {
+            let error = renderer.prepare_draw(&on_device.layout, cameras, target).unwrap_err();
+            let message = error.to_string();
+            assert_eq!(error.exit_code(), 2, "{message}");
+            assert!(!message.contains('\n'), "{message}");
+            named.iter().for_each(|name| assert!(message.contains(name), "{message}"));
+        };
+        let [camera, _] = cameras();
+        refused(&[], &good, &["no camera"]);
+        refused(&[camera], &Target::default(), &["no target"]);
+        refused(&[Camera { width: 0, ..camera }], &good, &["camera 0", "0x40"]);
+        refused(&[camera, Camera { width: 49, ..camera }], &good, &["color", "48x40", "49x40"]);
+        let focal = DVec2::new(-1.0, 40.0);
+        refused(&[Camera { focal, ..camera }], &good, &["focal length", "-1"]);
+        let principal_point = DVec2::NAN;
+        refused(&[Camera { principal_point, ..camera }], &good, &["not finite"]);
+        let scaled = DAffine3::from_scale(DVec3::splat(1.01));
+        refused(&[Camera { view_from_world: scaled, ..camera }], &good, &["not rigid"]);
+        let mirrored = DAffine3::from_scale(DVec3::new(-1.0, 1.0, 1.0));
+        refused(&[Camera { view_from_world: mirrored, ..camera }], &good, &["not rigid"]);
+        let exposure = f32::NAN;
+        refused(&[camera], &Target { exposure, ..good }, &["exposure"]);
+        let null = HostImage { handle: 0, ..image };
+        refused(&[camera], &Target { color: Some(&null), ..good }, &["color", "null"]);
+        let float = HostImage { format: ImageFormat::R32Float, ..image };
+        refused(&[camera], &Target { color: Some(&float), ..good }, &["R32Float", "Rgba16Float"]);
+        refused(&[camera], &Target { depth: Some(&image), ..good }, &["depth", "R32Float"]);
+        let convention = DepthConvention::Linear;
+        let scene = |image, convention| Some(SceneDepth { image, convention });
+        let scene_of = |image, convention| Target { scene: scene(image, convention), ..good };
+        refused(&[camera], &scene_of(&image, convention), &["scene depth", "D32Float"]);
+        let coarse = HostImage { format: ImageFormat::D16Unorm, ..image };
+        refused(&[camera], &scene_of(&coarse, convention), &["linear", "D16Unorm"]);
+        let near = DepthConvention::Forward { near: 0.0, far: None };
+        refused(&[camera], &scene_of(&coarse, near), &["near plane is 0"]);
+        let far = DepthConvention::Forward { near: 1.0, far: Some(0.5) };
+        refused(&[camera], &scene_of(&coarse, far), &["far plane"]);
+        let other = Gaussians::zeros(3, 2).upload(gpu).unwrap();
+        let error = renderer.prepare_draw(&other.layout, &[camera], &good).unwrap_err();
+        assert!(error.to_string().contains("cannot be rendered"), "{error}");
+        host.free_picture(picture);
+    });
+}
+
+#[test]
+fn no_gaussians_are_drawn_as_background() {
+    with_host(|host, gpu| {
+        let picture = host.picture(ImageFormat::Rgba8Unorm, SIZE).unwrap();
+        let image = picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE);
+        let target = Target { color: Some(&image), ..Target::default() };
+        let none = Gaussians::zeros(0, 0).upload(gpu).unwrap();
+        let mut renderer = Renderer::new(gpu, show_settings()).unwrap();
+        let commands = host.begin();
+        record(gpu, commands.as_raw(), 1, &mut renderer, &none, &target);
+        host.submit_frame(commands, 1);
+        host.wait_frame(1);
+        let [pixels, _] = host.read_picture(&picture, PIXELS);
+        let background = u32::from_le_bytes(
+            OPTIONS
+                .background
+                .map(|c| (c * 255.0).round() as u8)
+                .iter()
+                .copied()
+                .chain([0])
+                .collect::<Vec<_>>()
+                .try_into()
+                .unwrap(),
+        );
+        assert!(pixels.iter().all(|&pixel| levels(&[pixel], &[background], false) <= 1));
+        host.free_picture(picture);
+    });
+}
