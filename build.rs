@@ -15,7 +15,10 @@
 #[path = "build/kernels.rs"]
 mod kernels;
 #[path = "build/precompiled.rs"]
-#[allow(dead_code, reason = "a build compiles the kernels, or takes those that were compiled before")]
+#[allow(
+    dead_code,
+    reason = "a build compiles the kernels, or takes those that were compiled before"
+)]
 mod precompiled;
 
 use std::env;

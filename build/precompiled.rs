@@ -56,7 +56,9 @@ fn hash_of_sources() -> String {
             // Windows writes paths and lines otherwise.
             hasher.write(path.to_string_lossy().replace('\\', "/").as_bytes());
             match source {
-                "Cargo.lock" => hasher.write(compilers(&String::from_utf8_lossy(&bytes)).as_bytes()),
+                "Cargo.lock" => {
+                    hasher.write(compilers(&String::from_utf8_lossy(&bytes)).as_bytes())
+                }
                 _ => hasher.write(String::from_utf8_lossy(&bytes).replace("\r\n", "\n").as_bytes()),
             }
         }

@@ -10,9 +10,9 @@
 //! | train into a directory with log, checkpoints and scores | [`run::train`] |
 //! | handle errors | [`Error`]: one line that names the object and the remedy |
 //!
-//! Without default features there is the renderer, forward and backward, and nothing else. Feature `io` adds files,
-//! datasets and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command. `glslang` compiles
-//! the kernels, which a checkout needs and a packaged crate does not.
+//! Without default features, the crate is only the renderer, forward and backward. Feature `io` adds files, datasets
+//! and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command. `glslang` compiles the
+//! kernels, which a checkout requires and a packaged crate does not.
 //!
 //! # Render a model
 //!
@@ -38,8 +38,8 @@
 //! # Ok::<(), nightsplat::Error>(())
 //! ```
 //!
-//! A host with a Vulkan device of its own lends it ([`Gpu::from_host`]) and has [`Renderer::draw`] record into its own
-//! command buffers ([`Gpu::record_into`]) and images; `docs/embedding.md` is the contract, `examples/embed.rs` and
+//! A host with its own Vulkan device lends it ([`Gpu::from_host`]) and lets [`Renderer::draw`] record into its command
+//! buffers ([`Gpu::record_into`]) and images; `docs/embedding.md` is the contract, `examples/embed.rs` and
 //! `examples/c/embed.c` are such hosts. Without default features this is the whole API; feature `io` adds files,
 //! datasets and training.
 //!

@@ -15,8 +15,8 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::photographs::metrics::{self, Scores};
 use crate::photographs::tone::{SceneTone, ToneCurve, ToneSettings};
-use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::model::Model;
+use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::{DeviceGaussians, Feature, Shape};
 use crate::train::{Networks, Rendered, TestTargets, TrainConfig};
 use crate::{Error, Result};
@@ -223,7 +223,8 @@ pub struct ModelRenderer {
 }
 
 impl ModelRenderer {
-    /// Uploads the model of a run of `config`; `networks` belong to it. The run's tile is taken where it suits the device.
+    /// Uploads the model of a run of `config`, with its `networks`. The run's tile size is used if the device supports
+    /// it.
     ///
     /// # Errors
     /// The device is out of memory or lost.

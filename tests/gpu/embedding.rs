@@ -53,7 +53,7 @@ fn lend_and_take_back(extensions: &[&CStr]) {
 }
 
 #[test]
-fn a_host_without_a_loader_function_is_told_so() {
+fn a_host_without_a_loader_function_is_refused() {
     let host = HostDevice::default();
     // SAFETY: the first handle, which is null, is refused before any is used.
     let message = unsafe { Gpu::from_host(host) }.unwrap_err().to_string();
@@ -123,7 +123,7 @@ fn render_into(host: &Host, gpu: &Gpu, memory: &mut Memory) {
         // SAFETY: the command buffer is recording.
         let recorded = unsafe {
             gpu.record_into(&frame, |pass| {
-                // Nothing of ours would know when the copy is there.
+                // The library cannot tell when the copy is done.
                 let message = pass.download(&on_device.parameters).unwrap_err().to_string();
                 assert!(message.contains("`parameters`"), "{message}");
                 renderer.forward(pass, &on_device, &camera(), &OPTIONS)

@@ -4,10 +4,10 @@ use std::fs;
 use std::path::Path;
 
 use glam::DVec3;
+use nightsplat::Error;
 use nightsplat::results::run::load_config;
 use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::{Gaussians, ply};
-use nightsplat::Error;
 
 use crate::common::command::{refused, run, succeed};
 use crate::common::place::Place;
@@ -191,7 +191,8 @@ fn what_a_file_states_is_one_line_of_an_error_where_it_is_nonsense() {
         Model::from(Gaussians::zeros(2, 0)).save(&path).unwrap();
         // All zeros: the file is text.
         let text = fs::read_to_string(&path).unwrap();
-        fs::write(&path, text.replacen("element", &format!("comment {comment}\nelement"), 1)).unwrap();
+        fs::write(&path, text.replacen("element", &format!("comment {comment}\nelement"), 1))
+            .unwrap();
         let error = Model::load(&path).map(|model| model.near).unwrap_err();
         assert!(matches!(error, Error::Input { .. }), "{error:?}");
         let error = error.to_string();

@@ -20,8 +20,8 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(push_constant, scalar) uniform Params {
     uvec2 size;
     uint tile_columns;
-    uint longest_run;  // splats of a tile that this device follows
-    uint has_limits;   // 1: `limits` holds a depth for each pixel
+    uint longest_run;  // the most splats of a tile that this device can process
+    uint has_limits;   // 1: `limits` has a depth for each pixel
     uint takes_median; // 1: the last channel is the median depth
     float background[MAX_CHANNELS];
 };

@@ -219,9 +219,11 @@ const MOST: u64 = 1 << 30;
 /// # Errors
 /// The problem: another format or version, cut short, or nonsense in what it states.
 pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
-    let mut zip = ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is no SOG: {error}"))?;
+    let mut zip =
+        ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is no SOG: {error}"))?;
     let meta = bytes_of(&mut zip, "meta.json")?;
-    let meta: Value = serde_json::from_slice(&meta).map_err(|error| format!("meta.json: {error}"))?;
+    let meta: Value =
+        serde_json::from_slice(&meta).map_err(|error| format!("meta.json: {error}"))?;
     if meta["version"] != 2 {
         return Err(format!("is SOG of version {}; version 2 is read", meta["version"]));
     }
@@ -270,7 +272,11 @@ pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
 }
 
 /// The higher coefficients.
-fn decode_rest(zip: &mut Archive<'_>, rest: &Rest, gaussians: &mut Gaussians) -> Result<(), String> {
+fn decode_rest(
+    zip: &mut Archive<'_>,
+    rest: &Rest,
+    gaussians: &mut Gaussians,
+) -> Result<(), String> {
     let coefficients = rest_coefficients(rest.bands);
     let [sets, labels] = &rest.files;
     let labels = image_of(zip, labels, gaussians.count)?;

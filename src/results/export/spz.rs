@@ -99,7 +99,8 @@ pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     let fixed = |bytes: &[u8]| i32::from_le_bytes([0, bytes[0], bytes[1], bytes[2]]) >> 8;
     let unit_of_positions = (-f32::from(header.fraction)).exp2();
     for (mean, bytes) in gaussians.means_mut().iter_mut().zip(positions.chunks_exact(9)) {
-        *mean = Vec3::from_array([0, 3, 6].map(|at| fixed(&bytes[at..]) as f32)) * unit_of_positions;
+        *mean =
+            Vec3::from_array([0, 3, 6].map(|at| fixed(&bytes[at..]) as f32)) * unit_of_positions;
     }
     for (opacity, &byte) in gaussians.raw_opacities_mut().iter_mut().zip(opacities) {
         *opacity = raw_opacity(byte);
@@ -210,7 +211,8 @@ fn unpacked(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
     let lengths = header.lengths();
     for place in 0..stream_count {
         let length = word(file, table + 16 * place)? as usize;
-        let (stream, after) = rest.and_then(|rest| rest.split_at_checked(length)).ok_or(CUT_SHORT)?;
+        let (stream, after) =
+            rest.and_then(|rest| rest.split_at_checked(length)).ok_or(CUT_SHORT)?;
         rest = Some(after);
         if let Some(own) = streams.get_mut(place) {
             let decoder = StreamingDecoder::new(stream);
@@ -315,8 +317,7 @@ mod tests {
         for stream in 0..streams {
             let [compressed, whole] = [0, 8].map(|field| word(32 + 16 * stream + field));
             let mut bytes = vec![];
-            let mut decoder =
-                StreamingDecoder::new(&file[begin..begin + compressed]).unwrap();
+            let mut decoder = StreamingDecoder::new(&file[begin..begin + compressed]).unwrap();
             decoder.read_to_end(&mut bytes).unwrap();
             assert_eq!(bytes.len(), whole);
             all.extend(bytes);
@@ -407,7 +408,8 @@ mod tests {
         for version in [Version::V3, Version::V4] {
             let file = encode(&drawn(5, 1), &provenance, version).unwrap();
             // The text ends the file of version 4, and no text is a text.
-            let end = file.len() - if version == Version::V4 { "nightsplat near 0.1".len() } else { 0 };
+            let end =
+                file.len() - if version == Version::V4 { "nightsplat near 0.1".len() } else { 0 };
             for length in 0..end {
                 assert!(decode(&file[..length]).is_err(), "{version:?}: {length} bytes");
             }

@@ -117,8 +117,6 @@ fn origin(text: &str) -> Result<DVec3, String> {
         Ok(&[x, y, z]) if [x, y, z].iter().all(|number| number.is_finite()) => {
             Ok(DVec3::new(x, y, z))
         }
-        _ => {
-            Err(format!("names the origin `{}`, which is not three finite numbers", text.trim()))
-        }
+        _ => Err(format!("names the origin `{}`, which is not three finite numbers", text.trim())),
     }
 }
