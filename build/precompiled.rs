@@ -20,7 +20,7 @@ const COMPILERS: [&str; 3] = ["glslang", "glslang-sys", "spirq"];
 /// The file with the hash of the sources, beside what was compiled from them.
 const HASH: &str = "sources.hash";
 
-/// Writes the hash of the sources, behind everything else that belongs to them.
+/// Writes the hash of the sources; call it last.
 pub(crate) fn write_hash(out_dir: &Path) {
     fs::write(out_dir.join(HASH), hash_of_sources()).expect("OUT_DIR is ours");
 }

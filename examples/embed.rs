@@ -68,7 +68,7 @@ fn draw(host: &Host, gpu: &Gpu, gaussians: &Gaussians) -> Result<Vec<u8>, Box<dy
                 renderer.draw(pass, &on_device, &[camera], &options, &target)
             })
         }
-        // The host goes on here: with its own passes, in the same command buffer.
+        // The host continues here with its own passes, in the same command buffer.
     })
 }
 
@@ -93,7 +93,7 @@ struct Host {
     device: ash::Device,
     queue: vk::Queue,
     pool: vk::CommandPool,
-    /// Reaches the number of each frame.
+    /// Signalled with the number of each frame.
     frames: vk::Semaphore,
 }
 

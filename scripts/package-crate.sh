@@ -20,10 +20,11 @@ scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
 rm -rf precompiled
 refuses "the kernels are not compiled"
-compiled=$(cargo check --lib --locked --no-default-features --features glslang --message-format=json-render-diagnostics |
+compiled=$(cargo check --lib --locked --no-default-features --features glslang \
+    --message-format=json-render-diagnostics |
     sed -n '/"reason":"build-script-executed","package_id":"path+/s|.*"out_dir":"\([^"]*\)".*|\1|p')
 mkdir precompiled
-# Former kernels may lie there as well.
+# Former kernels may still be there.
 grep -o '[a-z0-9_]*\.spv' "$compiled/kernels.rs" | while read -r name; do cp "$compiled/$name" precompiled/; done
 cp "$compiled/kernels.rs" "$compiled/sources.hash" precompiled/
 cargo package --quiet --locked --offline --no-verify "$@"

@@ -300,8 +300,8 @@ impl Shared {
     }
 
     /// Frees every retired object that no submission of ours after `reached` and no unfinished frame of the host's
-    /// uses; command buffers before the objects that they name. One thread at a time: validation layers have crashed where two threads free objects that belong
-    /// together.
+    /// uses; command buffers before the objects that they name. One thread at a time: validation layers have crashed
+    /// where two threads free objects that belong together.
     fn collect(&self, reached: u64) {
         self.collect_within(LastUse { submission: reached, frame: self.frames_reached() });
     }

@@ -30,7 +30,7 @@ struct Output<'a> {
     chosen: Option<usize>,
     /// The variables of a scheduler that selected it.
     reason: Option<String>,
-    /// The paths of programs that some commands run; null where one is not found.
+    /// The paths of programs that some commands run; null if not found.
     programs: BTreeMap<&'static str, Option<PathBuf>>,
     verdict: String,
 }
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn a_program_that_is_missing_is_said_with_its_use_and_how_to_install_it() {
+    fn a_missing_program_is_listed_with_its_use_and_how_to_install_it() {
         let printed = program_lines(&BTreeMap::from([("ffmpeg", Some("/usr/bin/ffmpeg".into()))]));
         assert!(printed.contains("colmap  not found; install it for camera poses"), "{printed}");
         assert!(

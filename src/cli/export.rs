@@ -90,7 +90,7 @@ impl To {
 /// Writes the file.
 ///
 /// # Errors
-/// The folder holds no run with a model, the model does not fit the format, or the file cannot be written;
+/// The folder contains no run with a model, the model does not fit the format, or the file cannot be written;
 /// no partial file is left.
 pub fn run(args: &ExportArgs) -> Result<()> {
     let (out, wrote) = write(args)?;
@@ -269,7 +269,7 @@ fn bookmarks(
             view.loaded_reference()?.map(|image| ("reference".to_owned(), image.into_owned())),
             rendered(view)?,
         ];
-        // A mirrored photograph is of a mirrored world, which the page shows as it is.
+        // A mirrored photograph shows a mirrored world, which the page keeps.
         let turned =
             |(label, image): (String, Image)| (label, image.turned(view.orientation.turn()));
         Ok(Bookmark {

@@ -44,13 +44,13 @@ pub struct PoseArgs {
     /// COLMAP camera model; photographs of one size, lens and focal length share a camera
     #[arg(long, value_name = "NAME", default_value = "OPENCV")]
     pub camera_model: String,
-    /// Frames per second to take of a clip
+    /// Frames per second to extract from a clip
     #[arg(long, value_name = "F", default_value_t = 2.0)]
     pub fps: f64,
     /// Path of ffmpeg, for clips
     #[arg(long, value_name = "PATH", default_value = "ffmpeg")]
     pub ffmpeg: PathBuf,
-    /// Let COLMAP use the GPU, which takes a display or CUDA
+    /// Let COLMAP use the GPU, which requires a display or CUDA
     #[arg(long)]
     pub colmap_gpu: bool,
     /// Replace a dataset that `pose` wrote
@@ -65,7 +65,7 @@ const EXAMPLE: &str = "Example:
   nightsplat pose photos --out scene
   nightsplat train scene --out run";
 
-/// The most lenses that are listed.
+/// Maximum number of lenses that are listed.
 const MAX_LISTED: usize = 3;
 
 /// Estimates the cameras and writes the dataset.

@@ -80,8 +80,8 @@ impl Format {
 }
 
 impl Model {
-    /// Writes the model in the format that the file's extension names: `.ply`, `.spz`, `.glb` or `.sog`. The file states
-    /// the near plane, the alpha limit, the colours and the origin.
+    /// Writes the model in the format that the file's extension names: `.ply`, `.spz`, `.glb` or `.sog`. The file
+    /// states the near plane, the alpha limit, the colours and the origin.
     ///
     /// # Errors
     /// As [`Gaussians::save`].
@@ -90,7 +90,7 @@ impl Model {
         self.save_as(path, Format::of(path)?)
     }
 
-    /// Writes the model in a format, whatever the file is called.
+    /// Writes the model in a format, regardless of the file's extension.
     ///
     /// # Errors
     /// As [`Gaussians::save`].
@@ -131,11 +131,11 @@ pub struct Provenance {
     pub exposure: String,
     /// The rotation that was applied by [`Gaussians::rotated`].
     pub rotation: DQuat,
-    /// What a renderer must know; the origin is that of the Gaussians.
+    /// Settings that a renderer requires; the origin is that of the Gaussians.
     pub facts: Facts,
 }
 
-/// The program, as files name it.
+/// The program's name and version in files.
 pub const GENERATOR: &str = concat!("nightsplat ", env!("CARGO_PKG_VERSION"));
 
 impl Provenance {
@@ -156,13 +156,13 @@ impl Provenance {
 }
 
 impl Provenance {
-    /// What a renderer must know, with the origin.
+    /// The facts for a file of `gaussians`, with their origin.
     fn facts_of(&self, gaussians: &Gaussians) -> Facts {
         Facts { origin: gaussians.origin, ..self.facts }
     }
 
-    /// What a file's positions are in the dataset's world, where they are not the same: a line for a header. `half_turned`: the
-    /// file's axes are those of OpenGL.
+    /// A header line that maps the file's positions to the dataset's world, if they differ. `half_turned`: the file's
+    /// axes are those of OpenGL.
     fn world_line(&self, gaussians: &Gaussians, half_turned: bool) -> Option<String> {
         let back = self.rotation.inverse();
         let position = if self.rotation != DQuat::IDENTITY {
@@ -220,9 +220,9 @@ fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// The opacity before the sigmoid that a byte of 255 times the opacity stands for; finite at both ends.
+/// The opacity before the sigmoid that a byte represents; finite for 0 and 255.
 fn raw_opacity(byte: u8) -> f32 {
-    // The middle of what is rounded to 0, and to 255.
+    // The middle of the interval that rounds to 0, or to 255.
     let opacity = f32::from(byte).clamp(0.25, 254.75) / 255.0;
     (opacity / (1.0 - opacity)).ln()
 }

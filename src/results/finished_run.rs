@@ -88,7 +88,7 @@ impl FinishedRun {
         })
     }
 
-    /// Opens a model file, which holds few settings of its training.
+    /// Opens a model file, which has few settings of its training.
     fn open_model(
         path: &Path,
         dataset: Option<&Path>,
@@ -120,7 +120,7 @@ pub(crate) fn is_model(path: &Path) -> bool {
     path.is_file() || (!path.is_dir() && path.extension().is_some_and(is_named))
 }
 
-/// The settings to render a model file with; those of its training are unknown, but for what it states.
+/// The settings to render a model file with: the defaults, except for those that it states.
 pub(crate) fn config_of_file(
     gaussians: &Gaussians,
     facts: &Facts,

@@ -93,8 +93,8 @@ impl Model {
         }
     }
 
-    /// Reads a model: a PLY in the INRIA layout, recognised by its content. A build with the feature `io` reads SPZ, SOG
-    /// and run directories as well.
+    /// Reads a model: a PLY in the INRIA layout, recognised by its content. A build with the feature `io` reads SPZ,
+    /// SOG and run directories as well.
     ///
     /// The near plane, the alpha limit and the colours are those that the file states (`comment nightsplat near 0.1`),
     /// and else those of [`RenderSettings::default`].

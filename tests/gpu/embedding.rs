@@ -68,7 +68,7 @@ fn assert_same(what: &str, actual: &Image, expected: &Image) {
 }
 
 // ---------------------------------------------------------------------------
-// What is rendered
+// The scene
 
 const OPTIONS: RenderOptions = RenderOptions { sh_degree: 0, background: [0.1, 0.2, 0.3] };
 

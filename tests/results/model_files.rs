@@ -111,7 +111,7 @@ fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
     refused(&format!("export {model} --to html"), 3, &["copy.ply", "--dataset"]);
 }
 
-/// Removes what the file states of its model.
+/// Removes the facts that the file states.
 fn without_facts(path: &Path) {
     let bytes = fs::read(path).unwrap();
     let mut rest = &bytes[..];
@@ -131,7 +131,7 @@ fn without_facts(path: &Path) {
 }
 
 #[test]
-fn a_model_is_loaded_with_what_its_run_or_its_file_states_and_a_silent_file_with_the_defaults() {
+fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_defaults() {
     let place = Place::new();
     succeed(&place.train("run", "--steps 5 --near 0.05 --raw-colors on"));
     let own = place.path("run");
@@ -142,7 +142,7 @@ fn a_model_is_loaded_with_what_its_run_or_its_file_states_and_a_silent_file_with
     let settings = model.render_settings();
     assert_eq!((settings.near, settings.shape), (model.near, model.gaussians.shape));
 
-    // The file by itself, and the exports, state the same.
+    // The file alone and the exports state the same facts.
     let file = own.join("model.ply");
     let header = String::from_utf8_lossy(&fs::read(&file).unwrap()[..300]).into_owned();
     for line in ["max_alpha 0.99", "raw_colors true"] {
@@ -172,7 +172,7 @@ fn a_model_is_loaded_with_what_its_run_or_its_file_states_and_a_silent_file_with
     assert_eq!(stated["near"].to_string(), model.near.to_string());
     assert_eq!(stated["raw_colors"], true);
 
-    // A run from before files stated anything has its configuration.
+    // A run of a version whose files stated no facts uses its configuration.
     let shown = Gaussians::open(&file).unwrap();
     without_facts(&file);
     assert_eq!(Model::load(&own).unwrap(), model);
@@ -184,7 +184,7 @@ fn a_model_is_loaded_with_what_its_run_or_its_file_states_and_a_silent_file_with
 }
 
 #[test]
-fn what_a_file_states_is_one_line_of_an_error_where_it_is_nonsense() {
+fn an_invalid_fact_in_a_file_is_an_error_of_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.ply");
     let problem = |comment: &str| {
@@ -216,7 +216,7 @@ fn what_a_file_states_is_one_line_of_an_error_where_it_is_nonsense() {
         problem("world = position + 1 2"),
         "line 6 names the origin `1 2`, which is not three finite numbers"
     );
-    // What a later version states is skipped.
+    // Facts of later versions are skipped.
     Model::from(Gaussians::zeros(2, 0)).save(&path).unwrap();
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, text.replacen("element", "comment nightsplat later 1 2\nelement", 1)).unwrap();
@@ -224,7 +224,7 @@ fn what_a_file_states_is_one_line_of_an_error_where_it_is_nonsense() {
 
     fs::write(&path, "solid cube").unwrap();
     let error = Model::load(&path).unwrap_err().to_string();
-    assert!(error.ends_with("model.ply: is no model: it is not PLY, SPZ or SOG"), "{error}");
+    assert!(error.ends_with("model.ply: is not a model: neither PLY, SPZ nor SOG"), "{error}");
     let error = Model::load(folder.path()).unwrap_err().to_string();
     assert!(error.contains("no config.toml"), "{error}");
 }

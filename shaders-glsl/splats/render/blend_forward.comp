@@ -14,8 +14,8 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //! finds the groups of pixels that its ellipse meets; the batch is then broadcast splat by splat. The tile's state
 //! stays in registers: no shared memory, no barrier.
 //!
-//! With VIEW_DEPTHS the last channel is the depth in the view: a splat beyond a pixel's limit ends it, as the order is
-//! front to back, and the channel is the sum of the weighted depths, or the depth at which the transmittance passes 1/2.
+//! With VIEW_DEPTHS the last channel is the depth in the view: the sum of the weighted depths, or the depth at which
+//! the transmittance falls below 1/2. A splat beyond a pixel's limit ends the pixel, as the order is front to back.
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;
@@ -39,7 +39,7 @@ layout(binding = 9)           buffer Status     { uint status[]; };
 layout(binding = 10) readonly buffer Limits     { float limits[]; };  // (H, W) depth beyond which nothing is seen
 
 layout(constant_id = 11) const uint VIEW_DEPTHS = 0;  // 1: the last channel is the depth
-// The depth of a pixel without a limit, and of one where nothing is seen.
+// The depth of a pixel without a limit, and of one where nothing is visible.
 const float NO_DEPTH = 3.4e38;
 
 #include "tile_run.glsl"

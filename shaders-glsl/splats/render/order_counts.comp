@@ -8,8 +8,8 @@
 //!
 //! One subgroup per partition; the last to finish computes prefix sums of the partitions' sums, and the total. More
 //! intersections than the buffers hold set a sticky flag: the step then renders and updates nothing; the host grows the
-//! buffers, clears the flag and repeats it. A renderer that truncates keeps the nearest intersections that fit, and sets
-//! no flag.
+//! buffers, clears the flag and repeats it. A renderer that truncates keeps the nearest intersections that fit, and
+//! sets no flag.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

@@ -96,7 +96,7 @@ impl Page<'_> {
     }
 }
 
-/// The shader with what it has in common with the kernels.
+/// A shader of the page, with the constants and functions that it shares with the kernels.
 fn shader(text: &str, max_alpha: f32) -> String {
     let constants = [
         ("ALPHA_MIN", ALPHA_MIN),

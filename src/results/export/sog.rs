@@ -175,7 +175,7 @@ fn archive(meta: &str, files: &[(&str, [usize; 2], Vec<u8>)]) -> Result<Vec<u8>>
     Ok(zip.finish().map_err(|error| failed(&error))?.into_inner())
 }
 
-/// `meta.json`, as far as it is read.
+/// The parts of `meta.json` that are read.
 #[derive(Deserialize)]
 struct Meta {
     version: u32,
@@ -211,16 +211,16 @@ struct Rest {
     files: [String; 2],
 }
 
-/// The most bytes of a file in the archive.
+/// Maximum size of a file in the archive, bytes.
 const MOST: u64 = 1 << 30;
 
-/// The Gaussians of a file of version 2, and what it states of them.
+/// The Gaussians of a file of version 2, and the facts that it states.
 ///
 /// # Errors
-/// The problem: another format or version, cut short, or nonsense in what it states.
+/// The problem: another format or version, a truncated file, or an invalid fact.
 pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     let mut zip =
-        ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is no SOG: {error}"))?;
+        ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is not a SOG: {error}"))?;
     let meta = bytes_of(&mut zip, "meta.json")?;
     let meta: Value =
         serde_json::from_slice(&meta).map_err(|error| format!("meta.json: {error}"))?;
@@ -289,7 +289,7 @@ fn decode_rest(
     for (values, [a, b, ..]) in rows.zip(&labels.0) {
         let first = coefficients * usize::from(u16::from_le_bytes([*a, *b]));
         for (value, place) in values.iter_mut().zip(first..) {
-            let codes = sets.0.get(place).ok_or("names coefficients that it does not hold")?;
+            let codes = sets.0.get(place).ok_or("has a label beyond its coefficients")?;
             *value = decoded(&rest.codebook, *codes)?;
         }
     }
@@ -299,7 +299,7 @@ fn decode_rest(
 type Archive<'a> = ZipArchive<Cursor<&'a [u8]>>;
 
 fn bytes_of(zip: &mut Archive<'_>, name: &str) -> Result<Vec<u8>, String> {
-    let file = zip.by_name(name).map_err(|error| format!("is no SOG: {name}: {error}"))?;
+    let file = zip.by_name(name).map_err(|error| format!("is not a SOG: {name}: {error}"))?;
     let mut bytes = vec![];
     file.take(MOST).read_to_end(&mut bytes).map_err(|error| format!("{name}: {error}"))?;
     Ok(bytes)
@@ -327,11 +327,11 @@ fn image_of(zip: &mut Archive<'_>, name: &str, count: usize) -> Result<Pixels, S
     Ok(Pixels(pixels.to_vec(), image.width() as usize))
 }
 
-/// The three numbers that a pixel stands for.
+/// The three numbers that a pixel encodes.
 fn decoded(codebook: &[f32], [a, b, c, _]: [u8; 4]) -> Result<Vec3, String> {
     let number = |code: u8| codebook.get(usize::from(code)).copied();
     let numbers = number(a).zip(number(b)).zip(number(c));
-    let numbers = numbers.ok_or("names a code that its codebook does not have")?;
+    let numbers = numbers.ok_or("has a code beyond its codebook")?;
     Ok(Vec3::new(numbers.0.0, numbers.0.1, numbers.1))
 }
 
@@ -353,7 +353,7 @@ mod tests {
     use crate::results::export::tests::drawn;
 
     #[test]
-    fn a_model_comes_back_within_its_bits_with_what_is_stated_of_it() {
+    fn a_decoded_model_agrees_within_its_precision_and_has_the_stated_facts() {
         for degree in [0, 2] {
             let mut model = drawn(300, degree);
             model.origin = glam::DVec3::new(4_499_999.6, -519_997.7, 10_001.8);
@@ -384,7 +384,7 @@ mod tests {
             }
             let most = [3e-4, 0.03, 0.02, 1e-4, 0.14];
             assert!(errors.iter().zip(most).all(|(error, most)| *error < most), "{errors:?}");
-            // As many sets as Gaussians: each has its own.
+            // As many vectors in the palette as Gaussians: each has its own.
             let sum = |model: &Gaussians| model.rest().iter().sum::<Vec3>();
             assert!((sum(&back) - sum(&model)).abs().max_element() < 0.5, "{degree}");
         }
@@ -393,7 +393,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_cut_short_or_edited_is_an_error_and_no_panic() {
+    fn a_truncated_or_edited_file_is_an_error_and_not_a_panic() {
         let file = encode(&drawn(40, 1), &Provenance::default()).unwrap();
         for length in (0..file.len()).step_by(7) {
             assert!(decode(&file[..length]).is_err(), "{length} bytes");

@@ -1,9 +1,10 @@
 //! SPZ: fixed-point positions and 8 bits for everything else, about a tenth of a PLY. Source: the specification of the
 //! format.
 //!
-//! Version 4 has a plain header, a table and a Zstandard stream for each attribute; version 3, which more readers know, one
-//! gzip stream of a shorter header and the same bytes. Axes are those of OpenGL. What a renderer must know, and where the
-//! origin lies, is text where readers do not look: the comment of the gzip header, or the end of the file.
+//! Version 4 has a plain header, a table and a Zstandard stream per attribute; version 3, which more readers support,
+//! is one gzip stream of a shorter header and the same bytes. The axes are those of OpenGL. The facts for a renderer,
+//! including the origin, are text where readers do not look: in the comment of the gzip header, or at the end of the
+//! file.
 
 use std::io::Read;
 
@@ -78,17 +79,17 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) 
                 file.extend((stream.len() as u64).to_le_bytes());
             }
             compressed.iter().for_each(|stream| file.extend(stream));
-            // Behind all that the table names, where a reader does not look.
+            // After everything that the table lists, where readers do not look.
             file.extend(text.bytes());
             Ok(file)
         }
     }
 }
 
-/// The Gaussians of a file of version 2, 3 or 4, and what it states of them.
+/// The Gaussians of a file of version 2, 3 or 4, and the facts that it states.
 ///
 /// # Errors
-/// The problem: another format or version, cut short, or nonsense in the text.
+/// The problem: another format or version, a truncated file, or an invalid fact.
 pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     let (header, streams, text) = match file {
         [0x1f, 0x8b, ..] => unzipped(file)?,
@@ -122,7 +123,7 @@ pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     Ok((gaussians, facts))
 }
 
-/// The words that all versions begin with.
+/// The words at the start of every version.
 struct Header {
     version: u32,
     count: usize,
@@ -133,13 +134,13 @@ struct Header {
 /// Positions, opacities, colours, scales, rotations, higher coefficients.
 type Streams = [Vec<u8>; 6];
 
-const CUT_SHORT: &str = "is cut short";
+const TRUNCATED: &str = "is truncated";
 
 impl Header {
     fn parse(bytes: &[u8]) -> Result<Self, String> {
         let word = |at| word(bytes, at);
         if word(0)? != MAGIC {
-            return Err("is no SPZ".to_owned());
+            return Err("is not an SPZ".to_owned());
         }
         let [degree, fraction, ..] = word(12)?.to_le_bytes();
         if u32::from(degree) > MAX_SH_DEGREE {
@@ -166,15 +167,15 @@ impl Header {
 
 fn word(bytes: &[u8], at: usize) -> Result<u32, String> {
     let word = bytes.get(at..at + 4).and_then(|word| word.try_into().ok());
-    word.map(u32::from_le_bytes).ok_or_else(|| CUT_SHORT.to_owned())
+    word.map(u32::from_le_bytes).ok_or_else(|| TRUNCATED.to_owned())
 }
 
-/// Exactly `length` bytes of a decoder.
+/// Reads exactly `length` bytes from a decoder.
 fn exactly(decoder: &mut impl Read, length: usize) -> Result<Vec<u8>, String> {
     let mut bytes = vec![];
     let read = decoder.take(length as u64).read_to_end(&mut bytes);
     read.map_err(|error| format!("cannot be unpacked: {error}"))?;
-    if bytes.len() == length { Ok(bytes) } else { Err(CUT_SHORT.to_owned()) }
+    if bytes.len() == length { Ok(bytes) } else { Err(TRUNCATED.to_owned()) }
 }
 
 /// Header, streams and comment of version 2 or 3.
@@ -188,7 +189,7 @@ fn unzipped(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
     for (stream, length) in streams.iter_mut().zip(header.lengths()) {
         *stream = exactly(&mut decoder, length)?;
     }
-    // The end has the checksum.
+    // Reading to the end verifies the checksum.
     match decoder.read(&mut [0]) {
         Ok(0) => {}
         Ok(_) => return Err(format!("holds more than its {} Gaussians", header.count)),
@@ -212,7 +213,7 @@ fn unpacked(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
     for place in 0..stream_count {
         let length = word(file, table + 16 * place)? as usize;
         let (stream, after) =
-            rest.and_then(|rest| rest.split_at_checked(length)).ok_or(CUT_SHORT)?;
+            rest.and_then(|rest| rest.split_at_checked(length)).ok_or(TRUNCATED)?;
         rest = Some(after);
         if let Some(own) = streams.get_mut(place) {
             let decoder = StreamingDecoder::new(stream);
@@ -245,13 +246,13 @@ fn of_smallest_three(code: u32) -> [f32; 4] {
     [w, x, y, z]
 }
 
-/// Version 2: x, y and z in a byte each, and w is positive.
+/// Version 2: x, y and z in a byte each; w is positive.
 fn of_first_three(bytes: [f32; 3]) -> [f32; 4] {
     let [x, y, z] = bytes.map(|byte| byte / 127.5 - 1.0);
     [(1.0 - x * x - y * y - z * z).max(0.0).sqrt(), x, y, z]
 }
 
-/// As many as leave room for the farthest position.
+/// The most fractional bits that represent the farthest position.
 fn fractional_bits(gaussians: &Gaussians) -> Result<u8> {
     let farthest =
         floats(gaussians.means()).iter().fold(0.0_f32, |most, value| most.max(value.abs()));
@@ -369,7 +370,7 @@ mod tests {
     }
 
     #[test]
-    fn a_model_comes_back_within_its_bits_with_what_is_stated_of_it() {
+    fn a_decoded_model_agrees_within_its_precision_and_has_the_stated_facts() {
         let mut model = drawn(37, 3);
         model.origin = glam::DVec3::new(4_499_999.6, -519_997.7, 10_001.8);
         let facts = Facts {
@@ -393,7 +394,7 @@ mod tests {
                 (error(model.raw_opacities(), back.raw_opacities()), 0.14),
             ];
             assert!(pairs.iter().all(|(error, most)| error <= most), "{pairs:?}");
-            // What it holds comes back to the bit.
+            // A second round trip is exact.
             let again = decode(&encode(&back, &provenance, version).unwrap()).unwrap().0;
             assert_eq!((again.means(), again.dc()), (back.means(), back.dc()), "{version:?}");
         }
@@ -402,12 +403,12 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_cut_short_or_edited_is_an_error_and_no_panic() {
+    fn a_truncated_or_edited_file_is_an_error_and_not_a_panic() {
         let facts = Facts { near: Some(0.1), ..Facts::default() };
         let provenance = Provenance { facts, ..Provenance::default() };
         for version in [Version::V3, Version::V4] {
             let file = encode(&drawn(5, 1), &provenance, version).unwrap();
-            // The text ends the file of version 4, and no text is a text.
+            // A file of version 4 ends with the text, which is optional.
             let end =
                 file.len() - if version == Version::V4 { "nightsplat near 0.1".len() } else { 0 };
             for length in 0..end {

@@ -52,7 +52,7 @@ pub struct RunDirectory {
     terms: Vec<Term>,
     /// Seconds of the steps that the log already contained.
     seconds_before: f64,
-    /// Whether what it replaces is still there.
+    /// Whether the run that it replaces still exists.
     is_new: bool,
     /// The previous run; restored if this is dropped before [`RunDirectory::settle`].
     backup: Backup,
@@ -436,7 +436,7 @@ mod tests {
         assert!(load_config(folder.path()).unwrap_err().to_string().contains("config.toml"));
         drop(create(folder.path(), &TrainConfig::default(), false).unwrap());
         let refused = load_gaussians(folder.path()).unwrap_err().to_string();
-        assert!(refused.contains("did not finish"), "{refused}");
+        assert!(refused.contains("neither finished"), "{refused}");
     }
 
     #[test]

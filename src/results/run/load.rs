@@ -63,7 +63,7 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
 /// The trained Gaussians of a run, in the colours that viewers show.
 ///
 /// # Errors
-/// The run has not been trained to its end or a checkpoint, or the file is cut short.
+/// The run neither finished nor reached a checkpoint, or the file is truncated.
 pub fn load_gaussians(run: &Path) -> Result<Gaussians> {
     let path = run.join("model.ply");
     if !path.is_file() {

@@ -21,7 +21,7 @@ pub struct Target<'a> {
     pub color: Option<&'a HostImage>,
     /// R32F: depth in the view, world units; infinite where nothing is seen.
     pub depth: Option<&'a HostImage>,
-    /// What of `depth` is stored.
+    /// The kind of depth to store.
     pub depth_kind: DepthKind,
     /// The host's depth, beyond which nothing is drawn.
     pub scene: Option<SceneDepth<'a>>,

@@ -1,8 +1,8 @@
 //! Gaussians as a PLY file in the INRIA layout, which splat viewers open.
 //!
 //! Binary little-endian, one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`.
-//! Positions far from the world's origin are relative to another one, which a comment gives: `world = position + X Y
-//! Z`. Others state what a renderer must know, `nightsplat near 0.1`: [`Facts`]. Features, where the scene has any, are
+//! Positions far from the world's origin are relative to another origin, given in a comment: `world = position + X Y
+//! Z`. Other comments state the settings of a renderer, such as `nightsplat near 0.1`: [`Facts`]. Features, if any, are
 //! between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`, which viewers skip. Normals are
 //! zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid, scales are
 //! logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
@@ -148,10 +148,10 @@ pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     Ok(gaussians)
 }
 
-/// The Gaussians of a file, and what it states of them.
+/// The Gaussians of a file, and the facts that it states.
 ///
 /// # Errors
-/// The problem, as [`load`] has it.
+/// The problem, as in [`load`].
 pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
     let header = Header::parse(bytes)?;
     let body = &bytes[header.length..];
@@ -208,7 +208,7 @@ struct Header {
     properties: HashMap<String, (usize, String)>,
     /// Whether other elements follow the vertices.
     more_elements: bool,
-    /// What the comments state.
+    /// The facts in the comments.
     facts: Facts,
 }
 
