@@ -63,7 +63,7 @@ fn every_planted_defect_has_a_test() {
 #[test]
 fn every_planted_defect_replaces_text_that_exists_once() {
     for [name, file, before, ..] in defects() {
-        let text = fs::read_to_string(Path::new(ROOT).join(file)).unwrap();
+        let text = fs::read_to_string(Path::new(ROOT).join(&file)).unwrap();
         assert_eq!(text.matches(before.as_str()).count(), 1, "{name} ({file}): {before}");
     }
 }

@@ -1,4 +1,4 @@
-//! Whether a dataset is what it was, told without decoding a photograph.
+//! Detects without decoding whether a dataset has changed.
 
 use std::path::Path;
 
@@ -30,7 +30,7 @@ impl Dataset {
         let mut hasher = Hasher::default();
         hasher.write(READING);
         for source in sources(root, &frames, options, &files, &mut skipped) {
-            // Debug tells every two cameras apart.
+            // The Debug output distinguishes all cameras.
             let view = format!("{} {:?} {:?}", source.name, source.split, source.lens);
             hasher.write(view.as_bytes());
             hasher.write_numbers(&source.view_from_world.to_cols_array());
@@ -52,13 +52,13 @@ impl Dataset {
     }
 }
 
-/// Of how files are read: another where the same file gives other pixels than before.
+/// The version of the decoding; changed if the same file gives other pixels than before.
 const READING: &[u8] = b"in sRGB";
 
 fn write_file(hasher: &mut Hasher, path: &Path) {
     hasher.write(path.as_os_str().as_encoded_bytes());
     let Ok((length, changed)) = tree::metadata(path) else { return };
-    // Debug tells every two times apart.
+    // The Debug output distinguishes all times.
     let changed = format!("{changed:?}");
     hasher.write(&length.to_le_bytes());
     hasher.write(changed.as_bytes());
