@@ -1,15 +1,15 @@
-//! The up direction and the focus of a scene, from the axes of its cameras.
+//! What the axes of a scene's cameras tell: which way is up, and what they look at.
 
 use glam::{DMat3, DVec3};
 
 use super::Camera;
 
-/// The optical axis, in world space.
+/// The optical axis, in the world.
 pub(super) fn forward(pose: &Camera) -> DVec3 {
     pose.view_from_world.matrix3.row(2)
 }
 
-/// The image's up direction, in world space; y points down in an image.
+/// What is up in the image, in the world; an image's y points down.
 pub(super) fn up(pose: &Camera) -> DVec3 {
     -pose.view_from_world.matrix3.row(1)
 }
@@ -19,8 +19,8 @@ pub(super) fn mean(vectors: impl ExactSizeIterator<Item = DVec3>) -> DVec3 {
     vectors.sum::<DVec3>() / count
 }
 
-/// The up direction in world space, a unit vector, from level cameras: perpendicular to all their horizontal axes, on
-/// the side of their mean up direction. The mean itself would be tilted if cameras on one side look down.
+/// What is up in the world, a unit vector, for cameras that are held level: across all their horizontal axes, on the
+/// side of their mean. The mean of cameras on one side that look down would lean.
 pub(crate) fn upwards(poses: &[Camera]) -> DVec3 {
     let mut horizontal = DMat3::from_diagonal(DVec3::splat(1e-6));
     for pose in poses {
@@ -28,7 +28,7 @@ pub(crate) fn upwards(poses: &[Camera]) -> DVec3 {
         let axes = [right * right.x, right * right.y, right * right.z];
         horizontal += DMat3::from_cols(axes[0], axes[1], axes[2]) * (1.0 / poses.len() as f64);
     }
-    // Inverse iteration finds the direction with the smallest component along the axes.
+    // Inverse iteration: what the axes have least of is left.
     let (inverse, mut up) = (horizontal.inverse(), mean(poses.iter().map(up)));
     for _ in 0..8 {
         up = (inverse * up).normalize_or(DVec3::NEG_Y);
@@ -36,9 +36,9 @@ pub(crate) fn upwards(poses: &[Camera]) -> DVec3 {
     up
 }
 
-/// The point with the least squared distances to the optical axes; `None` if they are almost parallel.
+/// The point with the least squared distances to the optical axes; `None` where they are as good as parallel.
 pub(super) fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
-    /// With less rotation between cameras, distances are undetermined.
+    /// Less of the cameras' turns says nothing of a distance.
     const MIN_DETERMINANT: f64 = 1e-6;
     let (mut matrix, mut vector) = (DMat3::ZERO, DVec3::ZERO);
     for pose in poses {

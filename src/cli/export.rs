@@ -269,7 +269,7 @@ fn bookmarks(
             view.loaded_reference()?.map(|image| ("reference".to_owned(), image.into_owned())),
             rendered(view)?,
         ];
-        // A mirrored photograph shows a mirrored world, which the page keeps.
+        // A mirrored photograph is of a mirrored world, which the page shows as it is.
         let turned =
             |(label, image): (String, Image)| (label, image.turned(view.orientation.turn()));
         Ok(Bookmark {

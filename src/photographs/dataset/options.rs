@@ -27,7 +27,7 @@ pub struct LoadOptions {
     pub keep: Option<u64>,
     /// The folder with the photographs under their listed names, instead of their listed paths.
     pub images: Option<PathBuf>,
-    /// A folder of reference images by name, instead of those next to the photographs.
+    /// A folder of reference images by name, in place of what is found beside the input.
     pub reference: Option<PathBuf>,
     /// Whether test views also load their dark photograph, if any.
     pub load_low_test: bool,

@@ -105,7 +105,7 @@ struct Loading<'a> {
     originals: &'a Allowance,
     /// Black borders of photographs by their size as stored.
     borders: &'a BTreeMap<(u32, u32), Border>,
-    /// Counts of the colour conversions of photographs and of reference images.
+    /// What was made of the colours of photographs and of reference images.
     colours: &'a [ColourCounts; 2],
 }
 
@@ -150,7 +150,8 @@ fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOption
     if let Some(most) = excess {
         let [bytes, most] = [bytes, most].map(|bytes| bytes as f64 / f64::from(1 << 30));
         tracing::info!(
-            "the photographs take {bytes:.1} GiB decoded, the cache has {most:.1}: they are read anew when they are looked at"
+            "the photographs take {bytes:.1} GiB decoded, the cache has {most:.1}: they are read anew when they are \
+             looked at"
         );
     }
     let keep = if excess.is_some() { Some(0) } else { options.keep };
@@ -165,7 +166,7 @@ impl Source {
     /// [`Error::Input`] where the picture has another shape than its camera.
     fn fit(&mut self, headers: [Option<Header>; 2]) -> Result<()> {
         let lens = self.lens;
-        // A file without a readable header is reported when it is decoded.
+        // What has no readable header is named when it is decoded.
         self.turns = headers
             .map(|header| header.map(|header| Turns::new(header, &lens)).unwrap_or_default());
         let sizes = headers

@@ -60,7 +60,7 @@ impl Dataset {
         if gone > 0 {
             tracing::warn!(
                 "{}: {gone} of {before} points lie more than a million times the cameras' extent away, or nowhere; they \
-                 are                  left out",
+                 are left out",
                 self.root.display()
             );
         }

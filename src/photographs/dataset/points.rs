@@ -13,7 +13,7 @@ use crate::Result;
 use crate::base::tree;
 use crate::photographs::image::files::is_hidden;
 
-/// The largest camera-centre error, relative to the cameras' extent, at which two worlds count as the same.
+/// The maximum error of camera centres, relative to the cameras' extent, at which two worlds are the same.
 const MAX_WORLD_RESIDUAL: f64 = 0.01;
 
 /// The points of the dataset, in the views' world: those of its COLMAP model, which know the photographs that see them;
@@ -61,7 +61,8 @@ fn warn_of_unread(layout: &Layout, models: &[PathBuf]) {
     files.sort();
     if let Some(first) = files.first() {
         tracing::warn!(
-            "{}: is not read; points come from a COLMAP model, from `ply_file_path` of a transforms.json or from points3D.ply",
+            "{}: is not read; points come from a COLMAP model, from `ply_file_path` of a transforms.json or from \
+             points3D.ply",
             first.display()
         );
     }

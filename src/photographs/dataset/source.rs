@@ -63,5 +63,6 @@ impl Source {
     }
 }
 
-/// What files may take that are read before they are decoded, bytes: those beyond are opened once for their size, and again.
+/// Maximum size of files that are read before they are decoded, bytes: others are opened once for their size, and
+/// again.
 pub(super) const MAX_READ: u64 = 1 << 28;

@@ -13,9 +13,9 @@ use crate::base::tree;
 use crate::photographs::image::files::Files;
 
 impl Dataset {
-    /// A checksum of what is listed below `root`: views with their cameras and splits, and of every file that they or the points
-    /// are read from its path, length and time of change. Equal stamps are of the same dataset; one that was copied, or whose
-    /// photographs were written again, has another although it may hold the same pixels.
+    /// A checksum of the listing below `root`: views with their cameras and splits, and path, length and time of change
+    /// of every file of the views or the points. Equal stamps mean the same dataset; one that was copied, or whose
+    /// photographs were rewritten, has another stamp even with the same pixels.
     ///
     /// # Errors
     /// As [`Dataset::photographs`].
@@ -52,7 +52,7 @@ impl Dataset {
     }
 }
 
-/// The version of the decoding; changed if the same file gives other pixels than before.
+/// Of how files are read: another where the same file gives other pixels than before.
 const READING: &[u8] = b"in sRGB";
 
 fn write_file(hasher: &mut Hasher, path: &Path) {
