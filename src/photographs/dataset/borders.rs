@@ -10,7 +10,7 @@ use super::Split;
 use super::source::Source;
 use crate::photographs::image::{Image, PictureFile};
 
-/// The masked pixels of photographs of one size, as ascending indices into a plane.
+/// The pixels of photographs of one size that show nothing, as indices into a plane, ascending.
 pub(super) type Border = Arc<Vec<usize>>;
 
 /// The maximum encoded value of black: JPEG turns 0 into up to this within a block.
@@ -52,8 +52,7 @@ pub(super) fn find<'a>(sources: impl Iterator<Item = &'a Source>) -> BTreeMap<(u
         let border = border(images, size)?;
         let (width, height) = size;
         tracing::warn!(
-            "{:.1} % of the photographs of {width}x{height} is black in the same place at the border, as undistorting \
-             leaves \
+            "{:.1} % of the photographs of {width}x{height} is black in the same place at the border, as undistorting leaves \
              it where the lens saw nothing: masked (mask_borders = false trains on it)",
             100.0 * border.len() as f64 / f64::from(width) / f64::from(height)
         );
