@@ -58,6 +58,8 @@ pub use check::{CheckReport, CheckedPass, Difference, Tolerance};
 pub use choice::DeviceChoice;
 pub(crate) use choice::SchedulerVariables;
 pub use cooperative::CooperativeMatrix;
+#[cfg(feature = "capi")]
+pub(crate) use device::check_physical_device;
 pub use device_report::{DeviceLimits, DeviceReport, RequirementReport, devices};
 pub use download::Download;
 pub use host::{HostAllocation, HostDevice, HostFrame, MemoryFunctions, QueueLock};

@@ -18,7 +18,6 @@ pub mod attributes;
 pub mod batches;
 #[cfg(feature = "io")]
 pub mod densify;
-#[cfg(any(feature = "io", feature = "check"))]
 pub mod harmonics;
 pub mod model;
 #[cfg(feature = "io")]

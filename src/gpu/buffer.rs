@@ -40,6 +40,12 @@ impl<T: bytemuck::Pod> Buffer<T> {
         self.memory.handle().as_raw()
     }
 
+    /// Whether it is in the memory of this device.
+    #[cfg(feature = "capi")]
+    pub(crate) fn is_on(&self, gpu: &Gpu) -> bool {
+        std::sync::Arc::ptr_eq(&self.memory.shared, &gpu.shared)
+    }
+
     /// All of it, to read.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn slice(&self) -> Slice<'_, T> {

@@ -145,6 +145,12 @@ impl Gpu {
         Self::assemble(&instance, parts, Owner::Host(&host))
     }
 
+    /// Whether the device only records, so that nothing can be submitted or read back.
+    #[cfg(feature = "capi")]
+    pub(crate) fn is_record_only(&self) -> bool {
+        self.shared.host.as_ref().is_some_and(|host| host.is_record_only)
+    }
+
     fn assemble(instance: &ash::Instance, parts: DeviceParts, owner: Owner<'_>) -> Result<Self> {
         #[cfg(feature = "testing")]
         let faults = Faults::from_environment()?;
@@ -193,6 +199,25 @@ impl Gpu {
             }),
         })
     }
+}
+
+/// Whether a physical device of a host's can be used.
+///
+/// # Errors
+/// It lacks a requirement, which is named.
+///
+/// # Safety
+/// The handles are valid.
+#[cfg(feature = "capi")]
+pub(crate) unsafe fn check_physical_device(
+    get_instance_proc_addr: vk::PFN_vkGetInstanceProcAddr,
+    instance: vk::Instance,
+    physical: vk::PhysicalDevice,
+) -> Result<()> {
+    // SAFETY: as the caller promises.
+    let instance =
+        unsafe { ash::Instance::load(&ash::StaticFn { get_instance_proc_addr }, instance) };
+    Supported::gather(&instance, physical).map_err(loader_error)?.check()
 }
 
 /// A device before it is a [`Gpu`].

@@ -66,7 +66,8 @@ impl Ring {
             known.filter(|(_, slot)| is_done(slot)).max_by_key(|(_, slot)| slot.number)?;
         let bytes = self.words * size_of::<u32>();
         let mapped = self.memory.mapped()?.get(index * bytes..)?.get(..bytes)?;
-        let words = bytemuck::pod_collect_to_vec(mapped);
+        let mut words = vec![0u32; self.words];
+        bytemuck::cast_slice_mut(&mut words).copy_from_slice(mapped);
         Some(Newest { frame: slot.recording.frame, number: slot.number, tag: slot.tag, words })
     }
 }

@@ -2,13 +2,18 @@
 
 use std::borrow::Cow;
 
+#[cfg(feature = "capi")]
+use glam::{DAffine3, DMat3, DQuat};
+
 #[cfg(any(test, not(feature = "io")))]
 use crate::base::input;
 use crate::splats::render::RenderSettings;
+#[cfg(feature = "capi")]
+use crate::splats::scene::Features;
 #[cfg(any(test, not(feature = "io")))]
 use crate::splats::scene::ply;
 use crate::splats::scene::{Facts, Gaussians};
-#[cfg(any(test, not(feature = "io")))]
+#[cfg(any(test, feature = "capi", not(feature = "io")))]
 use crate::{Error, Result};
 
 /// A model with what a renderer must know of it.
@@ -74,6 +79,48 @@ impl Model {
         }
     }
 
+    /// One model of several, each turned and moved by a rigid pose, so that all are sorted together. Near plane, alpha
+    /// limit and colours are the first one's; positions are relative to its origin, and to none where they are moved.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] where there is no part, a pose is not rigid, or a part has other colours or another alpha limit.
+    #[cfg(feature = "capi")]
+    pub(crate) fn join(parts: &[(&Self, DAffine3)]) -> Result<Self> {
+        let [(first, _), ..] = parts else {
+            return Err(Error::Usage("no models to join; pass at least one".to_owned()));
+        };
+        let sh_degree = parts.iter().map(|(part, _)| part.gaussians.shape.sh_degree).max();
+        let count = parts.iter().map(|(part, _)| part.gaussians.count).sum();
+        let mut joined = Gaussians::zeros(count, sh_degree.unwrap_or_default());
+        let mut at = 0;
+        for (index, (part, pose)) in parts.iter().enumerate() {
+            let refuse = |problem: &str| Err(Error::Usage(format!("model {index} {problem}")));
+            if !is_rigid(pose) {
+                return refuse("has a pose that is not rigid; take scale and reflection out");
+            }
+            if part.raw_colors != first.raw_colors || part.max_alpha != first.max_alpha {
+                return refuse("has other colours or another alpha limit than the first");
+            }
+            let shown = part.gaussians.with_features(Features::NONE);
+            let moved = shown
+                .with_sh_degree(joined.shape.sh_degree)
+                .rotated(DQuat::from_mat3(&pose.matrix3));
+            let offset = moved.origin + pose.translation;
+            let range = at..at + moved.count;
+            for (to, from) in joined.means_mut()[range.clone()].iter_mut().zip(moved.means()) {
+                *to = (from.as_dvec3() + offset).as_vec3();
+            }
+            joined.quats_mut()[range.clone()].copy_from_slice(moved.quats());
+            joined.log_scales_mut()[range.clone()].copy_from_slice(moved.log_scales());
+            joined.raw_opacities_mut()[range.clone()].copy_from_slice(moved.raw_opacities());
+            joined.dc_mut()[range.clone()].copy_from_slice(moved.dc());
+            let rest = moved.rest().len() / moved.count.max(1);
+            joined.rest_mut()[rest * range.start..rest * range.end].copy_from_slice(moved.rest());
+            at = range.end;
+        }
+        Ok(Self { gaussians: joined, ..**first })
+    }
+
     /// The Gaussians in the colours that viewers show, as files hold them.
     pub(crate) fn shown(&self) -> Cow<'_, Gaussians> {
         let mut shown = Cow::Borrowed(&self.gaussians);
@@ -105,6 +152,14 @@ impl Model {
     pub fn load(path: impl AsRef<std::path::Path>) -> Result<Self> {
         load_ply(path.as_ref())
     }
+}
+
+/// A rotation within a thousandth, and a translation.
+#[cfg(feature = "capi")]
+fn is_rigid(pose: &DAffine3) -> bool {
+    let off = pose.matrix3 * pose.matrix3.transpose() - DMat3::IDENTITY;
+    let is_rotation = off.to_cols_array().iter().all(|x| x.abs() <= 1e-3);
+    is_rotation && pose.matrix3.determinant() > 0.0 && pose.translation.is_finite()
 }
 
 /// What a build without the feature `io` reads.

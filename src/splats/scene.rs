@@ -3,10 +3,7 @@
 use std::fmt;
 use std::ops::Range;
 
-#[cfg(feature = "io")]
-use glam::{DMat3, DQuat};
-use glam::{DVec3, Vec3};
-#[cfg(feature = "io")]
+use glam::{DMat3, DQuat, DVec3, Vec3};
 use rayon::prelude::*;
 
 mod device;
@@ -22,7 +19,6 @@ pub mod ply;
 use crate::camera::TrainingFrame;
 pub use crate::splats::attributes::{ATTRIBUTES, Attribute, PlaneCounts, rest_coefficients};
 use crate::splats::attributes::{column_count, planes};
-#[cfg(feature = "io")]
 use crate::splats::harmonics::HarmonicRotation;
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
 pub use facts::Facts;
@@ -186,9 +182,8 @@ impl Gaussians {
 
     /// The model in a world that is rotated about its origin: direction `d` becomes `rotation * d`.
     ///
-    /// [`Gaussians::save`] assumes the up direction -y, as for level cameras with `OpenCV`'s axes; rotate a model with
-    /// another `up` by `DQuat::from_rotation_arc(up, DVec3::NEG_Y)` first.
-    #[cfg(feature = "io")]
+    /// [`Gaussians::save`] takes the direction -y for up, as cameras that are held level in `OpenCV`'s axes have it;
+    /// a model whose `up` is another one is turned by `DQuat::from_rotation_arc(up, DVec3::NEG_Y)` first.
     pub fn rotated(&self, rotation: DQuat) -> Self {
         let mut rotated = self.clone();
         rotated.origin = rotation * self.origin;

@@ -141,8 +141,22 @@ impl Preset {
 }
 
 impl Trainer {
-    /// A trainer as of `nightsplat train --preset`: the photographs are diagnosed, unless the preset sets everything.
-    /// `dataset` must be loaded with [`Preset::load_options`].
+    /// A trainer on the dataset in a folder, with settings as config.toml holds them; a diagnosis of the photographs
+    /// decides the rest.
+    ///
+    /// # Errors
+    /// A setting is invalid, the dataset cannot be used, or the device is out of memory or lost.
+    #[cfg(feature = "capi")]
+    pub(crate) fn with_settings(gpu: &Gpu, dataset: &str, toml: &str) -> Result<Self> {
+        let file = SettingsLayer::of_toml(toml, &Origin::Default)?;
+        let mut requested = RequestedSettings { file, ..RequestedSettings::default() };
+        requested.options.push("dataset", dataset.into(), Origin::Option("dataset"))?;
+        let run = requested.planned(PlanSource::Diagnosis, gpu)?;
+        Self::new(gpu, run.config, &run.dataset)
+    }
+
+    /// A trainer as of `nightsplat train --preset`: the photographs are diagnosed, unless the preset states everything.
+    /// `dataset` is loaded with [`Preset::load_options`].
     ///
     /// # Errors
     /// The dataset cannot be used, or the device is out of memory or lost.

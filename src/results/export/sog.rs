@@ -39,7 +39,7 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
 
     let scales = codebook(gaussians.log_scales().iter().flat_map(|scale| scale.to_array()));
     let colors = codebook(gaussians.dc().iter().flat_map(|dc| dc.to_array()));
-    let coded = |codes: &[f32], value: glam::Vec3| value.to_array().map(|v| nearest(codes, v));
+    let coded = |codes: &[f32], value: Vec3| value.to_array().map(|v| nearest(codes, v));
     let byte = |i: usize, shift: u32| positions[i].map(|value| (value >> shift) as u8);
     let opaque = |[r, g, b]: [u8; 3], a: u8| [r, g, b, a];
     let opacity = |i: usize| (255.0 * sigmoid(gaussians.raw_opacities()[i])).round() as u8;
@@ -220,7 +220,7 @@ const MOST: u64 = 1 << 30;
 /// The problem: another format or version, a truncated file, or an invalid fact.
 pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     let mut zip =
-        ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is not a SOG: {error}"))?;
+        ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is no SOG: {error}"))?;
     let meta = bytes_of(&mut zip, "meta.json")?;
     let meta: Value =
         serde_json::from_slice(&meta).map_err(|error| format!("meta.json: {error}"))?;

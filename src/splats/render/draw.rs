@@ -157,6 +157,25 @@ impl Renderer {
         self.reserve_sorts()
     }
 
+    /// Takes memory for this many Gaussians, views of this size and this many intersections ahead of the first draw.
+    ///
+    /// # Errors
+    /// The device is out of memory, or the tiles exceed its limit.
+    #[cfg(feature = "capi")]
+    pub(crate) fn reserve_draw(
+        &mut self,
+        gaussian_count: usize,
+        size: [u32; 2],
+        intersections: u32,
+    ) -> Result<()> {
+        self.reserve_sizes(gaussian_count, gaussian_count, [size.into()])?;
+        let wanted = intersections.min(self.max_intersections());
+        if wanted > self.frame.intersection_capacity() {
+            self.frame.grow_intersections(&self.gpu, wanted)?;
+        }
+        self.reserve_sorts()
+    }
+
     /// Grows the memory where the newest draw that is done had more intersections. Where memory is out, draws go on
     /// with what there is.
     fn grow_as_drawn(&mut self) {

@@ -1,0 +1,280 @@
+//! Codes, the last error of each thread, and the log.
+
+use std::any::Any;
+use std::cell::RefCell;
+use std::ffi::{c_char, c_void};
+use std::fmt::{self, Write as _};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Mutex, Once, PoisonError};
+
+use ash::vk;
+use tracing::field::{Field, Visit};
+use tracing::span::{Attributes, Id, Record};
+use tracing::{Event, Level, Metadata, Subscriber};
+
+use crate::Error;
+
+/// The version of this header, as `VK_MAKE_API_VERSION(0, major, minor, patch)`.
+pub const NSP_HEADER_VERSION: u32 = 1 << 12;
+
+/// 0 or more: done. Otherwise an error, whose text is in `nsp_last_error`.
+pub type NspResult = i32;
+
+/// Done.
+pub const NSP_OK: NspResult = 0;
+/// Arguments that make no sense; nothing was recorded.
+pub const NSP_ERROR_USAGE: NspResult = -2;
+/// A file that cannot be used.
+pub const NSP_ERROR_INPUT: NspResult = -3;
+/// The device lacks a feature, or a limit of it is too low.
+pub const NSP_ERROR_DEVICE: NspResult = -4;
+/// Out of device or host memory; the object is as it was.
+pub const NSP_ERROR_MEMORY: NspResult = -5;
+/// The device was lost; destroy everything.
+pub const NSP_ERROR_LOST: NspResult = -6;
+/// A file that cannot be written.
+pub const NSP_ERROR_OUTPUT: NspResult = -7;
+/// A `struct_size` below that of version 0.1, or bytes that are not zero beyond what this library reads.
+pub const NSP_ERROR_VERSION: NspResult = -8;
+/// Not part of this build: training, or a file format.
+pub const NSP_ERROR_UNSUPPORTED: NspResult = -9;
+/// A number that is not finite.
+pub const NSP_ERROR_NOT_FINITE: NspResult = -10;
+/// Stopped on request.
+pub const NSP_ERROR_STOPPED: NspResult = -11;
+/// A bug of the library, caught; the object can only be destroyed.
+pub const NSP_ERROR_INTERNAL: NspResult = -127;
+
+/// Bytes of an error's text, with the NUL at its end.
+const TEXT: usize = 1024;
+
+thread_local!(static LAST: RefCell<[u8; TEXT]> = const { RefCell::new([0; TEXT]) });
+
+/// An error on its way to C.
+#[derive(Debug)]
+pub(super) struct Failure {
+    code: NspResult,
+    text: String,
+}
+
+impl Failure {
+    pub(super) fn usage(text: impl Into<String>) -> Self {
+        Self { code: NSP_ERROR_USAGE, text: text.into() }
+    }
+
+    pub(super) fn new(code: NspResult, text: impl Into<String>) -> Self {
+        Self { code, text: text.into() }
+    }
+}
+
+impl From<Error> for Failure {
+    fn from(error: Error) -> Self {
+        Self { code: code(&error), text: error.to_string() }
+    }
+}
+
+fn code(error: &Error) -> NspResult {
+    match error {
+        Error::Usage(_) | Error::Setting { .. } => NSP_ERROR_USAGE,
+        Error::Input { .. } => NSP_ERROR_INPUT,
+        Error::Output { .. } => NSP_ERROR_OUTPUT,
+        Error::OutOfMemory { .. } => NSP_ERROR_MEMORY,
+        Error::DeviceLost { .. } => NSP_ERROR_LOST,
+        Error::NotFinite { .. } | Error::ParameterNotFinite { .. } => NSP_ERROR_NOT_FINITE,
+        Error::Stopped { .. } | Error::BatchStopped { .. } => NSP_ERROR_STOPPED,
+        Error::Vulkan { result, .. } => match *result {
+            vk::Result::ERROR_OUT_OF_DEVICE_MEMORY | vk::Result::ERROR_OUT_OF_HOST_MEMORY => {
+                NSP_ERROR_MEMORY
+            }
+            _ => NSP_ERROR_DEVICE,
+        },
+        Error::Disagrees { .. } => NSP_ERROR_INTERNAL,
+        Error::NoDevice(_)
+        | Error::MissingFeature { .. }
+        | Error::BufferTooLarge { .. }
+        | Error::TileLimit { .. } => NSP_ERROR_DEVICE,
+    }
+}
+
+/// Keeps `text` as this thread's last error, in one line.
+fn keep(text: &str) {
+    LAST.with_borrow_mut(|last| {
+        let text = text.replace('\n', " ");
+        let mut len = text.len().min(TEXT - 1);
+        while !text.is_char_boundary(len) {
+            len -= 1;
+        }
+        last[..len].copy_from_slice(&text.as_bytes()[..len]);
+        last[len] = 0;
+    });
+}
+
+/// Runs the body of the function called `name`; a panic ends in an error as well.
+pub(super) fn guard(name: &str, run: impl FnOnce() -> Result<(), Failure>) -> NspResult {
+    let run = || {
+        #[cfg(feature = "testing")]
+        panic_if_asked(name);
+        run()
+    };
+    match catch_unwind(AssertUnwindSafe(run)) {
+        Ok(Ok(())) => NSP_OK,
+        Ok(Err(Failure { code, text })) => {
+            keep(&format!("{name}: {text}"));
+            code
+        }
+        Err(panic) => {
+            keep(&format!("{name}: a bug of nightsplat: {}", text_of(&*panic)));
+            NSP_ERROR_INTERNAL
+        }
+    }
+}
+
+fn text_of(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("a panic")
+}
+
+/// `NIGHTSPLAT_PANIC=nsp_record_render` has that function panic.
+#[cfg(feature = "testing")]
+#[expect(clippy::panic, reason = "what a test asks for")]
+fn panic_if_asked(name: &str) {
+    if std::env::var_os("NIGHTSPLAT_PANIC").is_some_and(|asked| asked == *name) {
+        panic!("a test asked for a panic");
+    }
+}
+
+/// An object that C holds, until a panic leaves it in an unknown state.
+#[derive(Debug)]
+pub(super) struct Object<T> {
+    inner: T,
+    is_broken: bool,
+}
+
+impl<T> Object<T> {
+    pub(super) fn new(inner: T) -> Self {
+        Self { inner, is_broken: false }
+    }
+
+    pub(super) fn get(&self, what: &str) -> Result<&T, Failure> {
+        match self.is_broken {
+            true => Err(broken(what)),
+            false => Ok(&self.inner),
+        }
+    }
+
+    /// Runs `body` on the object; one that is left by a panic is broken.
+    pub(super) fn with<R>(
+        &mut self,
+        what: &str,
+        body: impl FnOnce(&mut T) -> Result<R, Failure>,
+    ) -> Result<R, Failure> {
+        if self.is_broken {
+            return Err(broken(what));
+        }
+        self.is_broken = true;
+        let done = body(&mut self.inner);
+        self.is_broken = false;
+        done
+    }
+}
+
+fn broken(what: &str) -> Failure {
+    let text = format!("{what} was left by a bug of nightsplat; destroy it");
+    Failure::new(NSP_ERROR_INTERNAL, text)
+}
+
+/// The text of this thread's last error: one line, never NULL, valid until the thread's next error.
+#[unsafe(no_mangle)]
+pub extern "C" fn nsp_last_error() -> *const c_char {
+    LAST.with_borrow(|last| last.as_ptr().cast())
+}
+
+/// The library's version, as `VK_MAKE_API_VERSION(0, major, minor, patch)`.
+#[unsafe(no_mangle)]
+pub extern "C" fn nsp_version() -> u32 {
+    let part = |text: &str| text.parse().unwrap_or_default();
+    vk::make_api_version(
+        0,
+        part(env!("CARGO_PKG_VERSION_MAJOR")),
+        part(env!("CARGO_PKG_VERSION_MINOR")),
+        part(env!("CARGO_PKG_VERSION_PATCH")),
+    )
+}
+
+/// The host's function for lines of the log.
+type Function = unsafe extern "C" fn(user: *mut c_void, level: i32, line: *const c_char);
+
+struct Log {
+    function: Option<Function>,
+    user: *mut c_void,
+}
+
+// SAFETY: the host promises that its function may be called from any thread with its pointer.
+unsafe impl Send for Log {}
+
+static LOG: Mutex<Log> = Mutex::new(Log { function: None, user: std::ptr::null_mut() });
+
+/// Sets the function that gets the log's lines, from any thread; NULL: none. `level`: 1 error, 2 warning,
+/// 3 information. It is the only state that is not of an object.
+///
+/// # Safety
+/// `log` may be called from any thread with `user` until it is replaced.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn nsp_set_log(
+    log: Option<unsafe extern "C" fn(user: *mut c_void, level: i32, line: *const c_char)>,
+    user: *mut c_void,
+) {
+    static ONCE: Once = Once::new();
+    // A Rust host with a subscriber of its own keeps it.
+    ONCE.call_once(|| tracing::subscriber::set_global_default(Lines).unwrap_or_default());
+    *LOG.lock().unwrap_or_else(PoisonError::into_inner) = Log { function: log, user };
+}
+
+/// Turns events into lines.
+struct Lines;
+
+struct Line(String);
+
+impl Visit for Line {
+    fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+        // Writing into a string cannot fail.
+        let _ = match field.name() {
+            "message" => write!(self.0, "{value:?}"),
+            name => write!(self.0, " {name}={value:?}"),
+        };
+    }
+}
+
+impl Subscriber for Lines {
+    fn enabled(&self, metadata: &Metadata<'_>) -> bool {
+        *metadata.level() <= Level::INFO && metadata.is_event()
+    }
+
+    fn new_span(&self, _: &Attributes<'_>) -> Id {
+        Id::from_u64(1)
+    }
+
+    fn record(&self, _: &Id, _: &Record<'_>) {}
+
+    fn record_follows_from(&self, _: &Id, _: &Id) {}
+
+    fn event(&self, event: &Event<'_>) {
+        let mut line = Line(String::new());
+        event.record(&mut line);
+        let level = match *event.metadata().level() {
+            Level::ERROR => 1,
+            Level::WARN => 2,
+            _ => 3,
+        };
+        let text = std::ffi::CString::new(line.0.replace('\n', " ")).unwrap_or_default();
+        let log = LOG.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(function) = log.function {
+            // SAFETY: as the host promised when it set the function.
+            unsafe { function(log.user, level, text.as_ptr()) };
+        }
+    }
+
+    fn enter(&self, _: &Id) {}
+
+    fn exit(&self, _: &Id) {}
+}
