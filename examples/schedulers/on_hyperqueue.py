@@ -17,7 +17,7 @@ from hyperqueue import Client, Job, LocalCluster
 from hyperqueue.cluster import WorkerConfig
 
 PROGRAM = os.environ.get("NIGHTSPLAT", "nightsplat")
-# Exit code 75: saved, to be run again. 137 and 143: killed, for example for lack of memory. $0 is the lock of the point:
+# Exit code 75: saved, run again. 137 and 143: killed, for example for lack of memory. $0 is the lock of the point:
 # a training may have outlived the worker that started it, and is waited for.
 AGAIN = """
 for attempt in $(seq 20); do

@@ -182,8 +182,8 @@ impl Gaussians {
 
     /// The model in a world that is rotated about its origin: direction `d` becomes `rotation * d`.
     ///
-    /// [`Gaussians::save`] takes the direction -y for up, as cameras that are held level in `OpenCV`'s axes have it;
-    /// a model whose `up` is another one is turned by `DQuat::from_rotation_arc(up, DVec3::NEG_Y)` first.
+    /// [`Gaussians::save`] assumes the up direction -y, as for level cameras with `OpenCV`'s axes; rotate a model with
+    /// another `up` by `DQuat::from_rotation_arc(up, DVec3::NEG_Y)` first.
     pub fn rotated(&self, rotation: DQuat) -> Self {
         let mut rotated = self.clone();
         rotated.origin = rotation * self.origin;

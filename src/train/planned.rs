@@ -141,7 +141,7 @@ impl Preset {
 }
 
 impl Trainer {
-    /// A trainer on the dataset in a folder, with settings as config.toml holds them; a diagnosis of the photographs
+    /// A trainer on the dataset in a folder, with settings in the format of config.toml; a diagnosis of the photographs
     /// decides the rest.
     ///
     /// # Errors
@@ -155,8 +155,8 @@ impl Trainer {
         Self::new(gpu, run.config, &run.dataset)
     }
 
-    /// A trainer as of `nightsplat train --preset`: the photographs are diagnosed, unless the preset states everything.
-    /// `dataset` is loaded with [`Preset::load_options`].
+    /// A trainer as of `nightsplat train --preset`: the photographs are diagnosed, unless the preset sets everything.
+    /// `dataset` must be loaded with [`Preset::load_options`].
     ///
     /// # Errors
     /// The dataset cannot be used, or the device is out of memory or lost.

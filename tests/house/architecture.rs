@@ -197,7 +197,7 @@ fn a_test_dispatches_a_kernel_by_hand_only_to_test_that_kernel() {
 }
 
 #[test]
-fn unsafe_code_is_in_the_gpu_layer_and_the_c_interface_alone() {
+fn unsafe_code_is_only_in_the_gpu_layer_and_the_c_interface() {
     for (path, text) in files("src", "rs") {
         if matches!(module(&path), "gpu" | "capi") {
             continue;

@@ -30,8 +30,8 @@ pub(super) fn drop_from(loaded: &mut [Loaded], options: &LoadOptions) {
         dropped.push(name.as_str());
     }
     tracing::warn!(
-        "{} reference images are as dark as the photographs (mean {reference:.3} and {photograph:.3}; {} the first), so \
-             they are none: test views are scored against their own targets",
+        "{} reference images are as dark as the photographs (mean {reference:.3} and {photograph:.3}; {} the first), \
+             so they are none: test views are scored against their own targets",
         dropped.len(),
         dropped.first().copied().unwrap_or_default()
     );

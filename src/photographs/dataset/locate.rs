@@ -72,8 +72,8 @@ pub(super) fn photographs(
         match elsewhere(root, &paths, &used, files) {
             Elsewhere::In(folder, rests) => {
                 listing.remarks.push(format!(
-                    "{}: {} of its photographs are not where it lists them ({} the first); those of the same names in {} \
-                     are taken",
+                    "{}: {} of its photographs are not where it lists them ({} the first); those of the same names \
+                     in {} are taken",
                     root.display(),
                     rests.iter().filter(|(_, file)| file.is_some()).count(),
                     paths.first().copied().unwrap_or_default(),

@@ -59,8 +59,8 @@ impl Dataset {
         let gone = before - self.points.len();
         if gone > 0 {
             tracing::warn!(
-                "{}: {gone} of {before} points lie more than a million times the cameras' extent away, or nowhere; they \
-                 are left out",
+                "{}: {gone} of {before} points lie more than a million times the cameras' extent away, or nowhere; \
+                 they are left out",
                 self.root.display()
             );
         }

@@ -220,7 +220,7 @@ const MOST: u64 = 1 << 30;
 /// The problem: another format or version, a truncated file, or an invalid fact.
 pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     let mut zip =
-        ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is no SOG: {error}"))?;
+        ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is not a SOG: {error}"))?;
     let meta = bytes_of(&mut zip, "meta.json")?;
     let meta: Value =
         serde_json::from_slice(&meta).map_err(|error| format!("meta.json: {error}"))?;

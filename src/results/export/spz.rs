@@ -213,7 +213,7 @@ fn unpacked(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
     for place in 0..stream_count {
         let length = word(file, table + 16 * place)? as usize;
         let (stream, after) =
-            rest.and_then(|rest| rest.split_at_checked(length)).ok_or(CUT_SHORT)?;
+            rest.and_then(|rest| rest.split_at_checked(length)).ok_or(TRUNCATED)?;
         rest = Some(after);
         if let Some(own) = streams.get_mut(place) {
             let decoder = StreamingDecoder::new(stream);
@@ -408,7 +408,7 @@ mod tests {
         let provenance = Provenance { facts, ..Provenance::default() };
         for version in [Version::V3, Version::V4] {
             let file = encode(&drawn(5, 1), &provenance, version).unwrap();
-            // The text ends the file of version 4, and no text is a text.
+            // A file of version 4 ends with the text, which is optional.
             let end =
                 file.len() - if version == Version::V4 { "nightsplat near 0.1".len() } else { 0 };
             for length in 0..end {
