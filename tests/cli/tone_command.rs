@@ -461,7 +461,7 @@ fn a_well_lit_folder_is_unchanged_and_a_black_one_refused() {
     refused(ApplyArgs { brightness: Some(0.5), ..of(ToneCurve::Ap3) }, "tone.brightness");
     refused(ApplyArgs { brightness: Some(2.0), ..of(ToneCurve::Auto) }, "tone.brightness");
     refused(ApplyArgs { colour: Some(-0.5), ..of(ToneCurve::Auto) }, "tone.colour");
-    refused(ApplyArgs { gain: auto, ..of(ToneCurve::LumPreserve) }, "no gain");
+    refused(ApplyArgs { gain: auto, ..of(ToneCurve::LumPreserve) }, "no automatic gain");
 }
 
 /// PSNR of the curve, without training, on the test views; ASE and AP3 with constant gains have means of 23.4 and 23.0

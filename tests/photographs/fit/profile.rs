@@ -114,7 +114,7 @@ fn pairs_that_determine_no_profile_are_refused() {
     grey.pairs[0].colours.iter_mut().for_each(|[dark, _]| *dark = [0.5; 3]);
     let problem =
         fit_profile(&[("a", grey.pairs.iter().collect())], 1.345).unwrap_err().to_string();
-    assert!(problem.contains("one colour"), "{problem}");
+    assert!(problem.contains("a single colour"), "{problem}");
     for name in ["low/0.png", "high/0.png"] {
         Image::filled(40, 40, [0.0; 3]).save_png8(dir.path().join(name)).unwrap();
     }
