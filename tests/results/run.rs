@@ -105,7 +105,7 @@ fn a_run_prints_a_summary_at_its_start() {
         "8 views of 48x32 to train on",
         "2 test views (as the transforms files say) scored against reference images",
         "points; on ",
-        "curve auto: as bright as",
+        "curve auto: brightness chosen from the photographs",
     ] {
         assert!(message.contains(part), "no `{part}` in: {message}");
     }
