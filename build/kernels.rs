@@ -37,8 +37,8 @@ pub(crate) fn compile(out_dir: &Path) {
     fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");
 }
 
-/// The source with `restrict` on every buffer, so that drivers may move loads across stores. This is sound: a pass
-/// binds `Slice`s and `SliceMut`s, which borrow their buffer as `&` and `&mut` do, and the parts of one `SliceMut` are
+/// The source with `restrict` on every buffer, so that drivers may move loads across stores. It holds: a pass binds
+/// `Slice`s and `SliceMut`s, which borrow their buffer as `&` and `&mut` do, and the parts of one `SliceMut` are
 /// checked to be disjoint.
 fn restricted(source: &str) -> String {
     let line = |line: &str| match line.starts_with("layout(binding") {

@@ -20,7 +20,7 @@ const COMPILERS: [&str; 3] = ["glslang", "glslang-sys", "spirq"];
 /// The file with the hash of the sources, beside what was compiled from them.
 const HASH: &str = "sources.hash";
 
-/// Writes the hash of the sources; call it last.
+/// Writes the hash of the sources, after what was compiled from them.
 pub(crate) fn write_hash(out_dir: &Path) {
     fs::write(out_dir.join(HASH), hash_of_sources()).expect("OUT_DIR is ours");
 }
@@ -52,15 +52,13 @@ fn hash_of_sources() -> String {
     let mut hasher = hash::Hasher::default();
     for source in SOURCES {
         for path in files(Path::new(source)) {
-            let bytes = fs::read(&path).unwrap_or_default();
             // Windows writes paths and lines otherwise.
-            hasher.write(path.to_string_lossy().replace('\\', "/").as_bytes());
-            match source {
-                "Cargo.lock" => {
-                    hasher.write(compilers(&String::from_utf8_lossy(&bytes)).as_bytes())
-                }
-                _ => hasher.write(String::from_utf8_lossy(&bytes).replace("\r\n", "\n").as_bytes()),
-            }
+            let name = path.to_string_lossy().replace('\\', "/");
+            let bytes = fs::read(&path).unwrap_or_default();
+            let text = String::from_utf8_lossy(&bytes).replace("\r\n", "\n");
+            let text = if source == "Cargo.lock" { compilers(&text) } else { text };
+            hasher.write(name.as_bytes());
+            hasher.write(text.as_bytes());
         }
     }
     hash::text(hasher.finish())
@@ -68,7 +66,6 @@ fn hash_of_sources() -> String {
 
 /// The names and versions of the packages that compile.
 fn compilers(lock: &str) -> String {
-    let lock = lock.replace("\r\n", "\n");
     let is_compiler = |package: &&str| {
         COMPILERS.iter().any(|name| package.starts_with(&format!("\nname = \"{name}\"\n")))
     };

@@ -1,11 +1,17 @@
 #!/usr/bin/env bash
 # Packs the crate with compiled kernels as dist/nightsplat-VERSION.crate, with its checksum: who builds it without the
-# feature `glslang` needs no C++ compiler. The kernels stay in precompiled/, from which `cargo publish` takes them.
-# Builds the package once so, on one core, and prints the processor time.
+# feature `glslang` needs no C++ compiler. The kernels stay in precompiled/, from which `cargo publish --allow-dirty` takes
+# them: git ignores that folder, which cargo calls uncommitted. Builds the package once so, on one core, and prints the
+# processor time. Option --allow-dirty packs what is not committed as well.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
 export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$root/target}
+
+if [ "${1:-}" != --allow-dirty ] && [ -n "$(git status --porcelain)" ]; then
+    echo "there are uncommitted changes; commit them, or pass --allow-dirty" >&2
+    exit 1
+fi
 
 # Fails unless a build ends with an error of one line that matches.
 refuses() {
@@ -27,7 +33,7 @@ mkdir precompiled
 # Former kernels may still be there.
 grep -o '[a-z0-9_]*\.spv' "$compiled/kernels.rs" | while read -r name; do cp "$compiled/$name" precompiled/; done
 cp "$compiled/kernels.rs" "$compiled/sources.hash" precompiled/
-cargo package --quiet --locked --offline --no-verify "$@"
+cargo package --quiet --locked --offline --no-verify --allow-dirty
 version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
 crate=nightsplat-$version.crate
 package=$CARGO_TARGET_DIR/package/$crate

@@ -3,6 +3,7 @@
 //! - [`input`]: files that users name, read whole
 //! - [`output`]: files that appear when complete
 //! - [`hash`]: checksums of numbers and bytes
+//! - [`ply`]: headers of PLY files
 //! - [`random`]: counter-based random numbers
 //! - [`settings`]: a row for each setting: key, default, rule, unit, help, option
 //! - [`tree`]: files and folders by path, on the disk or in a ZIP archive
@@ -11,6 +12,7 @@
 pub mod hash;
 pub mod input;
 pub mod output;
+pub mod ply;
 #[cfg(feature = "io")]
 pub mod random;
 #[cfg(feature = "io")]

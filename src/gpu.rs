@@ -26,6 +26,7 @@ mod host;
 mod image;
 mod instance;
 mod kernel;
+mod lent;
 mod limits;
 mod memory;
 mod pci;
@@ -43,6 +44,7 @@ mod supported;
 #[doc(hidden)]
 pub mod testing;
 mod tuning;
+mod upload;
 mod validation;
 
 use std::collections::BTreeMap;
@@ -52,6 +54,8 @@ use std::thread::{self, ThreadId};
 
 use ash::{ext, khr, vk};
 
+#[cfg(feature = "capi")]
+pub(crate) use allocated::HostMemoryError;
 pub use buffer::Buffer;
 #[cfg(feature = "check")]
 pub use check::{CheckReport, CheckedPass, Difference, Tolerance};
@@ -62,11 +66,11 @@ pub use cooperative::CooperativeMatrix;
 pub(crate) use device::check_physical_device;
 pub use device_report::{DeviceLimits, DeviceReport, RequirementReport, devices};
 pub use download::Download;
-pub use host::{HostAllocation, HostDevice, HostFrame, MemoryFunctions, QueueLock};
 pub use image::{HostImage, ImageFormat, ImageState};
 pub use kernel::{Binding, Bound, Interface, Kernel, Recordable};
 #[cfg(feature = "check")]
 pub use kernel::{OnHost, Reference};
+pub use lent::{HostAllocation, HostDevice, HostFrame, MemoryFunctions, QueueLock};
 pub use memory::MemoryBudget;
 pub use pci::PciAddress;
 pub use pipeline::Pipeline;

@@ -10,9 +10,9 @@
 //! | train into a directory with log, checkpoints and scores | [`run::train`] |
 //! | handle errors | [`Error`]: one line that names the object and the remedy |
 //!
-//! Without default features, the crate is only the renderer, forward and backward. Feature `io` adds files, datasets
-//! and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command. `glslang` compiles the
-//! kernels, which a checkout requires and a packaged crate does not.
+//! Without default features there is the renderer, forward and backward, and nothing else. Feature `io` adds files,
+//! datasets and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command. `glslang`
+//! compiles the kernels, which a checkout needs and a packaged crate does not.
 //!
 //! # Render a model
 //!
@@ -216,7 +216,7 @@ pub mod config {
     pub use crate::loss::exposure::ExposureRates;
     pub use crate::loss::{ParameterWeights, Weights};
     pub use crate::networks::{DenoiserSettings, NetworkVariant, Precision};
-    pub use crate::photographs::dataset::MeasuredSize;
+    pub use crate::photographs::dataset::{MeasuredSize, PixelOrientation};
     pub use crate::photographs::tone::{GainChoice, TableInput, White};
     pub use crate::splats::densify::DensityControl;
     pub use crate::splats::optimizer::{LearningRates, Schedule};

@@ -96,6 +96,15 @@ impl TrainingFrame {
     }
 }
 
+/// What is to be said of a file whose positions are relative to an origin; nothing of the world's.
+#[cfg(feature = "cli")]
+pub(crate) fn relative_to(origin: DVec3) -> Option<String> {
+    let [x, y, z] = origin.to_array();
+    (origin != DVec3::ZERO).then(|| {
+        format!("positions are relative, as f32 is too coarse: world = position + {x} {y} {z}")
+    })
+}
+
 /// Mean and extent of the camera positions: the extent is 1.1 times the largest distance to the mean (3DGS). Cameras
 /// more than 32 times as far away as the median are excluded, since their poses are most likely wrong.
 ///

@@ -6,7 +6,7 @@ use super::error::{Failure, NspResult, guard};
 use super::structs::object_mut;
 use crate::camera::{Camera, CameraModel};
 
-/// A pinhole camera in OpenCV's axes: x right, y down, z forward.
+/// A pinhole camera, in axes x right, y down, z forward.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspCamera {

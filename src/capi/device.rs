@@ -12,27 +12,58 @@ use crate::gpu::{
     check_physical_device, required_device_features,
 };
 
-pub(super) type VkInstance = vk::Instance;
-pub(super) type VkPhysicalDevice = vk::PhysicalDevice;
-pub(super) type VkDevice = vk::Device;
-pub(super) type VkQueue = vk::Queue;
-pub(super) type VkPipelineCache = vk::PipelineCache;
-pub(super) type VkSemaphore = vk::Semaphore;
-pub(super) type VkDeviceMemory = vk::DeviceMemory;
-pub(super) type VkDeviceSize = vk::DeviceSize;
-pub(super) type VkMemoryRequirements = vk::MemoryRequirements;
-pub(super) type VkMemoryPropertyFlags = vk::MemoryPropertyFlags;
-pub(super) type VkAllocationCallbacks = vk::AllocationCallbacks<'static>;
-pub(super) type VkPhysicalDeviceFeatures2 = vk::PhysicalDeviceFeatures2<'static>;
-pub(super) type VkPhysicalDeviceVulkan12Features = vk::PhysicalDeviceVulkan12Features<'static>;
-pub(super) type VkPhysicalDeviceVulkan13Features = vk::PhysicalDeviceVulkan13Features<'static>;
+/// Vulkan's.
+pub type VkInstance = vk::Instance;
+/// Vulkan's.
+pub type VkPhysicalDevice = vk::PhysicalDevice;
+/// Vulkan's.
+pub type VkDevice = vk::Device;
+/// Vulkan's.
+pub type VkQueue = vk::Queue;
+/// Vulkan's.
+pub type VkPipelineCache = vk::PipelineCache;
+/// Vulkan's.
+pub type VkSemaphore = vk::Semaphore;
+/// Vulkan's.
+pub type VkDeviceMemory = vk::DeviceMemory;
+/// Vulkan's.
+pub type VkDeviceSize = vk::DeviceSize;
+/// Vulkan's.
+pub type VkMemoryRequirements = vk::MemoryRequirements;
+/// Vulkan's.
+pub type VkMemoryPropertyFlags = vk::MemoryPropertyFlags;
+/// Vulkan's.
+pub type VkAllocationCallbacks = vk::AllocationCallbacks<'static>;
+/// Vulkan's.
+pub type VkPhysicalDeviceFeatures2 = vk::PhysicalDeviceFeatures2<'static>;
+/// Vulkan's.
+pub type VkPhysicalDeviceVulkan12Features = vk::PhysicalDeviceVulkan12Features<'static>;
+/// Vulkan's.
+pub type VkPhysicalDeviceVulkan13Features = vk::PhysicalDeviceVulkan13Features<'static>;
 #[allow(non_camel_case_types, reason = "Vulkan's own name")]
-pub(super) type PFN_vkGetInstanceProcAddr = Option<vk::PFN_vkGetInstanceProcAddr>;
-pub(super) type VkResult = vk::Result;
+/// Vulkan's.
+pub type PFN_vkGetInstanceProcAddr = Option<vk::PFN_vkGetInstanceProcAddr>;
+/// Vulkan's.
+pub type VkResult = vk::Result;
 
 /// A device and what belongs to it. Any thread may use it.
 #[derive(Debug)]
 pub struct NspDevice(pub(super) Object<Gpu>);
+
+/// For tests, which make allocations fail.
+#[cfg(feature = "testing")]
+impl NspDevice {
+    /// The device.
+    ///
+    /// # Panics
+    /// It was left by a panic.
+    pub fn gpu(&self) -> Gpu {
+        match self.0.get("the device") {
+            Ok(gpu) => gpu.clone(),
+            Err(failure) => unreachable!("{failure:?}"),
+        }
+    }
+}
 
 /// A piece of device memory of the host's.
 #[repr(C)]
@@ -280,6 +311,25 @@ unsafe fn extensions<'a>(host: &NspHostDevice) -> Result<Vec<&'a CStr>, Failure>
     }
 }
 
+type AllocateOfC = unsafe extern "C" fn(
+    *mut c_void,
+    *const VkMemoryRequirements,
+    VkMemoryPropertyFlags,
+    VkMemoryPropertyFlags,
+    *const c_char,
+    *mut NspMemory,
+) -> VkResult;
+type Allocate = unsafe extern "C" fn(
+    *mut c_void,
+    *const vk::MemoryRequirements,
+    vk::MemoryPropertyFlags,
+    vk::MemoryPropertyFlags,
+    *const c_char,
+    *mut HostAllocation,
+) -> vk::Result;
+type FreeOfC = unsafe extern "C" fn(*mut c_void, *const NspMemory);
+type Free = unsafe extern "C" fn(*mut c_void, *const HostAllocation);
+
 /// # Safety
 /// NULL or valid.
 unsafe fn memory_functions(
@@ -291,23 +341,14 @@ unsafe fn memory_functions(
         let text = "NspHostDevice::device_memory needs both allocate and free";
         return Err(Failure::usage(text));
     };
-    // SAFETY: both types have the same members in the same order.
-    unsafe {
-        type Allocate = unsafe extern "C" fn(
-            *mut c_void,
-            *const vk::MemoryRequirements,
-            vk::MemoryPropertyFlags,
-            vk::MemoryPropertyFlags,
-            *const c_char,
-            *mut HostAllocation,
-        ) -> vk::Result;
-        type Free = unsafe extern "C" fn(*mut c_void, *const HostAllocation);
-        Ok(Some(MemoryFunctions {
-            allocate: std::mem::transmute::<_, Allocate>(allocate),
-            free: std::mem::transmute::<_, Free>(free),
-            user: own.user,
-        }))
-    }
+    // SAFETY: `NspMemory` and `HostAllocation` have the same members in the same order.
+    let (allocate, free) = unsafe {
+        (
+            std::mem::transmute::<AllocateOfC, Allocate>(allocate),
+            std::mem::transmute::<FreeOfC, Free>(free),
+        )
+    };
+    Ok(Some(MemoryFunctions { allocate, free, user: own.user }))
 }
 
 /// Refuses a chain of enabled features without one that is needed.
@@ -331,6 +372,7 @@ unsafe fn check_features(features: *const VkPhysicalDeviceFeatures2) -> Result<(
     let mut next = features.cast::<vk::BaseInStructure<'_>>();
     // SAFETY: each struct begins with its type, which says what it is, and the next of the chain.
     while let Some(base) = unsafe { next.as_ref() } {
+        // SAFETY: as above.
         unsafe {
             match base.s_type {
                 vk::StructureType::PHYSICAL_DEVICE_VULKAN_1_2_FEATURES => {

@@ -13,6 +13,7 @@ use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Level, Metadata, Subscriber};
 
 use crate::Error;
+use crate::gpu::HostMemoryError;
 
 /// The version of this header, as `VK_MAKE_API_VERSION(0, major, minor, patch)`.
 pub const NSP_HEADER_VERSION: u32 = 1 << 12;
@@ -69,7 +70,8 @@ impl Failure {
 
 impl From<Error> for Failure {
     fn from(error: Error) -> Self {
-        Self { code: code(&error), text: error.to_string() }
+        let cause = std::error::Error::source(&error).map(|cause| format!(" ({cause})"));
+        Self { code: code(&error), text: format!("{error}{}", cause.unwrap_or_default()) }
     }
 }
 
@@ -78,7 +80,10 @@ fn code(error: &Error) -> NspResult {
         Error::Usage(_) | Error::Setting { .. } => NSP_ERROR_USAGE,
         Error::Input { .. } => NSP_ERROR_INPUT,
         Error::Output { .. } => NSP_ERROR_OUTPUT,
-        Error::OutOfMemory { .. } => NSP_ERROR_MEMORY,
+        Error::OutOfMemory { source, .. } => match source.downcast_ref::<HostMemoryError>() {
+            Some(cause) if cause.breaks_the_contract() => NSP_ERROR_INTERNAL,
+            _ => NSP_ERROR_MEMORY,
+        },
         Error::DeviceLost { .. } => NSP_ERROR_LOST,
         Error::NotFinite { .. } | Error::ParameterNotFinite { .. } => NSP_ERROR_NOT_FINITE,
         Error::Stopped { .. } | Error::BatchStopped { .. } => NSP_ERROR_STOPPED,
@@ -113,7 +118,7 @@ fn keep(text: &str) {
 pub(super) fn guard(name: &str, run: impl FnOnce() -> Result<(), Failure>) -> NspResult {
     let run = || {
         #[cfg(feature = "testing")]
-        panic_if_asked(name);
+        panics::panic_if_asked(name);
         run()
     };
     match catch_unwind(AssertUnwindSafe(run)) {
@@ -132,15 +137,6 @@ pub(super) fn guard(name: &str, run: impl FnOnce() -> Result<(), Failure>) -> Ns
 fn text_of(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<String>().map(String::as_str);
     text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("a panic")
-}
-
-/// `NIGHTSPLAT_PANIC=nsp_record_render` has that function panic.
-#[cfg(feature = "testing")]
-#[expect(clippy::panic, reason = "what a test asks for")]
-fn panic_if_asked(name: &str) {
-    if std::env::var_os("NIGHTSPLAT_PANIC").is_some_and(|asked| asked == *name) {
-        panic!("a test asked for a panic");
-    }
 }
 
 /// An object that C holds, until a panic leaves it in an unknown state.
@@ -172,6 +168,8 @@ impl<T> Object<T> {
             return Err(broken(what));
         }
         self.is_broken = true;
+        #[cfg(feature = "testing")]
+        panics::panic_if_asked(what);
         let done = body(&mut self.inner);
         self.is_broken = false;
         done
@@ -277,4 +275,25 @@ impl Subscriber for Lines {
     fn enter(&self, _: &Id) {}
 
     fn exit(&self, _: &Id) {}
+}
+
+/// Panics on purpose.
+#[cfg(feature = "testing")]
+pub mod panics {
+    use std::cell::Cell;
+
+    thread_local!(static ASKED: Cell<Option<&'static str>> = const { Cell::new(None) });
+
+    /// Has the function of this name, or the next call on an object of this kind, panic once on this thread.
+    pub fn panic_in(name: &'static str) {
+        ASKED.set(Some(name));
+    }
+
+    #[expect(clippy::panic, reason = "what a test asks for")]
+    pub(super) fn panic_if_asked(name: &str) {
+        if ASKED.get() == Some(name) {
+            ASKED.set(None);
+            panic!("a test asked for a panic");
+        }
+    }
 }

@@ -15,13 +15,20 @@ use crate::splats::render::{
     Target,
 };
 
-pub(super) type VkImage = vk::Image;
-pub(super) type VkFormat = vk::Format;
-pub(super) type VkExtent2D = vk::Extent2D;
-pub(super) type VkImageLayout = vk::ImageLayout;
-pub(super) type VkPipelineStageFlags2 = vk::PipelineStageFlags2;
-pub(super) type VkAccessFlags2 = vk::AccessFlags2;
-pub(super) type VkCommandBuffer = vk::CommandBuffer;
+/// Vulkan's.
+pub type VkImage = vk::Image;
+/// Vulkan's.
+pub type VkFormat = vk::Format;
+/// Vulkan's.
+pub type VkExtent2D = vk::Extent2D;
+/// Vulkan's.
+pub type VkImageLayout = vk::ImageLayout;
+/// Vulkan's.
+pub type VkPipelineStageFlags2 = vk::PipelineStageFlags2;
+/// Vulkan's.
+pub type VkAccessFlags2 = vk::AccessFlags2;
+/// Vulkan's.
+pub type VkCommandBuffer = vk::CommandBuffer;
 
 /// A renderer: kernels, and memory that grows with the views. One thread uses it at a time.
 #[derive(Debug)]
@@ -50,7 +57,7 @@ pub struct NspImageState {
     pub access: VkAccessFlags2,
 }
 
-/// A layer of an image: mip level 0, one sample; usage TRANSFER_DST to be written, TRANSFER_SRC to be read.
+/// A layer of an image: mip level 0, one sample; usage `TRANSFER_DST` to be written, `TRANSFER_SRC` to be read.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspImage {

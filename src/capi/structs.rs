@@ -82,7 +82,7 @@ pub(super) unsafe fn write<T: Sized0 + Copy>(to: *mut T, own: &T) -> Result<(), 
     Ok(())
 }
 
-/// The object that a pointer points to.
+/// The object that a pointer names.
 ///
 /// # Safety
 /// Null, or valid.
@@ -91,7 +91,7 @@ pub(super) unsafe fn object<'a, T>(pointer: *const T, name: &str) -> Result<&'a 
     unsafe { pointer.as_ref() }.ok_or_else(|| Failure::usage(format!("{name} is NULL")))
 }
 
-/// The object that a pointer points to, to change.
+/// The object that a pointer names, to change.
 ///
 /// # Safety
 /// Null, or valid and used by nothing else.

@@ -11,7 +11,7 @@ use super::{finish, table, word, words};
 use crate::Error;
 use crate::base::output::{check_writable, write_whole};
 use crate::gpu::{DeviceChoice, Gpu};
-use crate::photographs::dataset::Dataset;
+use crate::photographs::dataset::{Dataset, PixelOrientation};
 use crate::photographs::white_balance::WhiteBalance;
 use crate::results::diagnosis;
 use crate::results::eval::{ResidualTransmittance, hole_warning};
@@ -57,6 +57,9 @@ pub struct DiagnoseArgs {
     /// VIEW,x1,y1,..,x4,y4
     #[arg(long, value_name = "WHITE")]
     pub white_balance: Option<WhiteBalance>,
+    /// Which pixels the cameras are of where Exif turns photographs, as `train` has it: auto, stored or exif
+    #[arg(long, value_name = "PIXELS")]
+    pub orientation: Option<PixelOrientation>,
     /// Plan for this preset: draft, fast, balanced or best [default: balanced]
     #[arg(long, value_name = "NAME", value_parser = words::presets())]
     pub preset: Option<Preset>,
@@ -97,6 +100,7 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     config.max_resolution = args.max_resolution.unwrap_or(config.max_resolution);
     args.report.iter().chain(&args.plan).try_for_each(|path| check_writable(path))?;
     config.white_balance.clone_from(&args.white_balance);
+    config.orientation = args.orientation.unwrap_or_default();
     let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
     let options = diagnosed(&config);
     let (dataset, mut diagnosis) = Diagnosis::load(&config.dataset, &options)?;

@@ -11,16 +11,18 @@ use glam::{DAffine3, DVec3};
 use super::{finish, word};
 use crate::base::output::{check_writable, is_same_file, write_whole};
 use crate::camera::Camera;
-use crate::gpu::DeviceChoice;
+use crate::camera::frame::relative_to;
+use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
+use crate::photographs::tone::ToneCurve;
 use crate::results::export::page::{Bookmark, Page};
 use crate::results::export::{Format, Provenance, spz};
 use crate::results::finished_run::{FinishedRun, config_of_file, is_model, needs_photographs};
 use crate::results::models;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE};
-use crate::train::TrainConfig;
+use crate::train::{TestTargets, TrainConfig};
 use crate::{Error, results::run};
 
 pub use up::Up;
@@ -142,7 +144,9 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     let (shown, count) = (out.display().to_string(), gaussians.count);
     let kib = std::fs::metadata(out).map_or(0, |file| file.len()).div_ceil(1024);
     let brightness = if is_model(&args.run) { "" } else { ", as bright as their targets" };
-    let wrote = format!("{shown}: {count} Gaussians in {kib} KiB{brightness}{turned}");
+    let relative = relative_to(gaussians.origin).map(|line| format!("; {line}"));
+    let relative = relative.unwrap_or_default();
+    let wrote = format!("{shown}: {count} Gaussians in {kib} KiB{brightness}{turned}{relative}");
     Ok((out.clone(), wrote))
 }
 
@@ -218,7 +222,7 @@ fn page(
     let title = format!("{} by nightsplat", provenance.dataset);
     let up = args.up(config);
     let (bookmarks, up) = if has_networks(config) {
-        let FinishedRun { mut model_renderer, dataset, .. } = FinishedRun::open_with(
+        let FinishedRun { gpu, config, mut model_renderer, dataset, .. } = FinishedRun::open_with(
             &args.run,
             args.dataset.as_deref(),
             args.device.as_ref(),
@@ -226,7 +230,8 @@ fn page(
                 own.undistort = true;
             },
         )?;
-        let bookmarks = bookmarks(args, gaussians.origin, &dataset, |view| {
+        let targets = targets(&config, &dataset, || Ok(gpu.clone()))?;
+        let bookmarks = bookmarks(args, gaussians.origin, &dataset, targets, |view| {
             let networks = model_renderer.render(view)?.output().clone();
             Ok(Some(("model with its networks".to_owned(), networks)))
         })?;
@@ -243,7 +248,12 @@ fn page(
         if is_model(&args.run) {
             frame = dataset.frame();
         }
-        let bookmarks = bookmarks(args, gaussians.origin, &dataset, |_| Ok(None))?;
+        let device = || match &args.device {
+            Some(device) => Gpu::new(device),
+            None => Gpu::new(&config.device.parse()?),
+        };
+        let targets = targets(&config, &dataset, device)?;
+        let bookmarks = bookmarks(args, gaussians.origin, &dataset, targets, |_| Ok(None))?;
         (bookmarks, up.unwrap_or_else(|| dataset.up()))
     };
     let near = provenance.facts.near.or(config.facts(&frame).near);
@@ -251,10 +261,31 @@ fn page(
     Ok(Page { title, gaussians, provenance, bookmarks, near, up }.html()?)
 }
 
+/// What makes the targets of views that have a photograph and no reference image, where there are such views and a
+/// curve. Without a device the page has no targets.
+fn targets(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    gpu: impl FnOnce() -> crate::Result<Gpu>,
+) -> crate::Result<Option<TestTargets>> {
+    let lacks = |view: &View| view.has_photograph() && !view.has_reference();
+    if config.tone.curve == ToneCurve::None || !dataset.views.iter().any(lacks) {
+        return Ok(None);
+    }
+    match gpu() {
+        Ok(gpu) => TestTargets::new(&gpu, &config.tone, dataset).map(Some),
+        Err(error) => {
+            tracing::warn!("the page has no targets to compare with: {error}");
+            Ok(None)
+        }
+    }
+}
+
 fn bookmarks(
     args: &ExportArgs,
     origin: DVec3,
     dataset: &Dataset,
+    mut targets: Option<TestTargets>,
     mut rendered: impl FnMut(&View) -> crate::Result<Option<(String, Image)>>,
 ) -> crate::Result<Vec<Bookmark>> {
     let mut views: Vec<&View> = dataset.test_views().collect();
@@ -264,11 +295,13 @@ fn bookmarks(
     let (all, count) = (views.len(), args.views.clamp(1, views.len().max(1)));
     let bookmark = |place: usize| {
         let view = views[place * all / count];
-        let pictures = [
-            view.loaded()?.map(|image| ("photograph".to_owned(), image.into_owned())),
-            view.loaded_reference()?.map(|image| ("reference".to_owned(), image.into_owned())),
-            rendered(view)?,
-        ];
+        let lit = match (view.loaded_reference()?, &mut targets) {
+            (Some(image), _) => Some(("reference".to_owned(), image.into_owned())),
+            (None, Some(targets)) => targets.of(view)?.map(|image| ("target".to_owned(), image)),
+            (None, None) => None,
+        };
+        let photograph = view.loaded()?.map(|own| ("photograph".to_owned(), own.into_owned()));
+        let pictures = [photograph, lit, rendered(view)?];
         // A mirrored photograph is of a mirrored world, which the page shows as it is.
         let turned =
             |(label, image): (String, Image)| (label, image.turned(view.orientation.turn()));

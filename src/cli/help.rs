@@ -22,7 +22,8 @@ const COMMON: [(&str, &str); 8] = [
 const GROUPS: [(&str, &str); 6] = [
     (
         "Photographs",
-        "images reference white-balance downscale max-resolution patch-pixels test-every invert-masks undistort",
+        "images orientation reference white-balance downscale max-resolution patch-pixels test-every invert-masks \
+         undistort",
     ),
     ("Tone curve", "curve profile gain brightness colour theta exposure exposures"),
     (

@@ -12,6 +12,7 @@ use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
 use super::{finish, signals, word};
 use crate::base::output::{check_writable, printable};
+use crate::camera::frame;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::results::eval;
 use crate::results::run::{self, IfExists, RunDirectory, RunSummary, Session};
@@ -140,6 +141,10 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let (steps, seconds) = (trainer.steps_done(), spent.seconds);
     writeln!(out, "{steps} steps, {gaussians} Gaussians, {seconds:.0} s")?;
+    let frame = run::load_config(&args.out)?.frame.unwrap_or_default();
+    if let Some(line) = frame::relative_to(frame.file_origin()) {
+        writeln!(out, "model.ply: {line}")?;
+    }
     let run = args.out.display();
     finish(&format!("{run}/model.ply, {run}/metrics.json"), &next(args))
 }

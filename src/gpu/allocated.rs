@@ -9,7 +9,7 @@ use gpu_allocator::vulkan::{
 };
 use gpu_allocator::{AllocationError, MemoryLocation};
 
-use super::host::{HostAllocation, MemoryFunctions};
+use super::lent::{HostAllocation, MemoryFunctions};
 use super::limits::whole_quads;
 use super::{Bound, LastUse, Retired, Shared, lock};
 use crate::{Error, Result};
@@ -54,13 +54,21 @@ unsafe impl Send for MemorySource {}
 
 /// The host's allocator failed.
 #[derive(Debug, thiserror::Error)]
-enum HostMemoryError {
+pub(crate) enum HostMemoryError {
     #[error("the host's allocator returned {0:?}")]
     Refused(vk::Result),
     #[error("the host's allocator returned offset {offset}, which is no multiple of {alignment}")]
     Misaligned { offset: u64, alignment: u64 },
     #[error("the host's allocator returned no mapped address")]
     Unmapped,
+}
+
+#[cfg(feature = "capi")]
+impl HostMemoryError {
+    /// Whether the allocator gave memory that cannot be used, instead of none.
+    pub(crate) fn breaks_the_contract(&self) -> bool {
+        !matches!(self, Self::Refused(_))
+    }
 }
 
 impl MemorySource {

@@ -97,7 +97,7 @@ impl Gpu {
         match opened {
             Ok(parts) => {
                 let instance = owned.instance.clone();
-                Self::assemble(&instance, parts, Owner::Ours(owned))
+                Self::assemble(&instance, parts, Owner::Ours(Box::new(owned)))
             }
             Err(error) => {
                 // SAFETY: no device was created from the instance.
@@ -138,6 +138,7 @@ impl Gpu {
         let supported = Supported::gather(&instance, physical).map_err(loader_error)?;
         supported.check()?;
         let (queue, family) = (vk::Queue::from_raw(host.queue), host.queue_family);
+        check_family(&instance, physical, family)?;
         let own = properties(&instance, physical, &supported)?;
         let has_push_descriptors = own.has_push_descriptors && host.has_push_descriptors;
         let properties = Properties { has_push_descriptors, ..own };
@@ -163,7 +164,7 @@ impl Gpu {
         let debug = owner.names_objects().then(|| ext::debug_utils::Device::new(instance, &device));
         let has_labels = owner.takes_labels();
         let (owned, host) = match owner {
-            Owner::Ours(owned) => (Some(owned), None),
+            Owner::Ours(owned) => (Some(*owned), None),
             Owner::Host(lent) => (None, Some(Host::new(lent))),
         };
         let executables = properties
@@ -201,6 +202,20 @@ impl Gpu {
     }
 }
 
+/// # Errors
+/// The family does not exist, or does not compute.
+fn check_family(instance: &ash::Instance, physical: vk::PhysicalDevice, family: u32) -> Result<()> {
+    // SAFETY: the handle was enumerated from the instance.
+    let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
+    let own = families.get(family as usize);
+    if own.is_some_and(|own| own.queue_flags.contains(vk::QueueFlags::COMPUTE)) {
+        return Ok(());
+    }
+    Err(Error::Usage(format!(
+        "queue_family {family} has no compute; lend a queue of a family that does"
+    )))
+}
+
 /// Whether a physical device of a host's can be used.
 ///
 /// # Errors
@@ -231,7 +246,7 @@ struct DeviceParts {
 
 /// Who created the device.
 enum Owner<'a> {
-    Ours(OwnedInstance),
+    Ours(Box<OwnedInstance>),
     Host(&'a HostDevice),
 }
 
@@ -257,9 +272,10 @@ impl Owner<'_> {
     unsafe fn callbacks(&self) -> Option<vk::AllocationCallbacks<'static>> {
         match self {
             Self::Ours(_) => None,
-            // SAFETY: as the caller promises.
             Self::Host(lent) => {
-                unsafe { lent.host_memory.cast::<vk::AllocationCallbacks<'_>>().as_ref() }.copied()
+                let callbacks = lent.host_memory.cast::<vk::AllocationCallbacks<'_>>();
+                // SAFETY: as the caller promises.
+                unsafe { callbacks.as_ref() }.copied()
             }
         }
     }

@@ -31,7 +31,7 @@ impl ImageState {
         Self { layout, family, stages: stages.as_raw(), access: access.as_raw() }
     }
 
-    /// Contents are not needed.
+    /// Contents that are not needed.
     pub const UNDEFINED: Self = Self::new(
         vk::ImageLayout::UNDEFINED,
         vk::PipelineStageFlags2::NONE,

@@ -1,4 +1,4 @@
-//! Words that recordings write to the host, to be read later: nothing waits for them.
+//! Words that recordings leave on the host, to be read later: nothing waits for them.
 
 use gpu_allocator::MemoryLocation;
 

@@ -31,6 +31,7 @@ mod source;
 mod split;
 mod stamp;
 pub mod synthetic;
+mod tracked;
 mod transforms;
 mod turns;
 mod undistort;
@@ -47,6 +48,7 @@ use crate::photographs::image::files::Files;
 use crate::photographs::image::{Image, Mask, MaskFile, Orientation};
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
+pub(crate) use borders::Borders;
 pub use fingerprint::Fingerprint;
 use layout::Layout;
 use listed::{ListedView, Listing};
@@ -59,6 +61,7 @@ pub(crate) use pixels::Look;
 use points::points;
 use source::Source;
 use split::{TEST_EVERY, log_split, split};
+pub use turns::PixelOrientation;
 
 /// Photographs with cameras, and points of the scene they show.
 #[derive(Clone, Debug)]
@@ -298,7 +301,7 @@ impl Dataset {
 
         let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
         let gains = white_balance_gains(&layout.root, &sources, options)?;
-        let views = pixels::load(sources, options, (look, gains), &mut skipped)?;
+        let views = pixels::load(sources, &layout, options, (look, gains), &mut skipped)?;
         if !views.iter().any(|view| view.split == Split::Train) {
             let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
             let problem = format!(

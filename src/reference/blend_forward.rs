@@ -123,7 +123,7 @@ impl<'a> Depths<'a> {
             true => f64::from(self.limits[at]),
             false => NO_DEPTH,
         };
-        (0..list.splats.len()).take_while(|&i| !(list.depth(i) > limit)).count()
+        (0..list.splats.len()).take_while(|&i| list.depth(i) <= limit || limit.is_nan()).count()
     }
 
     /// The depth at which the transmittance passes 1/2, and whether a rounding of it decides.

@@ -43,7 +43,7 @@ impl Reference for Kernel {
             let e = f64::from(nearness(params, depth));
             let (near, far) = (f64::from(params.near), f64::from(params.far));
             let error = if is_float { 0.0 } else { 4.0 * unit * f64::from(depth) };
-            if !(e > 0.0) {
+            if e <= 0.0 || e.is_nan() {
                 return if error > 0.0 && e > -error { f64::INFINITY } else { 0.0 };
             }
             if error >= e {

@@ -173,7 +173,8 @@ pub(crate) fn page(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
             exposure.as_ref().map_or_else(|| image.clone(), |found| tone_mapped(image, found));
         dark.add(&image.data);
         bright.add(&target.data);
-        comparisons.push(comparison(&view.name, image, &target));
+        let [shown, target] = [image.clone(), target].map(|image| view.upright(image));
+        comparisons.push(comparison(&view.name, &shown, &target));
     }
     let mut intro = vec![format!(
         "{} photographs to train on ({}), {} held out, {} points.",

@@ -75,9 +75,9 @@ pub(crate) struct EvalPage {
 impl EvalPage {
     /// Adds a scored view.
     pub(crate) fn add(&mut self, score: &ViewScore, compared: &ScoredImages<'_>) {
-        let ScoredImages { render, target, .. } = compared;
+        let ScoredImages { view, render, target } = compared;
         let picture = |caption: &str, image: &Image| {
-            Picture::shrunk(caption, String::new(), image, PICTURE_WIDTH)
+            Picture::shrunk(caption, String::new(), &view.upright(image.clone()), PICTURE_WIDTH)
         };
         let error = |(a, b): (&f32, &f32)| (ERROR_SCALE * (a - b).abs()).min(1.0);
         let data = render.data.iter().zip(&target.data).map(error).collect();

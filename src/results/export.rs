@@ -67,8 +67,7 @@ impl Format {
                 let turned = provenance.rotation != DQuat::IDENTITY;
                 let line = provenance.world_line(gaussians, false).filter(|_| turned);
                 lines.extend(line.map(|line| format!("dataset's {line}")));
-                // The origin has a line of its own.
-                lines.extend(Facts { origin: DVec3::ZERO, ..provenance.facts }.lines());
+                lines.extend(provenance.facts.comments());
                 return ply::save_with_comments(gaussians, path, &lines);
             }
             Self::Spz(version) => spz::encode(gaussians, provenance, version)?,

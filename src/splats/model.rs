@@ -83,7 +83,8 @@ impl Model {
     /// limit and colours are the first one's; positions are relative to its origin, and to none where they are moved.
     ///
     /// # Errors
-    /// [`Error::Usage`] if there is no part, a pose is not rigid, or a part has other colours or another alpha limit.
+    /// [`Error::Usage`] where there is no part, a pose is not rigid, or a part has other colours or another alpha
+    /// limit.
     #[cfg(feature = "capi")]
     pub(crate) fn join(parts: &[(&Self, DAffine3)]) -> Result<Self> {
         let [(first, _), ..] = parts else {

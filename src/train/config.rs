@@ -19,7 +19,9 @@ use crate::camera::frame::{FRAME_EXTENT, TrainingFrame};
 use crate::gpu::Tile;
 use crate::loss::{LossConfig, ParameterWeights};
 use crate::networks::NetworkVariant;
-use crate::photographs::dataset::{DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize};
+use crate::photographs::dataset::{
+    DOWNSCALE, Dataset, DepthOptions, LoadOptions, MeasuredSize, PixelOrientation,
+};
 use crate::photographs::tone::ToneSettings;
 use crate::photographs::white_balance::WhiteBalance;
 use crate::splats::densify::DensityControl;
@@ -68,6 +70,10 @@ pub struct TrainConfig {
     dataset: PathBuf = PathBuf::new() => Rule::PATH;
     /// The folder that holds the photographs by their listed names.
     images: Option<PathBuf> = None, "where the dataset's listing says" => Rule::PATH, "--images DIR";
+    /// Which pixels the dataset's cameras are of, where a photograph's Exif turns or mirrors it and its size does not
+    /// tell: those that are stored, or those that Exif shows; auto: found from the points that photographs share.
+    orientation: PixelOrientation = PixelOrientation::Auto
+        => Rule::OneOf(&PixelOrientation::NAMES), "--orientation PIXELS";
     /// Folder of reference images, under the names of the photographs, for scores only.
     reference: Option<PathBuf> = None, "found beside the photographs" => Rule::PATH, "--reference DIR";
     /// Initial Gaussians from a PLY in the dataset's coordinates, instead of the dataset's points; all SH degrees are
@@ -268,6 +274,7 @@ impl TrainConfig {
             test_every: self.test_every,
             keep: CacheSize::on_host(self.cache, self.max_ram),
             images: self.images.clone(),
+            orientation: self.orientation,
             reference: self.reference.clone(),
             invert_masks: self.invert_masks,
             mask_borders: self.mask_borders,

@@ -23,7 +23,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::camera::Camera;
-use crate::photographs::dataset::{self, Dataset, LoadOptions, View};
+use crate::photographs::dataset::{self, Borders, Dataset, LoadOptions, View};
 use crate::photographs::image::{ColourCounts, Image, MIDDLE_GREY, Mask, PictureFile, files};
 use crate::photographs::tone::{Exposure, LuminanceHistogram, is_black};
 use crate::photographs::white_balance::WhiteBalanceGains;
@@ -252,10 +252,15 @@ fn read(
     let named = || all.iter().map(|file| (file.name.as_str(), file.input.as_path()));
     let balance = options.white_balance.as_ref().filter(|_| !files.is_empty());
     let gains = balance.map(|balance| balance.gains(root, named())).transpose()?;
+    let borders = match options.mask_borders && !files.is_empty() {
+        true => Borders::of_photographs(all),
+        false => Borders::default(),
+    };
     let mut photographs = vec![];
     for files in files.chunks(Image::decoded_at_once(largest)) {
         let read = files.par_iter().map(|file| {
-            let photograph = Photograph::load(file, options.invert_masks, gains, &colours)?;
+            let hidden = (options.invert_masks, &borders);
+            let photograph = Photograph::load(file, hidden, gains, &colours)?;
             Ok((file.name.clone(), photograph))
         });
         photographs.extend(read.collect::<Result<Vec<_>>>()?);
@@ -275,7 +280,7 @@ struct Photograph {
 impl Photograph {
     fn load(
         file: &dataset::Photograph,
-        invert_masks: bool,
+        (invert_masks, borders): (bool, &Borders),
         gains: Option<WhiteBalanceGains>,
         colours: &ColourCounts,
     ) -> Result<Self> {
@@ -285,6 +290,7 @@ impl Photograph {
         }
         let decoded = (&image, alpha.as_ref());
         let mask = Mask::over(&file.input, decoded, file.mask.as_ref(), invert_masks)?;
+        let mask = borders.hidden_too(mask, (image.width, image.height));
         Ok(Self::of(&image, mask.as_ref()))
     }
 

@@ -126,6 +126,11 @@ impl Host {
         }
     }
 
+    /// The loader's function.
+    pub(crate) fn loader_function(&self) -> vk::PFN_vkGetInstanceProcAddr {
+        self.entry.static_fn().get_instance_proc_addr
+    }
+
     /// The same without the queue.
     pub(crate) fn lend_to_record(&self) -> HostDevice {
         HostDevice { queue: 0, is_record_only: true, ..self.lend() }
@@ -306,6 +311,26 @@ impl Host {
             self.free(memory);
             words
         })
+    }
+
+    /// The same of the first layer alone; the other was never drawn.
+    pub(crate) fn read_first_layer(&self, picture: &Picture, words: usize) -> [Vec<u32>; 2] {
+        let memory = self.memory(words);
+        self.submit(|commands| self.copy(commands, picture, 0, &memory, false));
+        let words = memory.read();
+        self.free(memory);
+        [words, vec![]]
+    }
+
+    /// Submits nothing, by `submit_within`, and waits.
+    pub(crate) fn submit_empty(&self, submit_within: impl FnOnce(&dyn Fn())) {
+        // SAFETY: the fence is live until it was waited for; the caller holds the queue's lock.
+        unsafe {
+            let fence = self.device.create_fence(&Default::default(), None).unwrap();
+            submit_within(&|| self.device.queue_submit(self.queue, &[], fence).unwrap());
+            self.device.wait_for_fences(&[fence], true, u64::MAX).unwrap();
+            self.device.destroy_fence(fence, None);
+        }
     }
 
     pub(crate) fn fill(&self, memory: &Memory, word: u32) {

@@ -6,9 +6,11 @@
 #[macro_use]
 mod common;
 
+mod capi;
 mod descriptors;
 mod embedding;
 mod faults;
 mod gpu;
 mod host;
 mod images;
+mod stereo;

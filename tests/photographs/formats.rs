@@ -17,6 +17,7 @@ mod pose_cameras;
 mod raw;
 mod real;
 pub(crate) mod synthetic;
+mod turned;
 
 use std::path::Path;
 

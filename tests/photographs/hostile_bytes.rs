@@ -106,4 +106,5 @@ fn no_bytes_of_a_model_a_checkpoint_or_settings_make_their_parser_panic() {
         |name| name.starts_with("curve") || ["ply", "checkpoint", "config_toml"].contains(&name),
         400,
     );
+    assert_survive(|name| ["spz", "sog"].contains(&name), 100);
 }

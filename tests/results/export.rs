@@ -38,6 +38,14 @@ fn every_format_is_one_file_of_the_run_with_its_expected_beginning() {
         assert!(html.contains(part), "{part}");
     }
 
+    // Without reference images the targets are what the model is compared with.
+    std::fs::remove_dir_all(folder.path().join("set/high")).unwrap();
+    succeed(&format!("export {run} --to html"));
+    let html = std::fs::read_to_string(Path::new(&run).join("model.html")).unwrap();
+    let labels = ["photograph", "target", "reference"]
+        .map(|label| html.matches(&format!("\"label\":\"{label}\"")).count());
+    assert!(labels[0] > 0 && labels == [labels[0], labels[0], 0], "{labels:?}");
+
     let copy = folder.path().join("copy.ply");
     succeed(&format!("export {run} --to ply --out {}", copy.display()));
     let header = String::from_utf8_lossy(&std::fs::read(&copy).unwrap()[..300]).into_owned();
@@ -51,6 +59,39 @@ fn every_format_is_one_file_of_the_run_with_its_expected_beginning() {
     let v3 = folder.path().join("v3.spz");
     succeed(&format!("export {run} --to spz --spz 3 --out {}", v3.display()));
     assert!(std::fs::read(v3).unwrap().starts_with(&[0x1f, 0x8b]));
+}
+
+/// Positions in a GLB, which come first.
+fn positions_of_glb(path: &Path) -> Vec<[f32; 3]> {
+    let file = std::fs::read(path).unwrap();
+    let word = |at: usize| u32::from_le_bytes(file[at..at + 4].try_into().unwrap()) as usize;
+    let text = word(12);
+    let json: serde_json::Value = serde_json::from_slice(&file[20..20 + text]).unwrap();
+    let attributes = &json["meshes"][0]["primitives"][0]["attributes"];
+    let accessor = &json["accessors"][attributes["POSITION"].as_u64().unwrap() as usize];
+    let view = &json["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
+    let begin = 28 + text + view["byteOffset"].as_u64().unwrap_or(0) as usize;
+    let count = accessor["count"].as_u64().unwrap() as usize;
+    let number = |at: usize| f32::from_le_bytes(file[at..at + 4].try_into().unwrap());
+    (0..count).map(|own| [0, 4, 8].map(|at| number(begin + 12 * own + at))).collect()
+}
+
+#[test]
+fn what_is_up_in_a_listing_of_z_up_is_plus_y_of_a_glb() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = trained(folder.path());
+    let message = succeed(&format!("export {run} --to glb"));
+    assert!(message.contains("(0.000, 0.000, 1.000) of the dataset is +Y, up"), "{message}");
+    let model = ply::load(Path::new(&run).join("model.ply")).unwrap();
+    let positions = positions_of_glb(&Path::new(&run).join("model.glb"));
+    assert_eq!(positions.len(), model.count);
+    for ([x, y, z], mean) in positions.into_iter().zip(model.means()) {
+        assert!((y - mean.z).abs() < 1e-4, "{y} for {mean}");
+        let away = mean.x.hypot(mean.y);
+        assert!((x.hypot(z) - away).abs() < 1e-4, "{x}, {z} for {mean}");
+    }
+    let message = succeed(&format!("export {run} --to spz"));
+    assert!(message.contains("is +Y, up"), "{message}");
 }
 
 #[test]

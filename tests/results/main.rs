@@ -13,3 +13,4 @@ mod model_files;
 mod profile;
 mod report;
 mod run;
+mod turned;

@@ -201,20 +201,20 @@ fn an_invalid_fact_in_a_file_is_an_error_of_one_line() {
     };
     for near in ["x", "-1", "0", "NaN", "inf", ""] {
         let stated = problem(&format!("nightsplat near {near}"));
-        let expected = format!("line 6 states near `{near}`, which is not a finite number above 0");
+        let expected = format!("line 7 states near `{near}`, which is not a finite number above 0");
         assert_eq!(stated, expected);
     }
     assert_eq!(
         problem("nightsplat max_alpha 1"),
-        "line 6 states max_alpha `1`, which is not a finite number between 0 and 1"
+        "line 7 states max_alpha `1`, which is not a finite number between 0 and 1"
     );
     assert_eq!(
         problem("nightsplat raw_colors on"),
-        "line 6 states raw_colors `on`, which is neither true nor false"
+        "line 7 states raw_colors `on`, which is neither true nor false"
     );
     assert_eq!(
         problem("world = position + 1 2"),
-        "line 6 names the origin `1 2`, which is not three finite numbers"
+        "line 7 names the origin `1 2`, which is not three finite numbers"
     );
     // Facts of later versions are skipped.
     Model::from(Gaussians::zeros(2, 0)).save(&path).unwrap();
@@ -238,7 +238,8 @@ fn an_export_keeps_the_origin_and_the_page_the_near_plane() {
     gaussians.origin = DVec3::new(4_499_999.6, 519_997.7, 10_001.8);
     ply::save(&gaussians, &path).unwrap();
     let (run, out) = (place.path("run"), place.path("out.ply"));
-    succeed(&format!("export {} --to ply --out {}", run.display(), out.display()));
+    let message = succeed(&format!("export {} --to ply --out {}", run.display(), out.display()));
+    assert!(message.contains("world = position + 4499999.6 519997.7 10001.8"), "{message}");
     assert_eq!(ply::load(&out).unwrap(), gaussians.with_sh_degree(3));
     let line = "comment world = position + 4499999.6 519997.7 10001.8";
     assert!(String::from_utf8_lossy(&fs::read(&out).unwrap()).contains(line));
@@ -247,7 +248,30 @@ fn an_export_keeps_the_origin_and_the_page_the_near_plane() {
     let html = fs::read_to_string(Path::new(&run).join("model.html")).unwrap();
     let (_, after) = html.split_once("\"near\":").unwrap();
     let near: f64 = after.split([',', '}']).next().unwrap().parse().unwrap();
-    let config = nightsplat::results::run::load_config(&run).unwrap();
+    let config = load_config(&run).unwrap();
     let scale = config.frame.unwrap_or_default().scale;
     assert!((near - 1.0 / scale).abs() < 1e-6, "{near} at a scale of {scale}");
+}
+
+#[test]
+fn training_far_from_the_origin_of_the_world_says_what_positions_are_relative_to() {
+    let place = Place::new();
+    let near = succeed(&place.train("near", "--steps 2"));
+    assert!(!near.contains("relative"), "{near}");
+    for listing in ["transforms_train.json", "transforms_test.json"] {
+        let path = place.path("set").join(listing);
+        let mut listed: serde_json::Value =
+            serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
+        for frame in listed["frames"].as_array_mut().unwrap() {
+            let x = &mut frame["transform_matrix"][0][3];
+            *x = (x.as_f64().unwrap() + 448_262.5).into();
+        }
+        fs::write(&path, listed.to_string()).unwrap();
+    }
+    let far = succeed(&place.train("far", "--steps 2"));
+    assert!(far.contains("model.ply: positions are relative"), "{far}");
+    let header = fs::read(place.path("far/model.ply")).unwrap();
+    let header = String::from_utf8_lossy(&header[..400]).into_owned();
+    let origin = header.lines().find(|line| line.contains("world = position + ")).unwrap();
+    assert!(far.contains(origin.trim_start_matches("comment ")), "{origin}: {far}");
 }

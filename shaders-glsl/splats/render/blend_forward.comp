@@ -14,8 +14,8 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //! finds the groups of pixels that its ellipse meets; the batch is then broadcast splat by splat. The tile's state
 //! stays in registers: no shared memory, no barrier.
 //!
-//! With VIEW_DEPTHS the last channel is the depth in the view: the sum of the weighted depths, or the depth at which
-//! the transmittance falls below 1/2. A splat beyond a pixel's limit ends the pixel, as the order is front to back.
+//! With VIEW_DEPTHS the last channel is the depth in the view: a splat beyond a pixel's limit ends it, as the order is
+//! front to back. The channel is the sum of the weighted depths, or the depth at which the transmittance passes 1/2.
 
 layout(push_constant, scalar) uniform Params {
     uvec2 size;

@@ -5,8 +5,8 @@
 
 //! Depth limits: converts a host's depth image to the depths in the view beyond which everything is hidden.
 //!
-//! With e = d if depth is reversed and 1 - d otherwise: z = near far / (near + e (far - near)), and z = near / e for an
-//! infinite far plane. At e = 0 the host drew nothing, and nothing is hidden.
+//! With e = d where depth is reversed and 1 - d else: z = near far / (near + e (far - near)), and z = near / e before
+//! an infinite far plane. At e = 0 the host drew nothing, and nothing is hidden.
 
 layout(local_size_x = 64) in;
 

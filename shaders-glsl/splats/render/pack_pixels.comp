@@ -27,7 +27,7 @@ layout(binding = 0) readonly  buffer Render { float render[]; };  // (channels, 
 layout(binding = 1) readonly  buffer Transmittances { float transmittances[]; };  // (pixels)
 layout(binding = 2) readonly  buffer Under  { uint under[]; };    // as `pixels`
 layout(binding = 3) writeonly buffer Pixels { uint pixels[]; };   // (pixels, words)
-layout(binding = 4) writeonly buffer Depths { float depths[]; };  // (pixels) world units; infinite if empty
+layout(binding = 4) writeonly buffer Depths { float depths[]; };  // (pixels) world units; infinite: nothing is seen
 
 // Below this, a channel of sRGB is linear.
 const float LINEAR_END = 0.04045;
@@ -36,8 +36,8 @@ const float NOTHING_SEEN = 3.3e38;
 const uint INFINITE = 0x7f800000u;
 
 vec3 eotf(vec3 c) {
-    vec3 power = pow((max(c, vec3(LINEAR_END)) + 0.055) / 1.055, vec3(2.4));
-    return mix(power, c / 12.92, lessThanEqual(c, vec3(LINEAR_END)));
+    vec3 curved = pow((max(c, vec3(LINEAR_END)) + 0.055) / 1.055, vec3(2.4));
+    return mix(curved, c / 12.92, lessThanEqual(c, vec3(LINEAR_END)));
 }
 
 vec3 inverse_eotf(vec3 c) {

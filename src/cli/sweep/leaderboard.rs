@@ -147,7 +147,7 @@ impl Leaderboard<'_> {
         let picture = |caption: &str, scores: String, image: &Image| Picture {
             caption: caption.to_owned(),
             scores,
-            image: image.clone(),
+            image: view.upright(image.clone()),
         };
         let scored = |psnr: Option<f64>, ssim: Option<f64>| {
             let text = |(psnr, ssim)| format!("{psnr:.2} dB, SSIM {ssim:.3}");

@@ -4,14 +4,10 @@
 //! scene.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
-use super::Split;
-use super::source::Source;
-use crate::photographs::image::{Image, PictureFile};
-
-/// The pixels of photographs of one size that show nothing, as indices into a plane, ascending.
-pub(super) type Border = Arc<Vec<usize>>;
+use super::source::{Source, shown};
+use super::{Photograph, Split};
+use crate::photographs::image::{Image, Mask, PictureFile};
 
 /// The maximum encoded value of black: JPEG turns 0 into up to this within a block.
 const BLACK: f32 = 1.5 / 255.0;
@@ -36,44 +32,60 @@ const BLOCK: usize = 8;
 /// How far interpolation spreads black, pixels.
 const REACH: usize = 2;
 
-/// Finds the borders by size, width and height.
-pub(super) fn find<'a>(sources: impl Iterator<Item = &'a Source>) -> BTreeMap<(u32, u32), Border> {
-    let mut by_size: BTreeMap<(u32, u32), Vec<&Source>> = BTreeMap::new();
-    // Who has masks has masked what shows nothing.
-    for source in sources.filter(|source| source.split == Split::Train && source.mask.is_none()) {
-        let size = source.read[0].as_ref().and_then(|file| file.size().ok());
-        let size = size.or_else(|| Image::size_of(source.input.as_deref()?).ok());
-        by_size.entry(size.unwrap_or_default()).or_default().push(source);
-    }
-    by_size.retain(|_, sources| sources.len() >= NEEDED);
-    let found = by_size.into_iter().filter_map(|(size, sources)| {
-        let step = sources.len().div_ceil(LOOKED_AT);
-        let images = sources.iter().step_by(step).filter_map(|source| decoded(source));
-        let border = border(images, size)?;
-        let (width, height) = size;
-        tracing::warn!(
-            "{:.1} % of the photographs of {width}x{height} is black in the same place at the border, as undistorting leaves \
-             it where the lens saw nothing: masked (mask_borders = false trains on it)",
-            100.0 * border.len() as f64 / f64::from(width) / f64::from(height)
-        );
-        Some((size, Arc::new(border)))
-    });
-    found.collect()
+/// The pixels that show nothing, as indices into a plane, ascending; by width and height of the photographs as stored.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Borders(BTreeMap<(u32, u32), Vec<usize>>);
+
+/// A training photograph without a mask: who has masks has masked what shows nothing.
+struct Candidate<'a> {
+    size: (u32, u32),
+    picture: Box<dyn Fn() -> Option<Image> + 'a>,
 }
 
-/// A photograph as it is stored; what its alpha hides is not black.
-fn decoded(source: &Source) -> Option<Image> {
-    let file = match &source.read[0] {
-        Some(read) => PictureFile::clone(read),
-        None => PictureFile::open(source.input.as_deref()?).ok()?,
-    };
-    let (mut image, alpha) = file.decode().ok()?;
-    if let Some(alpha) = alpha {
-        for (value, alpha) in image.data.iter_mut().zip(alpha.data) {
-            *value = if alpha < 1.0 { 1.0 } else { *value };
-        }
+impl Borders {
+    pub(super) fn of_sources<'a>(sources: impl Iterator<Item = &'a Source>) -> Self {
+        let sources =
+            sources.filter(|source| source.split == Split::Train && source.mask.is_none());
+        Self::find(sources.map(|source| {
+            let size = source.read[0].as_ref().and_then(|file| file.size().ok());
+            let size = size.or_else(|| Image::size_of(source.input.as_deref()?).ok());
+            let picture = Box::new(|| source.picture());
+            Candidate { size: size.unwrap_or_default(), picture }
+        }))
     }
-    Some(image)
+
+    /// Those of a dataset that is not loaded.
+    pub(crate) fn of_photographs(photographs: &[Photograph]) -> Self {
+        let own = photographs.iter().filter(|own| own.split == Split::Train && own.mask.is_none());
+        Self::find(own.map(|Photograph { input, .. }| {
+            let picture = Box::new(|| shown(PictureFile::open(input).ok()?));
+            Candidate { size: Image::size_of(input).unwrap_or_default(), picture }
+        }))
+    }
+
+    fn find<'a>(candidates: impl Iterator<Item = Candidate<'a>>) -> Self {
+        let mut by_size: BTreeMap<(u32, u32), Vec<Candidate<'_>>> = BTreeMap::new();
+        candidates.for_each(|own| by_size.entry(own.size).or_default().push(own));
+        by_size.retain(|_, candidates| candidates.len() >= NEEDED);
+        let found = by_size.into_iter().filter_map(|(size, candidates)| {
+            let step = candidates.len().div_ceil(LOOKED_AT);
+            let images = candidates.iter().step_by(step).filter_map(|own| (own.picture)());
+            let border = border(images, size)?;
+            let (width, height) = size;
+            tracing::warn!(
+                "{:.1} % of the photographs of {width}x{height} is black in the same place at the border, as \
+                 undistorting leaves it where the lens saw nothing: masked (mask_borders = false trains on it)",
+                100.0 * border.len() as f64 / f64::from(width) / f64::from(height)
+            );
+            Some((size, border))
+        });
+        Self(found.collect())
+    }
+
+    /// The mask of a photograph of this size as stored that hides its border beside what `own` hides; none of none.
+    pub(crate) fn hidden_too(&self, own: Option<Mask>, size: (u32, u32)) -> Option<Mask> {
+        Mask::hiding_too(own, size, self.0.get(&size).map_or(&[], Vec::as_slice))
+    }
 }
 
 /// The black border that images of one size have in common.

@@ -3,6 +3,7 @@
 use std::ops::Bound;
 use std::path::PathBuf;
 
+use super::PixelOrientation;
 use crate::base::settings::Rule;
 use crate::base::tree;
 use crate::photographs::white_balance::WhiteBalance;
@@ -27,6 +28,8 @@ pub struct LoadOptions {
     pub keep: Option<u64>,
     /// The folder with the photographs under their listed names, instead of their listed paths.
     pub images: Option<PathBuf>,
+    /// Which pixels the cameras are of, where a photograph's Exif turns or mirrors it and sizes do not tell.
+    pub orientation: PixelOrientation,
     /// A folder of reference images by name, in place of what is found beside the input.
     pub reference: Option<PathBuf>,
     /// Whether test views also load their dark photograph, if any.
@@ -79,6 +82,7 @@ impl Default for LoadOptions {
             test_every: None,
             keep: None,
             images: None,
+            orientation: PixelOrientation::Auto,
             reference: None,
             load_low_test: true,
             hold_out: 0,

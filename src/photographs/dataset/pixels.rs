@@ -1,21 +1,24 @@
 //! From files to views: decode, check against the camera, undistort, downscale. Parallel over views.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use rayon::prelude::*;
 
 use super::allowance::Allowance;
-use super::borders::{self, Border};
+use super::borders::Borders;
 use super::dark_references;
 use super::depth::depth_map;
+use super::layout::Layout;
 use super::loaded::Loaded;
 use super::original::Original;
 use super::packed::Packed;
+use super::points;
 use super::prepare::{Preparation, check_size, disagreement, pixel_count};
 use super::source::{MAX_READ, Source};
-use super::turns::{Header, Turns};
+use super::tracked;
+use super::turns::{Header, Pixels, Turns};
 use super::undistort::WIDEST;
 use super::{LoadOptions, MeasuredSize, Split, View};
 use crate::base::hash::Hasher;
@@ -36,15 +39,20 @@ pub(crate) type Look<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>) + Sync);
 
 /// The views in order of name. Files that cannot be decoded are named in `skipped`.
 pub(super) fn load(
-    sources: Vec<Source>,
+    mut sources: Vec<Source>,
+    layout: &Layout,
     options: &LoadOptions,
     (look, gains): (Option<Look<'_>>, Option<WhiteBalanceGains>),
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
     let memory = Allowance::new(MAX_READ);
-    let fitted = sources.into_par_iter().map(|mut source| {
-        let headers = source.headers(&memory);
-        source.fit(headers)?;
+    let headers: Vec<[Option<Header>; 2]> =
+        sources.par_iter_mut().map(|source| source.headers(&memory)).collect();
+    let own: Vec<Option<Header>> = headers.iter().map(|[own, _]| *own).collect();
+    let points = || points::of_sources(layout, &sources);
+    let pixels = tracked::pixels(&sources, &own, options.orientation, points)?;
+    let fitted = sources.into_par_iter().zip(headers).map(|(mut source, headers)| {
+        source.fit(headers, pixels)?;
         Ok(source)
     });
     let mut groups: Vec<(Lens, Vec<Source>)> = Vec::new();
@@ -59,8 +67,8 @@ pub(super) fn load(
     }
     let options = &resolved(&groups, options);
     let borders = match options.mask_borders {
-        true => borders::find(groups.iter().flat_map(|(_, group)| group)),
-        false => BTreeMap::new(),
+        true => Borders::of_sources(groups.iter().flat_map(|(_, group)| group)),
+        false => Borders::default(),
     };
     let largest = groups.iter().map(|(lens, _)| pixel_count((lens.width, lens.height))).max();
     let at_once = Image::decoded_at_once(largest.unwrap_or_default());
@@ -104,7 +112,7 @@ struct Loading<'a> {
     /// For photographs at their own size.
     originals: &'a Allowance,
     /// Black borders of photographs by their size as stored.
-    borders: &'a BTreeMap<(u32, u32), Border>,
+    borders: &'a Borders,
     /// What was made of the colours of photographs and of reference images.
     colours: &'a [ColourCounts; 2],
 }
@@ -164,11 +172,11 @@ impl Source {
     ///
     /// # Errors
     /// [`Error::Input`] where the picture has another shape than its camera.
-    fn fit(&mut self, headers: [Option<Header>; 2]) -> Result<()> {
+    fn fit(&mut self, headers: [Option<Header>; 2], pixels: Pixels) -> Result<()> {
         let lens = self.lens;
         // What has no readable header is named when it is decoded.
-        self.turns = headers
-            .map(|header| header.map(|header| Turns::new(header, &lens)).unwrap_or_default());
+        let turns = |header: Header| Turns::new(header, &lens, pixels);
+        self.turns = headers.map(|header| header.map(turns).unwrap_or_default());
         let sizes = headers
             .into_iter()
             .zip(self.turns)
@@ -280,8 +288,9 @@ impl ViewLoader<'_> {
                 let decoded = (image, alpha.as_ref());
                 let own = Mask::over(path, decoded, mask.as_ref(), options.invert_masks)?;
                 let size = (image.width, image.height);
-                let border = self.loading.borders.get(&size).map(|border| border.as_slice());
-                Mask::hiding_too(own, size, border.unwrap_or_default())
+                self.loading
+                    .borders
+                    .hidden_too(own, size)
                     .map(|stored| (stored, path.clone(), turns.loading))
             }
             None => None,

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use glam::{DAffine3, DVec3};
 
 use crate::base::input;
+use crate::base::ply::{Encoding, Header, Kind, Property};
 use crate::{Error, Result};
 
 /// A file of points.
@@ -15,75 +16,6 @@ pub(super) struct Cloud {
     pub(super) applied: Option<DAffine3>,
 }
 
-/// How vertices are written.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Encoding {
-    Text,
-    Little,
-    Big,
-}
-
-/// A scalar property of a vertex.
-#[derive(Clone, Copy)]
-struct Property {
-    /// Bytes before it.
-    at: usize,
-    kind: Kind,
-}
-
-#[derive(Clone, Copy)]
-enum Kind {
-    Signed(usize),
-    Unsigned(usize),
-    Float(usize),
-}
-
-impl Kind {
-    fn of(name: &str) -> Option<Self> {
-        Some(match name {
-            "char" | "int8" => Self::Signed(1),
-            "short" | "int16" => Self::Signed(2),
-            "int" | "int32" => Self::Signed(4),
-            "uchar" | "uint8" => Self::Unsigned(1),
-            "ushort" | "uint16" => Self::Unsigned(2),
-            "uint" | "uint32" => Self::Unsigned(4),
-            "float" | "float32" => Self::Float(4),
-            "double" | "float64" => Self::Float(8),
-            _ => return None,
-        })
-    }
-
-    fn size(self) -> usize {
-        match self {
-            Self::Signed(size) | Self::Unsigned(size) | Self::Float(size) => size,
-        }
-    }
-
-    /// The value of its bytes, the least significant first.
-    fn value(self, bytes: [u8; 8]) -> f64 {
-        let unsigned = u64::from_le_bytes(bytes);
-        match self {
-            Self::Float(4) => f64::from(f32::from_bits(unsigned as u32)),
-            Self::Float(_) => f64::from_bits(unsigned),
-            Self::Unsigned(_) => unsigned as f64,
-            Self::Signed(size) => {
-                let unused = 64 - 8 * size as u32;
-                ((unsigned << unused) as i64 >> unused) as f64
-            }
-        }
-    }
-}
-
-/// What the header says of the vertices, which come first.
-struct Header {
-    encoding: Encoding,
-    count: usize,
-    /// Of the file, of each vertex: bytes, or of text fields.
-    stride: usize,
-    /// x, y and z: with the number of the field.
-    axes: [(usize, Property); 3],
-}
-
 /// The finite points of a file. Normals and colours are skipped: they may come from normal-light photographs.
 ///
 /// # Errors
@@ -92,92 +24,61 @@ pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
     let bytes = input::bytes(path)?;
     let no_points =
         |problem: &str| Error::input(path, format!("{problem}; its points are not read"));
-    const END: &[u8] = b"end_header";
-    let end = bytes
-        .windows(END.len())
-        .take(1 << 16)
-        .position(|window| window == END)
-        .ok_or_else(|| no_points("is no PLY file"))?;
-    let line_end = bytes[end..].iter().position(|byte| *byte == b'\n').unwrap_or(END.len());
-    let text = String::from_utf8_lossy(&bytes[..end]);
-    let header = header(&text).map_err(no_points)?;
-    let body = bytes.get(end + line_end + 1..).unwrap_or_default();
+    let header = Header::parse(&bytes).map_err(|problem| no_points(&problem))?;
+    if header.properties.iter().any(|own| own.name.starts_with("f_dc_")) {
+        return Err(no_points("is a model of Gaussians, not of points"));
+    }
+    let body = &bytes[header.length..];
+    let axes = ["x", "y", "z"].map(|axis| header.property(axis));
+    let [Some(x), Some(y), Some(z)] = axes else { return Err(no_points("has no x, y and z")) };
     let points = match header.encoding {
-        Encoding::Text => of_text(&String::from_utf8_lossy(body), &header),
-        _ => of_bytes(body, &header),
+        Encoding::Text => {
+            of_text(&String::from_utf8_lossy(body), &header, [x, y, z].map(|(place, _)| place))
+        }
+        _ => of_bytes(body, &header, [x, y, z].map(|(_, own)| own)),
     };
     let mut points = points.ok_or_else(|| no_points("is cut short or damaged"))?;
     points.retain(|point| point.is_finite());
     Ok(points)
 }
 
-fn header(text: &str) -> Result<Header, &'static str> {
-    let mut lines = text.lines().map(str::split_whitespace).map(|words| words.collect::<Vec<_>>());
-    if lines.next().as_deref() != Some(&["ply"]) {
-        return Err("is no PLY file");
-    }
-    let mut encoding = None;
-    let mut count = None;
-    let (mut at, mut field) = (0, 0);
-    let mut axes = [None; 3];
-    let mut is_vertex = false;
-    for words in lines {
-        match words.as_slice() {
-            ["format", "ascii", ..] => encoding = Some(Encoding::Text),
-            ["format", "binary_little_endian", ..] => encoding = Some(Encoding::Little),
-            ["format", "binary_big_endian", ..] => encoding = Some(Encoding::Big),
-            ["element", "vertex", number] => {
-                count = number.parse().ok();
-                is_vertex = true;
-            }
-            ["element", ..] if count.is_none() => {
-                return Err("has other elements before its vertices");
-            }
-            ["element", ..] => is_vertex = false,
-            ["property", "list", ..] if is_vertex => return Err("has vertices of varying length"),
-            ["property", kind, name] if is_vertex => {
-                let kind = Kind::of(kind).ok_or("has a property of an unknown type")?;
-                if name.starts_with("f_dc_") {
-                    return Err("is a model of Gaussians, not of points");
-                }
-                if let Some(axis) = ["x", "y", "z"].iter().position(|axis| axis == name) {
-                    axes[axis] = Some((field, Property { at, kind }));
-                }
-                at += kind.size();
-                field += 1;
-            }
-            _ => {}
-        }
-    }
-    let [Some(x), Some(y), Some(z)] = axes else { return Err("has no x, y and z") };
-    let encoding = encoding.ok_or("has no format")?;
-    let count = count.ok_or("has no vertices")?;
-    Ok(Header { encoding, count, stride: at, axes: [x, y, z] })
-}
-
-fn of_bytes(body: &[u8], header: &Header) -> Option<Vec<DVec3>> {
+fn of_bytes(body: &[u8], header: &Header, axes: [&Property; 3]) -> Option<Vec<DVec3>> {
     let body = body.get(..header.count.checked_mul(header.stride)?)?;
-    let value = |vertex: &[u8], Property { at, kind }: Property| {
+    let number = |vertex: &[u8], own: &Property| {
         let mut bytes = [0; 8];
-        let own = &mut bytes[..kind.size()];
-        own.copy_from_slice(&vertex[at..at + kind.size()]);
+        let size = own.kind.size();
+        bytes[..size].copy_from_slice(&vertex[own.at..own.at + size]);
         if header.encoding == Encoding::Big {
-            own.reverse();
+            bytes[..size].reverse();
         }
-        kind.value(bytes)
+        value(own.kind, bytes)
     };
-    let point =
-        |vertex: &[u8]| DVec3::from_array(header.axes.map(|(_, property)| value(vertex, property)));
+    let point = |vertex: &[u8]| DVec3::from_array(axes.map(|own| number(vertex, own)));
     Some(body.chunks_exact(header.stride.max(1)).map(point).collect())
 }
 
-fn of_text(body: &str, header: &Header) -> Option<Vec<DVec3>> {
+/// The value of a number's bytes, the least significant first.
+fn value(kind: Kind, bytes: [u8; 8]) -> f64 {
+    let unsigned = u64::from_le_bytes(bytes);
+    match kind {
+        Kind::Float(4) => f64::from(f32::from_bits(unsigned as u32)),
+        Kind::Float(_) => f64::from_bits(unsigned),
+        Kind::Unsigned(_) => unsigned as f64,
+        Kind::Signed(size) => {
+            let unused = 64 - 8 * size as u32;
+            ((unsigned << unused) as i64 >> unused) as f64
+        }
+    }
+}
+
+/// Of the places of x, y and z in a line.
+fn of_text(body: &str, header: &Header, axes: [usize; 3]) -> Option<Vec<DVec3>> {
     let lines = body.lines().filter(|line| !line.trim().is_empty()).take(header.count);
     let point = |line: &str| {
         let fields: Vec<&str> = line.split_whitespace().collect();
         let mut point = DVec3::ZERO;
-        for (axis, (field, _)) in header.axes.iter().enumerate() {
-            point[axis] = fields.get(*field)?.parse().ok()?;
+        for (axis, place) in axes.into_iter().enumerate() {
+            point[axis] = fields.get(place)?.parse().ok()?;
         }
         Some(point)
     };
@@ -218,7 +119,7 @@ mod tests {
         assert_eq!(read(&head("binary_little_endian", "float"), &little).unwrap(), expected);
         let big = body(&|value| value.to_be_bytes().to_vec());
         assert_eq!(read(&head("binary_big_endian", "double"), &big).unwrap(), expected);
-        let whole = Kind::of("short").unwrap().value([0xfe, 0xff, 0, 0, 0, 0, 0, 0]);
+        let whole = value(Kind::Signed(2), [0xfe, 0xff, 0, 0, 0, 0, 0, 0]);
         assert_eq!(whole, -2.0);
     }
 
@@ -227,9 +128,12 @@ mod tests {
         let head = |lines: &str| format!("ply\nformat ascii 1.0\n{lines}\nend_header\n");
         let xyz = "property float x\nproperty float y\nproperty float z";
         let cases = [
-            ("no ply".to_owned(), "is no PLY file"),
+            ("no ply".to_owned(), "is not a PLY file"),
             (head("element vertex 1\nproperty float x"), "has no x, y and z"),
-            (head(&format!("element face 1\nelement vertex 1\n{xyz}")), "other elements before"),
+            (
+                head(&format!("element face 1\nelement vertex 1\n{xyz}")),
+                "comes before the vertices",
+            ),
             (
                 head(&format!("element vertex 1\n{xyz}\nproperty float f_dc_0")),
                 "a model of Gaussians",

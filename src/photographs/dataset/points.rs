@@ -8,6 +8,7 @@ use glam::{DAffine3, DVec3};
 use super::layout::{CAMERAS, Layout};
 use super::ply::Cloud;
 use super::similarity::Similarity;
+use super::source::Source;
 use super::{Point, View, colmap, names, ply};
 use crate::Result;
 use crate::base::tree;
@@ -19,7 +20,8 @@ const MAX_WORLD_RESIDUAL: f64 = 0.01;
 /// The points of the dataset, in the views' world: those of its COLMAP model, which know the photographs that see them;
 /// where it has none, those of a PLY file that the listing names or that lies beside it.
 pub(super) fn points(layout: &Layout, views: &[View], listed: &[Cloud]) -> Result<Vec<Point>> {
-    let of_model = of_model(layout, views)?;
+    let places: Vec<Place<'_>> = views.iter().map(Place::of_view).collect();
+    let of_model = of_model(layout, &places)?;
     if !of_model.is_empty() {
         return Ok(of_model);
     }
@@ -31,7 +33,7 @@ pub(super) fn points(layout: &Layout, views: &[View], listed: &[Cloud]) -> Resul
     let models = layout.models(&CAMERAS);
     for folder in &models {
         let Some(points) = beside(folder).find_map(|cloud| read(&cloud.file)) else { continue };
-        if let Some(to_views) = Shared::of(folder, views)?.to_views(folder) {
+        if let Some(to_views) = Shared::of(folder, &places)?.to_views(folder) {
             let point = |position| Point { position: to_views(position), views: vec![] };
             return Ok(points.into_iter().map(point).collect());
         }
@@ -107,6 +109,30 @@ fn placed(cloud: &Cloud, points: Vec<DVec3>, views: &[View]) -> Vec<Point> {
     points.into_iter().map(point).collect()
 }
 
+/// The points of the dataset's COLMAP model, with indices into `sources`.
+///
+/// # Errors
+/// [`Error::Input`](crate::Error::Input) where the model is damaged.
+pub(super) fn of_sources(layout: &Layout, sources: &[Source]) -> Result<Vec<Point>> {
+    of_model(layout, &sources.iter().map(Place::of_source).collect::<Vec<_>>())
+}
+
+/// A view's name, and where its camera stands.
+struct Place<'a> {
+    name: &'a str,
+    center: DVec3,
+}
+
+impl Place<'_> {
+    fn of_view(view: &View) -> Place<'_> {
+        Place { name: &view.name, center: view.camera.center() }
+    }
+
+    fn of_source(source: &Source) -> Place<'_> {
+        Place { name: &source.name, center: source.view_from_world.inverse().translation }
+    }
+}
+
 /// The photographs that a model and the views share.
 struct Shared {
     /// Image id, view, and the camera's position in either world.
@@ -114,13 +140,13 @@ struct Shared {
 }
 
 impl Shared {
-    fn of(folder: &Path, views: &[View]) -> Result<Self> {
+    fn of(folder: &Path, views: &[Place<'_>]) -> Result<Self> {
         let view_named = view_named(views);
         let images = colmap::read_images(folder)?;
         let shared = images.iter().filter_map(|image| {
             let view = view_named(&image.name)?;
             let own = image.view_from_world?.inverse().translation;
-            Some((image.id, view, [own, views[view as usize].camera.center()]))
+            Some((image.id, view, [own, views[view as usize].center]))
         });
         Ok(Self { images: shared.collect() })
     }
@@ -132,9 +158,9 @@ impl Shared {
 }
 
 /// The view of a photograph that a model names.
-fn view_named(views: &[View]) -> impl Fn(&str) -> Option<u32> {
+fn view_named(views: &[Place<'_>]) -> impl Fn(&str) -> Option<u32> {
     let by_name: BTreeMap<&str, u32> =
-        views.iter().zip(0..).map(|(view, index)| (view.name.as_str(), index)).collect();
+        views.iter().zip(0..).map(|(view, index)| (view.name, index)).collect();
     move |image| {
         let names = names::possible(&image.replace('\\', "/"));
         names.iter().find_map(|name| by_name.get(name.as_str()).copied())
@@ -142,7 +168,7 @@ fn view_named(views: &[View]) -> impl Fn(&str) -> Option<u32> {
 }
 
 /// The points of the dataset's COLMAP model.
-fn of_model(layout: &Layout, views: &[View]) -> Result<Vec<Point>> {
+fn of_model(layout: &Layout, views: &[Place<'_>]) -> Result<Vec<Point>> {
     let models = layout.models(&["images", "points3D"]);
     let view_named = view_named(views);
     let Some((folder, _)) = colmap::largest(&models, |name| view_named(name).is_some())? else {

@@ -61,6 +61,26 @@ impl Source {
         }
         headers
     }
+
+    /// The photograph as it is stored, white where its alpha hides it; `None` where there is none that decodes.
+    pub(super) fn picture(&self) -> Option<Image> {
+        let file = match &self.read[0] {
+            Some(read) => PictureFile::clone(read),
+            None => PictureFile::open(self.input.as_deref()?).ok()?,
+        };
+        shown(file)
+    }
+}
+
+/// A picture, white where its alpha hides it; `None` where it does not decode.
+pub(super) fn shown(file: PictureFile) -> Option<Image> {
+    let (mut image, alpha) = file.decode().ok()?;
+    if let Some(alpha) = alpha {
+        for (value, alpha) in image.data.iter_mut().zip(alpha.data) {
+            *value = if alpha < 1.0 { 1.0 } else { *value };
+        }
+    }
+    Some(image)
 }
 
 /// Maximum size of files that are read before they are decoded, bytes: others are opened once for their size, and

@@ -53,7 +53,7 @@ impl Dataset {
 }
 
 /// Of how files are read: another where the same file gives other pixels than before.
-const READING: &[u8] = b"in sRGB";
+const READING: &[u8] = b"in sRGB, turned by what points show";
 
 fn write_file(hasher: &mut Hasher, path: &Path) {
     hasher.write(path.as_os_str().as_encoded_bytes());

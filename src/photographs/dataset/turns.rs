@@ -1,7 +1,53 @@
-//! How photographs are turned, of which Exif says that they lie on a side.
+//! Which pixels the cameras are of, where Exif turns or mirrors a photograph: those that are stored, as COLMAP reads
+//! them, or those that Exif shows, as many converters write them.
+
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
 
 use crate::camera::Lens;
 use crate::photographs::image::Orientation;
+use crate::{Error, Result};
+
+/// Which pixels the cameras of a dataset are of, where a photograph's Exif turns or mirrors it and its size does not
+/// tell.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PixelOrientation {
+    /// As with those photographs of the dataset whose size tells; else found from the points that several photographs
+    /// show; else those that are stored, with a warning.
+    #[default]
+    Auto,
+    /// Those that are stored.
+    Stored,
+    /// Those that Exif shows.
+    Exif,
+}
+
+impl PixelOrientation {
+    /// Their names.
+    pub(crate) const NAMES: [&'static str; 3] = ["auto", "stored", "exif"];
+}
+
+impl FromStr for PixelOrientation {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        match name {
+            "auto" => Ok(Self::Auto),
+            "stored" => Ok(Self::Stored),
+            "exif" => Ok(Self::Exif),
+            _ => Err(Error::Usage(format!("unknown orientation `{name}`; auto, stored or exif"))),
+        }
+    }
+}
+
+/// The pixels that the cameras of a dataset are of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Pixels {
+    Stored,
+    Exif,
+}
 
 /// What the header of a picture says.
 #[derive(Clone, Copy, Debug)]
@@ -10,6 +56,18 @@ pub(super) struct Header {
     pub(super) size: (u32, u32),
     /// How that is turned for people, by its Exif.
     pub(super) orientation: Orientation,
+}
+
+impl Header {
+    /// The pixels that a camera is of, by its size; `None` where both have it.
+    pub(super) fn by_size(self, lens: &Lens) -> Option<Pixels> {
+        let fits = |(width, height): (u32, u32)| lens.fitted(width, height).is_some();
+        match (fits(self.size), fits(self.orientation.size(self.size))) {
+            (true, true) => None,
+            (false, true) => Some(Pixels::Exif),
+            (_, false) => Some(Pixels::Stored),
+        }
+    }
 }
 
 /// How a photograph is turned.
@@ -22,15 +80,12 @@ pub(super) struct Turns {
 }
 
 impl Turns {
-    /// Poses are of what is stored, as COLMAP reads it; where the camera's size is that of what is seen, and not of what is
-    /// stored, they are of that.
-    pub(super) fn new(header: Header, lens: &Lens) -> Self {
-        let Header { size, orientation } = header;
-        let fits = |(width, height): (u32, u32)| lens.fitted(width, height).is_some();
-        if !fits(size) && fits(orientation.size(size)) {
-            Self { loading: orientation, viewing: Orientation::UPRIGHT }
-        } else {
-            Self { loading: Orientation::UPRIGHT, viewing: orientation }
+    /// Of a picture whose camera is of these pixels unless their sizes say otherwise.
+    pub(super) fn new(header: Header, lens: &Lens, pixels: Pixels) -> Self {
+        let orientation = header.orientation;
+        match header.by_size(lens).unwrap_or(pixels) {
+            Pixels::Exif => Self { loading: orientation, viewing: Orientation::UPRIGHT },
+            Pixels::Stored => Self { loading: Orientation::UPRIGHT, viewing: orientation },
         }
     }
 }

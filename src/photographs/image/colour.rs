@@ -14,6 +14,8 @@ mod metadata;
 #[cfg(test)]
 mod tests;
 
+use std::sync::OnceLock;
+
 use glam::{DMat3, DVec3};
 use moxcms::{
     CicpColorPrimaries, CicpProfile, ColorProfile, DataColorSpace, MatrixCoefficients, ProfileText,
@@ -331,15 +333,17 @@ fn description(profile: &ColorProfile) -> Option<String> {
 
 /// The name of the colour space with these primaries, from the matrix to linear sRGB.
 fn known_name(matrix: DMat3) -> Option<&'static str> {
-    let known = [
-        ("sRGB", ColorProfile::new_srgb()),
-        ("Display P3", ColorProfile::new_display_p3()),
-        ("Adobe RGB", ColorProfile::new_adobe_rgb()),
-        ("ProPhoto RGB", ColorProfile::new_pro_photo_rgb()),
-        ("Rec. 2020", ColorProfile::new_bt2020()),
-    ];
-    let is_near = |profile: &ColorProfile| {
-        from_d50(colorants(profile)).is_some_and(|own| own.abs_diff_eq(matrix, 0.01))
-    };
-    known.into_iter().find(|(_, profile)| is_near(profile)).map(|(name, _)| name)
+    static KNOWN: OnceLock<[(&str, Option<DMat3>); 5]> = OnceLock::new();
+    let known = KNOWN.get_or_init(|| {
+        let profiles = [
+            ("sRGB", ColorProfile::new_srgb()),
+            ("Display P3", ColorProfile::new_display_p3()),
+            ("Adobe RGB", ColorProfile::new_adobe_rgb()),
+            ("ProPhoto RGB", ColorProfile::new_pro_photo_rgb()),
+            ("Rec. 2020", ColorProfile::new_bt2020()),
+        ];
+        profiles.map(|(name, profile)| (name, from_d50(colorants(&profile))))
+    });
+    let is_near = |own: Option<DMat3>| own.is_some_and(|own| own.abs_diff_eq(matrix, 0.01));
+    known.iter().find(|(_, own)| is_near(*own)).map(|(name, _)| *name)
 }

@@ -178,7 +178,6 @@ fn archive(meta: &str, files: &[(&str, [usize; 2], Vec<u8>)]) -> Result<Vec<u8>>
 /// The parts of `meta.json` that are read.
 #[derive(Deserialize)]
 struct Meta {
-    version: u32,
     count: usize,
     #[serde(default)]
     asset: Value,

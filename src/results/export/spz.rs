@@ -210,16 +210,14 @@ fn unpacked(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
     let mut rest = file.get(table..).and_then(|table| table.get(16 * stream_count..));
     let mut streams = Streams::default();
     let lengths = header.lengths();
-    for place in 0..stream_count {
+    for (place, stream) in streams.iter_mut().enumerate().take(stream_count) {
         let length = word(file, table + 16 * place)? as usize;
-        let (stream, after) =
-            rest.and_then(|rest| rest.split_at_checked(length)).ok_or(TRUNCATED)?;
+        let (packed, after) =
+            rest.and_then(|rest| rest.split_at_checked(length)).ok_or(CUT_SHORT)?;
         rest = Some(after);
-        if let Some(own) = streams.get_mut(place) {
-            let decoder = StreamingDecoder::new(stream);
-            let mut decoder = decoder.map_err(|error| format!("cannot be unpacked: {error}"))?;
-            *own = exactly(&mut decoder, lengths[place])?;
-        }
+        let mut decoder = StreamingDecoder::new(packed)
+            .map_err(|error| format!("cannot be unpacked: {error}"))?;
+        *stream = exactly(&mut decoder, lengths[place])?;
     }
     match streams.iter().zip(lengths).all(|(stream, length)| stream.len() == length) {
         true => Ok((header, streams, rest.unwrap_or_default().to_vec())),
@@ -344,8 +342,8 @@ mod tests {
     #[test]
     fn positions_use_all_24_bits_and_a_farther_one_is_refused() {
         let mut model = drawn(2, 0);
-        model.means_mut()[0] = glam::Vec3::new(3.0, -1.0, 0.25);
-        model.means_mut()[1] = glam::Vec3::ZERO;
+        model.means_mut()[0] = Vec3::new(3.0, -1.0, 0.25);
+        model.means_mut()[1] = Vec3::ZERO;
         assert_eq!(fractional_bits(&model).unwrap(), 21);
         let body = body(&encode_alone(&model, Version::V4));
         let fixed = |at: usize| i32::from_le_bytes([0, body[at], body[at + 1], body[at + 2]]) >> 8;

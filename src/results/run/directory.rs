@@ -38,7 +38,7 @@ use crate::gpu::Gpu;
 use crate::loss::Term;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, Split, View};
-use crate::splats::scene::Gaussians;
+use crate::splats::scene::{Gaussians, ply};
 use crate::train::diagnose::Plan;
 use crate::train::{Networks, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
@@ -325,7 +325,9 @@ impl RunDirectory {
         self.flush_log()?;
         let in_frame = trainer.gaussians_in_frame()?;
         trainer.refuse_not_finite(&in_frame)?;
-        trainer.model_of(&in_frame).save(self.path.join("model.ply"))
+        let model = trainer.model_of(&in_frame);
+        let comments = model.facts().comments();
+        ply::save_with_comments(&model.shown(), self.path.join("model.ply"), &comments)
     }
 
     /// Writes the weights of the networks.

@@ -476,10 +476,11 @@ impl TrainLoop<'_> {
         &mut self,
         step: u64,
         ViewScore { name, against, .. }: &ViewScore,
-        ScoredImages { render, target, .. }: &ScoredImages<'_>,
+        ScoredImages { view, render, target }: &ScoredImages<'_>,
     ) -> Result<()> {
         let Some(events) = &mut self.events else { return Ok(()) };
         for (what, image) in [("render", render), (against.name(), target)] {
+            let image = view.upright(image.clone());
             let size = [image.width, image.height];
             events.picture(step, &format!("view {name}/{what}"), size, &image.to_png8()?)?;
         }

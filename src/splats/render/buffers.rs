@@ -13,6 +13,10 @@ use crate::kernels::{self, ProjectedSplat};
 
 /// The first estimate of tiles per Gaussian; a view that needs more grows the memory.
 const TILES_PER_GAUSSIAN: u32 = 6;
+/// The same without gradients, where an intersection takes a quarter of the bytes, and the least estimate: a first draw
+/// should not have to leave out any.
+const SHOWN_TILES_PER_GAUSSIAN: u32 = 16;
+const LEAST_SHOWN_INTERSECTIONS: u32 = 1 << 20;
 
 /// Depth ranks whose tiles one subgroup counts. Small, because `emit` sums the counts before a rank within them.
 pub(super) const RANKS_PER_PARTITION: u32 = 256;
@@ -139,7 +143,6 @@ impl RenderBuffers {
     ) -> Result<()> {
         if self.splats.len() < count {
             let count = capacity.max(count);
-            self.splats = gpu.uninit("splats", count)?;
             self.colors = gpu.uninit("colors", color_vectors(self.channels) * count)?;
             self.depth_keys = gpu.uninit("depth_keys", count)?;
             self.ids = gpu.uninit("ids", count)?;
@@ -148,16 +151,24 @@ impl RenderBuffers {
             let partitions = (count as u32).div_ceil(RANKS_PER_PARTITION).max(1);
             self.sums = gpu.uninit("sums", partitions as usize)?;
             self.intersection_ranges = gpu.uninit("intersection_ranges", count)?;
+            // Its length says that the others are there.
+            self.splats = gpu.uninit("splats", count)?;
         }
         if self.render.len() < self.channels * pixels {
-            self.render = gpu.uninit("render", self.channels * pixels)?;
             self.transmittances = gpu.uninit("transmittances", pixels)?;
+            self.render = gpu.uninit("render", self.channels * pixels)?;
         }
         if self.tile_ranges.len() < tiles {
             self.tile_ranges = gpu.uninit("tile_ranges", tiles)?;
         }
         if self.tiles.is_empty() {
-            let guess = (count.max(1024) as u32).saturating_mul(TILES_PER_GAUSSIAN);
+            let count = count.max(1024) as u32;
+            let guess = match self.purpose {
+                Purpose::Train => count.saturating_mul(TILES_PER_GAUSSIAN),
+                Purpose::Show => {
+                    count.saturating_mul(SHOWN_TILES_PER_GAUSSIAN).max(LEAST_SHOWN_INTERSECTIONS)
+                }
+            };
             self.set_intersection_capacity(gpu, guess.min(self.max_intersections(gpu)))?;
         }
         Ok(())
@@ -184,11 +195,12 @@ impl RenderBuffers {
             }
             self.gradient_records = gpu.uninit("gradient_records", 0)?;
             gpu.free_unused();
-            self.tiles = gpu.uninit("tiles", capacity)?;
             self.intersection_ids = gpu.uninit("intersection_ids", capacity)?;
             self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
             self.gradient_records =
                 gpu.uninit("gradient_records", self.record_vectors() * capacity)?;
+            // Its length says that the others are there.
+            self.tiles = gpu.uninit("tiles", capacity)?;
         }
         Ok(())
     }

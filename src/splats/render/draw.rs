@@ -73,7 +73,7 @@ impl HostTargets {
 
 fn grow<T: bytemuck::Pod>(gpu: &Gpu, buffer: &mut Buffer<T>, len: usize) -> Result<()> {
     if buffer.len() < len {
-        *buffer = gpu.uninit(&buffer.name().to_owned(), len)?;
+        *buffer = gpu.uninit(buffer.name(), len)?;
     }
     Ok(())
 }

@@ -21,7 +21,7 @@ pub struct Target<'a> {
     pub color: Option<&'a HostImage>,
     /// R32F: depth in the view, world units; infinite where nothing is seen.
     pub depth: Option<&'a HostImage>,
-    /// The kind of depth to store.
+    /// The kind of depth in `depth`.
     pub depth_kind: DepthKind,
     /// The host's depth, beyond which nothing is drawn.
     pub scene: Option<SceneDepth<'a>>,

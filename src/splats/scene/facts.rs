@@ -42,6 +42,11 @@ impl Facts {
         self.entries().into_iter().map(line).collect()
     }
 
+    /// As comments of a PLY, which has the origin in one of its own.
+    pub(crate) fn comments(&self) -> Vec<String> {
+        Self { origin: DVec3::ZERO, ..*self }.lines()
+    }
+
     /// As an object of JSON.
     pub(crate) fn json(&self) -> Value {
         let value = |text: &str| {

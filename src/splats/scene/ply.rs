@@ -7,7 +7,6 @@
 //! zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid, scales are
 //! logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
 
-use std::collections::HashMap;
 use std::fs;
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
@@ -15,6 +14,7 @@ use std::path::Path;
 use super::{FEATURES, Facts, Feature, Features, Gaussians, MAX_SH_DEGREE, Shape, width};
 use crate::base::input;
 use crate::base::output::write_whole_with;
+use crate::base::ply::{Encoding, Header, Kind};
 use crate::splats::attributes::{
     ATTRIBUTES, Attribute, AttributeSpec, Ply, planes, rest_coefficients,
 };
@@ -154,6 +154,10 @@ pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
 /// The problem, as in [`load`].
 pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
     let header = Header::parse(bytes)?;
+    if header.encoding != Encoding::Little {
+        let format = header.encoding.name();
+        return Err(format!("is a PLY of format {format}; save it as binary_little_endian"));
+    }
     let body = &bytes[header.length..];
     let expected = header.count.checked_mul(header.stride).ok_or("the vertex count is absurd")?;
     if body.len() < expected {
@@ -164,7 +168,7 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
             body.len()
         ));
     }
-    if body.len() > expected && !header.more_elements {
+    if body.len() > expected && !header.has_more {
         return Err(format!(
             "has {} bytes more than its {} vertices need",
             body.len() - expected,
@@ -172,13 +176,14 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
         ));
     }
 
-    // Before allocation: vertices without properties take no bytes of the file, whatever their number.
-    let shape = header.shape()?;
-    let offset_of = |property: Property| Ok((header.offset(&property.name)?, property));
+    let facts = facts(&header)?;
+    // Before allocation: vertices without properties take no bytes of the file, however many there are.
+    let shape = shape(&header)?;
+    let offset_of = |property: Property| Ok((offset(&header, &property.name)?, property));
     let properties =
         properties(shape).into_iter().map(offset_of).collect::<Result<Vec<_>, String>>()?;
     let mut gaussians = Gaussians::zeros(header.count, shape);
-    gaussians.origin = header.facts.origin;
+    gaussians.origin = facts.origin;
     for (offset, property) in properties {
         let (begin, stride) = property.address(&gaussians);
         for (gaussian, vertex) in body[..expected].chunks_exact(header.stride).enumerate() {
@@ -193,145 +198,54 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
             gaussians.parameters[begin + stride * gaussian] = value;
         }
     }
-    Ok((gaussians, header.facts))
+    Ok((gaussians, facts))
 }
 
-/// The vertices according to the header.
-struct Header {
-    /// Bytes before the first vertex.
-    length: usize,
-    /// Vertices.
-    count: usize,
-    /// Bytes per vertex.
-    stride: usize,
-    /// Byte offset in the vertex and type of each property.
-    properties: HashMap<String, (usize, String)>,
-    /// Whether other elements follow the vertices.
-    more_elements: bool,
-    /// The facts in the comments.
-    facts: Facts,
+/// What the comments state.
+fn facts(header: &Header) -> Result<Facts, String> {
+    let mut facts = Facts::default();
+    for (line, comment) in &header.comments {
+        let stated = match comment.strip_prefix(ORIGIN) {
+            Some(numbers) => facts.set("origin", numbers),
+            None => facts.set_line(comment),
+        };
+        stated.map_err(|problem| format!("line {line} {problem}"))?;
+    }
+    Ok(facts)
 }
 
-impl Header {
-    fn parse(bytes: &[u8]) -> Result<Self, String> {
-        const END: &[u8] = b"end_header";
-        if !bytes.starts_with(b"ply") {
-            return Err("is not a PLY file; Gaussians are read from PLY alone".to_owned());
-        }
-        let end = bytes
-            .windows(END.len())
-            .position(|window| window == END)
-            .ok_or("is truncated in the header")?;
-        let newline = bytes[end..]
-            .iter()
-            .position(|&byte| byte == b'\n')
-            .ok_or("is truncated in the header")?;
-        let text = std::str::from_utf8(&bytes[..end]).map_err(|_| "the header is not text")?;
+fn shape(header: &Header) -> Result<Shape, String> {
+    Ok(Shape { sh_degree: sh_degree(header)?, features: features(header) })
+}
 
-        let mut header = Self {
-            length: end + newline + 1,
-            count: 0,
-            stride: 0,
-            properties: HashMap::new(),
-            more_elements: false,
-            facts: Facts::default(),
-        };
-        let (mut format_is_known, mut in_vertices) = (false, false);
-        for (number, line) in (1..).zip(text.lines()) {
-            if let Some(comment) = line.trim_start().strip_prefix("comment ") {
-                let stated = match comment.trim_start().strip_prefix(ORIGIN) {
-                    Some(numbers) => header.facts.set("origin", numbers),
-                    None => header.facts.set_line(comment),
-                };
-                stated.map_err(|problem| format!("line {number} {problem}"))?;
-                continue;
-            }
-            match *line.split_whitespace().collect::<Vec<_>>() {
-                ["format", "binary_little_endian", _] => format_is_known = true,
-                ["format", format, _] => {
-                    return Err(format!(
-                        "is a PLY of format {format}; save it as binary_little_endian"
-                    ));
-                }
-                ["element", "vertex", count] if !in_vertices => {
-                    in_vertices = true;
-                    header.count =
-                        count.parse().map_err(|_| format!("`{count}` is not a vertex count"))?;
-                }
-                ["element", name, _] if !in_vertices => {
-                    return Err(format!(
-                        "element `{name}` comes before the vertices; only vertices are expected"
-                    ));
-                }
-                ["element", ..] => header.more_elements = true,
-                ["property", kind, name] if in_vertices && !header.more_elements => {
-                    header.push(kind, name)?;
-                }
-                ["property", "list", ..] if !header.more_elements => {
-                    return Err("a list property in the vertices is not supported".to_owned());
-                }
-                _ => {}
-            }
-        }
-        if !format_is_known {
-            return Err("does not state its format".to_owned());
-        }
-        if !in_vertices {
-            return Err("has no vertices: `element vertex` is missing".to_owned());
-        }
-        Ok(header)
+/// The features whose first property is present.
+fn features(header: &Header) -> Features {
+    let has = |feature: Feature| {
+        let name = FEATURES[feature as usize].ply_name;
+        header.property(&format!("f_{name}_0")).is_some()
+    };
+    Features {
+        depth: has(Feature::Depth),
+        structure: has(Feature::Structure),
+        noise: has(Feature::Noise),
+        illumination: has(Feature::Illumination),
     }
+}
 
-    fn push(&mut self, kind: &str, name: &str) -> Result<(), String> {
-        let size = match kind {
-            "char" | "uchar" | "int8" | "uint8" => 1,
-            "short" | "ushort" | "int16" | "uint16" => 2,
-            "int" | "uint" | "int32" | "uint32" | "float" | "float32" => 4,
-            "double" | "float64" => 8,
-            _ => return Err(format!("property `{name}` has the unknown type `{kind}`")),
-        };
-        if self.properties.insert(name.to_owned(), (self.stride, kind.to_owned())).is_some() {
-            return Err(format!("property `{name}` occurs twice"));
-        }
-        self.stride += size;
-        Ok(())
-    }
+/// The degree whose `f_rest_*` properties are all present.
+fn sh_degree(header: &Header) -> Result<u32, String> {
+    let found = header.properties.iter().filter(|own| own.name.starts_with("f_rest_")).count();
+    let degree = (0..=MAX_SH_DEGREE).find(|&degree| 3 * rest_coefficients(degree) == found);
+    degree.ok_or_else(|| {
+        format!("has {found} f_rest_* properties; 0, 9, 24 or 45 make an SH degree of 0 to 3")
+    })
+}
 
-    fn shape(&self) -> Result<Shape, String> {
-        Ok(Shape { sh_degree: self.sh_degree()?, features: self.features() })
-    }
-
-    /// The features whose first property is present.
-    fn features(&self) -> Features {
-        let has = |feature: Feature| {
-            let name = FEATURES[feature as usize].ply_name;
-            self.properties.contains_key(&format!("f_{name}_0"))
-        };
-        Features {
-            depth: has(Feature::Depth),
-            structure: has(Feature::Structure),
-            noise: has(Feature::Noise),
-            illumination: has(Feature::Illumination),
-        }
-    }
-
-    /// The degree whose `f_rest_*` properties are all present.
-    fn sh_degree(&self) -> Result<u32, String> {
-        let found = self.properties.keys().filter(|name| name.starts_with("f_rest_")).count();
-        let degree = (0..=MAX_SH_DEGREE).find(|&degree| 3 * rest_coefficients(degree) == found);
-        degree.ok_or_else(|| {
-            format!("has {found} f_rest_* properties; 0, 9, 24 or 45 make an SH degree of 0 to 3")
-        })
-    }
-
-    /// The byte offset of a float property in the vertex.
-    fn offset(&self, name: &str) -> Result<usize, String> {
-        match self.properties.get(name) {
-            Some((offset, kind)) if kind == "float" || kind == "float32" => Ok(*offset),
-            Some((_, kind)) => Err(format!("property `{name}` is of type {kind}, not float")),
-            None => {
-                Err(format!("has no property `{name}`; is it a point cloud without Gaussians?"))
-            }
-        }
+/// The byte offset of a float property in the vertex.
+fn offset(header: &Header, name: &str) -> Result<usize, String> {
+    match header.property(name) {
+        Some((_, own)) if own.kind == Kind::Float(4) => Ok(own.at),
+        Some((_, own)) => Err(format!("property `{name}` is of type {}, not float", own.type_name)),
+        None => Err(format!("has no property `{name}`; is it a point cloud without Gaussians?")),
     }
 }

@@ -10,19 +10,7 @@ use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use super::synthetic::*;
 use super::{load, view};
 use crate::common::command::{refused, run};
-
-/// Inserts a chunk before the pixels of a PNG.
-fn put_chunk(path: &Path, name: &[u8; 4], data: &[u8]) {
-    let mut file = fs::read(path).unwrap();
-    let body = [&name[..], data].concat();
-    let crc = !body.iter().fold(u32::MAX, |crc, &byte| {
-        (0..8).fold(crc ^ u32::from(byte), |crc, _| (crc >> 1) ^ (0xEDB8_8320 * (crc & 1)))
-    });
-    let chunk = [&(data.len() as u32).to_be_bytes()[..], &body, &crc.to_be_bytes()].concat();
-    // After the signature and IHDR.
-    file.splice(33..33, chunk);
-    fs::write(path, file).unwrap();
-}
+use crate::common::png::put_chunk;
 
 /// Marks every image of a folder as linear light.
 fn mark_linear(folder: &Path) {

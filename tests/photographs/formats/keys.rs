@@ -96,7 +96,7 @@ fn an_unsupported_file_of_points_is_named() {
     let lines = warnings(|| drop(load(folder.path())));
     for part in [
         "absent.ply, its ply_file_path, is absent",
-        "points3d.ply: is no PLY file",
+        "points3d.ply: is not a PLY file",
         "points3d.ply: is not read",
     ] {
         assert!(lines.contains(part), "no `{part}` in: {lines}");

@@ -7,6 +7,7 @@ use std::path::Path;
 
 use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
 use nightsplat::photographs::image::Image;
+use nightsplat::train::diagnose::Diagnosis;
 use serde_json::json;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
@@ -329,6 +330,19 @@ fn black_borders_of_undistorted_photographs_are_masked_but_not_those_of_a_dark_s
         lines.contains("black in the same place at the border") && lines.contains("masked"),
         "{lines}"
     );
+    // Photographs that are read again are measured without their borders as well.
+    let options = LoadOptions::default();
+    let (dataset, loaded) = Diagnosis::load(folder.path(), &options).unwrap();
+    assert!(loaded.views[0].zero_fraction == 0.0, "{}", loaded.views[0].zero_fraction);
+    assert_eq!(Diagnosis::of(&dataset, &options).unwrap(), loaded);
+    #[cfg(feature = "cli")]
+    {
+        let apply = format!("tone apply {} --curve ap3 --json", folder.path().display());
+        let (report, _) = crate::common::command::run(&apply, 0);
+        let report: serde_json::Value = serde_json::from_str(&report).unwrap();
+        let p10 = report["views"]["v00"]["p10"].as_f64().unwrap();
+        assert!(p10 > 0.03, "{report}");
+    }
     let options = LoadOptions { mask_borders: false, ..LoadOptions::default() };
     assert!(
         Dataset::load(folder.path(), &options)

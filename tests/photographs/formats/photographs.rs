@@ -129,12 +129,15 @@ fn heic_is_refused_with_its_converter_and_listed_as_unread() {
 /// A JPEG of one grey with an orientation in its Exif.
 fn jpeg(path: &Path, (width, height): (u32, u32), orientation: u8) {
     fs::create_dir_all(path.parent().unwrap()).unwrap();
-    let plain = path.with_extension("plain.jpg");
     ImageBuffer::from_fn(width, height, |x, _| Luma([20 + (x > width / 2) as u8 * 20]))
-        .save(&plain)
+        .save(path)
         .unwrap();
-    let bytes = fs::read(&plain).unwrap();
-    fs::remove_file(&plain).unwrap();
+    orient(path, orientation);
+}
+
+/// Puts an orientation into a JPEG's Exif.
+pub(crate) fn orient(path: &Path, orientation: u8) {
+    let bytes = fs::read(path).unwrap();
     let exif = [
         b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".as_slice(),
         &[orientation, 0, 0, 0],

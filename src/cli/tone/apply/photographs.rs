@@ -2,12 +2,13 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use super::ApplyArgs;
 use crate::base::output::is_same_file;
 use crate::base::tree;
 use crate::cli::ImageFormat;
-use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, Split};
+use crate::photographs::dataset::{Borders, Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
 use crate::photographs::image::{ColourCounts, Image, Mask, MaskFile, Orientation, PictureFile};
 use crate::photographs::white_balance::WhiteBalanceGains;
@@ -26,6 +27,8 @@ pub(super) struct Listed {
     /// The file to write.
     pub(super) target: Option<PathBuf>,
     pub(super) gains: Option<WhiteBalanceGains>,
+    /// What the photographs of a dataset do not show at their borders.
+    pub(super) borders: Arc<Borders>,
 }
 
 impl Listed {
@@ -41,6 +44,7 @@ impl Listed {
         }
         let decoded = (&image, alpha.as_ref());
         let mask = Mask::over(&self.input, decoded, self.mask.as_ref(), inverted)?;
+        let mask = self.borders.hidden_too(mask, (image.width, image.height));
         let hidden = mask.as_ref().map(Mask::hidden).unwrap_or_default();
         Ok((image, hidden))
     }
@@ -74,6 +78,8 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
         vec![plain(input, args.reference.as_deref())?]
     } else if Dataset::is_at(input) {
         let options = LoadOptions { reference: args.reference.clone(), ..LoadOptions::default() };
+        let of_dataset = Dataset::photographs(input, &options)?;
+        let borders = Arc::new(Borders::of_photographs(&of_dataset));
         let of_view = |Photograph { name, split, input, reference, mask }| Listed {
             name,
             input,
@@ -82,8 +88,9 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
             split: Some(split),
             target: None,
             gains: None,
+            borders: borders.clone(),
         };
-        Dataset::photographs(input, &options)?.into_iter().map(of_view).collect()
+        of_dataset.into_iter().map(of_view).collect()
     } else {
         let files = photographs_in(input)?;
         if let Some(line) = unread_in(input) {
@@ -121,7 +128,8 @@ fn plain(input: &Path, reference: Option<&Path>) -> Result<Listed> {
     let candidates = [format!("{name}.png"), format!("{file}.png")].map(|mask| masks.join(mask));
     let mask = candidates.into_iter().find(|mask| mask.is_file()).map(MaskFile::shown);
     let input = input.to_owned();
-    Ok(Listed { name, input, reference, split: None, mask, target: None, gains: None })
+    let borders = Arc::default();
+    Ok(Listed { name, input, reference, split: None, mask, target: None, gains: None, borders })
 }
 
 /// Sets the file that each is written to, refusing duplicates and photographs.

@@ -1,0 +1,47 @@
+#!/usr/bin/env bash
+# Builds the C library and lays it out for hosts: scripts/build-capi.sh DIR [CARGO OPTIONS]
+#
+#   DIR/include/nightsplat.h
+#   DIR/lib/libnightsplat.so -> libnightsplat.so.0, and libnightsplat.a
+#   DIR/lib/pkgconfig/nightsplat.pc, DIR/lib/cmake/nightsplat/nightsplat-config.cmake
+#
+# Without options it is a renderer; `--features io` adds training and the formats beside PLY. From a checkout the
+# kernels are compiled, which needs C++; an archive holds them compiled.
+set -euo pipefail
+
+[ $# -ge 1 ] || {
+    echo "usage: scripts/build-capi.sh DIR [CARGO OPTIONS]" >&2
+    exit 2
+}
+mkdir -p "$1"
+out=$(cd "$1" && pwd)
+shift
+cd "$(dirname "$0")/.."
+
+profile=${NIGHTSPLAT_PROFILE:-release}
+features=capi
+[ -d precompiled ] || features=capi,glslang
+built=${CARGO_TARGET_DIR:-target}/$([ "$profile" = dev ] && echo debug || echo "$profile")
+options=(--profile "$profile" --lib --no-default-features --features "$features" "$@")
+
+version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -n 1)
+# Every 0.x may break its callers, so the name has the minor version; from 1 on the major one.
+case $version in
+    0.*) abi=0.$(cut -d. -f2 <<< "$version") ;;
+    *) abi=${version%%.*} ;;
+esac
+
+mkdir -p "$out/include" "$out/lib/pkgconfig" "$out/lib/cmake/nightsplat"
+cargo rustc "${options[@]}" --crate-type cdylib -- -C "link-arg=-Wl,-soname,libnightsplat.so.$abi"
+install -m 755 "$built/libnightsplat.so" "$out/lib/libnightsplat.so.$abi"
+[ "$profile" != release ] || strip --strip-unneeded "$out/lib/libnightsplat.so.$abi"
+ln -sf "libnightsplat.so.$abi" "$out/lib/libnightsplat.so"
+if [ "$profile" = release ]; then
+    cargo rustc "${options[@]}" --crate-type staticlib
+    install -m 644 "$built/libnightsplat.a" "$out/lib/libnightsplat.a"
+fi
+install -m 644 src/capi/nightsplat.h "$out/include/nightsplat.h"
+fill() { sed -e "s|@VERSION@|$version|; s|@PREFIX@|$out|; s|@ABI@|$abi|" "$1" > "$2"; }
+fill src/capi/nightsplat.pc.in "$out/lib/pkgconfig/nightsplat.pc"
+fill src/capi/nightsplat-config.cmake.in "$out/lib/cmake/nightsplat/nightsplat-config.cmake"
+echo "wrote $out; build a host with: cc host.c \$(PKG_CONFIG_PATH=$out/lib/pkgconfig pkg-config --cflags --libs nightsplat vulkan)"

@@ -1,0 +1,168 @@
+//! Headers of PLY files whose vertices come first: models of Gaussians, and clouds of points.
+
+/// How vertices are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Encoding {
+    /// A line each.
+    Text,
+    /// Binary, the least significant byte first.
+    Little,
+    /// Binary, the most significant byte first.
+    Big,
+}
+
+impl Encoding {
+    /// Its name in a header.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Text => "ascii",
+            Self::Little => "binary_little_endian",
+            Self::Big => "binary_big_endian",
+        }
+    }
+}
+
+/// The type of a number, with its bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// Of whole numbers.
+    Signed(usize),
+    /// Of whole numbers from 0 on.
+    Unsigned(usize),
+    /// Of floating point.
+    Float(usize),
+}
+
+impl Kind {
+    fn of(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Self::Signed(1),
+            "short" | "int16" => Self::Signed(2),
+            "int" | "int32" => Self::Signed(4),
+            "uchar" | "uint8" => Self::Unsigned(1),
+            "ushort" | "uint16" => Self::Unsigned(2),
+            "uint" | "uint32" => Self::Unsigned(4),
+            "float" | "float32" => Self::Float(4),
+            "double" | "float64" => Self::Float(8),
+            _ => return None,
+        })
+    }
+
+    /// Bytes.
+    pub fn size(self) -> usize {
+        match self {
+            Self::Signed(size) | Self::Unsigned(size) | Self::Float(size) => size,
+        }
+    }
+}
+
+/// A number of every vertex.
+#[derive(Clone, Debug)]
+pub struct Property {
+    /// Its name.
+    pub name: String,
+    /// The name of its type.
+    pub type_name: String,
+    /// Its type.
+    pub kind: Kind,
+    /// Bytes of a vertex before it.
+    pub at: usize,
+}
+
+/// What a header says of the vertices.
+#[derive(Clone, Debug)]
+pub struct Header {
+    /// Bytes before the first vertex.
+    pub length: usize,
+    /// How they are written.
+    pub encoding: Encoding,
+    /// Vertices.
+    pub count: usize,
+    /// Bytes per vertex, of a binary file.
+    pub stride: usize,
+    /// Their numbers, in order.
+    pub properties: Vec<Property>,
+    /// Whether other elements follow the vertices.
+    pub has_more: bool,
+    /// Its comments, each with the number of its line.
+    pub comments: Vec<(usize, String)>,
+}
+
+impl Header {
+    /// Reads the header at the beginning of a file.
+    ///
+    /// # Errors
+    /// What is wrong with it, in words that follow the name of the file.
+    pub fn parse(bytes: &[u8]) -> Result<Self, String> {
+        const END: &[u8] = b"end_header";
+        if !bytes.starts_with(b"ply") {
+            return Err("is not a PLY file".to_owned());
+        }
+        let cut_short = "is cut short in the header";
+        let end = bytes.windows(END.len()).position(|window| window == END).ok_or(cut_short)?;
+        let newline = bytes[end..].iter().position(|&byte| byte == b'\n').ok_or(cut_short)?;
+        let mut header = Self {
+            length: end + newline + 1,
+            encoding: Encoding::Text,
+            count: 0,
+            stride: 0,
+            properties: vec![],
+            has_more: false,
+            comments: vec![],
+        };
+        let (mut encoding, mut in_vertices) = (None, false);
+        for (number, line) in (1..).zip(String::from_utf8_lossy(&bytes[..end]).lines()) {
+            if let Some(comment) = line.trim_start().strip_prefix("comment ") {
+                header.comments.push((number, comment.trim_start().to_owned()));
+                continue;
+            }
+            match *line.split_whitespace().collect::<Vec<_>>() {
+                ["format", name, ..] => {
+                    let all = [Encoding::Text, Encoding::Little, Encoding::Big];
+                    let own = all.into_iter().find(|own| own.name() == name);
+                    encoding = Some(own.ok_or_else(|| format!("has the unknown format {name}"))?);
+                }
+                ["element", "vertex", count] if !in_vertices => {
+                    in_vertices = true;
+                    header.count =
+                        count.parse().map_err(|_| format!("`{count}` is not a vertex count"))?;
+                }
+                ["element", name, _] if !in_vertices => {
+                    return Err(format!(
+                        "element `{name}` comes before the vertices; only vertices are expected"
+                    ));
+                }
+                ["element", ..] => header.has_more = true,
+                ["property", "list", ..] if in_vertices && !header.has_more => {
+                    return Err("a list property in the vertices is not supported".to_owned());
+                }
+                ["property", kind, name] if in_vertices && !header.has_more => {
+                    header.push(kind, name)?;
+                }
+                _ => {}
+            }
+        }
+        header.encoding = encoding.ok_or("does not say its format")?;
+        if !in_vertices {
+            return Err("has no vertices: `element vertex` is missing".to_owned());
+        }
+        Ok(header)
+    }
+
+    fn push(&mut self, type_name: &str, name: &str) -> Result<(), String> {
+        let kind = Kind::of(type_name)
+            .ok_or_else(|| format!("property `{name}` has the unknown type `{type_name}`"))?;
+        if self.property(name).is_some() {
+            return Err(format!("property `{name}` is there twice"));
+        }
+        let (name, type_name) = (name.to_owned(), type_name.to_owned());
+        self.properties.push(Property { name, type_name, kind, at: self.stride });
+        self.stride += kind.size();
+        Ok(())
+    }
+
+    /// A number of every vertex, with its place among them.
+    pub fn property(&self, name: &str) -> Option<(usize, &Property)> {
+        self.properties.iter().enumerate().find(|(_, own)| own.name == name)
+    }
+}

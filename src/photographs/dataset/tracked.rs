@@ -1,0 +1,183 @@
+//! Which pixels cameras are of where sizes do not tell, found from tracked points: a point looks alike in all photographs
+//! that show it, if each is looked up where its camera has the point.
+
+use rayon::prelude::*;
+
+use super::Point;
+use super::source::Source;
+use super::turns::{Header, PixelOrientation, Pixels};
+use crate::Result;
+use crate::camera::Lens;
+use crate::photographs::image::{Image, Orientation};
+
+/// Photographs that are compared.
+const MOST: usize = 12;
+/// Pairs of photographs of a point below which chance decides.
+const LEAST_PAIRS: usize = 30;
+/// The difference of two correlations that is clear, and the number of standard errors that it has to exceed.
+const CLEAR: f64 = 0.1;
+const STANDARD_ERRORS: f64 = 4.0;
+/// A sample is the mean of a square whose half side is this part of the longest side.
+const HALF_SIDE: f64 = 1.0 / 250.0;
+
+/// The pixels that the cameras are of where sizes do not tell. One program found them all, so that one answer holds for
+/// all photographs. `points` gives the dataset's points, with indices into `sources`.
+///
+/// # Errors
+/// Those of `points`.
+pub(super) fn pixels(
+    sources: &[Source],
+    headers: &[Option<Header>],
+    choice: PixelOrientation,
+    points: impl FnOnce() -> Result<Vec<Point>>,
+) -> Result<Pixels> {
+    let turned: Vec<(usize, Header)> = headers
+        .iter()
+        .enumerate()
+        .filter_map(|(index, header)| Some((index, (*header)?)))
+        .filter(|(_, header)| header.orientation != Orientation::UPRIGHT)
+        .collect();
+    let by_size = |(index, header): &(usize, Header)| header.by_size(&sources[*index].lens);
+    let (told, open): (Vec<_>, Vec<_>) = turned.into_iter().partition(|own| by_size(own).is_some());
+    let Some(first) = open.first() else { return Ok(Pixels::Stored) };
+    match choice {
+        PixelOrientation::Stored => return Ok(Pixels::Stored),
+        PixelOrientation::Exif => return Ok(Pixels::Exif),
+        PixelOrientation::Auto => {}
+    }
+    let mut told: Vec<Pixels> = told.iter().filter_map(by_size).collect();
+    told.dedup();
+    if let [only] = told[..] {
+        return Ok(only);
+    }
+    let found = by_points(sources, headers, &open, &points()?);
+    let (count, name) = (open.len(), &sources[first.0].name);
+    let subject = format!(
+        "Exif turns or mirrors {count} photographs, {name} the first, whose sizes do not tell which pixels their \
+         cameras are of"
+    );
+    match found {
+        Some(Pixels::Stored) => tracing::info!("{subject}: those stored, by the points they share"),
+        Some(Pixels::Exif) => {
+            tracing::info!("{subject}: those that Exif shows, by the points they share");
+        }
+        None => tracing::warn!(
+            "{subject}: those stored are taken; `--orientation exif` takes those that Exif shows, `stored` keeps \
+             these"
+        ),
+    }
+    Ok(found.unwrap_or(Pixels::Stored))
+}
+
+/// The pixels with which the photographs agree on their points; `None` where that is not clear. `open` are those, with
+/// indices into `sources`, for which the answer is wanted.
+fn by_points(
+    sources: &[Source],
+    headers: &[Option<Header>],
+    open: &[(usize, Header)],
+    points: &[Point],
+) -> Option<Pixels> {
+    let chosen = neighbours(sources.len(), open, points)?;
+    let sampled = chosen.par_iter().map(|&view| {
+        let image = sources[view].picture()?;
+        let orientation = headers[view]?.orientation;
+        let own: Vec<(usize, &Point)> =
+            points.iter().enumerate().filter(|(_, point)| sees(point, view)).collect();
+        let turned = image.clone().turned(orientation);
+        Some([image, turned].map(|image| samples(&image, &sources[view], &own)))
+    });
+    let sampled: Vec<[Vec<(usize, f64)>; 2]> = sampled.flatten().collect();
+    let [stored, exif] =
+        [0, 1].map(|which| agreement(sampled.iter().map(|own| &own[which]), points.len()));
+    let ((stored, pairs), (exif, others)) = (stored?, exif?);
+    let pairs = pairs.min(others);
+    let clear = CLEAR.max(STANDARD_ERRORS / (pairs as f64).sqrt());
+    tracing::debug!("agreement on points: {stored:.3} as stored, {exif:.3} as Exif shows");
+    match exif - stored {
+        _ if pairs < LEAST_PAIRS => None,
+        difference if difference > clear => Some(Pixels::Exif),
+        difference if difference < -clear => Some(Pixels::Stored),
+        _ => None,
+    }
+}
+
+fn sees(point: &Point, view: usize) -> bool {
+    u32::try_from(view).is_ok_and(|view| point.views.binary_search(&view).is_ok())
+}
+
+/// The photograph that sees most points of those in question, and those that share most with it.
+fn neighbours(count: usize, open: &[(usize, Header)], points: &[Point]) -> Option<Vec<usize>> {
+    let mut seen = vec![0; count];
+    points.iter().flat_map(|point| &point.views).for_each(|&view| seen[view as usize] += 1);
+    let first = open.iter().map(|own| own.0).max_by_key(|&view| seen[view])?;
+    let mut shared = vec![0; count];
+    for point in points.iter().filter(|point| sees(point, first)) {
+        point.views.iter().for_each(|&view| shared[view as usize] += 1);
+    }
+    let mut views: Vec<usize> = (0..count).filter(|&view| shared[view] > 0).collect();
+    views.sort_by_key(|&view| std::cmp::Reverse(shared[view]));
+    views.truncate(MOST);
+    Some(views)
+}
+
+/// The brightness of points in a picture, by their index; without those that lie outside.
+fn samples(image: &Image, source: &Source, points: &[(usize, &Point)]) -> Vec<(usize, f64)> {
+    let brightness = |(index, point): &(usize, &Point)| {
+        let place = place(source, point)?;
+        let (width, height) = (f64::from(image.width), f64::from(image.height));
+        let half = (HALF_SIDE * width.max(height)).round() as i64;
+        let (x, y) = ((place[0] * width) as i64, (place[1] * height) as i64);
+        let (mut sum, mut count) = (0.0, 0.0);
+        for row in (y - half).max(0)..=(y + half).min(i64::from(image.height) - 1) {
+            for column in (x - half).max(0)..=(x + half).min(i64::from(image.width) - 1) {
+                sum += image.pixel(column as u32, row as u32).map(f64::from).iter().sum::<f64>();
+                count += 3.0;
+            }
+        }
+        Some((*index, sum / count))
+    };
+    points.iter().filter_map(brightness).filter(|(_, value)| value.is_finite()).collect()
+}
+
+/// Where a camera has a point, as parts of width and height.
+fn place(source: &Source, point: &Point) -> Option<[f64; 2]> {
+    let Lens { width, height, focal, principal_point, distortion } = source.lens;
+    let in_view = source.view_from_world.transform_point3(point.position);
+    let at = in_view.truncate() / in_view.z;
+    let pixel = focal * distortion.distort(at) + principal_point;
+    let place = [pixel.x / f64::from(width), pixel.y / f64::from(height)];
+    let is_seen = in_view.z > 0.0 && place.iter().all(|part| (0.0..1.0).contains(part));
+    is_seen.then_some(place)
+}
+
+/// The mean correlation of what photographs show of a point, each with its own mean and contrast divided out, and of how
+/// many pairs that is; `None` where no two show one point.
+fn agreement<'a>(
+    views: impl Iterator<Item = &'a Vec<(usize, f64)>>,
+    points: usize,
+) -> Option<(f64, usize)> {
+    // Sum, sum of squares, and number of views.
+    let mut by_point = vec![(0.0, 0.0, 0.0); points];
+    for view in views {
+        let count = view.len().max(1) as f64;
+        let mean = view.iter().map(|own| own.1).sum::<f64>() / count;
+        let variance = view.iter().map(|own| (own.1 - mean).powi(2)).sum::<f64>() / count;
+        if variance <= 0.0 {
+            continue;
+        }
+        for (point, value) in view {
+            let own = (value - mean) / variance.sqrt();
+            let (sum, squares, count) = &mut by_point[*point];
+            *sum += own;
+            *squares += own * own;
+            *count += 1.0;
+        }
+    }
+    let (mut products, mut pairs, mut independent) = (0.0, 0.0, 0.0);
+    for (sum, squares, count) in by_point.into_iter().filter(|own| own.2 > 1.0) {
+        products += sum * sum - squares;
+        pairs += count * (count - 1.0);
+        independent += count - 1.0;
+    }
+    (pairs > 0.0).then(|| (products / pairs, independent as usize))
+}

@@ -1,0 +1,167 @@
+//! The kernels of a renderer: those that every view needs at once, others on first use.
+
+use std::collections::BTreeMap;
+
+use super::buffers::{RANKS_PER_PARTITION, RenderBuffers};
+use super::limits::{longest_run, splats_per_turn};
+use super::{Purpose, RenderSettings, Renderer};
+use crate::Result;
+use crate::camera::CameraModel;
+use crate::gpu::{Gpu, Pipeline, Tile};
+use crate::kernels::{
+    blend_backward, blend_forward, emit, order_counts, project, project_backward,
+};
+use crate::splats::packed_sh::StorageFormat;
+use crate::splats::scene::Shape;
+use crate::splats::sort::RadixSort;
+
+impl Renderer {
+    /// Builds the kernels; [`Renderer::reserve`] allocates.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel, or the tile does not suit the device.
+    pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
+        let tile = settings.tile_on(gpu)?;
+        let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
+        let channels = settings.channels() as u32;
+        let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
+        let pinhole = (CameraModel::Pinhole.number(), false);
+        let projections = Projections::new(gpu, &settings, tile.size, pinhole)?;
+        let shaping_channels = settings.shaping_channels();
+        let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
+        let blend_backward = match settings.purpose {
+            Purpose::Show => None,
+            Purpose::Train => Some(gpu.pipeline(&blend_backward::Constants {
+                alpha_max,
+                channels,
+                tile_width,
+                tile_height,
+                shaping_channels,
+                skips_groups,
+                splats_per_turn,
+                subgroups_per_tile,
+            })?),
+        };
+        let depth_sort = RadixSort::new(gpu, 0)?;
+        let tile_sort = depth_sort.another()?;
+        Ok(Self {
+            gpu: gpu.clone(),
+            settings,
+            tile,
+            longest_run: longest_run(gpu),
+            projections: BTreeMap::from([(pinhole, projections)]),
+            order_counts: gpu.pipeline(&order_counts::Constants { partition_size })?,
+            emit: gpu.pipeline(&emit::Constants {
+                alpha_max,
+                channels,
+                tile_width,
+                tile_height,
+                partition_size,
+            })?,
+            blend_forward: blending(gpu, &settings, tile, false)?,
+            blend_depths: None,
+            blend_backward,
+            depth_sort,
+            tile_sort,
+            frame: RenderBuffers::new(gpu, settings.channels(), settings.purpose)?,
+            limits: gpu.uninit("limits", 1)?,
+            host_targets: None,
+        })
+    }
+
+    /// Builds the kernels for a camera model where they are not there yet.
+    pub(super) fn build_projections(&mut self, model: u32, view_depths: bool) -> Result<()> {
+        let key = (model, view_depths);
+        if !self.projections.contains_key(&key) {
+            let own = Projections::new(&self.gpu, &self.settings, self.tile.size, key)?;
+            self.projections.insert(key, own);
+        }
+        Ok(())
+    }
+
+    /// Builds the blending kernel that keeps depths where it is needed and not there yet.
+    pub(super) fn build_blending(&mut self, view_depths: bool) -> Result<()> {
+        if view_depths && self.blend_depths.is_none() {
+            self.blend_depths = Some(blending(&self.gpu, &self.settings, self.tile, true)?);
+        }
+        Ok(())
+    }
+
+    /// Switches to another SH degree.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel; the renderer is as it was.
+    pub(crate) fn set_sh_degree(&mut self, sh_degree: u32) -> Result<()> {
+        if sh_degree == self.settings.shape.sh_degree {
+            return Ok(());
+        }
+        let shape = Shape { sh_degree, ..self.settings.shape };
+        let settings = RenderSettings { shape, ..self.settings };
+        let own = |&key: &(u32, bool)| {
+            Ok((key, Projections::new(&self.gpu, &settings, self.tile.size, key)?))
+        };
+        self.projections = self.projections.keys().map(own).collect::<Result<_>>()?;
+        self.settings = settings;
+        Ok(())
+    }
+}
+
+/// The kernels that read Gaussians and cameras, the only ones that depend on the SH degree and the camera model.
+#[derive(Debug)]
+pub(super) struct Projections {
+    pub(super) forward: Pipeline<project::Kernel>,
+    /// Absent where the purpose is to show, and with depths.
+    pub(super) backward: Option<Pipeline<project_backward::Kernel>>,
+}
+
+impl Projections {
+    fn new(
+        gpu: &Gpu,
+        settings: &RenderSettings,
+        [tile_width, tile_height]: [u32; 2],
+        (camera_model, has_depths): (u32, bool),
+    ) -> Result<Self> {
+        let (view_depths, alpha_max) = (u32::from(has_depths), settings.max_alpha);
+        let channels = settings.channels() as u32 + view_depths;
+        let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
+        let half_rest = settings.rest == StorageFormat::Half;
+        macro_rules! pipeline {
+            ($kernel:ident $(, $own:ident)*) => {
+                gpu.pipeline(&$kernel::Constants {
+                    channels,
+                    alpha_max,
+                    tile_width,
+                    tile_height,
+                    sh_degree,
+                    raw_colors,
+                    half_rest,
+                    camera_model,
+                    $($own,)*
+                })?
+            };
+        }
+        let has_gradients = settings.purpose == Purpose::Train && !has_depths;
+        let backward = if has_gradients { Some(pipeline!(project_backward)) } else { None };
+        Ok(Self { forward: pipeline!(project, view_depths), backward })
+    }
+}
+
+/// The blending kernel, with or without the depth as the last channel.
+fn blending(
+    gpu: &Gpu,
+    settings: &RenderSettings,
+    Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile }: Tile,
+    has_depths: bool,
+) -> Result<Pipeline<blend_forward::Kernel>> {
+    let view_depths = u32::from(has_depths);
+    gpu.pipeline(&blend_forward::Constants {
+        alpha_max: settings.max_alpha,
+        channels: settings.channels() as u32 + view_depths,
+        tile_width,
+        tile_height,
+        skips_groups: !gpu.properties().is_cpu,
+        splats_per_turn: splats_per_turn(gpu),
+        subgroups_per_tile,
+        view_depths,
+    })
+}

@@ -1,0 +1,173 @@
+//! The library as C sees it: header, exports, layouts, and a host.
+
+use super::*;
+
+/// The library and its header, laid out by `scripts/build-capi.sh`, once.
+fn library() -> &'static Path {
+    static LIBRARY: OnceLock<PathBuf> = OnceLock::new();
+    LIBRARY.get_or_init(|| {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let out = Path::new(env!("CARGO_TARGET_TMPDIR")).join("capi");
+        let mut command = Command::new(root.join("scripts/build-capi.sh"));
+        command.arg(&out).env("NIGHTSPLAT_PROFILE", "dev").args(["--offline", "--quiet"]);
+        let built = command.output().unwrap();
+        assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
+        out
+    })
+}
+
+/// Compiles a source file with every warning an error.
+fn compile(compiler: &str, standard: &str, source: &Path, more: &[&str]) -> PathBuf {
+    let library = library();
+    let out = library.join(source.file_stem().unwrap());
+    let mut command = Command::new(compiler);
+    command.arg(standard).args(["-Wall", "-Wextra", "-pedantic", "-Werror"]).arg(source);
+    command.arg("-I").arg(library.join("include")).args(more).arg("-o").arg(&out);
+    let compiled = command.output().unwrap();
+    assert!(compiled.status.success(), "{}", String::from_utf8_lossy(&compiled.stderr));
+    out
+}
+
+fn linked() -> Vec<String> {
+    let lib = library().join("lib");
+    let lib = lib.to_str().unwrap();
+    vec![
+        format!("-L{lib}"),
+        "-lnightsplat".to_owned(),
+        "-lvulkan".to_owned(),
+        format!("-Wl,-rpath,{lib}"),
+    ]
+}
+
+/// The Vulkan headers and the loader to link with; hosts have them.
+fn has_vulkan_headers() -> bool {
+    let found = Command::new("pkg-config").args(["--exists", "vulkan"]).status();
+    let is_there = found.is_ok_and(|status| status.success());
+    assert!(is_there || std::env::var_os("CI").is_none(), "install libvulkan-dev");
+    if !is_there {
+        eprintln!("not run: the Vulkan headers are not installed (libvulkan-dev)");
+    }
+    is_there
+}
+
+#[test]
+fn the_c_host_draws_our_own_render_without_a_message() {
+    if !has_vulkan_headers() {
+        return;
+    }
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let linked = linked();
+    let linked: Vec<&str> = linked.iter().map(String::as_str).collect();
+    let program = compile("cc", "-std=c99", &root.join("examples/c/embed.c"), &linked);
+    let folder = tempfile::tempdir().unwrap();
+    let model = Model::from(gaussians(2));
+    model.save(folder.path().join("model.ply")).unwrap();
+    let run = |model: &str| {
+        let mut command = Command::new(&program);
+        command.current_dir(folder.path()).args([model, "out.ppm"]);
+        // The layer writes its messages to standard output.
+        command.env("VK_INSTANCE_LAYERS", "VK_LAYER_KHRONOS_validation");
+        command
+            .env("VK_LAYER_ENABLES", "VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT");
+        command.output().unwrap()
+    };
+    let done = run("model.ply");
+    let printed = String::from_utf8_lossy(&done.stdout).into_owned();
+    assert!(done.status.success(), "{printed} {}", String::from_utf8_lossy(&done.stderr));
+    assert!(!printed.contains("Validation"), "{printed}");
+    let file = std::fs::read(folder.path().join("out.ppm")).unwrap();
+    let pixels = &file[file.len() - 3 * PIXELS..];
+    assert_close(pixels, &own_render(&model));
+
+    let failed = run("absent.ply");
+    let printed = String::from_utf8_lossy(&failed.stdout).into_owned();
+    assert!(!failed.status.success() && !printed.contains("Validation"), "{printed}");
+    let error = String::from_utf8_lossy(&failed.stderr);
+    assert!(error.contains("nsp_model_load: absent.ply") && error.contains("(-3)"), "{error}");
+}
+
+#[test]
+fn the_header_is_c_and_cpp_and_names_what_the_library_exports() {
+    if !has_vulkan_headers() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let source = folder.path().join("header.c");
+    std::fs::write(&source, "#include <nightsplat.h>\nint main(void) { return 0; }\n").unwrap();
+    compile("cc", "-std=c99", &source, &[]);
+    compile("c++", "-std=c++11", &source, &["-x", "c++"]);
+    let header = std::fs::read_to_string(library().join("include/nightsplat.h")).unwrap();
+    let declared = header.lines().filter_map(|line| {
+        let name = line.split('(').next()?.rsplit([' ', '*']).next()?;
+        (line.contains('(') && !line.starts_with(['/', '#', ' ', '*']) && name.starts_with("nsp_"))
+            .then(|| name.to_owned())
+    });
+    let declared: std::collections::BTreeSet<String> = declared.collect();
+    let shared = library().join("lib/libnightsplat.so");
+    let exported = Command::new("nm").args(["-D", "--defined-only"]).arg(shared).output().unwrap();
+    let exported = String::from_utf8(exported.stdout).unwrap();
+    let exported: std::collections::BTreeSet<String> = exported
+        .lines()
+        .filter_map(|line| line.split_whitespace().nth(2))
+        .map(str::to_owned)
+        .collect();
+    assert_eq!(exported, declared);
+    assert_eq!(nsp_version(), NSP_HEADER_VERSION);
+}
+
+/// Offsets in Rust, and the C that prints its own.
+macro_rules! layouts {
+    ($($name:ident { $($member:ident),* $(,)? })*) => {{
+        let rust = vec![$(
+            format!("{} {}", stringify!($name), size_of::<$name>()),
+            $(format!(
+                "{}.{} {}",
+                stringify!($name), stringify!($member), std::mem::offset_of!($name, $member)
+            ),)*
+        )*];
+        let c = vec![$(
+            format!("printf(\"{0} %zu\\n\", sizeof({0}));", stringify!($name)),
+            $(format!(
+                "printf(\"{0}.{1} %zu\\n\", offsetof({0}, {1}));",
+                stringify!($name), stringify!($member)
+            ),)*
+        )*];
+        (rust, c)
+    }};
+}
+
+#[test]
+fn every_member_is_where_c_has_it() {
+    if !has_vulkan_headers() {
+        return;
+    }
+    let (rust, c) = layouts! {
+        NspMemory { memory, offset, mapped, cookie }
+        NspMemoryFunctions { allocate, free, user }
+        NspHostDevice {
+            struct_size, get_instance_proc_addr, instance, physical_device, device, queue, queue_family, flags,
+            extensions, extension_count, features, lock_queue, unlock_queue, user, pipeline_cache, host_memory,
+            device_memory, frames,
+        }
+        NspCamera { width, height, focal, principal_point, view_from_world }
+        NspModelInfo { struct_size, count, sh_degree, near_plane, max_alpha, raw_colors, reserved, origin }
+        NspImageState { layout, family, stages, access }
+        NspImage { image, format, extent, layer, before, after }
+        NspRender {
+            struct_size, commands, frame, cameras, camera_count, flags, color, depth_out, scene_depth, scene_near,
+            scene_far, exposure, background, budget, reserved,
+        }
+        NspStatus { struct_size, frame, intersections, capacity, left_out, splats_per_tile, device_bytes }
+        NspStep { step, loss, gaussians, reserved }
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let source = folder.path().join("offsets.c");
+    let body = c.join("\n    ");
+    let text = format!(
+        "#include <nightsplat.h>\n#include <stdio.h>\nint main(void) {{\n    {body}\n    return 0;\n}}\n"
+    );
+    std::fs::write(&source, text).unwrap();
+    let program = compile("cc", "-std=c99", &source, &[]);
+    let printed = String::from_utf8(Command::new(program).output().unwrap().stdout).unwrap();
+    assert_eq!(printed.lines().collect::<Vec<_>>(), rust);
+}

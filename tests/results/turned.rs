@@ -1,0 +1,59 @@
+//! Photographs of a camera that lay on a side, as their Exif says: what people see of a run is upright.
+
+use std::fs;
+use std::path::Path;
+
+use crate::common::command::succeed;
+use crate::common::png::put_chunk;
+
+/// Exif that says: turn a quarter clockwise.
+const TURNED: &[u8] = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0";
+
+/// The first bytes of a PNG of this size.
+fn header(width: u32, height: u32) -> Vec<u8> {
+    let start = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR";
+    [&start[..], &width.to_be_bytes(), &height.to_be_bytes()].concat()
+}
+
+fn base64(bytes: &[u8]) -> String {
+    const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let letters = |three: &[u8]| {
+        let bits = three.iter().fold(0, |bits, byte| bits << 8 | u32::from(*byte));
+        [18, 12, 6, 0].map(|shift| char::from(LETTERS[(bits >> shift & 63) as usize]))
+    };
+    bytes.chunks_exact(3).flat_map(letters).collect()
+}
+
+fn are_upright(page: &Path) {
+    let html = fs::read_to_string(page).unwrap();
+    let pictures: Vec<&str> = html.split("data:image/png;base64,").skip(1).collect();
+    let upright = base64(&header(32, 40));
+    assert!(!pictures.is_empty(), "{}", page.display());
+    assert!(pictures.iter().all(|own| own.starts_with(&upright)), "{}", page.display());
+}
+
+#[test]
+fn pages_and_event_files_show_photographs_and_renders_upright() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().display();
+    succeed(&format!("synth {root}/set --views 9 --width 40 --height 32"));
+    for part in ["low", "high"] {
+        for entry in fs::read_dir(folder.path().join("set").join(part)).unwrap() {
+            put_chunk(&entry.unwrap().path(), b"eXIf", TURNED);
+        }
+    }
+    let options = "--plan none --curve ase --steps 4 --progress none";
+    succeed(&format!("train {root}/set --out {root}/run --tensorboard --eval-every 2 {options}"));
+    let written = fs::read_dir(folder.path().join("run/tensorboard")).unwrap();
+    let events: Vec<u8> =
+        written.flat_map(|entry| fs::read(entry.unwrap().path()).unwrap()).collect();
+    let holds = |part: &[u8]| events.windows(part.len()).any(|bytes| bytes == part);
+    assert!(holds(&header(32, 40)) && !holds(&header(40, 32)));
+
+    succeed(&format!("eval {root}/run --report {root}/eval.html"));
+    are_upright(&folder.path().join("eval.html"));
+    succeed(&format!("diagnose {root}/set --report {root}/diagnosis.html"));
+    are_upright(&folder.path().join("diagnosis.html"));
+    succeed(&format!("sweep {root}/set --out {root}/sweep --curves ase --steps 4"));
+    are_upright(&folder.path().join("sweep/index.html"));
+}
