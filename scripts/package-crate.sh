@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Packs the crate with compiled kernels as dist/nightsplat-VERSION.crate, with its checksum: who builds it without the
-# feature `glslang` needs no C++ compiler. The kernels stay in precompiled/, from which `cargo publish --allow-dirty` takes
-# them: git ignores that folder, which cargo calls uncommitted. Builds the package once so, on one core, and prints the
-# processor time. Option --allow-dirty packs what is not committed as well.
+# Packs the crate with compiled kernels as dist/nightsplat-VERSION.crate, with its checksum: without the feature
+# `glslang`, it builds without a C++ compiler. The kernels stay in precompiled/ for `cargo publish --allow-dirty`: git
+# ignores that folder, which cargo treats as uncommitted. Builds the package once in this way, on one core, and prints
+# the processor time. Option --allow-dirty also packs uncommitted changes.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD

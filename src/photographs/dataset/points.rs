@@ -83,10 +83,10 @@ fn read(file: &Path) -> Option<Vec<DVec3>> {
     None
 }
 
-/// Points of a listing's world. Where the listing applied a transform to its cameras, it may have left it out of the points:
-/// of the two worlds the one that more photographs show counts.
+/// The points in a listing's world. If the listing applied a transform to its cameras, it may not have applied it to the
+/// points: of the two worlds, the one whose points are visible in more photographs is used.
 fn placed(cloud: &Cloud, points: Vec<DVec3>, views: &[View]) -> Vec<Point> {
-    /// Of a cloud seen from the wrong place about as much is seen; this much more is no chance.
+    /// In the wrong world, about as many points are visible by chance; this factor is not chance.
     const CLEARLY_MORE: f64 = 1.1;
     let seen = |to_views: DAffine3| {
         let step = points.len().div_ceil(1000);
