@@ -213,7 +213,7 @@ fn unpacked(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
     for (place, stream) in streams.iter_mut().enumerate().take(stream_count) {
         let length = word(file, table + 16 * place)? as usize;
         let (packed, after) =
-            rest.and_then(|rest| rest.split_at_checked(length)).ok_or(CUT_SHORT)?;
+            rest.and_then(|rest| rest.split_at_checked(length)).ok_or(TRUNCATED)?;
         rest = Some(after);
         let mut decoder = StreamingDecoder::new(packed)
             .map_err(|error| format!("cannot be unpacked: {error}"))?;
