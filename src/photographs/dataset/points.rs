@@ -83,8 +83,8 @@ fn read(file: &Path) -> Option<Vec<DVec3>> {
     None
 }
 
-/// The points in a listing's world. If the listing applied a transform to its cameras, it may not have applied it to the
-/// points: of the two worlds, the one whose points are visible in more photographs is used.
+/// The points in a listing's world. If the listing applied a transform to its cameras, it may not have applied it to
+/// the points: of the two worlds, the one whose points are visible in more photographs is used.
 fn placed(cloud: &Cloud, points: Vec<DVec3>, views: &[View]) -> Vec<Point> {
     /// In the wrong world, about as many points are visible by chance; this factor is not chance.
     const CLEARLY_MORE: f64 = 1.1;

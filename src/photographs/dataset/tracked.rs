@@ -1,5 +1,5 @@
-//! The pixels that cameras refer to, if sizes are ambiguous, from tracked points: a point looks alike in all photographs
-//! that show it, if each is sampled where its camera projects the point.
+//! The pixels that cameras refer to, if sizes are ambiguous, from tracked points: a point looks alike in all
+//! photographs that show it, if each is sampled where its camera projects the point.
 
 use rayon::prelude::*;
 
