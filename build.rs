@@ -1,7 +1,7 @@
 //! Compiles every kernel in `shaders-glsl/` and writes its Rust side, or takes what a packaged crate has of both.
 //!
-//! A kernel is declared once, in GLSL. Its SPIR-V tells us the parameters, buffers, constants and workgroup size, from
-//! which `$OUT_DIR/kernels.rs` gets one typed module per kernel: host code that disagrees with a shader does not compile.
+//! A kernel is declared once, in GLSL. Its parameters, buffers, constants and workgroup size are read from its SPIR-V;
+//! `$OUT_DIR/kernels.rs` gets one typed module per kernel, so host code that disagrees with a shader does not compile.
 //!
 //! - `build/precompiled.rs`: kernels that were compiled before
 //! - `build/kernels.rs`: compiles and reflects every kernel

@@ -1,4 +1,4 @@
-//! A host application with a Vulkan device of its own:
+//! A host application with its own Vulkan device:
 //! `cargo run --release --no-default-features --features glslang --example embed -- MODEL.ply OUT.ppm`.
 //!
 //! The host lends its device, lets the renderer record a frame into its command buffer, and submits that itself. The
@@ -30,7 +30,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         // SAFETY: the handles are the host's own and outlive `gpu`.
         let gpu = unsafe { Gpu::from_host(host.lend()) }?;
         draw(&host, &gpu, &Gaussians::open(&model)?)?
-        // What the library made goes before the device does.
+        // The library's objects are dropped before the device.
     };
     host.destroy();
     let [width, height] = SIZE;
@@ -68,7 +68,7 @@ fn draw(host: &Host, gpu: &Gpu, gaussians: &Gaussians) -> Result<Vec<u8>, Box<dy
                 renderer.draw(pass, &on_device, &[camera], &options, &target)
             })
         }
-        // The host goes on here: with its own passes, in the same command buffer.
+        // The host continues here with its own passes, in the same command buffer.
     })
 }
 
@@ -93,12 +93,12 @@ struct Host {
     device: ash::Device,
     queue: vk::Queue,
     pool: vk::CommandPool,
-    /// Reaches the number of each frame.
+    /// Signalled with the number of each frame.
     frames: vk::Semaphore,
 }
 
 impl Host {
-    /// The first device, with what the library needs beside what a host would need itself.
+    /// The first device, with the features that the library requires in addition to the host's own.
     fn new() -> Result<Self, Box<dyn Error>> {
         // SAFETY: every create info points at live locals; the entry is kept as long as the instance.
         unsafe {
@@ -177,7 +177,7 @@ impl Host {
                 .aspect_mask(vk::ImageAspectFlags::COLOR)
                 .layer_count(1),
         )];
-        // SAFETY: all objects are live and used by this thread alone, until the frame is done.
+        // SAFETY: all objects are live and used only by this thread, until the frame is done.
         unsafe {
             let image = device.create_image(&image, None)?;
             let image_memory =
@@ -239,7 +239,7 @@ impl Host {
     }
 
     fn destroy(self) {
-        // SAFETY: nothing is in flight, and nothing made from the device is left.
+        // SAFETY: nothing is in flight, and no object of the device is left.
         unsafe {
             self.device.destroy_semaphore(self.frames, None);
             self.device.destroy_command_pool(self.pool, None);

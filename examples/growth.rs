@@ -1,8 +1,8 @@
-//! How time and memory grow: `cargo run --release --example growth -- [WIDTH HEIGHT GAUSSIANS]`.
+//! Scaling of time and memory: `cargo run --release --example growth -- [WIDTH HEIGHT GAUSSIANS]`.
 //!
-//! One quantity changes at a time: Gaussians, pixels and channels of the scene of `nightsplat bench` (512 384 20000
-//! by default), photographs and points of a capture. Of each value it prints milliseconds and the most
-//! bytes of device memory, and of each quantity the exponents of the power that fits them.
+//! One quantity changes at a time: Gaussians, pixels and channels of the scene of `nightsplat bench` (512 384 20000 by
+//! default), photographs and points of a capture. It prints milliseconds and peak device memory for each value, and the
+//! exponents of a fitted power law for each quantity.
 
 use std::error::Error as StdError;
 use std::io::Write;
@@ -22,11 +22,11 @@ use nightsplat::train::{TrainConfig, Trainer};
 use nightsplat::{Error, Result};
 use tempfile::TempDir;
 
-/// In those of the scene that is asked for.
+/// Factors of the scene's number of Gaussians.
 const GAUSSIANS: [f64; 5] = [0.5, 1.5, 5.0, 12.5, 25.0];
 const PIXELS: [f64; 6] = [0.5, 1.5, 5.0, 10.0, 20.0, 40.0];
 
-/// 3 to 11 channels, a feature more each time.
+/// 3 to 11 channels, one more feature each time.
 const CHANNELS: [Features; 5] = [
     Features::NONE,
     Features { depth: true, ..Features::NONE },
@@ -38,10 +38,10 @@ const CHANNELS: [Features; 5] = [
 /// Photographs of a capture.
 const VIEWS: [usize; 4] = [16, 48, 144, 432];
 
-/// Points of a capture, in those of its own.
+/// Factors of the capture's own number of points.
 const POINTS: [usize; 4] = [1, 4, 16, 64];
 
-/// Timed runs of a step, after one that is not timed; the least counts.
+/// Timed runs of a step, after a warm-up; the fastest counts.
 const REPEATS: usize = 5;
 
 fn main() -> std::result::Result<(), Box<dyn StdError>> {
@@ -80,7 +80,7 @@ fn main() -> std::result::Result<(), Box<dyn StdError>> {
     })
 }
 
-/// Milliseconds and the most bytes of device memory, which are counted from the last call of `Gpu::reset_peak_memory`.
+/// Milliseconds and peak device memory in bytes, measured since the last call of `Gpu::reset_peak_memory`.
 type Measured = Result<(f64, u64)>;
 
 /// A training step of the plain model.
@@ -91,7 +91,8 @@ fn step(gpu: &Gpu, [width, height]: [u32; 2], gaussians: usize) -> Measured {
     Ok((least(|| trainer.profile_step())?, gpu.peak_memory()))
 }
 
-/// The rasteriser, there and back: the channels of a render reach no further, but for the parts that ask for them.
+/// Forward and backward pass of the rasteriser; other passes do not depend on the number of channels, unless a part of
+/// the model needs them.
 fn rasteriser(gpu: &Gpu, [width, height]: [u32; 2], count: usize, features: Features) -> Measured {
     const OPTIONS: RenderOptions = RenderOptions { sh_degree: 3, background: [0.0; 3] };
     gpu.reset_peak_memory();
@@ -141,7 +142,7 @@ fn placing(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Measured {
     Ok((begin.elapsed().as_secs_f64() * 1e3, gpu.peak_memory()))
 }
 
-/// The points several times, side by side.
+/// The points repeated several times, side by side.
 fn repeated(points: &[Point], times: usize) -> Vec<Point> {
     let near = |at: usize| {
         let draws = Stream::new(7, at as u64);
@@ -152,10 +153,10 @@ fn repeated(points: &[Point], times: usize) -> Vec<Point> {
     (0..times * points.len()).map(near).collect()
 }
 
-/// Of photographs so small that pixels cost little.
+/// A capture of photographs so small that pixels cost little.
 fn capture(views: usize) -> Result<TempDir> {
     let folder = tempfile::tempdir()
-        .map_err(|error| Error::Usage(format!("there is no temporary folder: {error}")))?;
+        .map_err(|error| Error::Usage(format!("a temporary folder cannot be created: {error}")))?;
     let options = SyntheticOptions { views, width: 48, height: 36, ..SyntheticOptions::default() };
     synthetic::write(folder.path(), &options)?;
     Ok(folder)
@@ -165,7 +166,7 @@ fn config(dataset: &Path) -> TrainConfig {
     TrainConfig { dataset: dataset.to_owned(), random_points: 1, ..TrainConfig::default() }
 }
 
-/// The least of the milliseconds that all passes of a run take.
+/// The shortest total time of all passes, in milliseconds.
 fn least(mut profile: impl FnMut() -> Result<Vec<PassTime>>) -> Result<f64> {
     profile()?;
     (0..REPEATS).try_fold(f64::INFINITY, |least, _| {
@@ -173,7 +174,7 @@ fn least(mut profile: impl FnMut() -> Result<Vec<PassTime>>) -> Result<f64> {
     })
 }
 
-/// Measures each value of a quantity and prints it; one that the device cannot hold says so.
+/// Measures and prints each value of a quantity, or an error if it does not fit the device.
 fn print_axis<T: Copy>(
     quantity: &str,
     timed: &str,
@@ -207,7 +208,7 @@ fn print_axis<T: Copy>(
     Ok(())
 }
 
-/// Of a line through the logarithms, by least squares; NaN of fewer than two values.
+/// The slope of a line through the logarithms, by least squares; NaN for fewer than two values.
 fn slope(logs: &[[f64; 3]], of: usize) -> f64 {
     let mean = |of: usize| logs.iter().map(|log| log[of]).sum::<f64>() / logs.len() as f64;
     let (x, y) = (mean(0), mean(of));

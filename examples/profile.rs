@@ -1,12 +1,12 @@
-//! Where the time of a training step goes: `cargo run --release --example profile -- DATASET DOWNSCALE STEPS`.
+//! The times of the passes of a training step: `cargo run --release --example profile -- DATASET DOWNSCALE STEPS`.
 //!
-//! Trains for STEPS steps, then prints each kernel's milliseconds, the median of nine steps.
+//! Trains for STEPS steps, then prints the milliseconds of each kernel, the median of nine steps.
 
 use std::io::Write;
 
 use nightsplat::{Dataset, DeviceChoice, Gpu, PassTime, TrainConfig, Trainer};
 
-/// Steps that are measured.
+/// Measured steps.
 const REPEATS: u64 = 9;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {

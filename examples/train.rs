@@ -1,8 +1,8 @@
-//! Trains a small set from a program: `cargo run --release --example train -- FOLDER`.
+//! Trains on a small dataset from a program: `cargo run --release --example train -- FOLDER`.
 //!
-//! Makes the set in FOLDER/set, trains it into FOLDER/run and says on the way what the run tells its observer.
+//! Writes the dataset to FOLDER/set, trains into FOLDER/run and prints the events of the run.
 
-#![expect(clippy::print_stdout, reason = "what a run tells its observer is what there is to see")]
+#![expect(clippy::print_stdout, reason = "the example prints the events of the run")]
 
 use std::path::PathBuf;
 

@@ -1,6 +1,6 @@
-//! Every parser of files from elsewhere as a function of bytes: what fuzzing and `tests/photographs/hostile_bytes.rs` feed.
+//! Every parser of external files as a function of bytes, for fuzzing and `tests/photographs/hostile_bytes.rs`.
 //!
-//! A parser may refuse whatever it is given, in one line. It never panics, and what it lets through keeps its promises.
+//! A parser may refuse any input with an error of one line. It never panics, and what it accepts is valid.
 
 use std::fs;
 use std::path::{Path, PathBuf};

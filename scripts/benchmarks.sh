@@ -4,14 +4,14 @@
 #     scripts/benchmarks.sh [SECTION...] > tables.md
 #
 # Sections: step tiles quality presets curves targets parts background profile memory growth loading build fisheye.
-# Without a name: all of them, some hours on two cores. Each table is preceded by its date, device and command.
+# Without a section: all of them, some hours on two cores. Each table is preceded by its date, device and command.
 #
 # NIGHTSPLAT    the command (default: target/release/nightsplat, built first)
-# SCENES        the folder of the LOM scenes; NAMES (chair,sofa,shrub): those that are measured
+# SCENES        the folder of the LOM scenes; NAMES (chair,sofa,shrub): the measured ones
 # LPIPS         the weights of scripts/lpips-weights.py; without them there is no LPIPS
 # SEEDS         of quality (1,2,3); DOWNSCALES (2,1): its sizes
-# OPTIONS       of every training, stronger than its own: OPTIONS="--set steps=20 --set downscale=8" tries a section
-# RUNS          keeps the run directories, where finished runs are found again (default: a temporary folder)
+# OPTIONS       of every training, overriding its own: OPTIONS="--set steps=20 --set downscale=8" tries a section
+# RUNS          folder of the run directories, in which finished runs are reused (default: a temporary folder)
 # SIZE          options of `bench`; REPEATS (7) and TUNE_REPEATS (3): of step and tiles
 # GROWTH        arguments of examples/growth.rs; PROFILE (release): cargo's profile of growth and build
 # VIEWS, POINTS of loading (2000, 100000); STEPS (1500): of fisheye
@@ -30,10 +30,10 @@ read -r -a options <<< "${OPTIONS:-}"
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
 RUNS=${RUNS:-$scratch/runs}
-# The built-in tiles, whatever `bench --tune` has found on this machine.
+# The built-in tiles, not those that `bench --tune` has found on this machine.
 export NIGHTSPLAT_TUNE=off
 
-# The command; what it says of itself is shown only where it fails.
+# The command; its standard error is only shown if it fails.
 tool() {
     "$NIGHTSPLAT" "$@" 2> "$scratch/log" || {
         cat "$scratch/log" >&2
@@ -44,14 +44,14 @@ tool() {
 # One scene's folder.
 scene() { echo "${SCENES:?set SCENES to the folder of the LOM scenes}/$1"; }
 
-# When, and on what.
+# Date, device and command.
 stamp() {
     local device
     device=$("$NIGHTSPLAT" doctor --json | sed -n '0,/"name"/ s/^ *"name": "\(.*\)",$/\1/p')
     printf '\n%s, %s, %s cores: `%s`\n\n' "$(date +%F)" "$device" "$(nproc)" "$*"
 }
 
-# Trains and scores: train NAME DATASET OPTION...; a run that is finished stays.
+# Trains and scores: train NAME DATASET OPTION...; a finished run is reused.
 train() {
     local run=$RUNS/$1 dataset=$2
     shift 2
@@ -102,7 +102,7 @@ section_quality() {
     done
 }
 
-# The presets that trade time for quality.
+# The presets, trade-offs of time and quality.
 section_presets() {
     stamp 'nightsplat train SCENE --downscale 2 --seed 1 --preset P; nightsplat eval RUN --lpips WEIGHTS'
     echo "| scene | preset | PSNR, dB | SSIM | LPIPS | steps | Gaussians | device, MiB | processor, s |"
@@ -116,7 +116,7 @@ section_presets() {
     done
 }
 
-# The default curve beside the baseline and the paper's.
+# The default curve, the baseline and the paper's curves.
 section_curves() {
     stamp 'nightsplat train SCENE --downscale 4 --steps 1000 --seed 1 --curve C; nightsplat eval RUN --lpips WEIGHTS'
     echo "| scene | curve | PSNR, dB | channel mean, dB | SSIM | LPIPS | processor, s |"
@@ -131,7 +131,7 @@ section_curves() {
     done
 }
 
-# The targets alone, without training.
+# The targets, without training.
 section_targets() {
     stamp 'nightsplat tone apply SCENE --curve C --json'
     echo "| scene | curve | PSNR, dB | channel mean, dB | SSIM |"
@@ -151,7 +151,7 @@ PYTHON
     done
 }
 
-# The parts of LITA-GS, each alone.
+# The parts of LITA-GS, one at a time.
 section_parts() {
     stamp 'nightsplat train SCENE --downscale 4 --steps 1000 --seed 1 --plan none --parts P'
     echo "| scene | parts | PSNR, dB | SSIM | LPIPS | Gaussians | processor, s |"
@@ -167,7 +167,7 @@ section_parts() {
     done
 }
 
-# Black or random colours behind the model: what is left of the background in the test views.
+# Training over black or random backgrounds: the background that shows through in the test views.
 section_background() {
     stamp 'nightsplat train SCENE --downscale 2 --seed 1 --preset fast --background B'
     echo "| scene | background | PSNR, dB | SSIM | residual transmittance | of 99 % of the pixels, below |"
@@ -198,7 +198,7 @@ section_profile() {
     done
 }
 
-# What storing less takes and costs.
+# Storage precision: memory and scores.
 section_memory() {
     stamp 'nightsplat train SCENE --downscale 2 --steps 1000 --seed 1 and the options of the row'
     echo "| scene | options | PSNR, dB | SSIM | Gaussians | device, MiB | host, MiB | processor, s |"
@@ -240,7 +240,7 @@ section_tiles() {
     echo '```'
 }
 
-# How time and memory of a step grow with Gaussians, pixels, channels, photographs and points.
+# Scaling of time and memory of a step with Gaussians, pixels, channels, photographs and points.
 section_growth() {
     stamp "cargo run --release --example growth -- ${GROWTH:-}"
     echo '```text'
@@ -249,12 +249,12 @@ section_growth() {
     echo '```'
 }
 
-# From the command to the end of the first step, of many small photographs.
+# From the command to the end of the first step, for many small photographs.
 section_loading() {
     local views=${VIEWS:-2000} points=${POINTS:-100000}
     stamp "nightsplat synth SET --views $views --width 64 --height 48; nightsplat train SET --steps 1"
     tool synth "$scratch/many" --views "$views" --width 64 --height 48 > /dev/null
-    # The points again and again, each beside itself.
+    # The points repeated, each slightly shifted.
     local file=$scratch/many/colmap_sparse/0/points3D.txt
     awk -v want="$points" '/^#/ { print; next } { kept[n++] = $0 }
         END { for (i = 0; i < want; i++) { $0 = kept[i % n]; $1 = i + 1; $2 += 0.001 * int(i / n); print } }' \
@@ -269,7 +269,7 @@ section_loading() {
     echo "| $views | $points | $wall | $(awk "BEGIN { print $user + $system }") |"
 }
 
-# A build from nothing, its crates downloaded.
+# A clean build, with crates already downloaded.
 section_build() {
     stamp 'cargo build --release --bin nightsplat, into an empty folder'
     TIMEFORMAT='%R %U %S'
@@ -283,7 +283,7 @@ section_build() {
     echo "| $wall | $(awk "BEGIN { print $user + $system }") |"
 }
 
-# A fisheye trained on as it is, and undistorted.
+# Training on a fisheye set, native and undistorted.
 section_fisheye() {
     stamp "STEPS=${STEPS:-1500} scripts/fisheye.py"
     echo '```text'

@@ -44,4 +44,5 @@ install -m 644 src/capi/nightsplat.h "$out/include/nightsplat.h"
 fill() { sed -e "s|@VERSION@|$version|; s|@PREFIX@|$out|; s|@ABI@|$abi|" "$1" > "$2"; }
 fill src/capi/nightsplat.pc.in "$out/lib/pkgconfig/nightsplat.pc"
 fill src/capi/nightsplat-config.cmake.in "$out/lib/cmake/nightsplat/nightsplat-config.cmake"
-echo "wrote $out; build a host with: cc host.c \$(PKG_CONFIG_PATH=$out/lib/pkgconfig pkg-config --cflags --libs nightsplat vulkan)"
+flags="PKG_CONFIG_PATH=$out/lib/pkgconfig pkg-config --cflags --libs nightsplat vulkan"
+echo "wrote $out; build a host with: cc host.c \$($flags)"

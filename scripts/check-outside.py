@@ -40,7 +40,7 @@ def main() -> None:
     programs.mkdir(parents=True, exist_ok=True)
     for old in programs.iterdir():
         old.unlink()
-    # The profile of the dependencies that are compiled already.
+    # The profile with which the dependencies are already compiled.
     manifest = (ROOT / "Cargo.toml").read_text()
     profile = re.search(r"^\[profile\.dev\].*?(?=^\[profile\.release\])", manifest, re.M | re.S)
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Checks licences, sources and versions of every crate (deny.toml), advisories where their database can be reached, and
+# Checks licences, sources and versions of every crate (deny.toml), advisories if their database can be reached, and
 # spelling (typos.toml). Installs prebuilt programs into target/tools.
 set -euo pipefail
 cd "$(dirname "$0")/.."

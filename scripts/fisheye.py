@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Measures what a native fisheye gains over the same photographs undistorted and cropped.
+"""Measures the gain of a native fisheye over the same photographs undistorted and cropped.
 
     scripts/fisheye.py [folder]
 
 Makes a synthetic fisheye set in the folder (default: a temporary one), replaces its dark photographs by its references,
-and trains twice: as it is, and with --undistort. Both models are scored against ray-traced references:
+and trains twice: native, and with --undistort. Both models are scored against ray-traced references:
 
 - in the fisheye's test views, on the pixels that the undistorted photographs also show
 - in a pinhole's test views from the same poses, at half the size, where a pixel is about as large as in either training
@@ -38,7 +38,7 @@ def command():
 
 
 def read_png(path):
-    """Width, and the rows of an 8-bit RGB file."""
+    """Width and rows of an 8-bit RGB file."""
     data, at, packed = path.read_bytes(), 8, b""
     while at < len(data):
         length, kind = struct.unpack(">I4s", data[at : at + 8])

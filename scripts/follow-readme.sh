@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Runs every command of README.md's `sh` blocks, in order, in a copy of this checkout; `cargo install` goes first. A
-# command that is left out is named by a comment of the README, `<!-- follow: ... -->`, and printed as `not run`.
+# command to skip is named in a comment of the README, `<!-- follow: ... -->`, and printed as `not run`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
@@ -10,10 +10,10 @@ git ls-files -z --cached --others --exclude-standard | xargs -0 -I {} sh -c '[ -
     tar -c -T - | tar -x -C "$scratch"
 cd "$scratch"
 
-# Installed into the copy, from the dependencies that are built already.
+# Installs into the copy, with the dependencies that are already built.
 export CARGO_INSTALL_ROOT=$scratch/installed CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$root/target}
 export PATH=$scratch/installed/bin:$PATH
-# This build takes half of the time, and is a little slower than what a user gets.
+# This profile builds in half of the time, and runs a little slower than the user's.
 export CARGO_PROFILE_RELEASE_OPT_LEVEL=1 CARGO_PROFILE_RELEASE_LTO=off CARGO_PROFILE_RELEASE_INCREMENTAL=false
 
 has() { command -v "$1" > /dev/null; }
@@ -61,4 +61,4 @@ done
 for file in demo/index.html run/model.html run/model.ply; do
     [ -s "$file" ] || { echo "failed: $file was not written"; exit 1; }
 done
-echo "the ${#commands[@]} commands of the README do what it says, in $SECONDS s"
+echo "the ${#commands[@]} commands of the README work, in $SECONDS s"

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Fuzzes every parser, or those that are named, for SECONDS each (600), and fails with the input that it found:
+# Fuzzes every parser, or the named ones, for SECONDS each (600), and fails with the offending input:
 #     scripts/fuzz.sh [SECONDS [PARSER...]]
-# Installs cargo-fuzz, prebuilt, into target/tools. cargo-fuzz needs a nightly compiler; without one, RUSTC_BOOTSTRAP lets
-# the installed compiler take nightly's options.
+# Installs cargo-fuzz, prebuilt, into target/tools. cargo-fuzz needs a nightly compiler; without one, RUSTC_BOOTSTRAP
+# makes the installed compiler accept nightly's options.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 seconds=${1:-600}

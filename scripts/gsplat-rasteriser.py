@@ -14,7 +14,7 @@ import torch
 
 
 def scene(count, width, height):
-    """Means, quaternions, scales, opacities and SH coefficients of degree 3, as leaves that take gradients."""
+    """Means, quaternions, scales, opacities and SH coefficients of degree 3, as leaves with gradients."""
     torch.manual_seed(65)
     focal = 0.9 * width
     center = torch.tensor([0.51 * width, 0.49 * height])

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Checks for what building and testing need: cargo, a C++ compiler, the Vulkan loader, a Vulkan device and the
+# Checks the requirements of building and testing: cargo, a C++ compiler, the Vulkan loader, a Vulkan device and the
 # validation layer. Installs the missing parts of Vulkan on Debian and Ubuntu; elsewhere prints what to install.
 set -euo pipefail
 
@@ -8,7 +8,7 @@ fail() {
     exit 1
 }
 
-# True if a folder in which Vulkan looks for manifests holds one that matches the pattern.
+# True if a folder of Vulkan's manifests contains one that matches the pattern.
 has_manifest() {
     local folder
     for folder in /usr/share/vulkan /usr/local/share/vulkan /etc/vulkan \
@@ -63,7 +63,8 @@ if command -v apt-get > /dev/null; then
     fi
     echo "installing ${missing[*]}" >&2
     "${as_root[@]}" apt-get update -qq
-    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${missing[@]}" >&2
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive \
+        apt-get install -y -qq --no-install-recommends "${missing[@]}" >&2
     exit 0
 fi
 

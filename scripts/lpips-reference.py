@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Prints PyTorch's LPIPS of the pictures of tests/networks/lpips.rs, with the weights that the test makes.
+"""Prints PyTorch's LPIPS of the images of tests/networks/lpips.rs, with the test's weights.
 
     pip install torch torchvision lpips
     scripts/lpips-reference.py

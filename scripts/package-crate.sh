@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Packs the crate with compiled kernels as dist/nightsplat-VERSION.crate, with its checksum: who builds it without the
-# feature `glslang` needs no C++ compiler. The kernels stay in precompiled/, from which `cargo publish --allow-dirty` takes
-# them: git ignores that folder, which cargo calls uncommitted. Builds the package once so, on one core, and prints the
-# processor time. Option --allow-dirty packs what is not committed as well.
+# Packs the crate with compiled kernels as dist/nightsplat-VERSION.crate, with its checksum: without the feature
+# `glslang`, it builds without a C++ compiler. The kernels stay in precompiled/ for `cargo publish --allow-dirty`: git
+# ignores that folder, which cargo treats as uncommitted. Builds the package once in this way, on one core, and prints
+# the processor time. Option --allow-dirty also packs uncommitted changes.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
@@ -26,10 +26,11 @@ scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
 rm -rf precompiled
 refuses "the kernels are not compiled"
-compiled=$(cargo check --lib --locked --no-default-features --features glslang --message-format=json-render-diagnostics |
+compiled=$(cargo check --lib --locked --no-default-features --features glslang \
+    --message-format=json-render-diagnostics |
     sed -n '/"reason":"build-script-executed","package_id":"path+/s|.*"out_dir":"\([^"]*\)".*|\1|p')
 mkdir precompiled
-# Former kernels may lie there as well.
+# Former kernels may still be there.
 grep -o '[a-z0-9_]*\.spv' "$compiled/kernels.rs" | while read -r name; do cp "$compiled/$name" precompiled/; done
 cp "$compiled/kernels.rs" "$compiled/sources.hash" precompiled/
 cargo package --quiet --locked --offline --no-verify --allow-dirty

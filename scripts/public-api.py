@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Lists the public API of the library, one item a line.
+"""Lists the public API of the library, one item per line.
 
     scripts/public-api.py            compares it with docs/public-api.txt, and counts the items
     scripts/public-api.py --write    rewrites that file
@@ -81,7 +81,7 @@ NAMED: set[int] = set()
 
 
 def named(path: dict) -> str:
-    """Its last segment, as in code that imports it."""
+    """The last segment of a path, as in code that imports it."""
     NAMED.add(path["id"])
     return path["path"].split("::")[-1] + arguments(path["args"])
 
@@ -221,7 +221,7 @@ class Api:
                     self.add("field", f"{path}::{field['name']}", f": {typed(field['inner']['struct_field'])}")
 
     def held(self, kind: dict | str) -> str:
-        """What a variant holds."""
+        """The fields of a variant."""
         def field(number: int) -> str:
             return typed(self.index[str(number)]["inner"]["struct_field"])
 

@@ -4,7 +4,7 @@
     python3 -m venv env && env/bin/pip install numpy plyfile pygltflib
     nightsplat export RUN --format glb && env/bin/python scripts/read-glb.py RUN
 
-glTF has y up: positions, rotations and the directions of SH are turned by half a turn about x.
+glTF has y up: positions, rotations and the directions of SH are rotated by half a turn about x.
 """
 
 import pathlib

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Campaigns that take longer than tests may. Each prints its result; the first that fails ends the script.
+"""Campaigns that take too long for tests. Each prints its result; the first that fails ends the script.
 
     scripts/stress.py [table] [conditioning] [cameras] [long] [kills] [fuzz] [guards] [growth]
 
@@ -74,8 +74,8 @@ def resident(pid):
 def long(folder):
     """Memory over many steps.
 
-    A software device's memory is the process's own. A debug build grows: its validation layer keeps part of the allocations
-    of each command buffer.
+    On a software device, device memory belongs to the process. A debug build grows, since its validation layer keeps a
+    part of the allocations of each command buffer.
     """
     data, out = synth(folder / "set", 32, 8), folder / "long"
     arguments = [command(), "train", data, "--out", out, "--steps", STEPS, "--max-gaussians", 1000, *PLAIN]
@@ -133,12 +133,12 @@ def fuzz(_):
 
 
 def guards(_):
-    """Removes every guard of the kernels, one at a time: a test has to fail."""
+    """Removes every guard of the kernels, one at a time: a test must fail."""
     run(sys.executable, ROOT / "scripts" / "plant-defects.py", "guard:")
 
 
 def growth(_):
-    """No round of density control costs the training views of a scene more than .3 dB."""
+    """No round of density control costs the training views of a scene more than 0.3 dB."""
     if not os.environ.get("NIGHTSPLAT_SCENES"):
         print("not run: NIGHTSPLAT_SCENES names no scene")
         return

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Builds the image of Containerfile and trains the demo's scene in it, on the image's software device. Needs root and
-# buildah, no daemon and no rights beyond a chroot. A base image that cannot be pulled is made by debootstrap from the
-# same packages.
+# buildah, no daemon and no privileges beyond a chroot. A base image that cannot be pulled is built by debootstrap from
+# the same packages.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 export BUILDAH_ISOLATION=chroot STORAGE_DRIVER=${STORAGE_DRIVER:-vfs}
@@ -13,7 +13,7 @@ if ! buildah inspect --type image "$base" > /dev/null 2>&1 && ! buildah pull "$b
     trap 'rm -rf "$root"' EXIT
     # The script of sid, since debootstrap may be older than the suite.
     debootstrap --variant=minbase "${suite%-slim}" "$root" "" /usr/share/debootstrap/scripts/sid
-    # Certificates of this machine, such as a proxy's, through which packages are fetched.
+    # Certificates of this machine, such as those of a proxy.
     mkdir -p "$root/usr/local/share/ca-certificates"
     find /usr/local/share/ca-certificates -name '*.crt' -exec cp {} "$root/usr/local/share/ca-certificates/" \;
     # A mirror's index may be older than its expiry date.

@@ -24,7 +24,7 @@ SPEC.loader.exec_module(weights)
 
 
 class Planted:
-    """Pickled as numpy pickles an array of 32-bit floats, which repeats values whose number is a prime."""
+    """Pickles like a numpy array of 32-bit floats; repeats a prime number of values."""
 
     def __init__(self, *shape, code="f4", missing=0, period=[at / 4093 for at in range(4093)]):
         self.shape, self.code, self.missing = shape, code, missing
@@ -47,7 +47,7 @@ class Planted:
 
 
 def stand_in_for_numpy():
-    """As much of numpy as its pickles name."""
+    """The parts of numpy that its pickles name."""
     numpy, multiarray = types.ModuleType("numpy"), types.ModuleType("numpy.core.multiarray")
 
     class ndarray:
@@ -71,7 +71,7 @@ def stand_in_for_numpy():
 
 
 def planted(net):
-    """What the package keeps of a network."""
+    """The package's tree of a network."""
     _, trunk, convolutions, compared = weights.NETWORKS[net]
     layers = {
         f"Conv_{index}": {"kernel": Planted(window, window, inputs, outputs), "bias": Planted(outputs)}
@@ -85,7 +85,7 @@ def planted(net):
 
 
 class Malicious:
-    """Would make a folder when it is read."""
+    """Would create a folder when read."""
 
     def __init__(self, folder):
         self.folder = folder

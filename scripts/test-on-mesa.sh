@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Runs every test on the software device of another Debian suite, in a chroot under target/, and prints that device:
 #     scripts/test-on-mesa.sh sid
-# Newer Mesa supports more, such as cooperative matrices, and newer validation layers check more. Needs root and
-# debootstrap.
+# Newer versions of Mesa support more, such as cooperative matrices, and newer validation layers check more. Needs root
+# and debootstrap.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 suite=${1:?name a Debian suite, such as sid}

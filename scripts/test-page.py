@@ -4,8 +4,8 @@
     scripts/test-page.py [NIGHTSPLAT]      (default: target/release/nightsplat, or debug)
 
 Trains a small synthetic set, opens the page from disk at the size of its views and at twice that, and requires 30 dB or
-more for every view. Turns the background grey by its key and black again by its control: grey must show where nothing
-is, and not where the model is opaque. Then opens the page in a browser without WebGL, where it must say so. Needs
+more for every view. Turns the background grey by its key and black again by its control: grey must show where the
+model is empty, and not where it is opaque. Then opens the page in a browser without WebGL, which it must report. Needs
 Python and Chromium, which it controls by the DevTools protocol through a pipe; without Chromium it prints `not run`.
 """
 
@@ -42,8 +42,7 @@ COMPARE = """(async (png) => {
   return 10 * Math.log10(255 ** 2 / Math.max(square, 1e-9));
 })('PNG')"""
 
-# The key G from far away: before, behind, and once the control has been clicked. Red of every pixel; the alpha is left
-# out.
+# Key G from far away: before, after, and once the control has been clicked. The red of every pixel; alpha is ignored.
 GREY = """(async () => {
   const canvas = document.getElementById('canvas'), gl = canvas.getContext('webgl2');
   const press = (key) => canvas.dispatchEvent(new KeyboardEvent('keydown', { key, bubbles: true }));
@@ -127,13 +126,13 @@ class Browser:
     def resize(self, width, height):
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.call("Emulation.setDeviceMetricsOverride", **metrics)
-        # A bar beside controls that do not fit would take its width from the canvas.
+        # A scroll bar for controls that do not fit would narrow the canvas.
         self.call("Emulation.setScrollbarsHidden", hidden=True)
         # Two frames: one in which the page sees its size, one in which it has drawn.
         self.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done())))")
 
     def open(self, page, view=0):
-        """Opens the page and gives what became of it: `true` or `failed`."""
+        """Opens the page and returns its state: `true` or `failed`."""
         self.call("Page.navigate", url="about:blank")
         self.call("Page.navigate", url=f"{page.as_uri()}#view={view}")
         end = time.monotonic() + PATIENCE
@@ -147,7 +146,7 @@ class Browser:
     def fit_canvas(self, width, height):
         """Resizes the window so that the canvas has this size."""
         window = [max(width, 400), height + 200]
-        # Controls that take more than the window leave nothing at first.
+        # Controls larger than the window initially leave no space.
         for _ in range(20):
             self.resize(*window)
             now = self.evaluate("[canvas.width, canvas.height]")
@@ -198,7 +197,7 @@ def main():
                 if not pictures:
                     raise RuntimeError(f"no renders in {renders}")
             seen = browser.evaluate(GREY)
-            # Rounding of half floats is one level.
+            # Half floats round by one level.
             is_grey = seen["isShown"] and seen["empty"] in (127, 128) and seen["least"] >= -1 and seen["most"] <= 129
             is_grey = is_grey and seen["opaque"] > 0 and seen["changed"] == 0
             print(f"{'ok' if is_grey else 'BAD':3} before grey: {seen}")

@@ -17,7 +17,7 @@ if ! grep -q '^test result' "$log"; then
     exit 1
 fi
 
-# Each test with its result: its own, or the validation layer's at the end of the process.
+# Each test with its result: its own, or that of the validation layer at the end of the process.
 outcomes() {
     sed -n 's/^test \(.*\) \.\.\. \(ok\|FAILED\)$/\2 \1/p' "$log"
     sed -n '/^validation failed in$/,/^ *Running /s/^\([a-z0-9_:]*\): .*/FAILED \1/p' "$log"

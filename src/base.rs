@@ -1,7 +1,7 @@
 //! The base of all other modules, independent of splatting: files read and written whole, hashes, random numbers.
 //!
 //! - [`input`]: files that users name, read whole
-//! - [`output`]: files that are never seen half-written
+//! - [`output`]: files that appear when complete
 //! - [`hash`]: checksums of numbers and bytes
 //! - [`ply`]: headers of PLY files
 //! - [`random`]: counter-based random numbers

@@ -1,4 +1,4 @@
-//! Cameras: the pinhole or fisheye that is rendered, and the calibrated lens of a dataset.
+//! Cameras: rendered pinhole or fisheye cameras, and the calibrated lenses of datasets.
 //!
 //! Axes are those of `OpenCV` (x right, y down, z forward). Pixel coordinates: the image's corner is (0, 0), pixel
 //! centres are at +0.5.
@@ -24,7 +24,7 @@ pub use path::CameraPath;
 #[cfg(feature = "io")]
 pub(crate) use poses::CameraPoses;
 
-/// A camera with its pose: a pinhole or a fisheye.
+/// A pinhole or fisheye camera with its pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Camera {
     /// Pixels per row.
@@ -71,19 +71,19 @@ impl Camera {
         Some(self.focal * place + self.principal_point)
     }
 
-    /// Unprojects a pixel at a depth, as `CameraModel::depth` counts it, to view space; `None` outside the field of
+    /// Unprojects a pixel at a depth, as defined by `CameraModel::depth`, to view space; `None` outside the field of
     /// view of a fisheye.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn in_view(&self, pixel: DVec2, depth: f64) -> Option<DVec3> {
         self.model.point((pixel - self.principal_point) / self.focal, depth)
     }
 
-    /// The depth of a world-space point, as [`CameraModel::depth`].
+    /// The depth of a world-space point, as defined by [`CameraModel::depth`].
     pub(crate) fn depth(&self, point: DVec3) -> Option<f64> {
         self.model.depth(self.view_from_world.transform_point3(point))
     }
 
-    /// As [`Camera::project`], `None` outside the image.
+    /// [`Camera::project`], and `None` outside the image.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn sees(&self, point: DVec3) -> Option<DVec2> {
         let size = DVec2::new(self.width.into(), self.height.into());
@@ -116,11 +116,11 @@ impl Camera {
             .collect()
     }
 
-    /// The camera whose image is that of this one turned clockwise by quarter turns: turned about its optical axis.
+    /// The camera rotated about its optical axis: its image is this one's, rotated clockwise by quarter turns.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn turned(&self, quarters: u32) -> Self {
         (0..quarters % 4).fold(*self, |own, _| {
-            // Right of the turned image is up of the other, down is right.
+            // Right in the rotated image is up in the original, and down is right.
             let turn = DMat3::from_cols(DVec3::Y, DVec3::NEG_X, DVec3::Z);
             Self {
                 width: own.height,
@@ -153,9 +153,9 @@ impl Camera {
 /// Lens distortion as COLMAP's camera models define it; the default is none.
 ///
 /// With `(x, y)` at unit depth and r its length, a perspective lens (COLMAP's `SIMPLE_RADIAL`, `RADIAL`, `OPENCV` and
-/// `FULL_OPENCV`, which differ in what is zero) scales by `(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6
-/// r^6)` and shifts by p1 and p2. A fisheye (`SIMPLE_RADIAL_FISHEYE`, `RADIAL_FISHEYE`, `OPENCV_FISHEYE`) projects the
-/// angle t off its axis, t = atan r, to `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`.
+/// `FULL_OPENCV`, which differ in the coefficients that are zero) scales by `(1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4
+/// r^2 + k5 r^4 + k6 r^6)` and shifts by p1 and p2. A fisheye (`SIMPLE_RADIAL_FISHEYE`, `RADIAL_FISHEYE`,
+/// `OPENCV_FISHEYE`) projects the angle t off its axis, t = atan r, to `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Distortion {
     /// Radial coefficient of r^2, or of a fisheye's t^2.
@@ -174,7 +174,7 @@ pub struct Distortion {
     pub p1: f64,
     /// Tangential coefficient; a fisheye has none.
     pub p2: f64,
-    /// Whether the polynomial is of angles, not of their tangents.
+    /// Whether the polynomial is a function of angles, not of their tangents.
     pub is_fisheye: bool,
 }
 
@@ -193,7 +193,7 @@ impl Distortion {
         )
     }
 
-    /// The determinant of the Jacobian of [`Distortion::distort`]: not positive where the model folds over.
+    /// The determinant of the Jacobian of [`Distortion::distort`]; not positive if the model folds over.
     pub fn determinant(&self, DVec2 { x, y }: DVec2) -> f64 {
         let r2 = x * x + y * y;
         if self.is_fisheye {
@@ -215,7 +215,7 @@ impl Distortion {
         let slope = |a: f64, b: f64, c: f64| a + 2.0 * b * r2 + 3.0 * c * r2 * r2;
         let (above, below) = (polynomial(k1, k2, k3), polynomial(k4, k5, k6));
         let slope = (slope(k1, k2, k3) * below - above * slope(k4, k5, k6)) / (below * below);
-        // Beyond a pole the factor changes its sign.
+        // Beyond a pole, the factor changes its sign.
         [if below > 0.0 { above / below } else { f64::NAN }, slope]
     }
 
@@ -254,10 +254,10 @@ pub struct Lens {
 }
 
 impl Lens {
-    /// The longest side that counts as plausible; anything beyond comes from a corrupt file.
+    /// The longest plausible side; more indicates a corrupt file.
     pub const MAX_SIDE: u32 = 65_535;
 
-    /// The camera model that renders this lens; `None` where there is none, and photographs are undistorted.
+    /// The camera model that renders this lens; `None` if there is none, and photographs are undistorted.
     pub fn model(&self) -> Option<CameraModel> {
         match self.distortion {
             distortion if distortion == Distortion::default() => Some(CameraModel::Pinhole),
@@ -268,7 +268,7 @@ impl Lens {
         }
     }
 
-    /// Why the intrinsics are unusable; `None` if they are fine.
+    /// The reason why the intrinsics are unusable; `None` if they are valid.
     pub fn problem(&self) -> Option<String> {
         let sides = 1..=Self::MAX_SIDE;
         if !sides.contains(&self.width) || !sides.contains(&self.height) {
@@ -284,8 +284,8 @@ impl Lens {
         }
     }
 
-    /// The lens of a photograph of `width` x `height`, which must have the same aspect ratio to the rounding of a
-    /// pixel; else `None`.
+    /// The lens for a photograph of `width` x `height`, which must have the same aspect ratio up to a pixel; else
+    /// `None`.
     pub fn fitted(&self, width: u32, height: u32) -> Option<Self> {
         let listed = DVec2::new(f64::from(self.width), f64::from(self.height));
         let actual = DVec2::new(f64::from(width), f64::from(height));
@@ -326,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn a_perspective_shows_half_its_angle_from_the_middle_to_the_top() {
+    fn a_perspective_shows_half_its_angle_from_the_centre_to_the_top() {
         let camera = Camera::perspective(DAffine3::IDENTITY, 1.2, [640, 480]);
         let top = camera.project(DVec3::new(0.0, -(0.6_f64.tan()), 1.0)).unwrap();
         assert!((top - DVec2::new(320.0, 0.0)).length() < 1e-9, "{top}");
@@ -350,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn resizing_scales_what_is_projected_along_each_axis() {
+    fn resizing_scales_projections_along_each_axis() {
         let point = in_world(DVec3::new(0.3, -0.2, 1.5));
         let (full, other) =
             (camera().project(point).unwrap(), camera().resized(25, 30).project(point).unwrap());
@@ -358,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turned_camera_shows_the_turned_image() {
+    fn a_rotated_camera_shows_the_rotated_image() {
         let point = in_world(DVec3::new(0.3, -0.2, 1.5));
         let DVec2 { x, y } = camera().project(point).unwrap();
         let (width, height) = (f64::from(camera().width), f64::from(camera().height));
@@ -443,7 +443,7 @@ mod tests {
         }
     }
 
-    /// The undistorted position by Newton's method with central differences: independent of the code under test.
+    /// The undistorted position by Newton's method with central differences, independent of the code under test.
     fn unprojected(model: &str, distortion: Distortion, target: DVec2) -> DVec2 {
         let forward = |at: DVec2| published(model, distortion, at.x, at.y);
         // Along the ray first: a fisheye's tangents are unbounded.
@@ -467,7 +467,7 @@ mod tests {
     }
 
     #[test]
-    fn every_model_projects_as_colmap_publishes_it_and_comes_back() {
+    fn every_model_projects_as_published_by_colmap_and_is_inverted() {
         for (model, distortion) in MODELS {
             // A fisheye up to 85 degrees off the axis, the others as far as their polynomials increase.
             let angles: &[f64] = if distortion.is_fisheye {
@@ -492,7 +492,7 @@ mod tests {
     }
 
     #[test]
-    fn the_determinant_is_that_of_the_distortions_derivative() {
+    fn the_determinant_is_that_of_the_jacobian() {
         let step = 1e-6;
         for (name, distortion) in MODELS {
             for at in [DVec2::new(0.4, -0.3), DVec2::new(0.0, 0.9), DVec2::new(1e-9, 0.0)] {
@@ -508,7 +508,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lens_fits_a_photograph_of_its_shape_only() {
+    fn a_lens_only_fits_a_photograph_of_its_aspect_ratio() {
         let distortion = Distortion { k1: 0.1, ..Distortion::default() };
         let (focal, principal_point) = (DVec2::new(500.0, 510.0), DVec2::new(240.0, 190.0));
         let lens = Lens { width: 500, height: 375, focal, principal_point, distortion };
@@ -521,7 +521,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_that_make_no_lens_are_told_apart() {
+    fn invalid_intrinsics_are_detected() {
         let (focal, principal_point) = (DVec2::splat(50.0), DVec2::splat(20.0));
         let good = Lens {
             width: 40,

@@ -97,7 +97,7 @@ impl Cli {
     /// Reads a command line, the program's name first.
     ///
     /// # Errors
-    /// Help where it is asked for, or what is wrong with the command line.
+    /// The requested help, or the problem of the command line.
     pub fn read(arguments: Vec<OsString>) -> Result<Self, clap::Error> {
         let everything = arguments.iter().any(|argument| argument == "--help-all");
         Self::from_arg_matches(&help::command(everything).try_get_matches_from(arguments)?)
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn words_are_quoted_where_a_shell_needs_it() {
+    fn words_are_quoted_if_a_shell_requires_it() {
         assert_eq!(quoted("--set"), "--set");
         assert_eq!(quoted("curve=ap3,seed=1"), "curve=ap3,seed=1");
         assert_eq!(quoted("a b"), "'a b'");
@@ -237,7 +237,7 @@ mod without_fit {
     use super::*;
 
     #[test]
-    fn fit_says_which_feature_has_it() {
+    fn fit_names_its_missing_feature() {
         let cli =
             Cli::read(["nightsplat", "tone", "fit", "pairs"].map(Into::into).to_vec()).unwrap();
         let message = cli.run().unwrap_err().to_string();

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 /// The result of everything in this crate that can fail.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// An error names the object, the fact and, where there is one, the remedy, in one line.
+/// An error names the object, the problem and, if there is one, the remedy, on one line.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -16,7 +16,7 @@ pub enum Error {
     Input {
         /// The file or folder.
         path: PathBuf,
-        /// The fact and the remedy.
+        /// The problem and the remedy.
         problem: String,
     },
     /// A file or folder could not be written.
@@ -24,7 +24,7 @@ pub enum Error {
     Output {
         /// The file or folder.
         path: PathBuf,
-        /// The fact and the remedy.
+        /// The problem and the remedy.
         problem: String,
     },
     /// A setting has an invalid value; the exit code is 2.
@@ -95,7 +95,7 @@ pub enum Error {
         call: &'static str,
         /// The device's name, or "the Vulkan loader".
         device: String,
-        /// What it returned.
+        /// The result code.
         result: ash::vk::Result,
     },
     /// A loss term is NaN or infinite.
@@ -112,7 +112,7 @@ pub enum Error {
     },
     /// More splats are on one tile than a kernel can process on this device.
     #[error(
-        "{view}: {splats} splats on one tile of {tile} pixels, {device} follows {limit}; lower \
+        "{view}: {splats} splats on one tile of {tile} pixels exceed the limit of {limit} on {device}; lower \
          max_gaussians or take another device"
     )]
     TileLimit {
@@ -141,7 +141,7 @@ pub enum Error {
         gaussian: usize,
     },
     /// A run stopped on request, with its state saved.
-    #[error("{}: {cause} after step {step}, and saved; go on with --resume", run.display())]
+    #[error("{}: {cause} after step {step}, and saved; continue with --resume", run.display())]
     Stopped {
         /// The run directory.
         run: PathBuf,
@@ -151,7 +151,7 @@ pub enum Error {
         cause: Stop,
     },
     /// A batch of runs stopped on request; those under way are saved.
-    #[error("{}: {cause} with {done} of {all} runs done; the same command goes on", folder.display())]
+    #[error("{}: {cause} with {done} of {all} runs done; repeat the command to continue", folder.display())]
     BatchStopped {
         /// The folder of their run directories.
         folder: PathBuf,
@@ -185,8 +185,8 @@ impl Error {
         Self::Output { path: path.as_ref().to_owned(), problem: in_a_line(problem.into()) }
     }
 
-    /// The process's exit code, by what a scheduler can do about it: 2 for misuse, 3 for unusable data, 4 for the
-    /// device and its memory, those of [`Stop`] for a run that can go on, 1 for everything else.
+    /// The process's exit code, for schedulers: 2 for misuse, 3 for unusable data, 4 for the device and its memory,
+    /// those of [`Stop`] for a run that can be resumed, 1 for everything else.
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Setting { .. } | Self::Usage(_) => 2,
@@ -220,14 +220,14 @@ fn in_a_line(text: String) -> String {
     }
 }
 
-/// Why a run stopped before its end, with its state saved.
+/// The reason why a run stopped before its end, with its state saved.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stop {
     /// SIGINT, from a terminal; the exit code is 130.
     Interrupted,
     /// SIGTERM, from the system or a scheduler; the exit code is 143.
     Terminated,
-    /// `max_minutes` are over; the exit code is 75, on which schedulers run it again.
+    /// `max_minutes` are over; the exit code is 75, on which schedulers repeat a job.
     TimeUp,
 }
 
@@ -246,7 +246,7 @@ impl std::fmt::Display for Stop {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter.write_str(match self {
             Self::Interrupted => "interrupted",
-            Self::Terminated => "told to end",
+            Self::Terminated => "terminated",
             Self::TimeUp => "its time was up",
         })
     }
@@ -257,7 +257,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_file_says_becomes_one_line_that_ends() {
+    fn quoted_text_becomes_one_line_of_limited_length() {
         let printed = |problem: &str| Error::input("file", problem).to_string();
         assert_eq!(printed("is no\nnumber"), r"file: is no\nnumber");
         let endless = printed(&"ö\n".repeat(5000));

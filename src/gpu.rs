@@ -92,7 +92,7 @@ pub struct Gpu {
     shared: Arc<Shared>,
 }
 
-/// What a device is and what it can hold.
+/// The identity of a device and its limits.
 #[derive(Clone, Debug)]
 pub struct Properties {
     /// The device's name, as the driver gives it.
@@ -182,7 +182,7 @@ struct Queue {
     raw: vk::Queue,
 }
 
-/// Progress of recording and submission. Unlike the queue, it is held for moments only.
+/// Progress of recording and submission. Unlike the queue, it is locked only briefly.
 #[derive(Default)]
 struct Progress {
     /// The thread that records, and under which label.
@@ -229,7 +229,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Gpu {
-    /// What the device is.
+    /// The device's identity and limits.
     pub fn properties(&self) -> &Properties {
         &self.shared.properties
     }
@@ -355,7 +355,7 @@ impl Shared {
 impl Drop for Shared {
     fn drop(&mut self) {
         let submitted = lock(&self.progress).submitted;
-        // A lost device still has to be torn down.
+        // A lost device must still be destroyed.
         let _ = self.wait(submitted);
         // A host destroys its device once all its frames are done.
         self.collect_within(LastUse { submission: u64::MAX, frame: u64::MAX });
@@ -383,7 +383,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lost_device_names_what_it_was_at() {
+    fn a_lost_device_names_its_submission() {
         let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
         let lost = || gpu.shared.error("vkQueueSubmit2", vk::Result::ERROR_DEVICE_LOST).to_string();
         assert!(lost().contains("`vkQueueSubmit2`"), "{}", lost());

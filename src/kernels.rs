@@ -1,4 +1,4 @@
-//! Every kernel of `shaders-glsl/`, as `build.rs` reflected it: `Params`, `Constants`, `Buffers`, `Slices`; and the
+//! Every kernel of `shaders-glsl/`, reflected by `build.rs`: `Params`, `Constants`, `Buffers`, `Slices`; and the
 //! constants of every include, a module each. Floats have the digits of the source: a shader rounds them to `f32`.
 
 #![allow(

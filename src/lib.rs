@@ -8,7 +8,7 @@
 //! | read photographs | [`Dataset::load`], [`Preset::load_options`] |
 //! | train | [`Trainer::planned`], [`TrainConfig`] |
 //! | train into a directory with log, checkpoints and scores | [`run::train`] |
-//! | learn what went wrong | [`Error`]: one line that names the object and the remedy |
+//! | handle errors | [`Error`]: one line that names the object and the remedy |
 //!
 //! Without default features there is the renderer, forward and backward, and nothing else. Feature `io` adds files,
 //! datasets and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command. `glslang`
@@ -38,8 +38,8 @@
 //! # Ok::<(), nightsplat::Error>(())
 //! ```
 //!
-//! A host with a Vulkan device of its own lends it ([`Gpu::from_host`]) and has [`Renderer::draw`] record into its own
-//! command buffers ([`Gpu::record_into`]) and images; `docs/embedding.md` is the contract, `examples/embed.rs` and
+//! A host with its own Vulkan device lends it ([`Gpu::from_host`]) and lets [`Renderer::draw`] record into its command
+//! buffers ([`Gpu::record_into`]) and images; `docs/embedding.md` is the contract, `examples/embed.rs` and
 //! `examples/c/embed.c` are such hosts. Without default features this is the whole API; feature `io` adds files,
 //! datasets and training.
 //!
@@ -78,7 +78,7 @@
 //! ```
 //!
 //! The names on this page are the API; `docs/public-api.txt` lists them with their methods and fields. The folders are
-//! no part of it. Data flows one way: a folder uses only folders above it in this list, as
+//! not part of it. Data flows one way: a folder uses only folders above it in this list, as
 //! `tests/house/architecture.rs` asserts. The first page of each folder describes its input and output, and lists its
 //! modules (`cargo doc --features testing`).
 //!
@@ -99,14 +99,14 @@
 
 #![cfg_attr(
     not(feature = "testing"),
-    allow(unreachable_pub, unused_imports, reason = "what is no API is public to tests")
+    allow(unreachable_pub, unused_imports, reason = "items outside the API are public to tests")
 )]
 #![cfg_attr(
     not(any(feature = "testing", all(feature = "cli", feature = "fit"))),
-    expect(dead_code, reason = "the command, and training, use more")
+    expect(dead_code, reason = "the command and training use more")
 )]
 
-// Tests reach into every folder;
+// Tests use every folder;
 #[cfg(feature = "testing")]
 pub mod base;
 #[cfg(feature = "testing")]
@@ -139,7 +139,7 @@ pub mod splats;
 #[cfg(feature = "testing")]
 pub mod train;
 
-// everyone else sees the names below.
+// all others use the names below.
 #[cfg(not(feature = "testing"))]
 mod base;
 #[cfg(not(feature = "testing"))]
@@ -169,7 +169,7 @@ mod splats;
 #[cfg(all(not(feature = "testing"), feature = "io"))]
 mod train;
 
-// Types of these crates are part of what follows.
+// Types of these crates are part of the API.
 pub use {ash, glam};
 
 pub use error::{Error, Result, Stop};

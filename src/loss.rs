@@ -1,8 +1,8 @@
 //! The loss terms, their gradients, and their log.
 //!
-//! A term is one file: its columns and weights, its kernels, its scratch memory, what it compares a view with.
-//! [`TERMS`] lists them; the columns of train.csv, the reported loss, the checks of the weights and the recording of a
-//! step follow from the list. Nothing is read back: each step writes its terms to a slot of a log.
+//! A term is one file: its columns and weights, its kernels, its scratch memory, and the target that it compares a view
+//! with. [`TERMS`] lists them; the columns of train.csv, the reported loss, the checks of the weights and the recording
+//! of a step follow from the list. Nothing is read back: each step writes its terms to a slot of a log.
 
 mod denoising;
 mod depth;
@@ -35,25 +35,25 @@ pub const TERMS: [LossSpec; 6] =
 
 settings! {
 "model.weights."
-/// What the terms weigh beside (1 - w) L1 + w (1 - SSIM). The defaults are those of LITA-GS's code but for the total
-/// variation, which blurs what holds no noise.
+/// The weights of the terms in addition to (1 - w) L1 + w (1 - SSIM). The defaults are those of LITA-GS's code except
+/// for the total variation, which blurs images without noise.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
-    /// Of mean `(R_K - target)^2`, in the paper's form `(R_K - R_0)^2`.
+    /// Weight of mean `(R_K - target)^2`; in the paper's variant, of mean `(R_K - R_0)^2`.
     denoising: f64 = 1.0 => Rule::POSITIVE_OR_0;
-    /// Of the total variation of R_K.
+    /// Weight of the total variation of R_K.
     total_variation: f64 = 0.0 => Rule::POSITIVE_OR_0;
-    /// The reconstruction of the dark photograph weighs 1: (1 - w) L1 + w (1 - SSIM); this is its w.
+    /// w of the reconstruction of the dark photograph, (1 - w) L1 + w (1 - SSIM), whose own weight is 1.
     low_ssim: f64 = 0.2 => Rule::SHARE;
-    /// Of mean |structure - edges of the target|.
+    /// Weight of mean |structure - edges of the target|.
     structure: f64 = 0.01 => Rule::POSITIVE_OR_0;
-    /// Of 1 minus the correlation with the depth map, over the view and over boxes.
+    /// Weight of 1 minus the correlation with the depth map, over the view and over boxes.
     depth: f64 = 0.1 => Rule::POSITIVE_OR_0;
 }
 }
 
 impl Weights {
-    /// Those of LITA-GS.
+    /// The weights of LITA-GS.
     pub(crate) fn paper() -> Self {
         Self { total_variation: 1.0, ..Self::default() }
     }
@@ -136,7 +136,7 @@ pub struct LossConfig {
     pub ssim_weight: f64,
     /// The weights of the other terms; 0 for parts that the model lacks.
     pub weights: Weights,
-    /// The weight of the reconstruction of the dark photograph: 1, or 0 where the model has no tonemapper.
+    /// The weight of the reconstruction of the dark photograph: 1, or 0 without a tonemapper.
     pub low: f64,
     /// The weights of the terms on parameters.
     pub parameters: ParameterWeights,
@@ -169,7 +169,7 @@ impl LossConfig {
     }
 }
 
-/// A training view as the terms see it before the first step.
+/// A training view as the terms prepare for it, before the first step.
 #[allow(missing_debug_implementations, reason = "it holds a closure")]
 pub struct ViewSource<'a> {
     /// Width and height in pixels.
@@ -185,7 +185,7 @@ pub struct ViewSource<'a> {
 pub struct TermInputs<'a> {
     /// Counted from 1.
     pub step: u64,
-    /// The index of the view among those that the terms were prepared for.
+    /// The index of the view among the prepared ones.
     pub view: usize,
     /// Width and height in pixels.
     pub size: UVec2,
@@ -193,8 +193,8 @@ pub struct TermInputs<'a> {
     pub features: Features,
     /// (channels, H, W), not clamped.
     pub render: &'a Buffer<f32>,
-    /// The image that is compared with the target, (3, H, W) or longer, not clamped: the colours of the render, with
-    /// the view's exposure if that is learned.
+    /// The image that is compared with the target, (3, H, W) or longer, not clamped: the colours of the render, at the
+    /// view's exposure if that is learned.
     pub colors: &'a Buffer<f32>,
     /// The target, (3, H, W).
     pub target: &'a Buffer<f32>,
@@ -209,7 +209,7 @@ impl TermInputs<'_> {
 
 /// A term of the render.
 pub trait LossTerm: std::fmt::Debug + Send {
-    /// Allocates scratch memory for these views, and prepares what each of them is compared with.
+    /// Allocates scratch memory for these views, and prepares the target of each.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -236,7 +236,7 @@ impl Losses {
     /// Builds the terms; [`Losses::prepare`] prepares them for views.
     ///
     /// # Errors
-    /// A weight makes no sense, or the device refuses a pipeline.
+    /// A weight is invalid, or the device refuses a pipeline.
     pub fn new(gpu: &Gpu, config: &LossConfig) -> Result<Self> {
         let (mut terms, mut gradient) = (vec![], Gradient::Written);
         for spec in config.specs() {
@@ -254,7 +254,7 @@ impl Losses {
         Ok(Self(terms))
     }
 
-    /// Prepares what is constant for these views, and allocates for them.
+    /// Prepares the data that is constant for these views, and allocates for them.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -265,7 +265,7 @@ impl Losses {
     /// Records every term of a step: dL/d render, (channels, H, W), and the values in the log.
     ///
     /// # Errors
-    /// As [`LossTerm::record_step`].
+    /// Those of [`LossTerm::record_step`].
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -306,7 +306,7 @@ impl LossRegion {
         value_count(self.size)
     }
 
-    /// Refuses a region that is empty or not inside a view of `size`.
+    /// Checks that the region is not empty and is inside a view of `size`.
     fn check(self, size: UVec2) -> Result<()> {
         let Self { origin, size: own } = self;
         let fits = own.min_element() > 0
@@ -314,7 +314,7 @@ impl LossRegion {
             && origin.cmple(size.saturating_sub(own)).all();
         if !fits {
             return Err(Error::Usage(format!(
-                "an interior of {} x {} at {}, {} does not lie in a view of {} x {}",
+                "a loss region of {} x {} at {}, {} is not inside a view of {} x {}",
                 own.x, own.y, origin.x, origin.y, size.x, size.y
             )));
         }
@@ -331,7 +331,7 @@ fn pixel_count(size: UVec2) -> u32 {
     size.x.saturating_mul(size.y)
 }
 
-/// Refuses a buffer that is too short.
+/// Checks that a buffer is long enough.
 fn holds(buffer: &Buffer<f32>, values: usize) -> Result<()> {
     if buffer.len() >= values {
         return Ok(());
@@ -345,7 +345,7 @@ fn no_scratch(term: &str, size: UVec2) -> Error {
     Error::Usage(format!("the {term} has no scratch memory for a view of {x} x {y}"))
 }
 
-/// Refuses a weight that is negative or not finite.
+/// Checks that a weight is finite and not negative.
 fn check_weight(of: &str, weight: f64) -> Result<()> {
     if weight.is_finite() && weight >= 0.0 {
         return Ok(());
@@ -358,7 +358,7 @@ mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
 
-    /// Another plane would train as well, on the wrong feature.
+    /// With another plane, training would still proceed, but on the wrong feature.
     #[test]
     fn a_term_reads_the_first_channel_of_its_feature() {
         let gpu = gpu();

@@ -34,7 +34,7 @@ fn main() -> ExitCode {
     ExitCode::from(error.downcast_ref::<Error>().map_or(1, Error::exit_code))
 }
 
-/// Prints help as it is, and a misuse in one line like every other error.
+/// Prints help as it is, and a misuse on one line like every other error.
 fn misuse(error: &clap::Error) -> ExitCode {
     use clap::error::ErrorKind;
     let help = [

@@ -1,7 +1,7 @@
 //! The networks: the denoiser of a render, the tonemapper that darkens it again, and the trunks of LPIPS.
 //!
 //! Images are planes, (C, H, W), row-major. A network owns its parameters with their gradients, and the memory of one
-//! view: [`Denoiser::reserve`] allocates it, `forward` fills it, `backward` consumes it. Sums over pixels are partial
+//! view: [`Denoiser::reserve`] allocates it, `forward` writes it, and `backward` reads it. Sums over pixels are partial
 //! sums in a fixed order, so that results are bit-identical.
 //!
 //! Norms use the statistics of the image itself, in training and in inference: there are no running averages.
@@ -34,15 +34,15 @@ pub use tonemapper::Tonemapper;
 pub use trunk::Network;
 pub(crate) use trunk::{Trunk, published};
 
-/// How the networks are initialised and what they output.
+/// The initialisation and the output of the networks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum NetworkVariant {
-    /// A residual whose last layer begins at zero and has no activation: the output is the input at first.
+    /// A residual whose last layer starts at zero and has no activation: the output is the input at first.
     #[default]
     Identity,
-    /// As in LITA-GS: the denoiser's last layer has a random initialisation and a sigmoid, about one half; the
-    /// tonemapper outputs the whole image.
+    /// As in LITA-GS: the denoiser's last layer has a random initialisation and a sigmoid, and outputs about one half;
+    /// the tonemapper outputs the whole image.
     Paper,
 }
 
@@ -51,12 +51,12 @@ const RGB: u32 = 3;
 
 /// The columns and rows of pixels per lane of `conv3x3`.
 ///
-/// On a CPU loads cost most, and neighbouring columns of a lane share theirs; on a GPU neighbouring lanes read
+/// On a CPU, loads cost most, and the neighbouring columns of a lane share them; on a GPU, neighbouring lanes read
 /// neighbouring pixels, and registers limit the block.
 const CPU_SHAPE: [u32; 2] = [4, 4];
 const GPU_SHAPE: [u32; 2] = [1, 8];
 
-/// The columns and rows of pixels that suit the device.
+/// The columns and rows of pixels for this device.
 pub(crate) fn conv_shape(gpu: &Gpu) -> [u32; 2] {
     if gpu.properties().is_cpu { CPU_SHAPE } else { GPU_SHAPE }
 }
@@ -68,14 +68,12 @@ pub(crate) fn conv_shape(gpu: &Gpu) -> [u32; 2] {
 fn pixel_count(size: UVec2) -> Result<usize> {
     let UVec2 { x: width, y: height } = size;
     match width as usize * height as usize {
-        0 => Err(Error::Usage(format!(
-            "a network has nothing to do for a view of {width} x {height}"
-        ))),
+        0 => Err(Error::Usage(format!("a view of {width} x {height} has no pixels for a network"))),
         pixels => Ok(pixels),
     }
 }
 
-/// A kernel that runs beyond a buffer corrupts its neighbours: refuse before anything is recorded.
+/// A kernel that exceeds a buffer corrupts other data, so lengths are checked before anything is recorded.
 fn check_images<const N: usize>(pixels: usize, images: [&Buffer<f32>; N]) -> Result<()> {
     let needed = RGB as usize * pixels;
     match images.into_iter().find(|image| image.len() < needed) {
@@ -89,7 +87,7 @@ fn check_images<const N: usize>(pixels: usize, images: [&Buffer<f32>; N]) -> Res
 }
 
 /// # Errors
-/// Refuses `len` floats of `what` that exceed one binding.
+/// `len` floats of `what` exceed one binding.
 fn check_binding(gpu: &Gpu, what: &str, size: UVec2, len: usize) -> Result<()> {
     let properties = gpu.properties();
     let (bytes, limit) = (float_bytes(len), properties.max_storage_buffer_range);
@@ -103,7 +101,7 @@ fn check_binding(gpu: &Gpu, what: &str, size: UVec2, len: usize) -> Result<()> {
     )))
 }
 
-/// The error for a pass that does not match the one before.
+/// The error for a pass that does not match the preceding one.
 fn out_of_turn(network: &str, size: UVec2, remedy: &str) -> Error {
     let UVec2 { x: width, y: height } = size;
     Error::Usage(format!("the {network} is not ready for a view of {width} x {height}; {remedy}"))

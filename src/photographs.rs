@@ -3,11 +3,12 @@
 //! In: image files, camera files, tone curves. Out: [`dataset::Dataset`], images, and pseudo-GT targets on the device.
 //!
 //! - [`image`]: float images and their files
-//! - [`white_balance`]: gains of the channels that the user knows
+//! - [`white_balance`]: white balance set by the user
 //! - [`metrics`]: PSNR and SSIM of a render against its reference image
 //! - [`tone`]: curves that brighten a photograph
 //! - [`fit`]: the constants of a curve from pairs of photographs
 //! - [`dataset`]: photographs with their cameras and points, from disk
+//! - [`pose`]: camera poses of dark photographs, by COLMAP
 //! - [`pseudo_gt`]: dark photograph and curve to target, on the device
 //! - [`structure`]: the edges of a pseudo-GT that do not depend on its illumination
 
@@ -18,6 +19,8 @@ pub mod fit;
 pub mod image;
 #[cfg(feature = "io")]
 pub mod metrics;
+#[cfg(feature = "io")]
+pub mod pose;
 #[cfg(feature = "io")]
 pub mod pseudo_gt;
 #[cfg(feature = "io")]

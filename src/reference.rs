@@ -1,6 +1,6 @@
 //! CPU references: one file per kernel, same name, same buffers, plain loops.
 //!
-//! They are written to be read beside the shader, line by line, and to be obviously right rather than fast; the tests
+//! They are written to be read next to the shader, line by line, and to be obviously correct rather than fast; tests
 //! compare each kernel with its reference. Coverage of pixels by splats is computed in f32, as in the shader; alphas,
 //! colours and gradients are computed in f64.
 

@@ -1,4 +1,4 @@
-//! What a training run leaves: its directory and events, scores, reports, and models in the formats of others.
+//! Results of a training run: its directory and events, scores, reports, and exported models.
 //!
 //! In: a configuration and a dataset, or a finished run. Out: files.
 //!
@@ -12,7 +12,7 @@
 //! - [`finished_run`]: a finished run or a model file, opened for rendering
 //! - [`view_exposures`]: renders at the exposure of their targets
 //! - [`video`]: frames as a video
-//! - [`export`]: a model in the formats of others
+//! - [`export`]: a model in other formats
 
 pub mod diagnosis;
 pub mod eval;

@@ -10,7 +10,7 @@
 //! - [`scene`]: Gaussians on the host and on the device, PLY
 //! - [`model`]: a model with what a renderer must know of it
 //! - [`sort`]: scan and radix sort on the device
-//! - [`optimizer`]: Adam, what is learned beside the Gaussians, and learning-rate schedules
+//! - [`optimizer`]: Adam, learned parameters other than the Gaussians, and learning-rate schedules
 //! - [`render`]: the differentiable rasteriser
 //! - [`densify`]: density control: clone, split, prune
 

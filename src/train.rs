@@ -171,10 +171,10 @@ impl Trainer {
         Self::on_patches(gpu, config, dataset, initial.as_ref())
     }
 
-    /// As [`Trainer::new`], starting from given Gaussians.
+    /// [`Trainer::new`] with given Gaussians to start from.
     ///
     /// # Errors
-    /// As [`Trainer::new`], or the shape of the Gaussians differs from the configured model's.
+    /// Those of [`Trainer::new`], or the shape of the Gaussians differs from the configured model's.
     pub fn from_gaussians(
         gpu: &Gpu,
         config: TrainConfig,
@@ -256,7 +256,8 @@ impl Trainer {
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
         if until > self.step && self.step < self.config.steps && self.has_ended() {
             return Err(Error::Usage(format!(
-                "the run has ended at step {}, before step {until}: the held-out views have converged (`Trainer::has_ended`)",
+                "the run has ended at step {}, before step {until}: the held-out views have converged \
+                 (`Trainer::has_ended`)",
                 self.step
             )));
         }
@@ -268,7 +269,7 @@ impl Trainer {
         }
     }
 
-    /// One step with every pass checked; a difference is an error or a warning, as configured.
+    /// Trains one step with every pass checked; a difference is an error or a warning, as configured.
     #[cfg(feature = "check")]
     fn agreeing_step(&mut self) -> Result<Vec<StepReport>> {
         let (reports, checks) = self.check_step();
@@ -286,8 +287,8 @@ impl Trainer {
         Err(Error::Usage(format!("{problem}: build with feature `check`, or set it to 0")))
     }
 
-    /// Trains one step with every pass checked ([`Gpu::checked`]), density control included. The model has the bits
-    /// that [`Trainer::advance`] gives it; a step that must be redone with more memory is not reported.
+    /// Trains one step with every pass checked ([`Gpu::checked`]), density control included. The model has the same
+    /// bits as after [`Trainer::advance`]; a step that must be redone with more memory is not reported.
     #[cfg(feature = "check")]
     pub fn check_step(&mut self) -> (Result<Vec<StepReport>>, CheckReport) {
         let next = self.step + 1;
@@ -297,8 +298,8 @@ impl Trainer {
     /// Trains one step and measures the time of each pass on the device.
     ///
     /// # Errors
-    /// As [`Trainer::advance`]. A step that overflows its memory is not counted; the next [`Trainer::advance`] redoes
-    /// it.
+    /// Those of [`Trainer::advance`]. A step that overflows its memory is not counted; the next [`Trainer::advance`]
+    /// redoes it.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
         let step = self.step + 1;
         self.allocate_sh_degree()?;
@@ -350,14 +351,14 @@ impl Trainer {
         self.supervision.networks()
     }
 
-    /// The learning rates of a step, cooldown included.
+    /// The learning rates of a step, including the cooldown.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn learning_rates(&self, step: u64) -> LearningRates {
         let rates = self.config.schedule.learning_rates(step, self.extent);
         rates.scaled(self.cooldown_factor(step))
     }
 
-    /// Renders the model from `camera`, with the SH degree reached so far, on a black background.
+    /// Renders the model from `camera`, with the SH degree reached so far, over a black background.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -366,7 +367,7 @@ impl Trainer {
         self.render_of_degree(&camera, self.sh_degree_in_use())
     }
 
-    /// As [`Trainer::render`], for a camera in the frame.
+    /// [`Trainer::render`] for a camera in the training frame.
     fn render_of_degree(&mut self, camera: &Camera, sh_degree: u32) -> Result<Rendered> {
         let options = RenderOptions { sh_degree, background: [0.0; 3] };
         let gaussians = &self.model.gaussians;

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""A sweep on HyperQueue (`pip install hyperqueue`): every point a task, any number of workers, leaderboard at the end.
+"""A sweep on HyperQueue (`pip install hyperqueue`): a task per point, any number of workers, a leaderboard at the end.
 
     on_hyperqueue.py photos --out sweep --curves all --seeds 1,2,3
 
-takes what `nightsplat sweep` takes. Without a server (`hq server start`) it starts one with WORKERS workers (2) here. A task
-whose worker dies is given to another, and goes on from the checkpoint of its point.
+takes the arguments of `nightsplat sweep`. Without a server (`hq server start`) it starts one with WORKERS workers (2)
+here. A task whose worker dies is given to another, and resumes from the checkpoint of its point.
 """
 
 import os
@@ -17,8 +17,8 @@ from hyperqueue import Client, Job, LocalCluster
 from hyperqueue.cluster import WorkerConfig
 
 PROGRAM = os.environ.get("NIGHTSPLAT", "nightsplat")
-# Exit code 75 says: saved, run me again. 137 and 143: killed, for lack of memory say. $0 is the lock of the point: a training
-# may have outlived the worker that began it, and is waited for.
+# Exit code 75: saved, run again. 137 and 143: killed, for example for lack of memory. $0 is the lock of the point:
+# a training may have outlived the worker that started it, and is waited for.
 AGAIN = """
 for attempt in $(seq 20); do
     [ ! -e "$0" ] || flock "$0" true
@@ -35,12 +35,12 @@ def main() -> None:
     points = subprocess.run([*sweep, "--dry-run"], check=True, capture_output=True, text=True).stdout.splitlines()
     if points:
         run([shlex.split(point) for point in points])
-    # Every point is there: this only ranks them.
+    # All points are finished: this only ranks them.
     subprocess.run(sweep, check=True)
 
 
 def run(points: list[list[str]]) -> None:
-    # More than one on a graphics card shares its memory: give --max-vram, or workers of one task each.
+    # Several tasks on a graphics card share its memory: pass --max-vram, or use workers of one task each.
     job = Job(max_fails=0, default_env=dict(os.environ))
     logs = Path(os.environ.get("LOGS", "hyperqueue-logs")).absolute()
     logs.mkdir(parents=True, exist_ok=True)
@@ -48,7 +48,8 @@ def run(points: list[list[str]]) -> None:
         folder = Path(point[point.index("--out") + 1])
         name = folder.name
         log = str(logs / f"{name}.log")
-        job.program(["sh", "-c", AGAIN, str(folder / ".lock"), *point], name=name, stdout=log, stderr=log, crash_limit=20)
+        command = ["sh", "-c", AGAIN, str(folder / ".lock"), *point]
+        job.program(command, name=name, stdout=log, stderr=log, crash_limit=20)
     if (Path.home() / ".hq-server" / "hq-current").exists():
         wait(Client(), job)
         return

@@ -1,21 +1,21 @@
 #!/usr/bin/env bash
-# A sweep as a Slurm array: every point a task that may be stopped and run again.
+# A sweep as a Slurm array: a task per point, which may be stopped and run again.
 #
 #     nightsplat sweep photos --out sweep --curves all --seeds 1,2,3 --dry-run > points.txt
 #     sbatch --array=1-$(wc -l < points.txt) --wait examples/schedulers/slurm.sh points.txt
 #     nightsplat sweep photos --out sweep --curves all --seeds 1,2,3
 #
-# The last line, for which every point is there, writes the leaderboard.
+# The last line, run when all points are finished, writes the leaderboard.
 #SBATCH --gpus=1
 #SBATCH --cpus-per-task=4
 #SBATCH --time=01:00:00
 #SBATCH --requeue
 #SBATCH --open-mode=append
-# Two minutes before the end of its time a point is told: it saves and ends with 143.
+# Two minutes before the end of its time a point gets a signal: it saves and ends with 143.
 #SBATCH --signal=TERM@120
 
 point=$(sed -n "${SLURM_ARRAY_TASK_ID:?run by sbatch --array}p" "${1:?name the file of points}")
-# `exec` by way of srun: the signal is for the training, not for this script.
+# `exec` within srun: the training receives the signal, not this script.
 srun sh -c "exec $point"
 code=$?
 case $code in

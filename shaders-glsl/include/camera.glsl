@@ -1,8 +1,8 @@
-// A camera: where a point of its view is seen, and how that changes with the point.
+// A camera: the projection of a point, and its derivatives.
 //
-// Every model has the same functions in a file of its own; those at the end of this file choose. A kernel is
-// specialised for one model, or defines CAMERA_MODEL as the `camera.model` that it meets at run time. A point in the
-// view has x to the right, y down and z forward, in world units.
+// Every model has the same functions in a file of its own; those at the end of this file select one. A kernel is
+// specialised for one model, or defines CAMERA_MODEL as `camera.model` to select at run time. In view space, x points
+// right, y down and z forward, in world units.
 
 const uint CAMERA_PINHOLE = 0;
 const uint CAMERA_FISHEYE = 1;
@@ -16,10 +16,10 @@ struct Camera {
     vec2  focal;            // pixels
     vec2  principal_point;  // pixels
     uvec2 size;             // pixels
-    vec2  min_slope;      // pinhole: where the Jacobian of the projection is taken at the least
-    vec2  max_slope;       // and at the most: beyond, the affine approximation of a splat explodes
+    vec2  min_slope;      // pinhole: the smallest x / z and y / z for the Jacobian
+    vec2  max_slope;       // and the largest: beyond, the affine approximation of a splat diverges
     vec4  distortion;       // fisheye: coefficients of the angle's powers 3, 5, 7 and 9
-    float largest_angle;    // fisheye: nothing is seen so far off the axis or farther, radians
+    float largest_angle;    // fisheye: angles off the axis from this one on are not seen, radians
     uint  model;            // CAMERA_*
 };
 
@@ -30,24 +30,23 @@ struct Jacobian {
     vec3 row1;
 };
 
-// Numbers of a camera's gradient: of a shift of all points in the view and of a turn about the camera, as (x, y, z)
-// each, of focal lengths, principal point and distortion.
+// Components of a camera's gradient: a translation of all points in view space and a rotation about the camera, (x, y,
+// z) each, then focal lengths, principal point and distortion.
 const uint CAMERA_WIDTH = 14;
 
-// A renderer without a near plane counts from here, in world units.
+// The near plane of a renderer without one, in world units.
 const float NEAREST = 1e-4;
 
 #include "camera_pinhole.glsl"
 #include "camera_fisheye.glsl"
 
-// The depth of a point, by which splats are sorted and the near plane cuts; not positive where the model does not see
-// it.
+// The depth of a point, for sorting and the near plane; not positive if the model does not see it.
 float camera_depth(vec3 point, Camera camera) {
     if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_depth(point, camera);
     return pinhole_depth(point);
 }
 
-// The pixel at which a point of positive depth is seen.
+// The pixel of a point of positive depth.
 vec2 camera_project(vec3 point, Camera camera) {
     if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_project(point, camera);
     return pinhole_project(point, camera);
@@ -59,25 +58,25 @@ Jacobian camera_jacobian(vec3 point, Camera camera) {
     return pinhole_jacobian(point, camera);
 }
 
-// The gradient of the point, from that of its pixel and those of the Jacobian's rows, scaled.
+// The gradient of the point, from those of its pixel and of the Jacobian's rows, scaled.
 vec3 camera_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
     if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_backward(point, camera, d_pixel, d_row0, d_row1);
     return pinhole_backward(point, camera, d_pixel, d_row0, d_row1);
 }
 
-// The gradient of the distortion, from the same.
+// The gradient of the distortion, from the same gradients.
 vec4 camera_distortion_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
     if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_distortion_backward(point, camera, d_pixel, d_row0, d_row1);
     return vec4(0.0);
 }
 
-// How much deeper a point is that lies beside another by an offset, to first order.
+// The first-order change of depth between a point and another at an offset.
 float camera_depth_change(vec3 point, vec3 offset, Camera camera) {
     if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_depth_change(point, offset);
     return pinhole_depth_change(offset);
 }
 
-// The point at another depth.
+// The point moved to another depth.
 vec3 camera_at_depth(vec3 point, float depth, Camera camera) {
     if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_at_depth(point, depth);
     return pinhole_at_depth(point, depth);

@@ -1,14 +1,14 @@
-// The fisheye of Kannala and Brandt (2006) with four coefficients, which OpenCV and COLMAP call OPENCV_FISHEYE: what is
-// seen at the angle t off the axis lies t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) focal lengths from the principal
+// The fisheye of Kannala and Brandt (2006) with four coefficients, OPENCV_FISHEYE in OpenCV and COLMAP: a point at the
+// angle t off the axis is projected to t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) focal lengths from the principal
 // point. Included by camera.glsl.
 //
-// A point is seen where it lies before the camera and its angle is below the camera's largest one, up to which the
-// polynomial rises: what is farther off the axis would be seen twice. Depth is the distance, as z says little of what
-// lies at 80 degrees.
+// A point is seen if it is in front of the camera and its angle is below the camera's largest, up to which the
+// polynomial increases: points farther off the axis would be seen twice. Depth is the distance, since z means little at
+// 80 degrees.
 //
-// With n the unit vector from the axis to the point across it, r the polynomial, r' its derivative by the angle, and d
-// the distance, the derivative of the pixel is focal / d times
-//     (r / sin t) (I - n n^T) + r' cos t n n^T   by x and y, and   -r' sin t n   by z.
+// With n the unit vector perpendicular to the axis towards the point, r the polynomial, r' its derivative with respect
+// to the angle, and d the distance, the derivative of the pixel is focal / d times (r / sin t) (I - n n^T) + r' cos t n
+// n^T   with respect to x and y, and   -r' sin t n   with respect to z.
 
 struct FisheyeRay {
     float distance;
@@ -20,11 +20,11 @@ struct FisheyeRay {
     float slope;      // r'
     float bend;       // r''
     float stretch;    // r / sin t
-    float d_stretch;  // its derivative by the angle
+    float d_stretch;  // its derivative with respect to the angle
 };
 
-// The angle off the axis of a point that lies r from it and z forward of the camera, both not negative: within three
-// units of the last place (polynomial of Cephes' atanf), where Vulkan demands no more of atan than 4096.
+// The angle off the axis of a point at the distance r from it and z in front of the camera, both not negative: within
+// three units in the last place (polynomial of Cephes' atanf), whereas Vulkan allows 4096 for atan.
 float angle_off_axis(float r, float z) {
     float base = 0.0, x = r / z;
     if (r > 2.414213562373095 * z) {
@@ -40,7 +40,7 @@ float angle_off_axis(float r, float z) {
 }
 
 float fisheye_depth(vec3 point, Camera camera) {
-    // Positive phrasing: a NaN is not seen.
+    // Written so that a NaN is not seen.
     bool is_seen = point.z > 0.0 && angle_off_axis(length(point.xy), point.z) < camera.largest_angle;
     return is_seen ? length(point) : -1.0;
 }
@@ -84,9 +84,8 @@ Jacobian fisheye_jacobian(vec3 point, Camera camera) {
     return Jacobian(camera.focal / ray.distance, row0, row1);
 }
 
-// By distance, angle and turn about the axis: what is differentiated is d_pixel . pixel and (S / d) with
-// S = r / sin t ss + r' cos t nn - r' sin t zn, where nn, ss and zn are components of the rows' gradient along and
-// across n.
+// With respect to distance, angle and azimuth: derivatives of d_pixel . pixel and (S / d) with S = r / sin t ss + r'
+// cos t nn - r' sin t zn, where nn, ss and zn are components of the rows' gradient along and across n.
 vec3 fisheye_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
     FisheyeRay ray = fisheye_ray(point, camera);
     vec2 n = ray.across, side = vec2(-n.y, n.x);
@@ -100,7 +99,7 @@ vec3 fisheye_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3
     float by_distance = -(ray.stretch * ss + ray.slope * (ray.cosine * nn - ray.sine * zn));
     float by_angle = ray.d_stretch * ss + (ray.bend * ray.cosine - ray.slope * ray.sine) * nn
         - (ray.bend * ray.sine + ray.slope * ray.cosine) * zn + ray.distance * ray.slope * dot(d_place, n);
-    // Over sin t: (r' cos t - r / sin t) / sin t is cos t times the derivative of r / sin t, less r.
+    // Divided by sin t: (r' cos t - r / sin t) / sin t is cos t times the derivative of r / sin t, minus r.
     float by_turn = (ray.d_stretch * ray.cosine - ray.stretch * ray.sine) * mixed - ray.slope * zs
         + ray.distance * ray.stretch * dot(d_place, side);
     vec2 d_xy = (by_distance * ray.sine + by_angle * ray.cosine) * n + by_turn * side;
@@ -108,7 +107,7 @@ vec3 fisheye_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3
     return vec3(d_xy, d_z) / ray.distance / ray.distance;
 }
 
-// d_pixel . pixel and S / d once more, by k1 to k4.
+// d_pixel . pixel and S / d with respect to k1 to k4.
 vec4 fisheye_distortion_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
     FisheyeRay ray = fisheye_ray(point, camera);
     vec2 n = ray.across, side = vec2(-n.y, n.x);

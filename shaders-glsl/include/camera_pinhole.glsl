@@ -1,6 +1,6 @@
 // The pinhole: focal * (x / z, y / z) + principal point. Included by camera.glsl.
 
-// The Jacobian is taken no farther outside the view than this fraction of its width and height.
+// The Jacobian is evaluated at most this fraction of width and height outside the view.
 const float JACOBIAN_MARGIN = 0.15;
 
 float pinhole_depth(vec3 point) { return point.z; }
@@ -9,7 +9,7 @@ vec2 pinhole_project(vec3 point, Camera camera) {
     return camera.focal * point.xy / point.z + camera.principal_point;
 }
 
-// x / z and y / z, no farther than the Jacobian is taken.
+// x / z and y / z, clamped to the range of the Jacobian.
 vec2 clamped_slope(vec3 point, Camera camera) {
     return clamp(point.xy / point.z, camera.min_slope, camera.max_slope);
 }
@@ -19,7 +19,7 @@ Jacobian pinhole_jacobian(vec3 point, Camera camera) {
     return Jacobian(camera.focal / point.z, vec3(1.0, 0.0, -slope.x), vec3(0.0, 1.0, -slope.y));
 }
 
-// A slope that is clamped passes nothing on.
+// A clamped slope has no gradient.
 vec3 pinhole_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
     float z = point.z;
     vec2 free_slope = point.xy / z;

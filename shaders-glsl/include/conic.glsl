@@ -1,5 +1,4 @@
-// From the gradient of a splat's conic to those of U = J W R S, of which cov2d = U U^T + 0.3 I and conic is the
-// inverse.
+// From the gradient of a splat's conic to those of U = J W R S, where cov2d = U U^T + 0.3 I and conic is its inverse.
 
 struct ConicGradient {
     vec3 u0;  // of U's rows
@@ -8,8 +7,8 @@ struct ConicGradient {
 };
 
 ConicGradient conic_backward(vec3 conic, vec3 u0, vec3 u1, vec3 d_conic) {
-    // Of conic U the large terms cancel, all of them for a needle; by hand, what is left of them is (U1 x N, N x U0)
-    // with N = U0 x U1.
+    // In conic U the large terms cancel, for a needle all of them; the closed form is (U1 x N, N x U0) with N = U0 x
+    // U1.
     float a = conic.x, b = conic.y, c = conic.z;
     vec3 normal = cross(u0, u1);
     float det = dot(normal, normal) + DILATION * (dot(u0, u0) + dot(u1, u1)) + DILATION * DILATION;

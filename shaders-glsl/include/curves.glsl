@@ -1,5 +1,5 @@
 // The shapes of the tone curves, f(t) for t >= 0: a number, a function and a case each.
-// `src/photographs/tone/catalogue.rs` is the host's side: a row each, with the same formula.
+// `src/photographs/tone/families/catalogue.rs` has a row for each on the host, with the same formula.
 
 const uint CURVE_NONE                = 0;
 const uint CURVE_LINEAR              = 1;
@@ -44,18 +44,18 @@ const uint CURVE_PROFILE             = 39;
 
 const uint MAX_CONSTANTS = 8;  // of a family
 
-// Beyond this t counts as this: the powers stay finite, and every curve is within an ulp of white or of its limit.
+// t is clamped to this: powers stay finite, and every curve is within an ulp of white or of its limit.
 const float LARGEST_T = 1e7;
 
 const float HALF_PI = 1.5707963267948966;
 
-// 1 - exp(-x) for x >= 0, without cancellation where x is tiny.
+// 1 - exp(-x) for x >= 0, without cancellation for tiny x.
 float one_minus_exp(float x) {
     // Two terms beyond the linear one keep the error below an ulp up to 0.01.
     return x < 0.01 ? x * (1.0 - x * (0.5 - x * (1.0 / 6.0))) : 1.0 - exp(-x);
 }
 
-// ln(1 + x) for x >= 0, without cancellation where x is tiny.
+// ln(1 + x) for x >= 0, without cancellation for tiny x.
 float log_1p(float x) {
     return x < 0.01 ? x * (1.0 - x * (0.5 - x * (1.0 / 3.0 - 0.25 * x))) : log(1.0 + x);
 }
@@ -65,13 +65,13 @@ float power(float x, float p) {
     return x > 0.0 ? pow(x, p) : 0.0;
 }
 
-// The built-in one overflows where x is large and cancels where it is tiny.
+// The built-in function overflows for large x and cancels for tiny x.
 float tanh_of(float x) {
     float q = one_minus_exp(2.0 * x);
     return q / (2.0 - q);
 }
 
-// The built-in one may be off by 4096 ulp. Halving the angle three times leaves x < 0.2 for a short series.
+// The built-in function may be off by 4096 ulp. Halving the angle three times leaves x < 0.2 for a short series.
 float arctan(float x) {
     [[unroll]] for (int halving = 0; halving < 3; ++halving) x = x / (1.0 + sqrt(1.0 + x * x));
     float z = x * x;
@@ -126,7 +126,7 @@ float gamma(float t, float c[MAX_CONSTANTS]) {
     return c[0] * power(max(t, 1e-10), c[1]);
 }
 
-// sinh overflows: both sides are divided by exp(b t) / 2.
+// sinh overflows, so numerator and denominator are divided by exp(b t) / 2.
 float sinh_ratio(float t, float c[MAX_CONSTANTS]) {
     float q = one_minus_exp(2.0 * c[1] * t);
     return c[0] * q / (q + 2.0 * c[2] * exp(-c[1] * t));
@@ -197,7 +197,7 @@ float piecewise3_standard(float t, float c[MAX_CONSTANTS]) {
     return c[1] * first + (c[3] - c[1]) * second + (1.0 - c[3]) * third;
 }
 
-// Without the constant E / F on both ends it would cancel at the black one.
+// Without the constant E / F on both ends, it would cancel at black.
 float hable_2010_part(float t, float c[MAX_CONSTANTS]) {
     float d = c[3] * c[5];
     // (t (A t + C B) + D E) / (t (A t + B) + D F) - E / F over one denominator.

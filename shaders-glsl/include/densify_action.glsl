@@ -1,18 +1,18 @@
-// The action of density control on a Gaussian, and how it is decided.
+// The action of density control on a Gaussian, and its constants.
 
 const uint ACTION_PRUNE = 0;  // the Gaussian is removed
 const uint ACTION_KEEP  = 1;  // unchanged
-const uint ACTION_CLONE = 2;  // kept, with a copy at a position drawn from it
+const uint ACTION_CLONE = 2;  // kept, with a copy at a random position within it
 const uint ACTION_SPLIT = 3;  // replaced by two smaller ones
 
-// The number of Gaussians that an action leaves.
+// The number of Gaussians after an action.
 uint child_count(uint action) { return min(action, 2u); }
 
 // Whether a copy is another Gaussian than its parent.
 bool is_new(uint action, uint copy_index) { return action == ACTION_SPLIT || copy_index > 0; }
 
-// Keys sort candidates by falling gradient, then those that are kept, then those that are pruned.
-const uint KEY_TOP   = 0x7f800000;  // the bits of an infinite gradient: a candidate's key is this less its own bits
+// Keys sort candidates by decreasing gradient, then Gaussians to keep, then Gaussians to prune.
+const uint KEY_TOP   = 0x7f800000;  // the bits of an infinite gradient: a candidate's key is this minus its own bits
 const uint KEY_KEEP  = 0x80000000;
 const uint KEY_PRUNE = 0x80000001;
 
@@ -27,17 +27,17 @@ const uint COUNTER_WORDS      = 4;
 const float PAPER_LOG_SPLIT_FACTOR = 0.47000362924573558;  // ln 1.6
 
 // The conserving split along the longest axis, for opacity o and in standard deviations of the parent: centres at
-// +-OFFSET; scales and opacity are constants + slopes times o, the opacity as a fraction of o. Fitted to the least
-// squared difference of the composited alpha over all directions of view (docs/benchmarks.md).
+// +-OFFSET; scales and opacity are constants + slopes times o, the opacity as a fraction of o. Fitted by least squares
+// of the composited alpha over all viewing directions (docs/benchmarks.md).
 const float SPLIT_OFFSET        = 0.5;
-const float SPLIT_ALONG         = 0.866;  // sqrt(1 - OFFSET^2): the pair keeps the parent's variance where o is small
+const float SPLIT_ALONG         = 0.866;  // sqrt(1 - OFFSET^2): the pair keeps the parent's variance for small o
 const float SPLIT_ALONG_SLOPE   = -0.105;
 const float SPLIT_ACROSS        = 0.993;
 const float SPLIT_ACROSS_SLOPE  = -0.063;
 const float SPLIT_OPACITY       = 0.565;
 const float SPLIT_OPACITY_SLOPE = 0.2;
 
-// The axis that a conserving split is along: the first of those that are equally long.
+// The axis of a conserving split: the longest, the first of equally long ones.
 uint longest_axis(vec3 log_scales) {
     float longest = max(log_scales.x, max(log_scales.y, log_scales.z));
     return log_scales.x == longest ? 0 : log_scales.y == longest ? 1 : 2;

@@ -1,6 +1,6 @@
-// What the kernels of the depth loss pass on: moments of chunks of a region, then the gradient over the region.
+// Intermediate results of the depth loss: moments of chunks of a region, then the gradient over the region.
 
-// Of the rendered depth a and the estimated depth b, counted from the region's first pixel.
+// Of the rendered depth a and the estimated depth b, relative to the region's first pixel.
 struct DepthMoments {
     vec2 mean;      // of a, b
     vec3 products;  // sums of aa, ab, bb about the means

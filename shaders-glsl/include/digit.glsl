@@ -1,4 +1,4 @@
-// Radix sort: the digit of a key that one pass orders by.
+// Radix sort: the digit of a key that a pass sorts by.
 
 // The most bits of a pass: the 256 counters of one subgroup take 1 KiB of shared memory.
 const uint MAX_DIGIT_BITS = 8;

@@ -1,16 +1,16 @@
-// The gradients that arrive at a splat, of a kernel that declares `gradient_records`, and lanes of SUBGROUP_SIZE.
+// Sums of gradient records, for a kernel that declares `gradient_records` and has SUBGROUP_SIZE lanes.
 
-// The record of the Gaussian whose slots are these, summed in slot order.
+// The record of the Gaussian with these slots, summed in slot order.
 //
-// The lanes share the slots of a Gaussian that has many: each sums every SUBGROUP_SIZE-th, then a tree the lanes. The
-// same order every time gives the same bits every time.
+// The lanes share the slots of a Gaussian that has many: each sums every SUBGROUP_SIZE-th, then a tree sums the lanes.
+// The fixed order gives the same bits every time.
 void sum_gradient_records(uvec2 intersection_ids, out vec3 sum[RECORD_VECTORS]) {
     uint lane = gl_SubgroupInvocationID;
     bool is_shared = intersection_ids.y - intersection_ids.x > SHARED_INTERSECTIONS;
     uvec4 sharing = subgroupBallot(is_shared);
 
-    // First every lane its own slots, then all together those that are shared: in one loop, for a device that does not
-    // jump over branches pays for a second one even where nothing is shared.
+    // First every lane's own slots, then all lanes together the shared ones: in one loop, since a device that does not
+    // skip branches would pay for a second loop even if nothing is shared.
     uvec2 walked = is_shared ? uvec2(0) : intersection_ids;
     uint owner = lane, stride = 1;
     while (true) {

@@ -1,15 +1,15 @@
-// SH coefficients above degree 0 as 16-bit floats, two in a word: a Gaussian's follow each other, and where their
-// number is odd, the last is alone. `src/splats/packed_sh.rs` is the host's.
+// SH coefficients above degree 0 as 16-bit floats, two per word, Gaussian by Gaussian; an odd last one has its own
+// word. `src/splats/packed_sh.rs` is the host side.
 
-// Below it a 16-bit float is subnormal, which some devices flush: of these there is none but 0.
+// Smaller 16-bit floats are subnormal, which some devices flush: only 0 is used instead.
 const float SMALLEST_HALF = 6.103515625e-05;
 const float LARGEST_HALF = 65504.0;
 
-// Words of this many coefficients.
+// Words for this many coefficients.
 uint words_of(uint coefficients) { return (coefficients + 1) / 2; }
 
-// A multiple of the unit of 16-bit floats, up or down as `chance` has it, so that the mean stays: to the nearest, steps
-// of less than half a unit would lead nowhere.
+// Rounds to a multiple of the unit of 16-bit floats, up or down depending on `chance`, which preserves the mean: with
+// rounding to nearest, steps below half a unit would have no effect.
 vec4 rounded_by_chance(vec4 x, uvec4 chance) {
     uvec4 exponent = floatBitsToUint(x) & 0x7f800000u;
     uvec4 smallest = uvec4(floatBitsToUint(SMALLEST_HALF));

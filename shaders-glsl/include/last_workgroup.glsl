@@ -1,9 +1,10 @@
-// What the last workgroup of a dispatch does when the others are done. No workgroup waits for another, so this asks for
-// no forward progress, and integers make it the same whichever is the last. What the others wrote is `coherent`.
+// Detects the last workgroup of a dispatch, when the others are done. No workgroup waits for another, so no forward
+// progress is required, and with integers the result does not depend on which is last. The others' writes are
+// `coherent`.
 //
 // The includer declares `coherent buffer` with `uint arrivals[]`: [0] is zero before the dispatch and after it.
 
-// True in the last workgroup, of one subgroup each, that comes here.
+// True in the last workgroup to call it; workgroups have one subgroup each.
 bool is_last_workgroup(uint workgroup_count) {
     subgroupBarrier();
     memoryBarrierBuffer();

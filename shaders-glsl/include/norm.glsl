@@ -1,4 +1,4 @@
-// How the norm kernels part an image: a subgroup takes CHUNK values of one channel.
+// The partition of an image in the norm kernels: a subgroup processes CHUNK values of one channel.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -8,7 +8,7 @@ layout(push_constant) uniform Params {
     uint pixel_count;  // of a channel
     uint channel_count;
     uint offset;  // of the layer in `values` or `gradients`: the scales gamma of all channels, then the shifts beta
-    uint slot;         // use of the layer, times `channel_count`: where its statistics are
+    uint slot;         // use of the layer times `channel_count`: the index of its statistics
 };
 
 // Mean and 1 / standard deviation of a channel.
@@ -17,10 +17,10 @@ struct ChannelStatistics {
     float inverse_deviation;
 };
 
-// Workgroups: (chunks, channels); (1, channels) where chunks are merged.
+// Workgroups: (chunks, channels); (1, channels) if chunks are merged.
 #define CHANNEL gl_WorkGroupID.y
 #define CHUNK_COUNT ((pixel_count + CHUNK - 1) / CHUNK)
 
-// Of the values of the channel: this lane's first, and one past its last.
+// Among the values of the channel: this lane's first, and one past its last.
 uint chunk_begin() { return gl_WorkGroupID.x * CHUNK + gl_SubgroupInvocationID; }
 uint chunk_end() { return min((gl_WorkGroupID.x + 1) * CHUNK, pixel_count); }

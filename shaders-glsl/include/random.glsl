@@ -1,4 +1,4 @@
-// Counter-based random numbers: each is a function of its key and nothing is carried from draw to draw.
+// Counter-based random numbers: each is a function of its key, without state.
 
 // One step of PCG-RXS-M-XS as a hash (Jarzynski and Olano 2020).
 uint random_bits(uint key) {

@@ -1,8 +1,8 @@
-// SH coefficients above degree 0, of a kernel that declares `parameters` with their constants and numbers.
+// SH coefficients above degree 0, for a kernel that declares `parameters` with their constants and counts.
 
 #include "half.glsl"
 
-// The k-th coefficient of Gaussian i, from 1 on: that of degree 0 is not among them.
+// The k-th coefficient of Gaussian i, from 1; that of degree 0 is not included.
 vec3 rest_coefficient(uint i, uint k) {
     uint plane = (FEATURES_COLUMN + FEATURE_COUNT) * gaussian_count;
     uint own = 3 * (sh_count(SH_DEGREE) - 1);

@@ -1,4 +1,4 @@
-// Quaternions (w, x, y, z) and the rotations that they are.
+// Quaternions (w, x, y, z) and their rotations.
 
 // The rotation of a unit quaternion (w, x, y, z).
 mat3 rotation(vec4 q) {
@@ -10,11 +10,11 @@ mat3 rotation(vec4 q) {
     );
 }
 
-// What a vector is multiplied by before its length counts, where that is too large or not finite: beyond 1e19 the
-// squares of its numbers are infinite.
+// A factor for a vector before its length is computed, if it is too large or not finite: beyond 1e19, squares of
+// components are infinite.
 float finite_scale(float length) { return length < 1e18 ? 1.0 : 1e-25; }
 
-// A quaternion of unit length; the identity where the length is not a positive number.
+// A quaternion of unit length; the identity if the length is not a positive number.
 vec4 unit_quat(vec4 q) {
     q *= finite_scale(length(q));
     float norm = length(q);

@@ -1,5 +1,5 @@
 // Real spherical harmonics to degree 3, in the order and with the signs that splat viewers use. The viewer of exported
-// pages includes this too: it is GLSL ES 3.00 as well.
+// pages includes this file, too: it is also valid GLSL ES 3.00.
 
 const uint MAX_SH_DEGREE = 3u;
 

@@ -1,4 +1,4 @@
-// How the slots of Gaussians are shared out within a subgroup that has one Gaussian per lane: each lane walks its own
-// Gaussian's, but for those of a Gaussian with more than these, which the whole subgroup walks together.
+// Distribution of the slots of Gaussians in a subgroup with one Gaussian per lane: each lane processes its own
+// Gaussian's, except for Gaussians with more than this number, which the whole subgroup processes together.
 
 const uint SHARED_INTERSECTIONS = 32;

@@ -1,11 +1,11 @@
-// One Gaussian after projection onto the image plane, and how it covers pixels.
-// Kerbl et al. 2023, section 4; the exact tile rows follow from the ellipse alpha = 1/255.
+// One Gaussian after projection onto the image plane, and its coverage of pixels. Kerbl et al. 2023, section 4; the
+// exact tile rows follow from the ellipse alpha = 1/255.
 
-// Below this alpha a splat leaves no trace on a pixel.
+// A splat of lower alpha does not contribute to a pixel.
 const float ALPHA_MIN = 1.0 / 255.0;
 // A pixel is done before its transmittance falls to this.
 const float TRANSMITTANCE_MIN = 1e-4;
-// Added to both diagonal entries of cov2d, in pixels^2: a splat covers about a pixel at least.
+// Added to both diagonal entries of cov2d, in pixels^2: a splat covers at least about a pixel.
 const float DILATION = 0.3;
 
 // The largest alpha: keeps 1 / (1 - alpha) finite in the backward pass.
@@ -17,9 +17,9 @@ layout(constant_id = 2) const uint CHANNELS = 3;
 // Values of a gradient record before its channels: mean2d 2, conic 3, opacity 1.
 const uint RECORD_HEAD = 6;
 const uint RECORD = RECORD_HEAD + CHANNELS;
-// The vectors of three that hold a record: a load or a store of three numbers costs hardly more than one of one.
+// The vectors of three floats of a record: loading or storing three floats costs hardly more than one.
 const uint RECORD_VECTORS = (RECORD + 2) / 3;
-// Those that hold the values of a splat.
+// The vectors of three floats of a splat's values.
 const uint COLOR_VECTORS = (CHANNELS + 2) / 3;
 // In pixels; a subgroup owns at most 32 rows of lanes.
 layout(constant_id = 3) const uint TILE_WIDTH = 16;
@@ -29,7 +29,7 @@ struct ProjectedSplat {
     vec2  mean2d;       // pixels
     vec3  conic;        // upper triangle (xx, xy, yy) of the inverse cov2d, 1 / pixels^2
     float opacity;      // after the sigmoid
-    vec2  half_extent;  // pixels: the box around the ellipse alpha = 1/255, a hair wide
+    vec2  half_extent;  // pixels: the box around the ellipse alpha = 1/255, slightly enlarged
 };
 
 // Exponent of the Gaussian at an offset from its mean, sign reversed: alpha = opacity exp(-sigma).
@@ -38,20 +38,20 @@ float splat_sigma(vec3 conic, vec2 d) {
     return sigma;
 }
 
-// Twice the sigma at which alpha falls to 1/255, a hair high so that rounding never loses a pixel.
+// Twice the sigma at which alpha falls to 1/255, slightly enlarged so that rounding never loses a pixel.
 float splat_level(float opacity) {
     precise float level = 2.002 * log(255.0 * opacity) + 1e-3;
     return level;
 }
 
-// The columns of pixels [first, last] whose centres lie in the ellipse somewhere between the pixel rows
-// `top` and `bottom`; empty where last < first. No term cancels: the half width at height y is
-// sqrt(level / conic.xx) sqrt(1 - (y / half_extent.y)^2) about the shear line -conic.xy / conic.xx y.
+// The columns of pixels [first, last] whose centres are in the ellipse somewhere between the pixel rows `top` and
+// `bottom`; empty if last < first. No term cancels: the half width at height y is sqrt(level / conic.xx) sqrt(1 - (y /
+// half_extent.y)^2) about the shear line -conic.xy / conic.xx y.
 ivec2 splat_columns(ProjectedSplat splat, float top, float bottom) {
     precise float y0 = top + 0.5 - splat.mean2d.y;
     precise float y1 = bottom + 0.5 - splat.mean2d.y;
     vec2 extent = splat.half_extent;
-    // Positive phrasing: a NaN covers nothing.
+    // Written so that a NaN covers nothing.
     if (!(y0 <= extent.y && y1 >= -extent.y)) return ivec2(1, 0);
     precise float shear = -splat.conic.y / splat.conic.x;
     precise float rightmost = -splat.conic.y / splat.conic.z * extent.x;
@@ -62,13 +62,13 @@ ivec2 splat_columns(ProjectedSplat splat, float top, float bottom) {
     precise float left = y_left / extent.y;
     right = splat.mean2d.x + shear * y_right + width * sqrt(max(0.0, 1.0 - right * right)) + 0.01;
     left = splat.mean2d.x + shear * y_left - width * sqrt(max(0.0, 1.0 - left * left)) - 0.01;
-    // Beyond any image: keeps the conversion to integers defined.
+    // Beyond any image; keeps the conversion to integers defined.
     left = clamp(left, -1e6, 1e6);
     right = clamp(right, -1e6, 1e6);
     return ivec2(int(ceil(left - 0.5)), int(floor(right - 0.5)));
 }
 
-// The tile columns [x, y) that the splat meets in a row of tiles of an image `width` pixels wide.
+// The tile columns [x, y) that the splat intersects in a row of tiles of an image `width` pixels wide.
 uvec2 splat_tiles(ProjectedSplat splat, uint tile_row, uint width) {
     float top = float(tile_row * TILE_HEIGHT);
     ivec2 columns = splat_columns(splat, top, top + float(TILE_HEIGHT - 1));
@@ -77,7 +77,7 @@ uvec2 splat_tiles(ProjectedSplat splat, uint tile_row, uint width) {
     return uvec2(uint(columns.x) / TILE_WIDTH, uint(columns.y) / TILE_WIDTH + 1);
 }
 
-// The rows of tiles [x, y) that the splat's box meets in an image `height` pixels high.
+// The rows of tiles [x, y) that the splat's box intersects in an image `height` pixels high.
 uvec2 splat_tile_rows(ProjectedSplat splat, uint height) {
     float top = clamp(splat.mean2d.y - splat.half_extent.y, 0.0, float(height));
     float bottom = clamp(splat.mean2d.y + splat.half_extent.y, 0.0, float(height));

@@ -1,6 +1,6 @@
-// Sums over a subgroup by shuffles, which a processor does faster than subgroupAdd, and in an order that is ours.
+// Sums over a subgroup by shuffles, which are faster than subgroupAdd on a CPU and have a fixed order.
 //
-// The loops are counted, so that drivers unroll them: subgroups have at most 128 lanes.
+// The loops have constant bounds, so that drivers unroll them: subgroups have at most 128 lanes.
 
 // The sum of `x` over the subgroup, in every lane: a butterfly.
 float subgroup_sum(float x) {

@@ -1,19 +1,20 @@
 // The part of a tile that a subgroup owns: lane l of group g owns pixel g * SUBGROUP_SIZE + l, counted row by row.
 //
-// Its state lives in registers, one array element per group. Loops over groups are therefore unrolled: every index is a
+// Its state is in registers, one array element per group. Loops over groups are therefore unrolled: every index is a
 // constant.
 
-// The parts of a tile, one above the other: more warps, of less state each, where a device has room for them.
+// The number of parts of a tile, one above the other: more subgroups with less state each, if the device has resources
+// for them.
 layout(constant_id = 9) const uint SUBGROUPS_PER_TILE = 1;
 layout(local_size_x_id = 100, local_size_y_id = 9) in;
-// A variable, as the reflection of kernels compares no constants; drivers do.
+// A function, since the reflection of kernels cannot compare constants; drivers fold it.
 bool tile_is_shared() {
     uint subgroups = SUBGROUPS_PER_TILE;
     return subgroups > 1;
 }
 
-// Whether the groups that a splat misses are skipped. A GPU skips them where its whole subgroup agrees; a software
-// device may only mask its lanes, does the work all the same, and is faster without the test.
+// Whether groups that a splat does not cover are skipped. A GPU skips them if its whole subgroup agrees; a software
+// device may only mask its lanes, do the work anyway, and be faster without the test.
 layout(constant_id = 6) const bool SKIPS_GROUPS = true;
 
 const uint PART_HEIGHT = TILE_HEIGHT / SUBGROUPS_PER_TILE;
@@ -37,8 +38,8 @@ uvec2 group_offset(uint group) {
     return uvec2(group * SUBGROUP_SIZE % TILE_WIDTH, group * SUBGROUP_SIZE / TILE_WIDTH);
 }
 
-// The groups of pixels, one bit each, that the splat's ellipse meets in the part at `origin`. In all others it is below
-// alpha 1/255: to skip them changes the time alone.
+// The groups of pixels, one bit each, that the splat's ellipse intersects in the part at `origin`. In all others its
+// alpha is below 1/255: skipping them changes only the time.
 uint splat_groups(ProjectedSplat splat, uvec2 origin) {
     uint groups = 0;
     for (uint row = 0; row < PART_HEIGHT; row++) {
@@ -48,7 +49,7 @@ uint splat_groups(ProjectedSplat splat, uvec2 origin) {
         if (columns.x <= columns.y) {
             uint first = (row * TILE_WIDTH + uint(columns.x)) / SUBGROUP_SIZE;
             uint last = (row * TILE_WIDTH + uint(columns.y)) / SUBGROUP_SIZE;
-            // Bits first..last; the shift past bit 31 wraps to zero, as it should.
+            // Bits first..last; the shift past bit 31 wraps to zero as intended.
             groups |= (2u << last) - (1u << first);
         }
     }

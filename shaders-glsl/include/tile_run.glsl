@@ -1,9 +1,8 @@
-// Where a tile's run lies in the intersections sorted by tile.
+// The run of a tile in the intersections sorted by tile.
 //
 // The includer declares `counts[]`, [0]: intersections, `sorted_tiles[]` and `status[]`.
 
-// How many intersections lie in tiles before `tile`: every lane probes, and the run of those before it goes on between
-// two probes.
+// The number of intersections in tiles before `tile`: every lane probes, and the search continues between two probes.
 uint intersections_before(uint tile) {
     uint begin = 0;
     uint end = counts[0];
@@ -18,8 +17,8 @@ uint intersections_before(uint tile) {
     return begin;
 }
 
-// The first intersection of a tile and one past its last. More than `longest_run` raise a flag that stays, and the tile
-// shows nothing.
+// The first intersection of a tile and one past its last. More than `longest_run` set a sticky flag, and the tile is
+// left empty.
 uvec2 tile_run(uint tile, uint longest_run) {
     uvec2 run = uvec2(intersections_before(tile), intersections_before(tile + 1));
     uint count = run.y - run.x;

@@ -1,19 +1,19 @@
-// The tone curves: sRGB-encoded dark value in, pseudo-GT value in [0, 1] out.
-// The statistics of the parameters are taken once per view; `tone::ToneCurve` is the host side.
+// The tone curves: from an sRGB-encoded dark value to the pseudo-GT value in [0, 1]. The statistics in the parameters
+// are measured once per view; `tone::ToneCurve` is the host side.
 
 #include "curves.glsl"
 
 layout(constant_id = 10) const uint TONE_CURVE = 3;
 
 struct ToneParameters {
-    float white;                     // t = x / white: p90, or what the curve puts in its place
+    float white;                     // t = x / white: p90, or the curve's replacement
     float offset;                    // delta0, the black level
-    float gain;                      // g where black is rescaled, b where it is added
-    float weight;                    // of the curve beside the photograph as it is, from 0 to 1
+    float gain;                      // g if the black level rescales, b if it is added
+    float weight;                    // of the curve relative to the unchanged photograph, 0 to 1
     float constants[MAX_CONSTANTS];  // of the family
 };
 
-// What lies outside (0, LARGEST_T), or is no number, counts as the end it is at, a NaN as black.
+// Clamps to (0, LARGEST_T); a NaN counts as black.
 float within(float t) {
     return t > 0.0 ? min(t, LARGEST_T) : 0.0;
 }
@@ -46,6 +46,6 @@ float tone_curve(float x, ToneParameters tone) {
     default:
         y = tone.offset + tone.gain * curve_shape(TONE_CURVE, within(t), tone.constants);
     }
-    // Positive phrasing: a NaN becomes black.
+    // Written so that a NaN becomes black.
     return y > 0.0 ? min(y, 1.0) : 0.0;
 }

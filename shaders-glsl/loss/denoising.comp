@@ -4,8 +4,8 @@
 
 //! The gradients of u mean(a - b)^2 + v TV(a) with respect to the denoised image a and the render b, and partial sums.
 //!
-//! TV(a) = 2 (mean of squared differences of neighbours along y + the same along x). Means are over the interior, and
-//! over pairs inside it; outside, both gradients are 0. A thread marches down `ROWS` pixels of one column of one
+//! TV(a) = 2 (mean of squared differences of neighbours along y + the same along x). Means are over the loss region,
+//! and over pairs inside it; outside, both gradients are 0. A thread marches down `ROWS` pixels of one column of one
 //! channel. Reference: `src/reference/denoising.rs`.
 
 layout(local_size_x_id = 100) in;
@@ -19,7 +19,7 @@ layout(push_constant) uniform Params {
     uvec2 loss_end;    // one past the last
     float mse_weight;      // u
     float tv_weight;       // v
-    float mean_scale;      // 1 / (3hw), h x w the interior
+    float mean_scale;      // 1 / (3hw), h x w the loss region
     float x_scale;         // 2 / (3h(w-1)), 0 for one column
     float y_scale;         // 2 / (3(h-1)w), 0 for one row
 };
@@ -40,7 +40,7 @@ void main() {
     uint strip = thread / width;
     uint first_row = strip % down * ROWS;
     uint plane = strip / down * width * height;
-    // A workgroup's last threads can be beyond the image: no rows, yet they take part in the sums.
+    // A workgroup's last threads can be beyond the image: they have no rows, but take part in the sums.
     uint end_row = strip < 3 * down ? min(first_row + ROWS, height) : first_row;
     bool in_columns = x >= loss_begin.x && x < loss_end.x;
     bool has_left = in_columns && x > loss_begin.x;

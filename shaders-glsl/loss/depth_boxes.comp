@@ -3,7 +3,7 @@
 #include "kernel.glsl"
 #include "random.glsl"
 
-//! The regions over which depths are correlated in one step: the view, and random boxes of one size.
+//! The regions in which depths are correlated in one step: the view, and random boxes of one size.
 //!
 //! One thread per region. A box's corner is uniform in [0, width - side) x [0, height - side); the same key gives the
 //! same boxes. Reference: `src/reference/depth_boxes.rs`.

@@ -7,7 +7,7 @@
 //!
 //! P = 1 - mean(a^ b^) with a^ = (a - mean a) / (s_a + 1e-6), s_a^2 the unbiased variance of the rendered depth a, b
 //! the estimated depth. One subgroup per region, in a fixed order: the mean of the means, then the sums of products
-//! about it. Where a or b is constant, P is 1 and its gradient 0. Reference: `src/reference/depth_correlation.rs`.
+//! about it. If a or b is constant, P is 1 and its gradient 0. Reference: `src/reference/depth_correlation.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -18,7 +18,7 @@ layout(push_constant) uniform Params {
     uint  view_chunks;  // of region 0
     uint  box_chunks;   // of each other region
     uint  region_count;
-    uint  chunk_size;   // pixels, but for the last chunk of a region, which has what is left
+    uint  chunk_size;   // pixels, except for the last chunk of a region, which has the rest
     float view_weight;  // of region 0's P
     float box_weight;   // of each other P: weight / number of boxes
 };
@@ -58,7 +58,7 @@ void main() {
     uint corner = region.y * width + region.x;
     DepthGradient gradient = DepthGradient(mean + vec2(render[first + corner], depth[corner]), 0.0, 0.0);
     float value = 1.0;
-    // Positive phrasing: a NaN is no constant and reaches the value.
+    // Written so that a NaN is not constant and reaches the value.
     bool is_constant = products.x == 0.0 || products.z == 0.0;
     if (!is_constant) {
         vec2 deviation = sqrt(products.xz / (n - 1.0));

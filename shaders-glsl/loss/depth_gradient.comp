@@ -3,7 +3,7 @@
 #include "kernel.glsl"
 #include "depth_region.glsl"
 
-//! The gradient of the depth loss with respect to one plane of the render: the sum of those of the regions around a
+//! The gradient of the depth loss with respect to one plane of the render: the sum over the regions that contain a
 //! pixel.
 //!
 //! One thread per pixel. Reference: `src/reference/depth_gradient.rs`.
@@ -32,7 +32,7 @@ void main() {
         uvec4 region = regions[k];
         DepthGradient gradient = gradients[k];
         vec2 deviation = depths - gradient.mean;
-        // Unsigned: a pixel before the region is far beyond it.
+        // Unsigned: a pixel before the region wraps beyond it.
         if (all(lessThan(pixel - region.xy, region.zw)))
             d += gradient.a_scale * deviation.x + gradient.b_scale * deviation.y;
     }

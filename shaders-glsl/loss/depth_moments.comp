@@ -5,8 +5,8 @@
 
 //! The first and second moments of both depths, rendered a and estimated b, over chunks of every region.
 //!
-//! A workgroup is one subgroup and takes one chunk: the means, then the sums of products about them, so that nothing
-//! cancels. Depths count from the region's first pixel, so that a constant has no variance at all, not even a rounding.
+//! A workgroup is one subgroup and processes one chunk: the means, then the sums of products about them, to avoid
+//! cancellation. Depths are relative to the region's first pixel, so that the variance of a constant is exactly 0.
 //! Reference: `src/reference/depth_moments.rs`.
 
 layout(local_size_x_id = 100) in;
@@ -19,7 +19,7 @@ layout(push_constant) uniform Params {
     uint view_chunks;   // of region 0
     uint box_chunks;    // of each other region
     uint chunk_count;   // of all regions
-    uint chunk_size;    // pixels, but for the last chunk of a region, which has what is left
+    uint chunk_size;    // pixels, except for the last chunk of a region, which has the rest
 };
 
 layout(binding = 0) readonly  buffer Render  { float render[]; };        // (channels, H, W)

@@ -4,9 +4,9 @@
 
 //! The gradient of mean|a - b| with respect to the render a, b the pseudo-GT, and partial sums of |a - b|.
 //!
-//! A thread takes `VALUES_PER_THREAD` values, one subgroup apart, so that a subgroup reads one run. At a = b the
-//! gradient is 0. With `WITH_LOSS_REGION` the mean is over a rectangle of the view, and outside it the gradient is 0.
-//! The first term of a step writes the gradient, the others add to it. Reference: `src/reference/l1.rs`.
+//! A thread processes `VALUES_PER_THREAD` values, one subgroup apart, so that a subgroup reads contiguous values. At a
+//! = b the gradient is 0. With `WITH_LOSS_REGION` the mean is over a rectangle of the view, and outside it the gradient
+//! is 0. The first term of a step writes the gradient, the others add to it. Reference: `src/reference/l1.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -16,8 +16,8 @@ layout(constant_id = 2) const bool ADDS = false;
 
 layout(push_constant) uniform Params {
     uint  value_count;     // 3HW
-    float l1_scale;        // 1 / (3hw), h x w the interior
-    uint  width;           // pixels; this and what follows only with an interior
+    float l1_scale;        // 1 / (3hw), h x w the loss region
+    uint  width;           // pixels; this and the following only with a loss region
     uint  height;          // pixels
     uvec2 loss_begin;  // the first pixel
     uvec2 loss_end;    // one past the last

@@ -5,8 +5,8 @@
 
 //! The means of two loss terms from their partial sums, into the step's slot of the log.
 //!
-//! One subgroup, in a fixed order. A term that is NaN or infinite raises a flag in the sticky status word,
-//! so that later steps in the recording change nothing. Reference: `src/reference/loss_log.rs`.
+//! One subgroup, in a fixed order. A term that is NaN or infinite sets a sticky flag in the status word, so that later
+//! steps of the recording change nothing. Reference: `src/reference/loss_log.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -15,7 +15,7 @@ layout(push_constant) uniform Params {
     uint  slot;            // row of `log`
     uint  term_count;      // columns of `log`
     uvec2 terms;           // a column each
-    uvec2 partial_counts;  // 0: the term is not modelled and its column left as it is
+    uvec2 partial_counts;  // 0: the model lacks the term, and its column is unchanged
     vec2  mean_scales;     // 1 / (number of values in the mean)
 };
 

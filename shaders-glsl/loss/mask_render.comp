@@ -2,10 +2,10 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! Mask: what the loss sees of a render, w a + (1 - w) b with the weights w of the pixels, a the render and b the
-//! pseudo-GT, one thread per value.
+//! Mask: the image for the loss, w a + (1 - w) b with the weights w of the pixels, a the render and b the pseudo-GT,
+//! one thread per value.
 //!
-//! A pixel that is hidden equals its target. `mask_gradient` goes back. Reference: `src/reference/mask_render.rs`.
+//! A masked pixel equals its target. `mask_gradient` is the backward pass. Reference: `src/reference/mask_render.rs`.
 
 layout(local_size_x = 256) in;
 
@@ -24,6 +24,6 @@ void main() {
     if (i >= value_count) return;
     float weight = weights[i % pixel_count];
     float a = render[i];
-    // What counts in full stays as it is, to the bit.
+    // Pixels of full weight keep their bits.
     shown[i] = weight < 1.0 ? weight * a + (1.0 - weight) * target[i] : a;
 }

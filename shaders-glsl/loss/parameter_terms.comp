@@ -4,11 +4,11 @@
 #include "gaussian.glsl"
 
 //! The gradients of w_o mean sigmoid(o) + w_s mean exp(s) + w_a mean max(max s - min s - ln r, 0) with respect to the
-//! raw opacities o and the logarithms s of the standard deviations, added to those that are there, and partial sums of
-//! the three.
+//! raw opacities o and the logarithms s of the standard deviations, added to the existing ones, and partial sums of the
+//! three terms.
 //!
-//! A thread takes `GAUSSIANS_PER_THREAD` Gaussians, one subgroup apart. A weight of 0 leaves the gradients as they are.
-//! Reference: `src/reference/parameter_terms.rs`.
+//! A thread processes `GAUSSIANS_PER_THREAD` Gaussians, one subgroup apart. A weight of 0 leaves the gradients
+//! unchanged. Reference: `src/reference/parameter_terms.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -19,7 +19,7 @@ layout(push_constant) uniform Params {
     float opacity_scale;    // w_o / N, N the Gaussians of all batches
     float log_scale_scale;  // w_s / (3N)
     float ratio_scale;      // w_a / N
-    float log_ratio;        // ln r, the logarithm of the ratio up to which nothing is pressed down
+    float log_ratio;        // ln r, the logarithm of the largest ratio without a loss
 };
 
 layout(binding = 0) readonly  buffer Parameters      { float parameters[]; };        // planes of the batch

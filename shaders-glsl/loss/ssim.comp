@@ -6,26 +6,26 @@
 //! respect to a, and partial sums of |a - b| and of SSIM.
 //!
 //! Wang et al. 2004 with the window of 3DGS: 11 x 11 Gaussian, sigma 1.5, zero padding, per channel. With E[.] the
-//! windowed mean, per pixel and channel: S = (2 E[a] E[b] + C1) (2 (E[ab] - E[a] E[b]) + C2)
-//!   / ((E[a]^2 + E[b]^2 + C1) (E[aa] - E[a]^2 + E[bb] - E[b]^2 + C2)),
-//! and the gradient of sum S is E[dS/dE[a]] + 2 a E[dS/dE[aa]] + b E[dS/dE[ab]]: the window is symmetric and zero
-//! outside the image, so the transposed blur is the blur. At a = b the gradient of the L1 term is 0. Means are over the
-//! interior: pixels outside are seen by the windows, but their S counts neither in the sum nor in the derivatives. The
-//! L1 term stays inside it, the SSIM term reaches a window's radius beyond. The first term of a step writes the
-//! gradient, the others add to it. Reference: `src/reference/ssim.rs`.
+//! windowed mean, per pixel and channel: S = (2 E[a] E[b] + C1) (2 (E[ab] - E[a] E[b]) + C2) / ((E[a]^2 + E[b]^2 + C1)
+//! (E[aa] - E[a]^2 + E[bb] - E[b]^2 + C2)), and the gradient of sum S is E[dS/dE[a]] + 2 a E[dS/dE[aa]] + b
+//! E[dS/dE[ab]]: the window is symmetric and zero outside the image, so the transposed blur is the blur. At a = b the
+//! gradient of the L1 term is 0. Means are over the loss region: windows include pixels outside it, but the S of those
+//! pixels counts neither in the sum nor in the derivatives. The gradient of the L1 term is zero outside the loss
+//! region, that of the SSIM term beyond a window's radius. The first term of a step writes the gradient, the others add
+//! to it. Reference: `src/reference/ssim.rs`.
 //!
 //! A subgroup owns a run of columns of one channel and marches down ROWS rows. Every lane loads COLUMNS of a row and
-//! takes what its windows reach beyond from the lanes beside it, so that a value is loaded once, but for the ends of
-//! the run, where windows lack a side and have no outputs. A row that is loaded is blurred along x in registers and
-//! added, weighted by the taps along y, to the moments still in reach; those RADIUS rows above are then complete, their
-//! derivatives go the same way, and the gradient 2 RADIUS rows above is complete. No barrier is needed, and nothing
-//! between the images and the gradient is written.
+//! gets the further columns of its windows from neighbouring lanes, so that a value is loaded once, except at the ends
+//! of the run, where windows are incomplete and have no outputs. A loaded row is blurred along x in registers and
+//! added, weighted by the taps along y, to the moments of the rows in reach; those RADIUS rows above are then complete,
+//! their derivatives are blurred in the same way, and the gradient 2 RADIUS rows above is complete. No barrier is
+//! needed, and no intermediate image is written.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(constant_id = 0) const uint COLUMNS = 8;    // per row and lane; SUBGROUP_SIZE COLUMNS > 2 HALO
-layout(constant_id = 1) const uint ROWS = 32;      // per subgroup, beside 4 RADIUS rows of warm-up
-layout(constant_id = 2) const uint ALIGNMENT = 1;  // 4 where width and COLUMNS are multiples of four: whole vectors
+layout(constant_id = 1) const uint ROWS = 32;      // per subgroup, in addition to 4 RADIUS rows of warm-up
+layout(constant_id = 2) const uint ALIGNMENT = 1;  // 4 if width and COLUMNS are multiples of four: whole vectors
 layout(constant_id = 3) const bool ADDS = false;
 
 layout(push_constant) uniform Params {
@@ -33,7 +33,7 @@ layout(push_constant) uniform Params {
     uint  height;          // pixels
     uvec2 loss_begin;  // the first pixel
     uvec2 loss_end;    // one past the last
-    float l1_scale;        // (1 - w) / (3hw), h x w the interior
+    float l1_scale;        // (1 - w) / (3hw), h x w the loss region
     float ssim_scale;      // w / (3hw)
 };
 
@@ -47,19 +47,19 @@ const float C1 = 0.0001;  // (0.01 L)^2, L = 1
 const float C2 = 0.0009;  // (0.03 L)^2
 
 const int RADIUS = 5;                  // of the window, pixels
-const uint PENDING = 2 * RADIUS;       // rows of outputs in reach beside the one that completes
+const uint PENDING = 2 * RADIUS;       // rows of outputs in reach, other than the completed one
 const uint REACH = COLUMNS + PENDING;  // columns that the windows of a lane see
-// Columns at an end of a subgroup's run whose windows' windows lack a side.
+// Columns at an end of a subgroup's run without complete windows of windows.
 const uint HALO = (2 * RADIUS + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
 const uint OUTPUTS = SUBGROUP_SIZE * COLUMNS - 2 * HALO;
-const uint QUADS = (COLUMNS + 7 - ALIGNMENT) / 4;  // vectors of four that hold COLUMNS, wherever they may begin
+const uint QUADS = (COLUMNS + 7 - ALIGNMENT) / 4;  // vectors of four that contain COLUMNS at any offset
 
 // exp(-d^2 / (2 sigma^2)) / sum for d = 0..RADIUS.
 const float TAPS[RADIUS + 1] =
     float[](0.2660117248617943, 0.21300553771125366, 0.1093606895097, 0.03600077212843082, 0.007598758135239184,
         0.0010283800844791099);
 
-// The blurred moments, in the order of the arrays below: of the squares, SSIM knows the sum alone.
+// The blurred moments, in the order of the arrays below; SSIM only needs the sum of the squares.
 const uint A = 0, B = 1, SQUARES = 2, PRODUCT = 3, MOMENTS = 4;
 // The derivatives with respect to E[a], E[aa] and E[ab].
 const uint DERIVATIVES = 3;
@@ -87,7 +87,7 @@ bool has_output(Strip strip, uint column) {
     return in_run - HALO < OUTPUTS && uint(strip.x) + column < width;
 }
 
-// The rectangle whose pixels count: all of them, or the interior of a view with a margin.
+// Whether a pixel is in the loss region, which may be the whole view.
 bool is_inside(uint x, uint y) {
     return x >= loss_begin.x && x < loss_end.x && y >= loss_begin.y && y < loss_end.y;
 }
@@ -97,7 +97,8 @@ bool is_aligned() {
     return alignment == 4;
 }
 
-// Float `k` of the quads from the one at `shift` on; two steps, as a device that only selects pays for four.
+// Float `k` of the quads from the one at `shift` on; in two steps, since a device without dynamic indexing would pay
+// for four.
 float unpack(vec4 quads[QUADS], uint k, int shift) {
     if (is_aligned()) return quads[k / 4][k % 4];
     float at[4];
@@ -124,7 +125,7 @@ void load_row(Strip strip, int y, out float a[COLUMNS], out float b[COLUMNS]) {
     }
 }
 
-// The gradient in a lane's columns that have outputs, the first of them value `at`.
+// Stores the gradient in a lane's columns that have outputs, from value `at` on.
 void store_row(Strip strip, uint at, float gradient[COLUMNS]) {
     if (is_aligned()) {
         [[unroll]] for (uint x = 0; x < COLUMNS; x += 4)
@@ -141,7 +142,7 @@ void store_row(Strip strip, uint at, float gradient[COLUMNS]) {
     }
 }
 
-// Column `k` of those that a lane's windows see, the first of them RADIUS before its own.
+// Column `k` of those within a lane's windows, the first of them RADIUS before its own.
 float seen(float own[COLUMNS], uint k) {
     int column = int(k) - RADIUS;
     int lanes = (column + 16 * int(COLUMNS)) / int(COLUMNS) - 16;
@@ -158,7 +159,7 @@ float blur(float row[REACH], uint x) {
     return sum;
 }
 
-// Adds a value that is blurred along x to the outputs in reach along y; gives the one that completes.
+// Adds a value blurred along x to the outputs in reach along y; returns the completed one.
 float march(inout float pending[PENDING], float value) {
     float complete = pending[0] + TAPS[RADIUS] * value;
     [[unroll]] for (int k = 1; k < PENDING; ++k) pending[k - 1] = pending[k] + TAPS[abs(k - RADIUS)] * value;
@@ -172,7 +173,7 @@ float ssim(float moments[MOMENTS], out vec3 d_moments) {
     float a1 = 2.0 * a * b + C1;
     float a2 = 2.0 * (moments[PRODUCT] - a * b) + C2;
     float b1 = a * a + b * b + C1;
-    // The variances are not negative: only the cancellation of large bright values reaches the floor.
+    // Variances are not negative: only cancellation of large bright values reaches the floor.
     float b2 = max(moments[SQUARES] - (a * a + b * b), 0.0) + C2;
     float scale = 1.0 / (b1 * b2);
     float s = a1 * a2 * scale;
@@ -227,7 +228,7 @@ void main() {
         [[unroll]] for (uint x = 0; x < COLUMNS; ++x) {
             float d[DERIVATIVES];
             [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) d[m] = march(d_pending[m][x], blur(d_row[m], x));
-            // A value that no window asks of passes nothing on, were it NaN.
+            // A value outside all windows has no gradient, even if it is NaN.
             float d_ssim = d[0] + (d[1] == 0.0 ? 0.0 : 2.0 * a[x] * d[1]) + b[x] * d[2];
             float difference = is_inside(uint(strip.x) + x, uint(done)) ? a[x] - b[x] : 0.0;
             gradient[x] = l1_scale * sign(difference) - ssim_scale * d_ssim;

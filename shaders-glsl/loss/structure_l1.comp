@@ -5,8 +5,8 @@
 //! The gradient of mean|clamp(p, 0, 1) - s| with respect to one plane p of the render, s the structure of the
 //! pseudo-GT, and partial sums of the difference.
 //!
-//! A thread takes `VALUES_PER_THREAD` values, one subgroup apart. The gradient passes the clamp for 0 <= p <= 1 and is
-//! 0 where there is no difference. Reference: `src/reference/structure_l1.rs`.
+//! A thread processes `VALUES_PER_THREAD` values, one subgroup apart. The gradient passes the clamp for 0 <= p <= 1 and
+//! is 0 without a difference. Reference: `src/reference/structure_l1.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

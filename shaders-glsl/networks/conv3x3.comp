@@ -2,13 +2,14 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! A 3x3 convolution with stride 1 and zero padding 1, and the gradient of its input, which is one too.
+//! A 3x3 convolution with stride 1 and zero padding 1, and the gradient of its input, which is also a convolution.
 //!
 //! output[o](p) = activation(bias[o] + sum over i and t of weight[o, i, t] input[i](p + t)), t in {-1, 0, 1}^2.
-//! TRANSPOSED: weight[i, o, -t] and no bias, which turns dL/d output into dL/d input; `in_channels` counts what is
-//! read. A lane owns COLUMNS x ROWS pixels of OUT_BLOCK output channels in registers: an implicit matrix product whose
-//! inner dimension is (i, t). The lanes of a subgroup lie side by side; they load the weights of an input channel
-//! together and broadcast them, so no shared memory and no barrier is needed. Reference: `src/reference/conv3x3.rs`.
+//! TRANSPOSED: weight[i, o, -t] and no bias, which turns dL/d output into dL/d input; `in_channels` is the number of
+//! channels read. A lane owns COLUMNS x ROWS pixels of OUT_BLOCK output channels in registers: an implicit matrix
+//! product whose inner dimension is (i, t). The lanes of a subgroup are side by side; they load the weights of an input
+//! channel together and broadcast them, so no shared memory and no barrier is needed. Reference:
+//! `src/reference/conv3x3.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -38,7 +39,7 @@ const uint WEIGHT_LOADS = (TAPS * OUT_BLOCK + SUBGROUP_SIZE - 1) / SUBGROUP_SIZE
 
 float activate(float x) {
     uint activation = ACTIVATION;
-    // Phrased so that a NaN stays one.
+    // Written so that a NaN stays one.
     if (activation == RELU) return x < 0.0 ? 0.0 : x;
     if (activation == SIGMOID) return 1.0 / (1.0 + exp(-x));
     return x;
@@ -51,7 +52,7 @@ void main() {
     ivec2 last = ivec2(size) - 1;
     uint plane = size.x * size.y;
 
-    // This lane's share of the weights of one input channel, and how far the next channel's are.
+    // This lane's share of the weights of one input channel, and the offset to the next channel's.
     uint weight_at[WEIGHT_LOADS];
     uint weight_stride = TAPS;
     if (TRANSPOSED) weight_stride = TAPS * out_channels;

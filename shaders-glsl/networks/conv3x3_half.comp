@@ -14,12 +14,11 @@
 
 //! The 3x3 convolution of `conv3x3` as a product of cooperative matrices: factors of 16 bits, sums in single precision.
 //!
-//! output(M channels, N pixels) += weight_t(M, K) input_t(K, N) for each tap t and every K input channels, the weights
-//! as
-//! `pack_weights` has them, the input as `pack_map`. A subgroup owns BLOCKS matrices of channels by PACKED_ROWS rows of
-//! pixels; a row that it loads serves the three taps above each other. The gradient of the input is the same of
-//! transposed weights. Rounding the factors costs 2^-9 of the terms' magnitudes, beside what the sums cost. Reference:
-//! `src/reference/conv3x3_half.rs`.
+//! output(M channels, N pixels) += weight_t(M, K) input_t(K, N) for each tap t and every K input channels, with weights
+//! from `pack_weights` and the input from `pack_map`. A subgroup owns BLOCKS matrices of channels by PACKED_ROWS rows
+//! of pixels; a loaded row is used for the three vertical taps. The gradient of the input is the same product with
+//! transposed weights. Rounding the factors adds an error of 2^-9 of the terms' magnitudes to that of the sums.
+//! Reference: `src/reference/conv3x3_half.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -34,12 +33,12 @@ layout(push_constant, scalar) uniform Params {
     uvec2 size;          // pixels
     uint  in_channels;
     uint  out_channels;
-    uint  biases;        // where they begin in `values`, if BIASED
+    uint  biases;        // their offset in `values`, if BIASED
 };
 
 // Workgroups: (out channels / (M BLOCKS), columns / N, rows / PACKED_ROWS).
-layout(binding = 0) readonly buffer LargestWeight { uint largest_weight[]; };  // as `pack_weights` took it
-layout(binding = 1) readonly buffer LargestSource { uint largest_source[]; };  // as `pack_map` took it
+layout(binding = 0) readonly buffer LargestWeight { uint largest_weight[]; };  // as for `pack_weights`
+layout(binding = 1) readonly buffer LargestSource { uint largest_source[]; };  // as for `pack_map`
 layout(binding = 2) readonly buffer Values  { float values[]; };
 layout(binding = 3) readonly buffer Weights { HALVES weights[]; };  // (tap, out, in)
 layout(binding = 4) readonly buffer Source  { HALVES source[]; };   // (rows, columns, in)
@@ -71,7 +70,7 @@ void main() {
                     gl_CooperativeMatrixLayoutColumnMajor);
             [[unroll]] for (uint row = 0; row < 3; ++row) {
                 [[unroll]] for (uint b = 0; b < BLOCKS; ++b) {
-                    // Beyond the last channels their sums are made once more, and not kept.
+                    // Blocks beyond the last channels repeat sums, which are discarded.
                     uint channel = min(first_channel + b * M, to - M);
                     coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> factor;
                     coopMatLoad(factor, weights, ((3 * row + column) * to + channel) * from + first, from,

@@ -4,10 +4,10 @@
 
 //! Partial sums of the gradient of a 3x3 convolution's weights and biases, one set per strip of ROWS rows.
 //!
-//! d weight[o, i, t] = sum over p of d_output[o](p) input[i](p + t), d bias[o] = sum over p of d_output[o](p).
-//! A subgroup takes one input channel, OUT_BLOCK output channels and one strip, its lanes side by side, and slides a
-//! window of three rows down the strip: an input value is loaded three times per strip, never nine.
-//! `reduce_strips` adds the sets up. Reference: `src/reference/conv3x3_weight_gradient.rs`.
+//! d weight[o, i, t] = sum over p of d_output[o](p) input[i](p + t), d bias[o] = sum over p of d_output[o](p). A
+//! subgroup processes one input channel, OUT_BLOCK output channels and one strip, its lanes side by side, and slides a
+//! window of three rows down the strip: an input value is loaded three times per strip instead of nine. `reduce_strips`
+//! sums the sets. Reference: `src/reference/conv3x3_weight_gradient.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

@@ -16,9 +16,9 @@
 //! single precision.
 //!
 //! d_weight(M out, N in) of tap t += d_target(M out, K pixels) input_t(K pixels, N in) for every K pixels of every row
-//! of a strip, both as `pack_map` has them. A subgroup owns BLOCKS matrices of output channels by one of input
-//! channels, for all nine taps, and slides a window of three rows down K columns after K columns: a matrix of input is
-//! loaded once. `pack_map` states the rounding error. Biases are summed in single precision. Reference:
+//! of a strip, both from `pack_map`. A subgroup owns BLOCKS matrices of output channels by one of input channels, for
+//! all nine taps, and slides a window of three rows down K columns after K columns: a matrix of input is loaded once.
+//! `pack_map` states the rounding error. Biases are summed in single precision. Reference:
 //! `src/reference/conv3x3_weight_gradient_half.rs`.
 
 layout(local_size_x_id = 100) in;
@@ -36,7 +36,7 @@ layout(push_constant, scalar) uniform Params {
 };
 
 // Workgroups: (in channels / N, out channels / (M BLOCKS), strips).
-layout(binding = 0) readonly  buffer LargestSource  { uint largest_source[]; };     // as `pack_map` took it
+layout(binding = 0) readonly  buffer LargestSource  { uint largest_source[]; };     // as for `pack_map`
 layout(binding = 1) readonly  buffer LargestDTarget { uint largest_d_target[]; };
 layout(binding = 2) readonly  buffer Source         { HALVES source[]; };           // (rows, columns, in)
 layout(binding = 3) readonly  buffer DTarget        { HALVES d_target[]; };         // (rows, columns, out)
@@ -65,7 +65,7 @@ void main() {
             sum[b][t] = coopmat<float, gl_ScopeSubgroup, M, N, gl_MatrixUseAccumulator>(0.0);
 
     for (uint first = 0; first < size.x; first += K) {
-        // Rows of the packed map, whose first lies above the image.
+        // Rows of the packed map, whose first is above the image.
         coopmat<float16_t, gl_ScopeSubgroup, K, N, gl_MatrixUseB> window[3][3];
         [[unroll]] for (uint r = 0; r < 2; ++r)
             [[unroll]] for (uint c = 0; c < 3; ++c)
@@ -76,7 +76,7 @@ void main() {
                 coopMatLoad(window[2][c], source, ((y + 2) * columns + first + c) * from + first_in, from,
                     gl_CooperativeMatrixLayoutRowMajor);
             [[unroll]] for (uint b = 0; b < BLOCKS; ++b) {
-                // Beyond the last channels their sums are made once more, and not kept.
+                // Blocks beyond the last channels repeat sums, which are discarded.
                 uint channel = min(first_out + b * M, to - M);
                 coopmat<float16_t, gl_ScopeSubgroup, M, K, gl_MatrixUseA> factor;
                 coopMatLoad(factor, d_target, ((y + 1) * columns + first + 1) * to + channel, to,

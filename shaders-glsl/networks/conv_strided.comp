@@ -5,9 +5,8 @@
 //! A convolution with a square window of any size, a stride and zero padding, followed by a ReLU.
 //!
 //! output[o](p) = max(0, bias[o] + sum over i and t of weight[o, i, t] input[i](stride p + t - padding)), t in [0,
-//! window)^2. A thread owns a pixel of OUT_BLOCK output channels, so that it loads what it reads once for all of them.
-//! Reference:
-//! `src/reference/conv_strided.rs`.
+//! window)^2. A thread owns a pixel of OUT_BLOCK output channels, so that it loads each input once for all of them.
+//! Reference: `src/reference/conv_strided.rs`.
 
 layout(local_size_x = 64) in;
 layout(constant_id = 0) const uint OUT_BLOCK = 8;
@@ -45,7 +44,7 @@ void main() {
     }
     for (uint c = 0; c < in_channels; ++c) {
         for (uint t = 0; t < taps; ++t) {
-            // Left of the image and above it, what is unsigned is large.
+            // Left of and above the image, the unsigned position is large.
             uvec2 at = stride * pixel + uvec2(t % window, t / window) - padding;
             bool is_inside = all(lessThan(at, size));
             uvec2 held = min(at, size - 1);
@@ -55,7 +54,7 @@ void main() {
         }
     }
     [[unroll]] for (uint o = 0; o < OUT_BLOCK; ++o) {
-        // Phrased so that a NaN stays one.
+        // Written so that a NaN stays one.
         if (first_channel + o < out_channels)
             target[first_channel * pixels + o * pixels + i % pixels] = sum[o] < 0.0 ? 0.0 : sum[o];
     }

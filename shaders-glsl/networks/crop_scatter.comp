@@ -2,7 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! Window scatter: adds planes to a rectangle of some planes of an image, one thread per value; `crop_gather` backward.
+//! Crop scatter: adds planes to a rectangle of some planes of an image, one thread per value; `crop_gather` backward.
 //!
 //! Reference: `src/reference/crop_scatter.rs`.
 
@@ -10,7 +10,7 @@ layout(local_size_x = 64) in;
 
 layout(push_constant) uniform Params {
     uvec2 size;         // pixels: the image
-    uvec2 origin;       // pixels: the window's corner
+    uvec2 origin;       // pixels: the crop's corner
     uvec2 crop;       // pixels: its size
     uint  first_plane;  // of the image
     uint  plane_count;

@@ -2,8 +2,9 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! The largest magnitude of some values, as bits, into what was 0: a subgroup takes CHUNK of them. As an integer the
-//! order of magnitudes is that of their bits, whatever the order of the threads; a NaN is larger than every number.
+//! The largest magnitude of some values, as bits, into a word that was 0; a subgroup processes CHUNK of them.
+//! Magnitudes are ordered like their bits as integers, so the order of the threads does not matter; a NaN is larger
+//! than every number.
 //!
 //! Reference: `src/reference/largest_magnitude.rs`.
 

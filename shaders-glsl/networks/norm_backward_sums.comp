@@ -6,8 +6,8 @@
 //! Per chunk: the sums of d_y and of d_y n, with n = (z - mean) / deviation, y = gamma n + beta, d_y = d_f' where y >
 //! 0.
 //!
-//! They are the gradients of beta and gamma, and what the gradient of z is made of.
-//! Reference: `src/reference/norm_backward_sums.rs`.
+//! They are the gradients of beta and gamma, and inputs of the gradient of z. Reference:
+//! `src/reference/norm_backward_sums.rs`.
 
 layout(binding = 0) readonly  buffer Values     { float values[]; };
 layout(binding = 1) readonly  buffer Statistics { ChannelStatistics statistics[]; };

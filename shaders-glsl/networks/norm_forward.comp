@@ -21,7 +21,7 @@ void main() {
     for (uint i = chunk_begin(); i < chunk_end(); i += SUBGROUP_SIZE) {
         float normalised = (source[plane + i] - of_channel.mean) * of_channel.inverse_deviation;
         float y = gamma * normalised + beta;
-        // Phrased so that a NaN stays one.
+        // Written so that a NaN stays one.
         target[plane + i] = shortcut[plane + i] + (y < 0.0 ? 0.0 : y);
     }
 }

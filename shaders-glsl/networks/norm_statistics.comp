@@ -5,9 +5,9 @@
 
 //! Mean and sum of squared deviations of every chunk of every channel.
 //!
-//! Two passes over the chunk: deviations are taken from its own mean, so that no large squares cancel, and what they
-//! add up to corrects the rounding of that mean (Chan, Golub and LeVeque 1983).
-//! `norm_merge` merges the chunks. Reference: `src/reference/norm_statistics.rs`.
+//! Two passes over the chunk: deviations are taken from its own mean, so that no large squares cancel, and their sum
+//! corrects the rounding of that mean (Chan, Golub and LeVeque 1983). `norm_merge` merges the chunks. Reference:
+//! `src/reference/norm_statistics.rs`.
 
 layout(binding = 0) readonly  buffer Source   { float source[]; };   // (C, H, W)
 layout(binding = 1) writeonly buffer Partials { vec2 partials[]; };  // (C, chunks): mean, sum of squared deviations

@@ -3,12 +3,12 @@
 #include "kernel.glsl"
 #include "packed.glsl"
 
-//! A map of features as the second factor of 16-bit matrices: packed(p + 1)[c] = scale source[c](p), zeros around and
+//! A feature map as the second factor of 16-bit matrices: packed(p + 1)[c] = scale source[c](p), zeros around and
 //! beyond.
 //!
-//! A thread writes PACKED_CHANNELS channels of a packed pixel; its neighbours read the pixels beside its own. Rounding
-//! costs 2^-10 at most, and what is below 2^-28 of the map's largest magnitude may vanish: below it halves are
-//! subnormal, which some devices flush; below 2^-39 it does. Reference: `src/reference/pack_map.rs`.
+//! A thread writes PACKED_CHANNELS channels of a packed pixel; neighbouring threads read neighbouring pixels. The
+//! rounding error is at most 2^-10, and values below 2^-28 of the map's largest magnitude may become 0, since their
+//! halves are subnormal, which some devices flush; below 2^-39 they do. Reference: `src/reference/pack_map.rs`.
 
 layout(local_size_x = 256) in;
 
@@ -26,7 +26,7 @@ void main() {
     uint pixels = extent.x * extent.y, blocks = packed_channels(channels) / PACKED_CHANNELS;
     uint pixel = THREAD_INDEX % pixels, block = THREAD_INDEX / pixels;
     if (block >= blocks) return;
-    // Around the map these are beyond it, on its left and above it too.
+    // In the border around the map, also left of it and above, these are beyond the map.
     uvec2 at = uvec2(pixel % extent.x, pixel / extent.x) - 1;
     bool is_inside = at.x < size.x && at.y < size.y;
     uint plane = size.x * size.y, from = is_inside ? at.y * size.x + at.x : 0;

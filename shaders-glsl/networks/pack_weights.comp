@@ -7,7 +7,7 @@
 //! beyond.
 //!
 //! TRANSPOSED: packed[t, i, o] = scale weight[o, i, -t], which turns dL/d output into dL/d input. A thread writes eight
-//! side by side. `pack_map` states the rounding error. Reference: `src/reference/pack_weights.rs`.
+//! adjacent ones. `pack_map` states the rounding error. Reference: `src/reference/pack_weights.rs`.
 
 layout(local_size_x = 256) in;
 layout(constant_id = 0) const bool TRANSPOSED = false;

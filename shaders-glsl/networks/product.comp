@@ -2,7 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! What the tonemapper sees: illumination times denoised image, one thread per value.
+//! The input of the tonemapper: illumination times denoised image, one thread per value.
 //!
 //! Reference: `src/reference/product.rs`.
 

@@ -2,7 +2,7 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! Stops the gradient where a ReLU gave zero.
+//! Zeroes the gradient where the output of a ReLU is zero.
 //!
 //! Reference: `src/reference/relu_backward.rs`.
 
@@ -12,7 +12,7 @@ layout(push_constant) uniform Params {
     uint value_count;
 };
 
-layout(binding = 0) readonly buffer Activations { float activations[]; };  // what the ReLU gave
+layout(binding = 0) readonly buffer Activations { float activations[]; };  // outputs of the ReLU
 layout(binding = 1)          buffer Gradient    { float gradient[]; };     // of the ReLU's output, then of its input
 
 void main() {

@@ -2,7 +2,8 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! The end of a denoiser stage, one thread per value: N = I + u, R = clamp(R_0 - N, 0, 1), as the identity R = I - u.
+//! The end of a denoiser stage, one thread per value: N = I + u, R = clamp(R_0 - N, 0, 1); in the identity variant R =
+//! I - u.
 //!
 //! Reference: `src/reference/residual.rs`.
 
@@ -26,6 +27,6 @@ void main() {
         return;
     }
     float difference = render[i] - (stage_input[i] + update[i]);
-    // Phrased so that a NaN stays one.
+    // Written so that a NaN stays one.
     denoised[i] = difference < 0.0 ? 0.0 : difference > 1.0 ? 1.0 : difference;
 }

@@ -4,7 +4,7 @@
 
 //! The gradient of `residual` and of the sigmoid before it: d_R_0 = -d_I = d_R where 0 <= R_0 - N <= 1, else 0.
 //!
-//! d_v = d_I u (1 - u) is that of the sigmoid's input. As the identity d_I = -d_u = d_R, without a sigmoid.
+//! d_v = d_I u (1 - u) is that of the sigmoid's input. In the identity variant d_I = -d_u = d_R, without a sigmoid.
 //! Reference: `src/reference/residual_backward.rs`.
 
 layout(local_size_x = 256) in;
@@ -18,7 +18,7 @@ layout(binding = 0) readonly  buffer Render      { float render[]; };         //
 layout(binding = 1) readonly  buffer StageInput  { float stage_input[]; };    // I, (3, H, W)
 layout(binding = 2) readonly  buffer Update      { float update[]; };         // u, (3, H, W)
 layout(binding = 3) readonly  buffer DDenoised   { float d_denoised[]; };     // d_R, (3, H, W)
-layout(binding = 4) writeonly buffer DUpdate     { float d_update[]; };       // d_v, as the identity d_u, (3, H, W)
+layout(binding = 4) writeonly buffer DUpdate     { float d_update[]; };       // d_v or d_u, (3, H, W)
 layout(binding = 5) writeonly buffer DStageInput { float d_stage_input[]; };  // d_I of this path, (3, H, W)
 layout(binding = 6)           buffer DRender     { float d_render[]; };       // d_R_0, added to, (3, H, W)
 

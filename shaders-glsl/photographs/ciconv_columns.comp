@@ -5,10 +5,10 @@
 
 //! The colour invariant W of an image, its logarithm, and the partial moments that normalise it.
 //!
-//! Smoothing and differentiating what `ciconv_rows` left along the columns gives E and the derivatives along x and y of
-//! E, E_l and E_ll; W = sum (d / (E + 1e-5))^2 over the six. One thread per pixel. A workgroup is one subgroup and
-//! leaves the mean of its ln(W + 1e-5) and their sum of squares about that mean: nothing cancels, however far from 0
-//! they lie. Lengyel et al. 2021. Reference: `src/reference/ciconv_columns.rs`.
+//! Smoothing and differentiating the output of `ciconv_rows` along the columns gives E and the derivatives along x and
+//! y of E, E_l and E_ll; W = sum (d / (E + 1e-5))^2 over the six. One thread per pixel. A workgroup is one subgroup and
+//! writes the mean of its ln(W + 1e-5) and their sum of squares about that mean: nothing cancels, however far from 0
+//! they are. Lengyel et al. 2021. Reference: `src/reference/ciconv_columns.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

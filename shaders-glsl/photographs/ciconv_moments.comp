@@ -4,14 +4,14 @@
 
 //! The mean of an image and the scale that makes its variance 1, from the partial moments of `ciconv_columns`.
 //!
-//! One workgroup, in a fixed order: the mean of the means, then the sum of squares about it. The variance is biased and
-//! has 1e-5 added, as an instance norm has. Reference: `src/reference/ciconv_moments.rs`.
+//! One workgroup, in a fixed order: the mean of the means, then the sum of squares about it. The variance is biased,
+//! plus 1e-5, as in an instance norm. Reference: `src/reference/ciconv_moments.rs`.
 
 layout(local_size_x = 256) in;
 
 layout(push_constant) uniform Params {
     uint pixel_count;
-    uint pixels_per_moment;  // but for the last, which has what is left
+    uint pixels_per_moment;  // except for the last, which has the rest
 };
 
 layout(binding = 0) readonly  buffer Moments { vec2 moments[]; };     // mean and sum of squares about it
@@ -21,7 +21,7 @@ const float EPSILON = 1e-5;
 
 shared float thread_sums[256];
 
-// Of all threads' values, the same on each of them.
+// The sum over all threads, the same on each of them.
 float total(float value) {
     uint thread = gl_LocalInvocationID.x;
     barrier();
@@ -36,7 +36,7 @@ float total(float value) {
 
 void main() {
     uint moment_count = (pixel_count + pixels_per_moment - 1) / pixels_per_moment;
-    // About the first mean: sums of values far from 0 would lose the digits in which they differ.
+    // Relative to the first mean: sums of values far from 0 would lose the digits in which they differ.
     float pivot = moments[0].x;
     float sum = 0.0;
     for (uint i = gl_LocalInvocationID.x; i < moment_count; i += 256) {

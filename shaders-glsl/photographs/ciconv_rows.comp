@@ -19,7 +19,7 @@ layout(binding = 0) readonly  buffer Image  { float image[]; };  // (3, H, W), i
 layout(binding = 1) writeonly buffer Smooth { vec3 smooth_rows[]; };  // (H, W, 3), E, E_l, E_ll
 layout(binding = 2) writeonly buffer Slope  { vec3 slope_rows[]; };   // (H, W, 3)
 
-// Columns: what R, G and B add to E, E_l, E_ll (Geusebroek et al. 2001).
+// Columns: the contributions of R, G and B to E, E_l, E_ll (Geusebroek et al. 2001).
 const mat3 COLOR_MODEL = mat3(0.06, 0.30, 0.34, 0.63, 0.04, -0.60, 0.27, -0.35, 0.17);
 
 void main() {

@@ -5,22 +5,21 @@
 
 //! Pseudo-GT: decodes a stored photograph and applies its curve; one thread per pixel.
 //!
-//! A code is looked up and not divided, which a device may round as it likes: what is decoded has the bits that were
-//! encoded. Most curves map each value alone. `lum_preserve` scales a pixel by what its luminance gains, `per_channel`
-//! each channel by its own white; `auto` mixes the curve of each channel with the curve of the luminance, which keeps
-//! the ratios of the channels; `table` and `profile` are what `tone::Table` and `tone::Profile` are. Of a photograph
-//! that is hardly too dark the curve has a part of the weight: the target is x + weight (curve(x) - x), x clamped to
-//! [0, 1]. Reference:
-//! `src/reference/pseudo_gt.rs`.
+//! A code is looked up rather than divided, since devices may round divisions differently: decoding restores the
+//! encoded bits. Most curves map each value separately. `lum_preserve` scales a pixel by the gain of its luminance,
+//! `per_channel` each channel by its own white; `auto` mixes the curve of each channel with the curve of the luminance,
+//! which keeps the ratios of the channels; `table` and `profile` are those of `tone::Table` and `tone::Profile`. For a
+//! photograph that is hardly too dark, the curve has a partial weight: the target is x + weight (curve(x) - x), x
+//! clamped to [0, 1]. Reference: `src/reference/pseudo_gt.rs`.
 
 layout(local_size_x = 256) in;
 
 layout(constant_id = 0) const uint CODE_BITS = 32;  // 8 or 16; 32: `values` are the photograph, and there are no codes
-layout(constant_id = 1) const bool WITH_CURVE = true;    // else the photograph is decoded alone, to the bit
+layout(constant_id = 1) const bool WITH_CURVE = true;    // else the photograph is only decoded, bit for bit
 
-// Of a profile: ramps of equal width of each channel,
+// Of a profile: segments of equal width per channel,
 const uint SEGMENTS = 16;
-// and its numbers: three weights, a bias, the value at 0 and the rises.
+// and the values per channel: three weights, a bias, the value at 0 and the rises.
 const uint PROFILE_WIDTH = 5 + SEGMENTS;
 
 layout(push_constant) uniform Params {
@@ -42,7 +41,8 @@ float stored(uint i) {
     return values[bitfieldExtract(codes[i / per_word], int(bits * (i % per_word)), int(bits))];
 }
 
-// Of values and luminance in units of white; constants[0] is lambda. At black the factor of the luminance's curve is 1.
+// For values and luminance in units of white; constants[0] is lambda. At black, the factor of the luminance's curve is
+// 1.
 vec3 automatic(vec3 t, float y, ToneParameters tone) {
     float least = max(y, 1e-20);
     float factor = one_minus_exp(least) / least;
@@ -51,7 +51,7 @@ vec3 automatic(vec3 t, float y, ToneParameters tone) {
     return tone.offset + (1.0 - tone.offset) * ((1.0 - share) * own + share * (t * factor));
 }
 
-// Positive phrasing: a NaN becomes black.
+// Written so that a NaN becomes black.
 vec3 measurable(vec3 rgb, float most) {
     return mix(vec3(0.0), min(rgb, vec3(most)), greaterThan(rgb, vec3(0.0)));
 }
@@ -71,7 +71,7 @@ vec3 knot(uint at) {
     return vec3(numbers[3 * at], numbers[3 * at + 1], numbers[3 * at + 2]);
 }
 
-// The last knot of those from `first` that is not above x, which lies between the first and the last.
+// The last knot from `first` on that is not above x, which is between the first and the last.
 uint knot_below(uint first, float x) {
     uint low = first;
     uint high = first + knot_count - 1;
@@ -83,12 +83,12 @@ uint knot_below(uint first, float x) {
     return low;
 }
 
-// Monotone cubics between the knots of a channel, whose slopes the host finds; constant beyond its ends.
+// Monotone cubics between the knots of a channel, with slopes from the host; constant beyond its ends.
 float tabled(uint channel, float x) {
     uint first = channel * knot_count;
     float low = numbers[3 * first];
     float high = numbers[3 * (first + knot_count - 1)];
-    // Positive phrasing: a NaN counts as the lower end.
+    // Written so that a NaN counts as the lower end.
     x = x > low ? min(x, high) : low;
     uint at = knot_below(first, x);
     vec3 left = knot(at);
@@ -140,7 +140,7 @@ void main() {
         ToneParameters tone = parameters[view];
         vec3 plain = measurable(rgb, 1.0);
         vec3 curved = mapped(rgb, tone);
-        // What has the whole weight stays as it is, to the bit.
+        // Pixels of full weight keep their bits.
         rgb = tone.weight < 1.0 ? plain + tone.weight * (curved - plain) : curved;
     }
     target[i] = rgb.r;

@@ -7,7 +7,7 @@
 #[derive(Clone, Copy, Debug)]
 pub struct Hasher(u64);
 
-/// Odd, with half of the bits set: the golden ratio's and the square root of three's.
+/// Odd numbers with half of the bits set, from the golden ratio and the square root of three.
 const WORD: u64 = 0x9E37_79B9_7F4A_7C15;
 const LENGTH: u64 = 0xBB67_AE85_84CA_A73B;
 
@@ -18,7 +18,7 @@ impl Default for Hasher {
 }
 
 impl Hasher {
-    /// Hashes bytes; the boundaries between slices count.
+    /// Hashes bytes; boundaries between slices matter.
     pub fn write(&mut self, bytes: &[u8]) {
         let (words, rest) = bytes.as_chunks::<8>();
         let mut last = [0; 8];
@@ -47,14 +47,14 @@ pub fn of(bytes: &[u8]) -> u64 {
     hasher.finish()
 }
 
-/// In files: sixteen hexadecimal digits.
+/// The hash as text for files: sixteen hexadecimal digits.
 pub fn text(hash: u64) -> String {
     format!("{hash:016x}")
 }
 
 fn folded(a: u64, b: u64) -> u64 {
     let product = u128::from(a) * u128::from(b);
-    // A factor of zero would forget everything before.
+    // A factor of zero would lose the preceding state.
     (product as u64) ^ (product >> 64) as u64 ^ a.rotate_left(32)
 }
 
@@ -63,7 +63,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_bit_every_length_and_every_border_counts() {
+    fn every_bit_length_and_boundary_matters() {
         let bytes: Vec<u8> = (0..67_u32).map(|i| (i * i % 251) as u8).collect();
         let mut seen = std::collections::BTreeSet::from([of(&bytes)]);
         for bit in 0..8 * bytes.len() {

@@ -1,4 +1,4 @@
-//! Files that users name: read whole, texts as editors leave them.
+//! Files named by the user: read whole, and text in the encodings of editors.
 
 use std::fs::File;
 use std::io::Read;
@@ -6,13 +6,13 @@ use std::path::Path;
 
 use crate::{Error, Result};
 
-/// What a device or a pipe may bring, in bytes: those that do not end are no files of ours.
+/// The limit for a device or a pipe, in bytes, which may have no end.
 const MOST: u64 = 1 << 28;
 
-/// What is in a file.
+/// The bytes of a file.
 ///
 /// # Errors
-/// [`Error::Input`] where it cannot be read, or does not end.
+/// [`Error::Input`] if it cannot be read, or has no end.
 pub fn bytes(path: &Path) -> Result<Vec<u8>> {
     let cannot = |error: std::io::Error| Error::input(path, format!("cannot be read: {error}"));
     #[cfg(feature = "io")]
@@ -31,10 +31,10 @@ pub fn bytes(path: &Path) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// The text of a file, UTF-8, or UTF-16 after its mark: a byte-order mark is no text.
+/// The text of a file in UTF-8, or in UTF-16 with a byte-order mark, which is removed.
 ///
 /// # Errors
-/// As [`bytes`]; it is no text.
+/// Those of [`bytes`], or the file is not text.
 pub fn text(path: &Path) -> Result<String> {
     let cannot = |what: String| Error::input(path, format!("cannot be read: {what}"));
     let bytes = bytes(path)?;
@@ -61,7 +61,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn what_does_not_end_is_refused_and_what_does_is_read() {
+    fn an_endless_file_is_refused_and_a_finite_one_is_read() {
         let error = bytes(Path::new("/dev/zero")).unwrap_err().to_string();
         assert!(error.contains("/dev/zero: does not end"), "{error}");
         assert_eq!(bytes(Path::new("/dev/null")).unwrap(), b"");
@@ -69,7 +69,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mark_of_the_byte_order_is_no_text() {
+    fn a_byte_order_mark_is_removed() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("text");
         for marked in [&b"ab"[..], b"\xEF\xBB\xBFab", b"\xFF\xFEa\0b\0", b"\xFE\xFF\0a\0b"] {

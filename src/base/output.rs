@@ -1,23 +1,23 @@
-//! Files that are never seen half-written, and text that does only what text does.
+//! Files that appear when complete, and text that is safe to print.
 
 use std::borrow::Cow;
 use std::path::Path;
 
 use crate::{Error, Result};
 
-/// Writes a file under another name first; it appears under its own once it is complete, or not at all.
+/// Writes a file under a temporary name and renames it when complete.
 ///
 /// # Errors
-/// [`Error::Output`] names the file; nothing is left of it.
+/// [`Error::Output`] if it cannot be written; no partial file is left.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     write_whole_with(path, |path| std::fs::write(path, bytes))
 }
 
-/// As [`write_whole`], for what writes the file itself, under the name that it is given. What a link leads to is
-/// written, and the link stays; a device or a pipe is written to, and not replaced.
+/// [`write_whole`] with a function that writes the file under the given name. The target of a link is replaced, and the
+/// link kept; a device or a pipe is written to, not replaced.
 ///
 /// # Errors
-/// As there.
+/// Those of [`write_whole`].
 pub fn write_whole_with(
     path: &Path,
     write: impl FnOnce(&Path) -> std::io::Result<()>,
@@ -34,7 +34,7 @@ pub fn write_whole_with(
     let partial = Path::new(&partial);
     let written = write(partial).and_then(|()| std::fs::rename(partial, &target));
     written.map_err(|error| {
-        // The first failure is the one worth reporting; a temporary file that remains is not.
+        // The first failure is the one to report; a remaining temporary file is not.
         let _ = std::fs::remove_file(partial);
         failed(error)
     })
@@ -62,7 +62,7 @@ pub fn is_same_file(a: &Path, b: &Path) -> bool {
 pub fn check_writable(path: &Path) -> Result<()> {
     let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     let parent = absolute.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
-    // A file is replaced in its folder; a device or a pipe is written to.
+    // A file is replaced within its folder; a device or a pipe is written to.
     let folder =
         if parent.is_file() && parent == absolute { parent.parent() } else { Some(parent) };
     let written = match folder {
@@ -75,8 +75,8 @@ pub fn check_writable(path: &Path) -> Result<()> {
     })
 }
 
-/// Text for a terminal or a line of a log: control characters, which names from elsewhere may hold, are spelled out.
-/// Line breaks stay.
+/// Text for a terminal or a line of a log: control characters, which foreign names may contain, are escaped. Line
+/// breaks are kept.
 pub fn printable(text: &str) -> Cow<'_, str> {
     let acts = |c: char| c.is_control() && c != '\n';
     if !text.contains(acts) {
@@ -86,7 +86,7 @@ pub fn printable(text: &str) -> Cow<'_, str> {
     Cow::Owned(text.chars().map(spelled).collect())
 }
 
-/// A field of a CSV file (RFC 4180) in one line: control characters, line breaks too, become underscores.
+/// A field of a CSV file (RFC 4180) on one line: control characters, including line breaks, become underscores.
 pub fn csv_field(text: &str) -> String {
     let plain = text.replace(char::is_control, "_");
     if plain.contains([',', '"']) { format!("\"{}\"", plain.replace('"', "\"\"")) } else { plain }
@@ -98,7 +98,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn a_link_and_a_pipe_stay_what_they_are() {
+    fn a_link_and_a_pipe_are_not_replaced() {
         let folder = tempfile::tempdir().unwrap();
         let [file, link, pipe] = ["file", "link", "pipe"].map(|name| folder.path().join(name));
         std::fs::write(&file, "before").unwrap();
@@ -116,13 +116,13 @@ mod tests {
     }
 
     #[test]
-    fn what_would_act_on_a_terminal_is_spelled_out() {
+    fn control_characters_are_escaped() {
         assert_eq!(printable("größer\nline"), "größer\nline");
         assert_eq!(printable("\u{1b}[31mred\r\u{9b}2J\u{7}"), r"\u{1b}[31mred\r\u{9b}2J\u{7}");
     }
 
     #[test]
-    fn a_field_stays_one_field_of_one_line() {
+    fn a_field_stays_one_field_on_one_line() {
         for (text, field) in [
             ("IMG_1", "IMG_1"),
             ("a,b", "\"a,b\""),

@@ -1,9 +1,9 @@
 //! Counter-based random numbers: each is a pure function of a seed, a stream and an index.
 //!
-//! Nothing is carried from draw to draw, so the order of evaluation and the number of threads change nothing.
-//! The mixer is `SplitMix64`'s finaliser (Steele, Lea and Flood 2014).
+//! There is no state, so the order of evaluation and the number of threads do not matter. The mixer is `SplitMix64`'s
+//! finaliser (Steele, Lea and Flood 2014).
 
-/// One stream of random numbers; draw `index` of it is always the same.
+/// A stream of random numbers; the draw at an index is always the same.
 #[derive(Clone, Copy, Debug)]
 pub struct Stream(u64);
 

@@ -22,13 +22,13 @@ pub struct Setting {
     pub unit: &'static str,
     /// What it does, in lines.
     pub help: &'static [&'static str],
-    /// What applies where it is left out, if it can be.
+    /// The value in effect if it is omitted, if it can be.
     pub absent: Option<&'static str>,
     /// The option of `train` with the name of its value: `--steps N`; a flag has no value.
     pub option: Option<&'static str>,
 }
 
-/// The values that a setting takes.
+/// The valid values of a setting.
 #[derive(Clone, Copy, Debug)]
 pub enum Rule {
     /// true or false.
@@ -37,18 +37,18 @@ pub enum Rule {
     Whole(u64, u64),
     /// A finite number within bounds.
     Number(Bound<f64>, Bound<f64>),
-    /// A list whose length is from the first to the second number, of values that follow a rule.
+    /// A list whose length is from the first to the second number, of values that obey a rule.
     List(usize, usize, &'static Self),
     /// One of these words.
     OneOf(&'static [&'static str]),
     /// A text: its description, and its check.
     Text(&'static str, fn(&str) -> bool),
-    /// Several values in a form that their type checks.
+    /// Several values in a format that their type checks.
     Table(&'static str),
 }
 
 impl Rule {
-    /// Any whole number that TOML can hold.
+    /// Any whole number that TOML can represent.
     pub const COUNT: Self = Self::at_least(0);
     /// 0 or more.
     pub const POSITIVE_OR_0: Self = Self::Number(Bound::Included(0.0), Bound::Unbounded);
@@ -102,7 +102,7 @@ impl Rule {
         }
     }
 
-    /// Whether its values are texts: an option need not quote them.
+    /// Whether its values are text, which an option need not quote.
     pub fn is_text(&self) -> bool {
         matches!(self, Self::OneOf(_) | Self::Text(..))
     }
@@ -175,8 +175,7 @@ impl Setting {
         Error::Setting { key, value: value.to_string(), rule }
     }
 
-    /// Refuses a value that the rule does not take; values with a type of their own, such as an enum, are valid by
-    /// their type.
+    /// Checks a value; values of a special type, such as an enum, are valid by their type.
     ///
     /// # Errors
     /// [`Error::Setting`].
@@ -221,9 +220,11 @@ pub(crate) fn row<'a>(rows: &'a [Setting], key: &str) -> Option<&'a Setting> {
 
 /// Declares a struct of settings with its defaults, its rows and the check of its values.
 ///
-/// A field is `name: type = default => rule;`. `default, "what applies"` is for a setting that can be left out, and
-/// `rule, in "unit", "--option VALUE"` adds unit and option. Its documentation is its help. Fields of `sections` have
-/// rows of their own, or none.
+///  rule;`. `default, "what applies"` is for a setting that can be left out, and `rule, in "unit", "--option VALUE"`
+///  adds unit and option.=>A field is `name: type = default => rule;`. `default, "value in effect"` is for an optional
+///  setting, and `rule, in "unit", "--option VALUE"` adds unit and option.=> rule;`. `default, "what applies"` is for a
+///  setting that can be left out, and `rule, in "unit", "--option VALUE"` adds unit and option. Its documentation is
+///  its help. Fields of `sections` have rows of their own, or none.
 macro_rules! settings {
     (
         $section:literal
@@ -254,13 +255,13 @@ macro_rules! settings {
         }
 
         impl $name {
-            /// A row for each setting but those of sections within.
+            /// A row for each setting, except those of inner sections.
             pub(crate) const SETTINGS: &'static [$crate::base::settings::Setting] = $crate::base::settings::settings! {
                 rows $section
                 $($(#[doc = $help])+ $field $(, $absent)? => $rule $(, in $unit)? $(, $option)?;)*
             };
 
-            /// Refuses a value that its row does not take.
+            /// Checks every value by its row.
             ///
             /// # Errors
             /// [`Error::Setting`](crate::Error::Setting).
@@ -271,7 +272,7 @@ macro_rules! settings {
             }
         }
     };
-    // The rows alone, of settings with another form in memory.
+    // Only the rows, for settings with another representation in memory.
     (
         rows $section:literal
         $(
@@ -299,7 +300,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_rule_takes_what_it_says() {
+    fn a_rule_accepts_the_values_that_it_describes() {
         use Bound::{Excluded, Included, Unbounded};
         let open = Rule::Number(Excluded(0.0), Excluded(1.0));
         for (rule, printed, taken, refused) in [
@@ -318,6 +319,6 @@ mod tests {
         assert!(
             Rule::OneOf(&["on", "off"]).takes_text("on") && !Rule::OneOf(&["a"]).takes_text("b")
         );
-        assert!(!Rule::COUNT.takes_whole(u64::MAX), "TOML holds no more than i64::MAX");
+        assert!(!Rule::COUNT.takes_whole(u64::MAX), "TOML has no more than i64::MAX");
     }
 }

@@ -1,6 +1,6 @@
-//! Files and folders by path, on the disk or in a ZIP archive that stands in the path: `scan.zip/images/1.png`.
+//! Files and folders by path, on the disk or in a ZIP archive within the path: `scan.zip/images/1.png`.
 //!
-//! An archive is read in place: nothing of it is written, so that no name in it can lead anywhere.
+//! An archive is read in place: nothing is extracted to disk, so its names cannot escape.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::fs::File;
@@ -11,16 +11,16 @@ use std::time::SystemTime;
 
 use zip::ZipArchive;
 
-/// The most that an entry of an archive may expand to, bytes.
+/// The largest decompressed size of an entry, bytes.
 const MOST_OF_ENTRY: u64 = 1 << 31;
-/// The most that all of them may, bytes.
+/// The largest decompressed size of all entries, bytes.
 const MOST_OF_ALL: u64 = 1 << 37;
 
-/// What is read, on disk or in memory.
+/// An open file, on disk or in memory.
 pub(crate) trait Source: Read + Seek + Send {}
 impl<T: Read + Seek + Send> Source for T {}
 
-/// Whether a path is a file's.
+/// Whether a path is a file.
 pub(crate) fn is_file(path: &Path) -> bool {
     match archived(path) {
         Some((archive, entry)) => archive.entries.contains_key(&entry),
@@ -28,7 +28,7 @@ pub(crate) fn is_file(path: &Path) -> bool {
     }
 }
 
-/// Whether a path is a folder's; an archive is one.
+/// Whether a path is a folder; an archive is one.
 pub(crate) fn is_dir(path: &Path) -> bool {
     match archived(path) {
         Some((archive, entry)) => archive.folders.contains_key(&entry),
@@ -36,7 +36,7 @@ pub(crate) fn is_dir(path: &Path) -> bool {
     }
 }
 
-/// The paths of what is in a folder, in any order.
+/// The paths of the entries of a folder, in any order.
 ///
 /// # Errors
 /// It cannot be read.
@@ -50,7 +50,7 @@ pub(crate) fn entries(folder: &Path) -> io::Result<Vec<PathBuf>> {
     }
 }
 
-/// The length of a file, and when it was changed.
+/// The length of a file, and its modification time.
 pub(crate) fn metadata(path: &Path) -> io::Result<(u64, Option<SystemTime>)> {
     match archived(path) {
         Some((archive, entry)) => {
@@ -72,12 +72,12 @@ pub(crate) fn open(path: &Path) -> io::Result<Box<dyn Source>> {
     }
 }
 
-/// The bytes of a file of an archive; `None` of one on disk.
+/// The bytes of a file in an archive; `None` for one on disk.
 pub(super) fn archived_bytes(path: &Path) -> Option<io::Result<Vec<u8>>> {
     archived(path).map(|(archive, entry)| archive.read(&entry))
 }
 
-/// The archive that a path leads into or to.
+/// The archive that a path leads to or into.
 pub(crate) fn archive_of(path: &Path) -> Option<&Path> {
     let is_archive = |path: &&Path| {
         path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("zip")) && path.is_file()
@@ -85,7 +85,7 @@ pub(crate) fn archive_of(path: &Path) -> Option<&Path> {
     path.ancestors().find(is_archive)
 }
 
-/// Why a path that names an archive is none.
+/// Checks a path that names an archive.
 ///
 /// # Errors
 /// The archive is damaged, or expands to too much.
@@ -94,10 +94,10 @@ pub(crate) fn check(path: &Path) -> io::Result<()> {
         .map_or(Ok(()), |path| Archive::open(path, [MOST_OF_ENTRY, MOST_OF_ALL]).map(drop))
 }
 
-/// An archive's folders and files by path with slashes; the root is "".
+/// An archive's folders and files, by path with slashes; the root is "".
 struct Archive {
     zip: Mutex<ZipArchive<File>>,
-    /// Place and length.
+    /// Index and length.
     entries: HashMap<String, (usize, u64)>,
     folders: BTreeMap<String, BTreeSet<String>>,
     changed: Option<SystemTime>,
@@ -113,14 +113,14 @@ impl Archive {
         let mut expanded = 0_u64;
         for place in 0..zip.len() {
             let entry = zip.by_index_raw(place).map_err(io::Error::other)?;
-            // Names that lead out of the archive are none of its files.
+            // Names that lead out of the archive are ignored.
             let Some(name) = entry.enclosed_name().and_then(|name| slashed(&name)) else {
                 continue;
             };
             expanded = expanded.saturating_add(entry.size());
             if entry.size() > of_entry || expanded > of_all {
                 return Err(io::Error::other(format!(
-                    "it expands to more than is read of an archive ({} GiB a file, {} GiB in all): expand it yourself",
+                    "it expands to more than the limit for archives ({} GiB per file, {} GiB in all); extract it first",
                     of_entry >> 30,
                     of_all >> 30
                 )));
@@ -145,19 +145,19 @@ impl Archive {
         Ok(Self { zip: Mutex::new(zip), entries, folders, changed })
     }
 
-    /// An entry as it was before it was compressed.
+    /// The decompressed bytes of an entry.
     fn read(&self, entry: &str) -> io::Result<Vec<u8>> {
         let &(place, length) = self.entries.get(entry).ok_or(io::ErrorKind::NotFound)?;
         let mut zip = self.zip.lock().unwrap_or_else(PoisonError::into_inner);
         let entry = zip.by_index(place).map_err(io::Error::other)?;
         let mut bytes = vec![];
-        // It may expand to more than it says.
+        // It may expand to more than it declares.
         entry.take(length).read_to_end(&mut bytes)?;
         Ok(bytes)
     }
 }
 
-/// A path within an archive with slashes; `None` where it leads out.
+/// A path within an archive with slashes; `None` if it leads out.
 fn slashed(path: &Path) -> Option<String> {
     let mut parts = vec![];
     for part in path.components() {
@@ -171,7 +171,7 @@ fn slashed(path: &Path) -> Option<String> {
     Some(parts.join("/"))
 }
 
-/// The archive of a path, opened once and again when it changes, and what the path is in it.
+/// The archive of a path, which is opened again when it changes, and the path within it.
 fn archived(path: &Path) -> Option<(Arc<Archive>, String)> {
     static OPENED: LazyLock<Mutex<HashMap<PathBuf, Arc<Archive>>>> = LazyLock::new(Mutex::default);
     let at = archive_of(path)?;
@@ -236,18 +236,18 @@ mod tests {
     }
 
     #[test]
-    fn an_archive_that_expands_to_too_much_is_refused_by_what_it_declares() {
+    fn an_archive_that_declares_too_large_a_size_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let zip = archive(folder.path(), &[("a", &[0; 60_000]), ("b", &[0; 60_000])]);
         assert!(Archive::open(&zip, [60_000, 120_000]).is_ok());
         for limits in [[59_999, 1 << 20], [60_000, 119_999]] {
             let error = Archive::open(&zip, limits).err().unwrap().to_string();
-            assert!(error.contains("expand it yourself"), "{error}");
+            assert!(error.contains("extract it first"), "{error}");
         }
     }
 
     #[test]
-    fn an_archive_that_was_written_again_is_read_again() {
+    fn a_changed_archive_is_read_again() {
         let folder = tempfile::tempdir().unwrap();
         let zip = archive(folder.path(), &[("a", b"old")]);
         assert!(is_file(&zip.join("a")));

@@ -5,7 +5,7 @@
 //! ```
 //!
 //! The device computes in f32, which is most precise near zero; near plane, squared distances and initial sizes are
-//! absolute. So cameras and points are transformed into the frame on the host, in f64, and the trained model is
+//! absolute. Therefore cameras and points are transformed into the frame on the host, in f64, and the trained model is
 //! transformed back. The scale is a power of two, and a world near its origin is not moved, so that a world of an
 //! extent of 1.5 to 3 is its own training frame, to the bit.
 
@@ -76,7 +76,7 @@ impl TrainingFrame {
         position / self.scale + self.center()
     }
 
-    /// The same camera in the training frame; its view space is scaled alike.
+    /// The camera in the training frame; its view space is scaled, too.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn camera(&self, camera: &Camera) -> Camera {
         if *self == Self::WORLD {
@@ -87,7 +87,7 @@ impl TrainingFrame {
         Camera { view_from_world: DAffine3 { matrix3, translation }, ..*camera }
     }
 
-    /// The origin of positions in files: the world's, or the training frame's where f32 is too coarse for that.
+    /// The origin of positions in files: the world's, or the training frame's if f32 is too coarse for the world's.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn file_origin(&self) -> DVec3 {
         let center = self.center();
@@ -106,9 +106,9 @@ pub(crate) fn relative_to(origin: DVec3) -> Option<String> {
 }
 
 /// Mean and extent of the camera positions: the extent is 1.1 times the largest distance to the mean (3DGS). Cameras
-/// more than 32 times as far out as the median are left out, since their poses are most likely wrong.
+/// more than 32 times as far away as the median are excluded, since their poses are most likely wrong.
 ///
-/// Where all positions coincide, the extent is zero.
+/// If all positions coincide, the extent is zero.
 pub fn spread(centers: &[DVec3]) -> (DVec3, f64) {
     let mut around = centers.to_vec();
     let middle = DVec3::from_array([0, 1, 2].map(|axis| median(centers.iter().map(|c| c[axis]))));
@@ -118,12 +118,12 @@ pub fn spread(centers: &[DVec3]) -> (DVec3, f64) {
     }
     let mean = around.iter().sum::<DVec3>() / around.len().max(1) as f64;
     let radius = around.iter().map(|center| center.distance(mean)).fold(0.0, f64::max);
-    // Below this the spread is rounding error of one position's coordinates.
+    // A smaller spread is rounding error of a single position's coordinates.
     let is_spread = radius > 1e-12 * mean.length();
     (mean, if is_spread { 1.1 * radius } else { 0.0 })
 }
 
-/// Whether [`spread`] leaves a camera out.
+/// Whether [`spread`] excludes a camera.
 pub fn stands_elsewhere(center: DVec3, (mean, extent): (DVec3, f64)) -> bool {
     // All inliers are closer than the extent.
     extent > 0.0 && center.distance(mean) > extent
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_before_the_frame_shows_what_it_shows_of_the_world() {
+    fn a_camera_shows_the_same_in_the_training_frame_as_in_the_world() {
         for (extent, offset) in [(2.0, 0.0), (2e-6, 0.0), (2e6, 3e7), (1.0, 1e7), (40.0, 1e7)] {
             let center = DVec3::new(offset, -0.5 * offset, 0.1 * offset);
             let frame = TrainingFrame::new(center, extent);
@@ -169,7 +169,7 @@ mod tests {
                 let position = center + extent * DVec3::new(x, 0.1, -0.2);
                 let there = camera.project(position).unwrap();
                 let here = frame.camera(&camera).project(frame.framed(position)).unwrap();
-                // An offset of 1e7 extents leaves nine digits of a pixel's position.
+                // At an offset of 1e7 extents, nine digits of a pixel's position remain.
                 assert!(here.distance(there) < 1e-5, "{extent} {offset}: {here} {there}");
                 let back = frame.unframed(frame.framed(position));
                 assert!(back.distance(position) <= 1e-8 * extent.max(offset), "{back}");
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn a_world_near_its_origin_of_an_extent_of_one_and_a_half_to_three_is_its_own_frame() {
+    fn a_centred_world_with_an_extent_of_1_5_to_3_is_its_own_frame() {
         for extent in [1.51, 2.0, 2.99] {
             assert_eq!(
                 TrainingFrame::new(DVec3::splat(4.0), extent),
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_far_from_all_others_moves_nothing() {
+    fn a_camera_far_from_all_others_is_ignored() {
         let ring: Vec<DVec3> = (0..12)
             .map(f64::from)
             .map(|a| DVec3::new((0.5 * a).cos(), (0.5 * a).sin(), 0.0))

@@ -38,12 +38,12 @@ impl KannalaBrandt {
         1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
     }
 
-    /// The largest angle of the field of view, in radians: 90 degrees, or less where the radius stops increasing.
+    /// The largest angle of the field of view, in radians: 90 degrees, or less if the radius stops increasing.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn largest_angle(&self) -> f64 {
         const STEPS: u32 = 4096;
         let at = |step: u32| FRAC_PI_2 * f64::from(step) / f64::from(STEPS);
-        // Positive phrasing: a NaN does not increase.
+        // Written so that a NaN does not increase.
         let rises = |angle: f64| self.slope(angle) > 0.0;
         let Some(step) = (1..=STEPS).find(|&step| !rises(at(step))) else { return FRAC_PI_2 };
         let (mut low, mut high) = (at(step - 1), at(step));
@@ -71,8 +71,8 @@ impl KannalaBrandt {
 }
 
 impl CameraModel {
-    /// The depth of a view-space point (x right, y down, z forward), by which it is sorted and which the near plane
-    /// cuts: z for a pinhole, the distance for a fisheye. `None` outside the field of view.
+    /// The depth of a view-space point (x right, y down, z forward), for sorting and the near plane: z for a pinhole,
+    /// the distance for a fisheye. `None` outside the field of view.
     pub(crate) fn depth(&self, point: DVec3) -> Option<f64> {
         match self {
             Self::Pinhole => Some(point.z).filter(|&z| z > 0.0),
@@ -122,7 +122,7 @@ mod tests {
     ];
 
     #[test]
-    fn what_is_seen_at_a_place_is_projected_to_it() {
+    fn unprojected_points_are_projected_to_their_place() {
         for coefficients in LENSES {
             let model = CameraModel::Fisheye(KannalaBrandt { coefficients });
             for (x, y) in [(0.0, 0.0), (0.3, -0.2), (-0.7, 0.1), (1e-9, 0.0), (0.5, 0.5)] {
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_seen_from_the_angle_on_at_which_the_radius_falls_or_at_90_degrees_and_behind() {
+    fn the_field_of_view_ends_at_90_degrees_or_where_the_radius_falls() {
         let fold = KannalaBrandt { coefficients: LENSES[2] };
         let largest = fold.largest_angle();
         assert!((largest - (1.0f64 / (3.0 * 0.2231)).sqrt()).abs() < 1e-9, "{largest}");

@@ -13,9 +13,9 @@ use crate::{Error, Result};
 pub enum CameraPath {
     /// A circle around the point nearest to all optical axes, at the mean height and distance of the cameras.
     Orbit,
-    /// The part of that circle which the cameras cover, there and back.
+    /// The part of that circle that the cameras cover, back and forth.
     Arc,
-    /// Two turns around the mean pose, as wide as the spread of the cameras, looking at their common point (LLFF).
+    /// Two turns around the mean pose, as wide as the spread of the cameras, looking at their focus (LLFF).
     Spiral,
     /// A smooth curve through all poses, in order.
     Interpolate,
@@ -31,14 +31,13 @@ const SURROUNDED: f64 = 100.0 * PI / 180.0;
 const MIN_ARC: f64 = 20.0 * PI / 180.0;
 
 impl CameraPath {
-    /// The path that stays where the cameras of `poses` show the scene: an orbit if they surround it, an arc if they
-    /// cover a part of the circle, a spiral if they are parallel, and a curve through all of them if they look
-    /// outwards.
+    /// The path that stays close to the cameras of `poses`: an orbit if they surround the scene, an arc if they cover a
+    /// part of the circle, a spiral if they are parallel, and a curve through all of them if they look outwards.
     pub fn suited(poses: &[Camera]) -> Self {
         Self::suited_about(poses, upwards(poses))
     }
 
-    /// The same about a given up direction, a unit vector.
+    /// [`CameraPath::suited`] with a given up direction, a unit vector.
     pub(crate) fn suited_about(poses: &[Camera], up: DVec3) -> Self {
         let Some(circle) = Circle::new(poses, up) else { return Self::Spiral };
         let faces = |pose: &&Camera| forward(pose).dot(circle.target - pose.center()) > 0.0;
@@ -58,12 +57,12 @@ impl CameraPath {
     /// `frames` cameras with the image size and focal lengths of the first of `poses`.
     ///
     /// # Errors
-    /// [`Error::Usage`]: there is no pose, or the cameras are parallel, so that there is no point to orbit.
+    /// [`Error::Usage`] if there is no pose, or the cameras are parallel and there is no point to orbit.
     pub fn cameras(self, poses: &[Camera], frames: usize) -> Result<Vec<Camera>> {
         self.cameras_about(poses, upwards(poses), frames)
     }
 
-    /// The same about a direction that is up, a unit vector.
+    /// [`CameraPath::cameras`] with a given up direction, a unit vector.
     pub(crate) fn cameras_about(
         self,
         poses: &[Camera],
@@ -71,7 +70,7 @@ impl CameraPath {
         frames: usize,
     ) -> Result<Vec<Camera>> {
         let first = poses.first().ok_or_else(|| {
-            Error::Usage("a path leads along cameras, and there are none".to_owned())
+            Error::Usage("a camera path needs cameras, and there are none".to_owned())
         })?;
         let at = |view_from_world| Camera { view_from_world, ..*first };
         let views: Vec<DAffine3> = match self {
@@ -120,18 +119,18 @@ fn weights(t: f64) -> [f64; 4] {
     ]
 }
 
-/// A circle around what all cameras look at, as high above it and as far from it as they are on the mean.
+/// A circle around the focus of all cameras, at their mean height and distance.
 struct Circle {
     target: DVec3,
     up: DVec3,
-    /// Unit vectors to the azimuths 0, which is that of the first camera, and a quarter.
+    /// Unit vectors to azimuth 0, that of the first camera, and to 90 degrees.
     axes: [DVec3; 2],
     height: f64,
     radius: f64,
 }
 
 impl Circle {
-    /// `None` where the cameras look in parallel.
+    /// `None` if the cameras are parallel.
     fn new(poses: &[Camera], up: DVec3) -> Option<Self> {
         let target = nearest_to_axes(poses)?;
         let offsets = poses.iter().map(|pose| pose.center() - target);
@@ -184,7 +183,8 @@ fn arc(poses: &[Camera], up: DVec3, frames: usize) -> Result<Vec<DAffine3>> {
 }
 
 fn parallel() -> Error {
-    let problem = "the cameras look in parallel: there is no point to orbit; take --path spiral or interpolate";
+    let problem =
+        "the cameras are parallel: there is no point to orbit; use --path spiral or interpolate";
     Error::Usage(problem.to_owned())
 }
 
@@ -200,7 +200,7 @@ fn spiral(poses: &[Camera], up: DVec3, frames: usize) -> Vec<DAffine3> {
     });
     let reach = DVec3::from(radii).length().max(f64::MIN_POSITIVE);
     let ahead = nearest_to_axes(poses).map(|target| (target - center).dot(forward));
-    // Parallel cameras have no common point; with one far away the frames are parallel too.
+    // Parallel cameras have no focus; with a distant one, the frames are parallel, too.
     let focus = ahead.filter(|&ahead| ahead > 0.0).unwrap_or(10.0 * reach);
     let world_from_middle = middle.inverse();
     let frame = |index: usize| {
@@ -212,7 +212,7 @@ fn spiral(poses: &[Camera], up: DVec3, frames: usize) -> Vec<DAffine3> {
     (0..frames).map(frame).collect()
 }
 
-/// World to view of a camera at `center` that looks at `target`, `up` upwards.
+/// World to view for a camera at `center` that looks at `target`, with `up` upwards.
 fn looking(center: DVec3, target: DVec3, up: DVec3) -> DAffine3 {
     let forward = (target - center).normalize_or(DVec3::Z);
     let right = forward.cross(up).try_normalize();
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn an_interpolated_path_goes_through_every_pose_and_nowhere_far_from_them() {
+    fn an_interpolated_path_goes_through_every_pose_and_stays_close_to_them() {
         let poses = ring(5, 2.0);
         let frames = CameraPath::Interpolate.cameras(&poses, 41).unwrap();
         assert_eq!(frames.len(), 41);
@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn an_orbit_looks_at_what_all_cameras_look_at_from_where_they_are() {
+    fn an_orbit_looks_at_the_focus_from_the_distance_of_the_cameras() {
         let poses = ring(7, 2.0);
         let frames = CameraPath::Orbit.cameras(&poses, 12).unwrap();
         assert!(frames.iter().all(sees_the_target_in_the_middle));
@@ -285,12 +285,12 @@ mod tests {
         let mut parallel = poses[0];
         parallel.view_from_world.translation += DVec3::X;
         let refused = CameraPath::Orbit.cameras(&[poses[0], parallel], 3).unwrap_err().to_string();
-        assert!(refused.contains("in parallel") && refused.contains("spiral"), "{refused}");
+        assert!(refused.contains("are parallel") && refused.contains("spiral"), "{refused}");
         assert!(CameraPath::Orbit.cameras(&[], 3).is_err());
     }
 
     #[test]
-    fn an_arc_goes_over_what_the_cameras_cover_and_back() {
+    fn an_arc_goes_back_and_forth_over_the_covered_part() {
         let poses = ring(9, 2.25);
         let frames = CameraPath::Arc.cameras(&poses, 16).unwrap();
         assert!(frames.iter().all(sees_the_target_in_the_middle));
@@ -307,8 +307,8 @@ mod tests {
     }
 
     #[test]
-    fn the_path_that_suits_stays_where_cameras_are() {
-        // Of eight on a circle, the last are left out one by one.
+    fn the_suited_path_stays_close_to_the_cameras() {
+        // From a circle of eight, the last are removed one by one.
         for (count, path) in [(8, CameraPath::Orbit), (7, CameraPath::Orbit), (6, CameraPath::Arc)]
         {
             assert_eq!(CameraPath::suited(&ring(8, TAU)[..count]), path, "{count}");
@@ -327,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn a_spiral_stays_among_the_cameras_and_looks_where_they_look() {
+    fn a_spiral_stays_among_the_cameras_and_looks_at_their_focus() {
         let poses = ring(9, 0.6);
         let frames = CameraPath::Spiral.cameras(&poses, 30).unwrap();
         let center = mean(poses.iter().map(Camera::center));
@@ -335,7 +335,7 @@ mod tests {
             assert!(frame.center().distance(center) < 1.5);
             assert!(forward(frame).dot((TARGET - frame.center()).normalize()) > 0.99);
         }
-        // Parallel cameras have no common point, and yet a spiral.
+        // Parallel cameras have no focus, but a spiral is possible.
         let mut parallel = poses[0];
         parallel.view_from_world.translation += DVec3::X;
         let frames = CameraPath::Spiral.cameras(&[poses[0], parallel], 5).unwrap();

@@ -66,7 +66,7 @@ impl Camera {
     }
 }
 
-/// Selects `count` of a group.
+/// Selects `count` poses of a group.
 fn pick(poses: &[CameraPose], mut group: Vec<usize>, count: usize, picked: &mut Vec<usize>) {
     match count {
         0 => {}
@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_is_covered_from_one_end_to_the_other_whatever_the_order_of_its_views() {
+    fn a_path_is_covered_from_end_to_end_in_any_order_of_its_views() {
         let steps: Vec<usize> = (0..32).map(|i| i * 13 % 32).collect();
         let cameras: Vec<Camera> =
             steps.iter().map(|&step| camera(DVec3::X * step as f64, 0.0)).collect();
@@ -136,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_in_one_place_are_told_apart_by_where_they_look() {
+    fn cameras_at_one_position_differ_by_direction() {
         let cameras: Vec<Camera> =
             (0..16).map(|i| camera(DVec3::ZERO, 0.1 * f64::from(i))).collect();
         let picked = Camera::covering(&cameras, 2);
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn no_camera_is_picked_twice_and_none_beyond_those_there_are() {
+    fn no_camera_is_selected_twice_nor_more_than_exist() {
         let cameras = vec![camera(DVec3::ONE, 0.0); 5];
         for (count, picked) in [(0, 0), (1, 1), (3, 3), (5, 5), (9, 5)] {
             let mut own = Camera::covering(&cameras, count);

@@ -14,7 +14,7 @@ use crate::train::Trainer;
 
 /// Compare every pass of some training steps with its CPU reference, and name the first number that differs.
 ///
-/// For a device or driver that you do not trust. Slow; writes nothing. Checks one step unless --steps says more.
+/// For a device or driver that you do not trust. Slow; writes nothing. Checks one step unless --steps sets more.
 #[derive(Clone, Debug, clap::Args)]
 pub struct CheckArgs {
     /// Dataset, as for `train`
@@ -29,9 +29,9 @@ pub struct CheckArgs {
 /// Checks and prints.
 ///
 /// # Errors
-/// [`crate::Error::Disagrees`] where something differs, and the errors of `train`.
+/// [`crate::Error::Disagrees`] if something differs, and the errors of `train`.
 pub fn run(args: &CheckArgs) -> Result<()> {
-    // The schedule is that of a whole run, of which the first steps are checked.
+    // The schedule is that of a complete run, whose first steps are checked.
     let steps = args.options.config(&args.dataset, None)?.steps;
     let steps = if args.options.gives("steps") { steps } else { 1 };
     let mut config = args.options.without("steps").config(&args.dataset, None)?;

@@ -14,7 +14,7 @@ use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
 /// Write a small dark dataset, train on it with several tone curves, and compare the results on a page.
 ///
 /// Takes less than three minutes on two processor cores. DIR/index.html is a self-contained page; the dataset is in
-/// DIR/dataset, with a run directory per curve beside it. An interrupted demo continues.
+/// DIR/dataset, with a run directory per curve next to it. An interrupted demo continues.
 #[derive(Clone, Debug, clap::Args)]
 pub struct DemoArgs {
     /// Folder to write to: new, empty or with an earlier demo
@@ -25,7 +25,7 @@ pub struct DemoArgs {
     pub device: Option<DeviceChoice>,
 }
 
-/// The default curve beside the paper's, with enough steps for a clear picture.
+/// The default curve and others, including the paper's, with enough steps for a clear picture.
 const SWEEP: [&str; 6] = ["--curves", "auto,ase,ap3,linear", "--steps", "500", "--sh-degree", "1"];
 /// The size of the photographs.
 const SIZE: [u32; 2] = [384, 288];
@@ -72,7 +72,7 @@ pub fn run(args: &DemoArgs) -> Result<()> {
 fn claim(folder: &Path) -> crate::Result<()> {
     let is_empty = std::fs::read_dir(folder).map_or(true, |mut entries| entries.next().is_none());
     if !is_empty && !folder.join("dataset").exists() {
-        let problem = "is not empty and holds no earlier demo; choose another folder with --out";
+        let problem = "is not empty and contains no earlier demo; choose another folder with --out";
         return Err(Error::output(folder, problem));
     }
     Ok(())

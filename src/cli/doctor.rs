@@ -8,11 +8,11 @@ use anyhow::Result;
 use serde::Serialize;
 
 use super::finish;
-use super::pose::sources;
 use crate::Error;
 use crate::gpu::{
     CooperativeMatrix, DeviceChoice, DeviceReport, SUBGROUP_VARIABLE, SchedulerVariables, devices,
 };
+use crate::photographs::pose::how_to_install;
 
 /// List the Vulkan devices and check what training requires of them.
 #[derive(Clone, Copy, Debug, clap::Args)]
@@ -30,7 +30,7 @@ struct Output<'a> {
     chosen: Option<usize>,
     /// The variables of a scheduler that selected it.
     reason: Option<String>,
-    /// The paths of programs that some commands run; null where one is not found.
+    /// The paths of programs that some commands run; null if not found.
     programs: BTreeMap<&'static str, Option<PathBuf>>,
     verdict: String,
 }
@@ -90,7 +90,7 @@ fn on_path(program: &str) -> Option<PathBuf> {
 fn program_lines(programs: &BTreeMap<&'static str, Option<PathBuf>>) -> String {
     let line = |(name, purpose): &(&'static str, &str)| match programs.get(name) {
         Some(Some(path)) => format!("{name}  {}, for {purpose}\n", path.display()),
-        _ => format!("{name}  not found; install it for {purpose}: {}\n", sources(name)),
+        _ => format!("{name}  not found; install it for {purpose}: {}\n", how_to_install(name)),
     };
     PROGRAMS.iter().map(line).collect::<String>() + "\n"
 }
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn a_program_that_is_missing_is_said_with_its_use_and_how_to_install_it() {
+    fn a_missing_program_is_listed_with_its_use_and_how_to_install_it() {
         let printed = program_lines(&BTreeMap::from([("ffmpeg", Some("/usr/bin/ffmpeg".into()))]));
         assert!(printed.contains("colmap  not found; install it for camera poses"), "{printed}");
         assert!(

@@ -19,12 +19,12 @@ use crate::train::OnOff;
 /// Score a run on the test views of its dataset.
 ///
 /// Renders every test view that has a reference image in normal light and compares the two at 8 bits: PSNR over all
-/// channels, the mean of the three channels' PSNRs (as in the paper's code), and SSIM. Without references, each view
-/// is compared with its own pseudo-GT, which the output states: such a score tells how well the model fits its
-/// targets, not how good they are. An interrupted run is scored at its last checkpoint.
+/// channels, the mean of the three channels' PSNRs (as in the paper's code), and SSIM. Without references, each view is
+/// compared with its own pseudo-GT, which the output states: such a score measures how well the model fits its targets,
+/// not how good they are. An interrupted run is scored at its last checkpoint.
 ///
 /// The residual transmittance is how much background each view shows: its mean and its 99th percentile. Against a black
-/// background no score tells a hole from a dark surface; a mean above 0.1 prints a warning.
+/// background no score distinguishes a hole from a dark surface; a mean above 0.1 prints a warning.
 #[derive(Clone, Debug, clap::Args)]
 pub struct EvalArgs {
     /// Run directory, or a model with --dataset: PLY, SPZ or SOG
@@ -74,7 +74,7 @@ impl From<LpipsRange> for Range {
 /// Scores the run and prints the scores.
 ///
 /// # Errors
-/// The folder holds no run with a model, its dataset is gone, or a file cannot be written.
+/// The folder contains no run with a model, its dataset is missing, or a file cannot be written.
 pub fn run(args: &EvalArgs) -> Result<()> {
     args.report.iter().try_for_each(|path| check_writable(path))?;
     let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer } =

@@ -39,7 +39,7 @@ const GROUPS: [(&str, &str); 6] = [
     ("Logs and checks", "progress eval-every tensorboard hash-every check-every check-stops"),
 ];
 
-/// Whether a list of names has one.
+/// Whether a list of names contains a name.
 fn lists(names: &str, name: &str) -> bool {
     names.split_whitespace().any(|own| own == name)
 }
@@ -79,7 +79,7 @@ fn with_help(command: Command, everything: bool) -> Command {
             Some(long) => Some(long.to_string()),
             None => arg.get_help().map(ToString::to_string),
         };
-        // A negative number is a value, so that what refuses it names its option.
+        // A negative number is a value, so that its error names the option.
         let takes_values = arg.get_action().takes_values();
         let is_enum = arg.get_possible_values().iter().any(|value| value.get_help().is_some());
         let arg =
@@ -99,7 +99,7 @@ fn filled(help: &str) -> String {
     parts.map(|(i, part)| if i % 2 == 0 { part.to_owned() } else { default_of(part) }).collect()
 }
 
-/// The default as an option takes it; the braces stay where there is no such setting.
+/// The default as a value of its option; unknown settings keep their braces.
 fn default_of(setting: &str) -> String {
     let (key, curve) = setting.split_once(" of ").unwrap_or((setting, ""));
     let mut config = TrainConfig::default();

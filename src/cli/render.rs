@@ -85,14 +85,14 @@ pub enum PathChoice {
 }
 
 impl PathChoice {
-    /// The path about what is up; says which one suits the cameras where that is asked.
+    /// The path around the up direction; logs the choice of `auto`.
     fn path(self, poses: &[Camera], up: DVec3) -> CameraPath {
         match self {
             Self::Auto => {
                 let path = CameraPath::suited_about(poses, up);
                 let reason = match path {
                     CameraPath::Orbit => "an orbit: the cameras surround the scene",
-                    CameraPath::Arc => "an arc: the cameras stand on a part of the circle",
+                    CameraPath::Arc => "an arc: the cameras cover a part of the circle",
                     CameraPath::Spiral => "a spiral: the cameras look in parallel",
                     CameraPath::Interpolate => "through all cameras: they look outwards",
                 };
@@ -133,20 +133,20 @@ struct Shot {
     /// File name without extension.
     name: String,
     camera: Camera,
-    /// How its image is turned to be what people see.
+    /// How its image is rotated for display.
     orientation: Orientation,
 }
 
 /// Renders the views or the path.
 ///
 /// # Errors
-/// The folder holds no run with a model, its dataset is gone or has no such view, a file cannot be written, or a
-/// video needs ffmpeg and there is none.
+/// The folder contains no run with a model, its dataset is missing or has no such view, a file cannot be written, or a
+/// video requires ffmpeg, which is missing.
 pub fn run(args: &RenderArgs) -> Result<()> {
     let RenderArgs { run, out, layer, view_exposure, format, device, .. } = args;
     if let Some(video) = args.video.as_ref().filter(|_| *format == ImageFormat::Exr) {
         let problem =
-            format!("--video {} needs PNG frames; leave out --format exr", video.display());
+            format!("--video {} requires PNG frames; leave out --format exr", video.display());
         return Err(Error::Usage(problem).into());
     }
     args.video.iter().chain([out]).try_for_each(|path| check_writable(path))?;
@@ -210,7 +210,7 @@ fn shots(args: &RenderArgs, config: &TrainConfig, dataset: &Dataset) -> crate::R
     let up = config.up.and_then(|up| DVec3::from_array(up).try_normalize());
     let up = up.unwrap_or_else(|| dataset.up());
     let cameras = path.path(&poses, up).cameras_about(&poses, up, args.frames as usize)?;
-    // A mirrored photograph is of a mirrored world.
+    // A mirrored photograph shows a mirrored world.
     let first = dataset.train_views().next().map(|view| view.orientation.mirror());
     let orientation = first.unwrap_or_default();
     // Numbered as ffmpeg expects.

@@ -31,10 +31,10 @@ pub struct SynthArgs {
     pub overwrite: bool,
 }
 
-/// Writes the set.
+/// Writes the dataset.
 ///
 /// # Errors
-/// [`Error::Output`] where the folder is not empty and `--overwrite` is not given, and those of [`synthetic::write`].
+/// [`Error::Output`] if the folder is not empty and `--overwrite` is not given, and those of [`synthetic::write`].
 pub fn run(args: SynthArgs) -> anyhow::Result<()> {
     let SynthArgs { dir, views, width, height, seed, fisheye, overwrite } = args;
     let is_empty = std::fs::read_dir(&dir).map_or(true, |mut entries| entries.next().is_none());

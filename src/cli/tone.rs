@@ -24,7 +24,7 @@ enum Command {
     Apply(Box<apply::ApplyArgs>),
     #[cfg(feature = "fit")]
     Fit(fit::FitArgs),
-    /// Arguments of the former `tone`, without a subcommand; `fit` where the feature is off.
+    /// Arguments of the former `tone`, without a subcommand; `fit` if the feature is off.
     #[command(external_subcommand)]
     Other(Vec<OsString>),
 }

@@ -1,7 +1,7 @@
 //! The address space of the process (`ulimit -v`, `RLIMIT_AS`).
 //!
-//! Software devices compile kernels on first use, and their compilers crash without a message where memory is refused.
-//! A limit below which that is certain is therefore an error before the driver is loaded.
+//! Software devices compile kernels on first use, and their compilers crash without a message if memory is refused. A
+//! limit that is certainly too low is therefore an error before the driver is loaded.
 
 use crate::{Error, Result};
 
@@ -20,7 +20,7 @@ pub(super) fn check() -> Result<()> {
             );
             Err(Error::NoDevice(problem))
         }
-        // Without a limit, or where the system does not say.
+        // Without a limit, or if the system does not report it.
         _ => Ok(()),
     }
 }

@@ -1,4 +1,4 @@
-//! Typed device buffers and the ways in and out of them.
+//! Typed device buffers, and their transfers to and from the host.
 
 use std::marker::PhantomData;
 
@@ -91,7 +91,7 @@ impl Gpu {
         self.uninit_in_windows(name, len)
     }
 
-    /// The same for a buffer of which passes bind windows alone: only memory limits its length.
+    /// [`Gpu::uninit`] for a buffer of which passes only bind parts: only memory limits its length.
     ///
     /// # Errors
     /// The device is out of memory.

@@ -1,4 +1,4 @@
-//! The result of a pass on the device against that of its CPU reference.
+//! The comparison of a pass's results on the device with those of its CPU reference.
 
 use std::fmt;
 
@@ -10,7 +10,7 @@ const ROUNDING: f64 = f32::EPSILON as f64 / 2.0;
 /// The allowed difference between the 32-bit numbers of a buffer and the reference's.
 ///
 /// Two NaNs agree, as do two zeros; a NaN on one side only is a difference. Vulkan lets a device flush subnormal
-/// numbers to zero, so wherever floats need not be exact that much is allowed as well.
+/// numbers to zero, so this difference is allowed as well wherever floats need not be exact.
 #[derive(Clone, Debug, Default)]
 pub enum Tolerance {
     /// None: integers, copies, and operations that IEEE 754 rounds correctly.
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn partial_sums_compare_as_one_and_nothing_is_written_behind_them() {
+    fn partial_sums_compare_as_one_and_nothing_is_written_after_them() {
         let sum = Tolerance::Sum(0.1);
         assert!(compare(&[1.0, 2.0, 0.0], &[3.05, 0.0, 0.0], &sum).first.is_none());
         assert_eq!(

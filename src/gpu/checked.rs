@@ -42,7 +42,7 @@ impl Checks {
     }
 }
 
-/// What a recorder needs to run its passes one by one.
+/// The state for running a recorder's passes one by one.
 #[derive(Debug)]
 pub(super) struct Checked<'g> {
     queue: &'g Queue,

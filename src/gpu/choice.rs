@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn a_device_is_chosen_by_index_name_uuid_place_and_kind() {
+    fn a_device_is_chosen_by_index_name_uuid_address_and_kind() {
         let node = node();
         for (text, name) in [
             ("", "Nine"),
@@ -356,7 +356,7 @@ mod tests {
             ("cpu", "llvmpipe"),
         ] {
             let choice: DeviceChoice = text.parse().unwrap();
-            // What is asked for by name holds whatever a scheduler says.
+            // A choice by name does not depend on a scheduler's variables.
             for variables in [SchedulerVariables::default(), variables(Some("0"), None, None)] {
                 let picked = variables.pick(&choice, &node).unwrap();
                 let is_free = choice != DeviceChoice::Best || variables.cuda.is_none();
@@ -367,7 +367,7 @@ mod tests {
     }
 
     #[test]
-    fn a_choice_that_names_no_device_says_which_there_are() {
+    fn a_choice_without_a_device_is_refused_with_the_list_of_devices() {
         let node = node();
         for (text, expected) in [
             ("5", "number 5"),
@@ -397,11 +397,11 @@ mod tests {
     }
 
     #[test]
-    fn a_schedulers_list_picks_among_the_devices_of_its_vendor() {
+    fn a_schedulers_list_selects_among_the_devices_of_its_vendor() {
         let node = node();
         for (cuda, rocr, hip, name) in [
             (None, None, None, "Nine"),
-            // Numbers count along the bus, and the first of the list is used.
+            // Numbers count in bus order, and the first of the list is used.
             (Some("0"), None, None, "Four"),
             (Some("1"), None, None, "Nine"),
             (Some("1,0"), None, None, "Nine"),
@@ -409,9 +409,9 @@ mod tests {
             (Some("GPU-46000000-0000-0000-0000-000000000046,1"), None, None, "Four"),
             (None, Some("0"), None, "Vega"),
             (None, None, Some("1"), "Radeon"),
-            // HIP counts what ROCR leaves.
+            // HIP counts the devices left by ROCR.
             (None, Some("1"), Some("0"), "Radeon"),
-            // Nothing of the one vendor leaves the other's.
+            // An empty list of one vendor leaves the other's devices.
             (Some(""), None, None, "Radeon"),
             (Some("-1"), None, None, "Radeon"),
             (Some("NoDevFiles"), Some(""), None, "llvmpipe"),
@@ -422,7 +422,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_that_names_what_vulkan_does_not_have_is_refused_unless_another_vendors_is_answered() {
+    fn a_list_of_unknown_devices_is_refused_unless_another_vendors_is_valid() {
         let node = node();
         for (cuda, rocr) in [
             (Some("2"), None),
@@ -452,7 +452,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_are_doubted_only_where_cuda_may_count_otherwise() {
+    fn indices_are_doubtful_only_if_cuda_may_count_differently() {
         let different = node();
         let same = [4, 9].map(|bus| device("Same", "discrete", NVIDIA, Some(bus)));
         let placeless = [None, None].map(|bus| device("Same", "discrete", NVIDIA, bus));
@@ -479,7 +479,7 @@ mod tests {
     }
 
     #[test]
-    fn where_no_visible_device_suffices_the_first_is_picked_to_say_what_it_lacks() {
+    fn without_a_sufficient_device_the_first_is_selected_for_the_error() {
         let devices =
             [device("Lame", "discrete", NVIDIA, Some(1)), device("Swift", "software", 0, None)];
         assert_eq!(best(&SchedulerVariables::default(), &devices), "Swift");

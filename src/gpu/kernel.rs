@@ -1,4 +1,4 @@
-//! What the host knows of a compute shader.
+//! The host's description of a compute shader.
 
 use std::fmt::Debug;
 
@@ -31,7 +31,7 @@ pub struct Bound {
     pub size: u64,
 }
 
-/// What Vulkan needs to know of a compute shader; the same for every type of kernel.
+/// The description of a compute shader for Vulkan, the same type for every kernel.
 #[derive(Debug)]
 pub struct Interface {
     /// The stem of the shader's file; also its label in captures, timings and errors.
@@ -91,7 +91,7 @@ impl<K: Kernel> Recordable for K {}
 
 /// The CPU reference of a kernel: same parameters, same buffers, plain loops.
 ///
-/// It reads from a slice what parameters and counts say and no more: a buffer may be longer than a view needs, and its
+/// It reads no more of a slice than parameters and counts specify: a buffer may be longer than a view needs, and its
 /// tail is undefined.
 #[cfg(feature = "check")]
 pub trait Reference: OnHost {

@@ -1,4 +1,4 @@
-//! Memory of a device: in all, in use, and our limit.
+//! Memory of a device: total, in use, and the user's limit.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -25,7 +25,7 @@ pub struct MemoryBudget {
     pub usage: u64,
 }
 
-/// What a query needs.
+/// Handles for a query.
 pub(super) struct BudgetQuery {
     instance: ash::Instance,
     physical: vk::PhysicalDevice,
@@ -68,7 +68,7 @@ impl Gpu {
         self.shared.budget.as_ref().map(BudgetQuery::ask)
     }
 
-    /// The bytes of all buffers, staging included, and of those that the device is not done with.
+    /// The bytes of all buffers, including staging, and of dropped ones that the device is not done with.
     pub fn memory_in_use(&self) -> u64 {
         self.shared.usage.now.load(Ordering::Acquire)
     }
@@ -78,7 +78,7 @@ impl Gpu {
         self.shared.usage.peak.load(Ordering::Acquire)
     }
 
-    /// Frees the memory of what was dropped, as far as the device is done with it; otherwise the next wait does.
+    /// Frees the memory of dropped buffers that the device is done with; the rest is freed by the next wait.
     pub(crate) fn free_unused(&self) {
         self.shared.collect(self.shared.reached());
     }
@@ -146,7 +146,7 @@ mod tests {
     use crate::gpu::{DeviceChoice, Gpu};
 
     #[test]
-    fn memory_counts_until_the_device_is_done_with_it_and_no_further_than_the_limit() {
+    fn memory_counts_until_the_device_is_done_with_it_and_up_to_the_limit() {
         let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
         let before = gpu.memory_in_use();
         let buffer = gpu.uninit::<u8>("buffer", 1 << 20).unwrap();
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn a_budget_is_no_less_than_what_is_taken() {
+    fn a_budget_is_at_least_the_memory_in_use() {
         let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
         if let Some(budget) = gpu.memory_budget() {
             assert!(budget.budget > 0 && budget.budget >= budget.usage, "{budget:?}");

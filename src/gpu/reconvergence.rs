@@ -78,9 +78,9 @@ mod tests {
         instruction(OP_EXTENSION, &bytes.chunks(4).map(word).collect::<Vec<_>>())
     }
 
-    /// A driver that does not know the extension rejects a module that names it, and a mode without it.
+    /// A driver without the extension rejects a module that names it, and a mode without it.
     #[test]
-    fn the_question_and_nothing_else_goes() {
+    fn only_the_request_is_removed() {
         const LOCAL_SIZE: u32 = 17;
         let header = vec![0x0723_0203, 0x0001_0600, 0, 99, 0];
         let [capability, storage] = [instruction(17, &[1]), extension("SPV_KHR_16bit_storage")];

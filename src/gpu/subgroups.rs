@@ -36,7 +36,7 @@ impl SubgroupSizes {
 
     /// AMD's drivers report 64, which RDNA issues as two successive halves of 32. With half as many lanes that wait for
     /// the last splat of a tile, 32 is the better choice for divergent kernels (AMD, RDNA whitepaper, 2019). GCN and
-    /// CDNA have 64 alone. Elsewhere the driver's choice holds.
+    /// CDNA only have 64. Otherwise the driver's choice is used.
     fn built_in(self, vendor: u32) -> u32 {
         if vendor == AMD && self.all().contains(&32) { 32 } else { self.own }
     }
@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn the_built_in_size_is_the_drivers_but_for_rdna() {
+    fn the_built_in_size_is_the_drivers_except_for_rdna() {
         for (vendor, sizes, expected) in [
             (NVIDIA, sizes(32, [32, 32]), 32),
             (AMD, sizes(64, [32, 64]), 32),
@@ -84,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn a_size_that_is_asked_for_is_one_that_the_device_has() {
+    fn a_requested_size_must_be_one_of_the_devices() {
         let intel = sizes(32, [8, 32]);
         assert_eq!(lanes(intel, INTEL, Some("16")), Ok(16));
         assert_eq!(SubgroupSizes { workgroup_limit: 16, ..intel }.all(), [16, 32]);

@@ -1,4 +1,4 @@
-//! The fastest tile sizes of this device, as measured by `nightsplat bench --tune`: a small file in the user's cache
+//! The fastest tile sizes of this device, measured by `nightsplat bench --tune`: a small file in the user's cache
 //! folder.
 
 use std::fmt;
@@ -121,7 +121,7 @@ impl Gpu {
         let Properties { name, driver, .. } = self.properties();
         let tuning = Tuning { device: name.clone(), driver: driver.clone(), tiles: tiles.to_vec() };
         let folder = path.parent().map_or(Ok(()), std::fs::create_dir_all);
-        folder.map_err(|error| Error::output(path, format!("cannot be made ({error})")))?;
+        folder.map_err(|error| Error::output(path, format!("cannot be created ({error})")))?;
         write_whole(path, format!("{:#}\n", serde_json::json!(tuning)).as_bytes())?;
         Ok(Some(path.to_owned()))
     }
@@ -148,7 +148,7 @@ fn load(path: &Path, properties: &Properties) -> Vec<TunedTile> {
         Ok(bytes) => tiles(&bytes, properties),
     };
     tiles.unwrap_or_else(|problem| {
-        let remedy = "`nightsplat bench --tune` measures anew";
+        let remedy = "`nightsplat bench --tune` measures again";
         tracing::warn!("{}: {problem}; it is ignored: {remedy}", path.display());
         vec![]
     })
@@ -194,14 +194,14 @@ mod tests {
     }
 
     #[test]
-    fn a_tile_has_one_to_thirty_two_rows_of_lanes() {
+    fn a_tile_has_1_to_32_rows_of_lanes() {
         let suits = |size: [u32; 2]| properties().suits_tile(size);
         assert!(suits([8, 1]) && suits([16, 16]) && suits([32, 8]));
         assert!(!suits([0, 8]) && !suits([3, 3]) && !suits([32, 16]) && !suits([u32::MAX; 2]));
     }
 
     #[test]
-    fn subgroups_share_a_tile_of_equal_parts() {
+    fn subgroups_share_a_tile_in_equal_parts() {
         let suits = |size, subgroups| properties().suits_tile(Tile { size, subgroups });
         assert!(suits([16, 16], 2) && suits([16, 16], 4) && suits([16, 32], 2) && suits([8, 2], 2));
         assert!(!suits([16, 6], 4) && !suits([4, 4], 4) && !suits([16, 128], 4));
@@ -224,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn only_an_undamaged_file_of_this_device_and_driver_is_taken() {
+    fn only_an_intact_file_of_this_device_and_driver_is_used() {
         let text = |device: &str, driver: &str, tile: [u32; 2]| {
             let tiles = vec![TunedTile { channels: 3, tile: tile.into() }];
             let tuning = Tuning { device: device.to_owned(), driver: driver.to_owned(), tiles };

@@ -1,4 +1,5 @@
-//! The denoising terms: the denoised image stays near the target (paper's variant: near the render), and smooth.
+//! The denoising terms: the denoised image must be close to the target (in the paper's variant, to the render), and
+//! smooth.
 
 use glam::UVec2;
 

@@ -1,4 +1,4 @@
-//! Learned exposure and colour per view, for photographs of one scene that are not equally bright.
+//! Learned exposure and colour per view, for photographs of one scene with different exposures.
 //!
 //! A target is compared with e = gain c + bias, an affine of the encoded colours c of the render, for each channel of
 //! each view. The brightness of the model is fixed: after every step the mean of the gains over the training views is 1
@@ -26,7 +26,7 @@ settings! {
 pub struct ExposureRates {
     /// Adam's rate of the gains at the start.
     initial: f64 = 0.01 => Rule::POSITIVE;
-    /// Adam's rate of the gains at the end of its exponential decay and from there on.
+    /// Adam's rate of the gains from the end of its exponential decay on.
     last: f64 = 0.001 => Rule::POSITIVE;
     /// The steps of the decay.
     steps: u64 = 600 => Rule::COUNT, in "steps";
@@ -53,7 +53,7 @@ pub struct Exposures {
     backward: Pipeline<expose_backward::Kernel>,
     gradient: Pipeline<exposure_gradient::Kernel>,
     center: Pipeline<exposure_center::Kernel>,
-    /// (views, `EXPOSURE_WIDTH`), as include/exposure.glsl has them.
+    /// (views, `EXPOSURE_WIDTH`), in the layout of include/exposure.glsl.
     parameters: Buffer<f32>,
     gradients: Buffer<f32>,
     moments: Moments,
@@ -130,10 +130,10 @@ impl Exposures {
         self.dispatch(pass, false, view, size, render)
     }
 
-    /// Records the target of `view`, (3, H, W), with its exposure undone, to [`Exposures::exposed`].
+    /// Records the target of `view`, (3, H, W), with its exposure removed, to [`Exposures::exposed`].
     ///
     /// # Errors
-    /// As [`Exposures::expose`].
+    /// Those of [`Exposures::expose`].
     pub fn neutralize(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -173,7 +173,7 @@ impl Exposures {
     /// Records the gradient of the exposures, and replaces dL/d exposed in the colours of `d_render` by dL/d render.
     ///
     /// # Errors
-    /// As [`Exposures::expose`].
+    /// Those of [`Exposures::expose`].
     pub fn backward(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -239,7 +239,7 @@ impl Exposures {
         pixels(size).div_ceil(self.chunk)
     }
 
-    /// A kernel that runs beyond a buffer corrupts its neighbours: refuse before anything is recorded.
+    /// A kernel that exceeds a buffer corrupts other data, so lengths are checked before anything is recorded.
     fn check(&self, view: usize, size: UVec2, planes: &Buffer<f32>) -> Result<()> {
         let values = COLOR_CHANNELS * pixels(size) as usize;
         if view >= self.view_count as usize {
@@ -286,7 +286,7 @@ fn pixels(size: UVec2) -> u32 {
 }
 
 impl Affine {
-    /// What is learned of it.
+    /// Its learned parameters.
     fn parameters(&self) -> Result<[f32; EXPOSURE_WIDTH as usize]> {
         let [gains, biases] = [self.gain.map(|gain| gain - 1.0), self.bias.map(|b| b / BIAS_SCALE)];
         let mut parameters = [0.0; EXPOSURE_WIDTH as usize];
@@ -296,7 +296,9 @@ impl Affine {
         if self.gain.iter().all(|&gain| gain > 0.0) && parameters.iter().all(|p| p.is_finite()) {
             return Ok(parameters);
         }
-        Err(Error::Usage(format!("{self} is no exposure: gains must be above 0 and all be finite")))
+        Err(Error::Usage(format!(
+            "{self} is not an exposure: gains must be above 0, and all values finite"
+        )))
     }
 
     fn of_parameters(parameters: &[f32]) -> Self {

@@ -72,9 +72,9 @@ struct SsimLayout {
 }
 
 impl SsimLayout {
-    /// The layouts that suit the device; the first that fits a view is used. On a CPU loads and stores cost most, so
-    /// that a subgroup is as wide as the L1 cache allows for what registers do not hold, and has many rows; a GPU needs
-    /// narrow strips, whose state stays in registers.
+    /// The layouts for the device; the first that fits a view is used. On a CPU, loads and stores cost most: a subgroup
+    /// is as wide as its state fits the L1 cache, and has many rows. A GPU needs narrow strips, whose state stays in
+    /// registers.
     fn on(gpu: &Gpu) -> Vec<Self> {
         let properties = gpu.properties();
         match properties.is_cpu {
@@ -101,8 +101,8 @@ impl SsimLayout {
     }
 }
 
-/// The least columns that a subgroup of a GPU loads: the fewer there are, the larger the share of the borders, which
-/// have no outputs.
+/// The fewest columns that a subgroup of a GPU loads: with fewer, the share of the borders, which have no outputs, is
+/// larger.
 const GPU_COLUMNS: u32 = 64;
 
 /// The settings of a loss between images.
@@ -217,7 +217,7 @@ impl Loss {
     }
 
     /// Writes dL/d render, (3, H, W), to `d_render` or adds it, also outside the loss region, and writes the means of
-    /// |a - b| and of SSIM to the log. Where the SSIM weight is 0, SSIM is neither evaluated nor logged.
+    /// |a - b| and of SSIM to the log. If the SSIM weight is 0, SSIM is neither evaluated nor logged.
     ///
     /// # Errors
     /// The view is empty or larger than those reserved for, the loss region is empty or not inside it, a buffer is
@@ -273,7 +273,7 @@ impl Loss {
         )
     }
 
-    /// A kernel that runs beyond a buffer corrupts its neighbours: refuse before anything is recorded.
+    /// A kernel that exceeds a buffer corrupts other data, so lengths are checked before anything is recorded.
     fn check(
         &self,
         inputs: &LossInputs<'_>,

@@ -15,7 +15,7 @@ pub struct StepLosses {
 }
 
 impl StepLosses {
-    /// The mean that `term` had; 0 if it was never recorded.
+    /// The mean of `term`; 0 if it was never recorded.
     pub fn get(&self, term: Term) -> f32 {
         self.values[term.index()]
     }
@@ -26,7 +26,7 @@ impl StepLosses {
     }
 }
 
-/// The terms of as many steps as it has slots, on the device.
+/// The terms of one step per slot, on the device.
 #[derive(Debug)]
 pub struct LossLog {
     pipeline: Pipeline<loss_log::Kernel>,
@@ -36,14 +36,14 @@ pub struct LossLog {
     statuses: Buffer<u32>,
 }
 
-/// A log on its way to the host.
+/// A download of a log.
 #[derive(Debug)]
 pub struct LossLogDownload {
     values: Download<f32>,
     statuses: Download<u32>,
 }
 
-/// Where the terms of one step go.
+/// The row of the log for one step.
 #[derive(Debug)]
 pub struct LogSlot<'a> {
     /// The log.
@@ -54,7 +54,7 @@ pub struct LogSlot<'a> {
     pub status: &'a mut Buffer<u32>,
 }
 
-/// A term and the partial sums that it is the scaled sum of; with none of them its column is left as it is.
+/// A term and the partial sums whose scaled sum it is; without any, its column is unchanged.
 #[derive(Clone, Copy)]
 pub(super) struct PartialSums<'a> {
     pub(super) term: Term,
@@ -76,12 +76,12 @@ impl LossLog {
         })
     }
 
-    /// Records zeros: a term that a step leaves out is 0.
+    /// Records zeros: a term that a step omits is 0.
     pub fn clear(&mut self, pass: &mut Recorder<'_>) {
         pass.fill(&mut self.values, 0);
     }
 
-    /// Copies the log as it is at this point of the recording to the host.
+    /// Copies the log at this point of the recording to the host.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -94,7 +94,7 @@ impl LossLog {
 }
 
 impl LossLogDownload {
-    /// Waits for the submission that the copy is part of; gives one element per slot.
+    /// Waits for the submission of the copy; returns one element per slot.
     ///
     /// # Errors
     /// The device was lost.
@@ -106,7 +106,7 @@ impl LossLogDownload {
 }
 
 impl LogSlot<'_> {
-    /// Refuses a slot that the log does not have, before anything is recorded.
+    /// Checks that the log has the slot, before anything is recorded.
     pub(super) fn check(&self) -> Result<()> {
         let (slot, slots) = (self.slot, self.log.statuses.len());
         if slot as usize >= slots || self.status.is_empty() {
@@ -152,7 +152,7 @@ mod tests {
     use crate::splats::scene::Features;
 
     #[test]
-    fn the_total_is_one_of_distances_and_of_what_likenesses_lack() {
+    fn the_total_sums_distances_and_one_minus_similarities() {
         let config = LossConfig {
             ssim_weight: 0.25,
             weights: Weights { denoising: 0.0, structure: 0.0, depth: 0.0, ..Weights::default() },

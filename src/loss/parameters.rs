@@ -3,9 +3,9 @@
 //!
 //! L = a mean sigmoid(o) + b mean exp(s) + c mean max(max s - min s - ln r, 0), a, b and c the weights, o the raw
 //! opacities, s the logarithms of the three standard deviations. The first two are the regularisers of 3DGS-MCMC
-//! (Kheradmand et al. 2024). The third is that of `PhysGaussian` (Xie et al. 2024), of the logarithm of the ratio: its
-//! gradient does not grow with the ratio. They look at no view, so they are recorded after the gradient of the render
-//! has become that of the parameters, and add to it.
+//! (Kheradmand et al. 2024). The third is that of `PhysGaussian` (Xie et al. 2024), applied to the logarithm of the
+//! ratio, so that its gradient does not grow with the ratio. They do not depend on a view: they are recorded after the
+//! backward pass of the render, and add to its gradient.
 
 use super::log::{LogSlot, PartialSums};
 use super::{LossSpec, Term, TermOn};
@@ -53,7 +53,7 @@ pub struct ParameterWeights {
     scale_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
     /// Weight of the mean excess of ln(longest / shortest standard deviation) over ln(`loss.anisotropy_limit`).
     anisotropy_weight: f64 = 0.0 => Rule::POSITIVE_OR_0;
-    /// The ratio of longest to shortest standard deviation that costs nothing.
+    /// The largest ratio of longest to shortest standard deviation without a loss.
     anisotropy_limit: f64 = 3.0 => Rule::from_to(1.0, 1e6);
 }
 }
@@ -64,18 +64,18 @@ impl ParameterWeights {
     }
 }
 
-/// What the terms read of a step.
+/// The inputs of the terms in a step.
 #[derive(Clone, Copy, Debug)]
 pub struct ParameterInputs<'a> {
-    /// How the planes of the Gaussians lie.
+    /// The layout of the planes of the Gaussians.
     pub batches: &'a Batches,
-    /// Words that a Gaussian has in `parameters`.
+    /// Words per Gaussian in `parameters`.
     pub words: usize,
     /// The planes; the columns of opacities and scales are those of include/gaussian.glsl.
     pub parameters: &'a Buffer<f32>,
 }
 
-/// A part begins at a multiple of this many floats, where every device lets a binding begin.
+/// A part begins at a multiple of this many floats, which is aligned for bindings on every device.
 const PART: usize = 64;
 
 /// Records the terms on parameters that have a weight.
@@ -85,14 +85,14 @@ pub struct ParameterTerms {
     weights: ParameterWeights,
     pipeline: Pipeline<parameter_terms::Kernel>,
     gaussians_per_workgroup: u32,
-    /// One a workgroup, of all batches one after the other.
+    /// One per workgroup, of all batches in order.
     opacity_partials: Buffer<f32>,
     scale_partials: Buffer<f32>,
     ratio_partials: Buffer<f32>,
 }
 
 impl ParameterTerms {
-    /// None where no weight is above 0.
+    /// `None` if no weight is above 0.
     ///
     /// # Errors
     /// The device refuses the pipeline.
@@ -128,7 +128,7 @@ impl ParameterTerms {
         log.check()?;
         let each = self.gaussians_per_workgroup;
         let workgroups = |batch: &Batch| batch.gaussian_count().div_ceil(each);
-        // Batches bind parts of the partial sums; what lies between these counts as 0.
+        // Batches bind parts of the partial sums; padding between them counts as 0.
         let padded = |batch: &Batch| (workgroups(batch) as usize).next_multiple_of(PART);
         let total: usize = batches.iter().map(|batch| padded(&batch)).sum();
         let all: u32 = batches.iter().map(|batch| batch.gaussian_count()).sum();

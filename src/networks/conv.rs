@@ -8,12 +8,12 @@ use crate::gpu::{Buffer, CooperativeMatrix, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{conv3x3, conv3x3_weight_gradient, reduce_strips};
 use crate::{Error, Result};
 
-/// The most output channels that one subgroup takes.
+/// The most output channels per subgroup.
 const OUT_BLOCK: u32 = 8;
 
 /// Rows of one partial sum of the weight gradient.
 const STRIP_ROWS: u32 = 16;
-/// With matrices, a subgroup takes more channels and fewer rows, so that there are as many subgroups.
+/// With matrices, a subgroup has more channels and fewer rows, for the same number of subgroups.
 pub(super) const HALF_STRIP_ROWS: u32 = 4;
 
 /// The activation of a convolution.
@@ -25,7 +25,7 @@ pub(super) enum Activation {
     Sigmoid = conv3x3::SIGMOID,
 }
 
-/// The output that a convolution adds to instead of overwriting it.
+/// The buffer that a convolution adds to instead of overwriting it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum AccumulateInto {
     Nothing,
@@ -42,7 +42,7 @@ pub enum Precision {
     /// 32 bits.
     #[default]
     Single,
-    /// 16 bits, by cooperative matrices where the device supports them, else as `Single`.
+    /// 16 bits, by cooperative matrices if the device supports them, else as `Single`.
     Half,
 }
 
@@ -89,7 +89,7 @@ pub(super) struct WeightGradientInputs<'a> {
 }
 
 impl Conv {
-    /// Builds the kernels. A buffer that is added to keeps its content in the sum.
+    /// Builds the kernels. A buffer that is accumulated into keeps its content in the sum.
     ///
     /// # Errors
     /// The driver refuses a kernel.
@@ -142,7 +142,7 @@ impl Conv {
         self.data_gradient.record(pass, size, channels, offset, values, d_target, d_source)
     }
 
-    /// Adds the gradients of weights and biases; `partials` holds [`partial_count`] values.
+    /// Adds the gradients of weights and biases; `partials` has [`partial_count`] values.
     pub(super) fn weight_gradient(
         &self,
         pass: &mut Recorder<'_>,

@@ -2,7 +2,7 @@
 //!
 //! The networks' losses are means over pixels, so a random crop estimates them without bias. The output of a crop's
 //! pixels depends on a margin around them, the receptive field: a padded crop is the crop with its margin, clipped to
-//! the image, where the zero padding is that of the whole view.
+//! the image, at whose borders the zero padding is that of the whole view.
 
 use std::ops::Range;
 
@@ -13,7 +13,7 @@ use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{crop_gather, crop_scatter};
 use crate::{Error, Result};
 
-/// A padded crop of a view, and the crop in it.
+/// A padded crop of a view, and the crop within it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PaddedCrop {
     /// The padded crop's corner in the view, pixels.
@@ -34,8 +34,8 @@ impl PaddedCrop {
 
     /// A random crop with a margin of `margin` pixels: one of the equal cells, at most `side` pixels wide and high,
     /// into which the view is divided. It is the cell of a uniformly drawn pixel, so that the expectation of means over
-    /// crops is the mean over the view: a crop at a random corner would favour the middle of the view. The draw depends
-    /// on the stream and `draw` alone.
+    /// crops is the mean over the view: crops at random corners would favour the middle of the view. The draw depends
+    /// only on the stream and `draw`.
     pub fn random(view: UVec2, side: u32, margin: u32, stream: &Stream, draw: u64) -> Self {
         let cells = UVec2::new(view.x.div_ceil(side), view.y.div_ceil(side));
         let uniform = |axis: u64, extent: u32| {
@@ -126,7 +126,7 @@ impl CropKernels {
     }
 }
 
-/// A kernel that runs beyond a buffer corrupts its neighbours: refuse before anything is recorded.
+/// A kernel that exceeds a buffer corrupts other data, so lengths are checked before anything is recorded.
 fn check(
     image: &Buffer<f32>,
     size: UVec2,
@@ -136,7 +136,7 @@ fn check(
 ) -> Result<()> {
     let pixels = |size: UVec2| size.x as usize * size.y as usize;
     if (crop.origin + crop.size).cmpgt(size).any() {
-        return Err(Error::Usage(format!("{crop:?} does not lie in a view of {size} pixels")));
+        return Err(Error::Usage(format!("{crop:?} is not inside a view of {size} pixels")));
     }
     for (buffer, needed) in
         [(image, planes.end * pixels(size)), (content, planes.len() * pixels(crop.size))]
@@ -144,7 +144,7 @@ fn check(
         if buffer.len() < needed {
             let (name, len) = (buffer.name(), buffer.len());
             return Err(Error::Usage(format!(
-                "buffer `{name}` holds {len} values, the window needs {needed}"
+                "buffer `{name}` holds {len} values, the crop needs {needed}"
             )));
         }
     }

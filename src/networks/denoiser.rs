@@ -6,11 +6,11 @@
 //! R_{k+1} = clamp(R_0 - (I_k + sigmoid(conv_out(f))), 0, 1)
 //! ```
 //!
-//! That is the paper's variant. In the identity variant `I_0 = R_0` and `R_{k+1} = I_k - conv_out(f)`, with the last
-//! layer zero at first: R_K begins as the render, and no gradient vanishes in a sigmoid or a clamp.
+//! This is the paper's variant. In the identity variant `I_0 = R_0` and `R_{k+1} = I_k - conv_out(f)`, with the last
+//! layer zero at first: R_K starts as the render, and no gradient vanishes in a sigmoid or a clamp.
 //!
-//! Activations are kept for one stage at a time, or for every stage where [`Denoiser::keep_activations`] finds memory:
-//! without it the backward pass recomputes those of the earlier stages from their inputs `R_k`, to the same bits.
+//! Activations are kept for one stage at a time, or for every stage if [`Denoiser::keep_activations`] finds memory;
+//! otherwise the backward pass recomputes those of the earlier stages from their inputs `R_k`, to the same bits.
 
 mod memory;
 
@@ -35,8 +35,8 @@ const STREAM: u64 = 5;
 
 settings! {
 "model.network."
-/// How large a denoiser is, and what it begins as. By default it is as small as pays on noisy photographs
-/// (docs/benchmarks.md).
+/// The size of a denoiser, and its initialisation. By default it is the smallest that is worth its time on noisy
+/// photographs (docs/benchmarks.md).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DenoiserSettings {
     /// Stages of the denoiser, each with its own weights.
@@ -45,16 +45,16 @@ pub struct DenoiserSettings {
     repeats: u32 = 2 => Rule::Whole(1, 64), "--denoiser-repeats N";
     /// Channels of the denoiser.
     channels: u32 = 8 => Rule::Whole(1, 512), "--denoiser-channels N";
-    /// Precision of the denoiser: single, or half, which takes 16-bit cooperative matrices.
+    /// Precision of the denoiser: single, or half, which requires 16-bit cooperative matrices.
     precision: Precision = Precision::Single => Rule::OneOf(&["single", "half"]), "--denoiser-precision P";
-    /// How the networks begin and end, the tonemapper too: identity, which lets through what goes in until something
-    /// better is learned, or paper.
+    /// Variant of the networks, including the tonemapper: identity, which starts as the identity and learns a residual,
+    /// or paper.
     variant: NetworkVariant = NetworkVariant::Identity => Rule::OneOf(&["identity", "paper"]);
 }
 }
 
 impl DenoiserSettings {
-    /// LITA-GS's.
+    /// The settings of LITA-GS.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn paper() -> Self {
         Self {
@@ -67,7 +67,7 @@ impl DenoiserSettings {
     }
 
     /// # Errors
-    /// A number is out of its range.
+    /// A value is out of range.
     pub(crate) fn check(&self) -> Result<()> {
         self.check_rows()
     }
@@ -87,7 +87,7 @@ impl DenoiserSettings {
 pub struct Denoiser {
     gpu: Gpu,
     settings: DenoiserSettings,
-    /// The same with the precision that the device supports.
+    /// The settings with the precision that the device supports.
     held: DenoiserSettings,
     parameters: Parameters,
     stages: Vec<Stage>,
@@ -177,7 +177,7 @@ impl Denoiser {
         &self.parameters
     }
 
-    /// As [`Denoiser::parameters`], mutable.
+    /// [`Denoiser::parameters`], mutable.
     pub fn parameters_mut(&mut self) -> &mut Parameters {
         &mut self.parameters
     }
@@ -194,7 +194,7 @@ impl Denoiser {
         self.gpu.write(&mut self.parameters.values, &values)
     }
 
-    /// The radius of a pixel's receptive field, in pixels, not counting the norms, which read the whole view.
+    /// The radius of a pixel's receptive field, in pixels, excluding the norms, which read the whole view.
     pub fn margin(&self) -> u32 {
         self.settings.stages * (self.settings.repeats + 2)
     }
@@ -237,8 +237,8 @@ impl Denoiser {
         Ok(())
     }
 
-    /// Keeps the activations of every stage in views up to `size` from now on, if that takes no more than `most` bytes
-    /// and the device has them; returns whether it does. Results are bit-identical either way.
+    /// Keeps the activations of every stage in views up to `size` from now on, if that takes at most `most` bytes and
+    /// the device has them; returns whether it does. Results are bit-identical either way.
     ///
     /// # Errors
     /// The device was lost.
@@ -308,8 +308,8 @@ impl Denoiser {
     }
 
     /// Records the backward pass from `dL/dR_K`: overwrites the gradients of the parameters, writes `d_input` and adds
-    /// to `d_render`, each (3, H, W), the gradient of the render beside `I_0`: zero in the identity variant. Inputs and
-    /// parameters must be those of the preceding forward pass.
+    /// to `d_render`, each (3, H, W), the gradient of the render other than through `I_0`: zero in the identity
+    /// variant. Inputs and parameters must be those of the preceding forward pass.
     ///
     /// # Errors
     /// There is no forward pass of that size before it, or an image is shorter than the view.
@@ -327,7 +327,7 @@ impl Denoiser {
         let pixels = pixel_count(size)?;
         check_images(pixels, [input, render, d_denoised, d_input, d_render])?;
         if self.recorded.take() != Some(size) {
-            let remedy = "each backward pass needs a forward pass of its own before it";
+            let remedy = "each backward pass needs its own preceding forward pass";
             return Err(out_of_turn("denoiser", size, remedy));
         }
         let Self { kernels, memory, earlier, parameters, stages, held, .. } = self;
@@ -379,7 +379,7 @@ impl Denoiser {
     }
 }
 
-/// What the backward pass of a stage reads and overwrites.
+/// The images that the backward pass of a stage reads and overwrites.
 struct Maps<'a> {
     activations: &'a mut Activations,
     d_features: &'a mut Buffer<f32>,
@@ -474,7 +474,7 @@ impl Kernels {
             let source = (activations.features(repeat), &activations.packed[repeat]);
             let d_target = Map { single: &*d_convolved, packed: &mut *d_packed };
             let strips = Strips { partials: &mut *partials, gradients: &mut *gradients };
-            // The shortcut passes the gradient on: that of the convolution is added to it.
+            // The shortcut passes the gradient through: that of the convolution is added to it.
             let layer = stage.inner(values);
             self.conv.backward(pass, size, layer, source, d_target, d_features, strips)?;
         }

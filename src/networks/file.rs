@@ -13,7 +13,7 @@ use crate::base::output::write_whole;
 use crate::gpu::Gpu;
 use crate::{Error, Result};
 
-/// The key of the metadata that holds the settings of every network, as one JSON object.
+/// The metadata key for the settings of every network, as one JSON object.
 const SETTINGS: &str = "networks";
 
 /// A safetensors file whose header is read once.
@@ -25,7 +25,7 @@ pub(crate) struct TensorFile<'a> {
 
 impl<'a> TensorFile<'a> {
     /// # Errors
-    /// The header is damaged, or contradicts the size of the data.
+    /// The header is damaged, or does not match the size of the data.
     pub(crate) fn of(bytes: &'a [u8]) -> std::result::Result<Self, SafeTensorError> {
         let (header_bytes, metadata) = SafeTensors::read_metadata(bytes)?;
         // The length of the header precedes it.
@@ -105,10 +105,11 @@ pub fn save(path: &Path, networks: &[&Parameters], gpu: &Gpu) -> Result<()> {
 /// Reads each network's values from the tensors `network.tensor`: all networks, or none on failure.
 ///
 /// # Errors
-/// The file is missing or damaged, a value is not finite, or the file holds a network of another configuration.
+/// The file is missing or damaged, a value is not finite, or a network in the file has another configuration.
 pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<()> {
     let bytes = input::bytes(path)?;
-    let damaged = |error| Error::input(path, format!("is no whole safetensors file ({error})"));
+    let damaged =
+        |error| Error::input(path, format!("is not an intact safetensors file ({error})"));
     let file = TensorFile::of(&bytes).map_err(damaged)?;
     let settings = file.note(SETTINGS);
     let settings: Value = settings.and_then(|s| serde_json::from_str(s).ok()).unwrap_or_default();

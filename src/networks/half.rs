@@ -12,7 +12,7 @@ use crate::kernels::{
 
 /// The most matrices of output channels per subgroup, times four rows of pixels: sixteen sums in registers.
 const BLOCKS: u32 = 4;
-/// The same for the weight gradient, times nine taps: eighteen sums.
+/// The most matrices of output channels for the weight gradient, times nine taps: eighteen sums.
 const STRIP_BLOCKS: u32 = 2;
 
 /// Values per subgroup of the search for the largest magnitude.

@@ -1,4 +1,4 @@
-//! LPIPS (Zhang et al. 2018, version 0.1): a perceptual distance between two images. Lower is more alike.
+//! LPIPS (Zhang et al. 2018, version 0.1): a perceptual distance between two images. Lower is more similar.
 
 use std::path::Path;
 
@@ -98,7 +98,7 @@ impl Lpips {
         let path = path.as_ref();
         let bytes = input::bytes(path)?;
         let file = TensorFile::of(&bytes).map_err(|error| {
-            Error::input(path, format!("is no whole safetensors file ({error})"))
+            Error::input(path, format!("is not an intact safetensors file ({error})"))
         })?;
         let network = Network::of(path, &file)?;
         let trunk = Trunk::new(gpu, path, &file, network)?;
@@ -116,12 +116,12 @@ impl Lpips {
     /// The distance between two images of one size, sRGB in [0, 1]; 0 for equal ones.
     ///
     /// # Errors
-    /// [`Error::Usage`] where the sizes differ, are too small, or are too large for a binding of the device; the device
-    /// is out of memory or lost.
+    /// [`Error::Usage`] if the sizes differ, are too small, or too large for a binding of the device; the device is out
+    /// of memory or lost.
     pub fn distance(&self, gpu: &Gpu, render: &Image, reference: &Image) -> Result<f64> {
         let size = |image: &Image| UVec2::new(image.width, image.height);
         if size(render) != size(reference) {
-            let problem = "two pictures of different sizes cannot be compared";
+            let problem = "two images of different sizes cannot be compared";
             return Err(Error::Usage(problem.to_owned()));
         }
         self.trunk.check(gpu, size(render))?;
@@ -144,7 +144,7 @@ impl Lpips {
 
 /// The mean over the pixels of the weighted squared differences of the unit vectors across the channels.
 fn layer_distance(a: &[f32], b: &[f32], weights: &[f32]) -> f64 {
-    /// The published measure's, which maps zero vectors to zero.
+    /// As in the published measure: zero vectors map to zero.
     const EPSILON: f64 = 1e-10;
     let pixels = a.len() / weights.len();
     let lengths = |values: &[f32]| -> Vec<f64> {

@@ -96,7 +96,7 @@ impl Layout {
         offset
     }
 
-    /// As [`Layout::conv`], all zero: the output is zero, and it still learns.
+    /// [`Layout::conv`] with zeros: the output is zero, and still learns.
     pub(super) fn zero_conv(&mut self, name: &str, inputs: u32, outputs: u32) -> u32 {
         let (inputs, outputs) = (inputs as usize, outputs as usize);
         let offset = self.tensor(format!("{name}.weight"), vec![outputs, inputs, 3, 3], |_| 0.0);

@@ -100,7 +100,7 @@ impl Tonemapper {
         &self.parameters
     }
 
-    /// As [`Tonemapper::parameters`], mutable.
+    /// [`Tonemapper::parameters`], mutable.
     pub fn parameters_mut(&mut self) -> &mut Parameters {
         &mut self.parameters
     }
@@ -202,7 +202,7 @@ impl Tonemapper {
         let pixels = pixel_count(size)?;
         check_images(pixels, [illumination, denoised, d_output, d_illumination, d_denoised])?;
         if self.recorded.take() != Some(size) {
-            let remedy = "each backward pass needs a forward pass of its own before it";
+            let remedy = "each backward pass needs its own preceding forward pass";
             return Err(out_of_turn("tonemapper", size, remedy));
         }
         let TonemapperMemory { product, features, d_features, d_product, partials, .. } =
@@ -253,7 +253,7 @@ fn lengths(size: UVec2) -> [usize; 2] {
 }
 
 /// # Errors
-/// The device does not bind what a view of `size` takes.
+/// A view of `size` exceeds what the device can bind.
 fn check_maps(gpu: &Gpu, size: UVec2) -> Result<()> {
     let [pixels, _] = lengths(size);
     check_binding(gpu, "the tonemapper's feature maps", size, CHANNELS as usize * pixels)

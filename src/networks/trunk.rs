@@ -133,14 +133,14 @@ impl Network {
     /// The network of a file, by its last convolution.
     ///
     /// # Errors
-    /// [`Error::Input`]: it holds no network's.
+    /// [`Error::Input`] if it has none of a known network.
     pub(crate) fn of(path: &Path, file: &TensorFile<'_>) -> Result<Self> {
         let is_held = |network: &Self| file.tensor(&network.last_tensor()).is_some();
         Self::ALL.into_iter().find(is_held).ok_or_else(|| {
             let wanted = Self::ALL
                 .map(|network| format!("`{}` of {}", network.last_tensor(), network.title()));
             let wanted = wanted.join(" nor ");
-            Error::input(path, format!("holds no weights of LPIPS, neither {wanted}; {REMEDY}"))
+            Error::input(path, format!("contains no weights of LPIPS, neither {wanted}; {REMEDY}"))
         })
     }
 }
@@ -190,13 +190,13 @@ impl Trunk {
     }
 
     /// # Errors
-    /// The last layer would have no pixel, or one binding cannot hold an image of it.
+    /// The last layer would have no pixel, or one of its images exceeds one binding.
     pub(crate) fn check(&self, gpu: &Gpu, size: UVec2) -> Result<()> {
         let UVec2 { x: width, y: height } = size;
         let (title, least) = (self.network.title(), self.network.min_size());
         if size.min_element() < least {
             return Err(Error::Usage(format!(
-                "LPIPS of {title} looks at pictures of {least} pixels to a side and more, not {width}x{height}"
+                "LPIPS of {title} needs images of at least {least} pixels per side, not {width}x{height}"
             )));
         }
         let (mut widest, mut size) = (0, size);
@@ -324,7 +324,7 @@ fn floats(channels: u32, UVec2 { x, y }: UVec2) -> usize {
 /// A tensor of the published weights.
 ///
 /// # Errors
-/// [`Error::Input`] where the file lacks it, has one of another shape, or one that is not finite.
+/// [`Error::Input`] if the file lacks it, or it has another shape or non-finite values.
 pub(crate) fn published(
     path: &Path,
     file: &TensorFile<'_>,

@@ -1,8 +1,8 @@
 //! Datasets: photographs on disk become views with undistorted cameras, a split and points.
 //!
-//! The format is found by looking: NeRF-style `transforms*.json` first (the layouts of LOM and `RealX3D` included), then a
-//! COLMAP model. What the model trains on is the dark photograph (`View::image`); a normal-light photograph of the
-//! same name is a test view's reference image (`View::reference`), used for scores only and loaded for test views only.
+//! The format is detected: NeRF-style `transforms*.json` first (including the layouts of LOM and `RealX3D`), then a
+//! COLMAP model. The model is trained on the dark photograph (`View::image`); a normal-light photograph of the same
+//! name is a test view's reference image (`View::reference`), used only for scores and loaded only for test views.
 
 mod allowance;
 mod borders;
@@ -66,48 +66,48 @@ pub use turns::PixelOrientation;
 /// Photographs with cameras, and points of the scene they show.
 #[derive(Clone, Debug)]
 pub struct Dataset {
-    /// The folder it was loaded from.
+    /// The folder that it was loaded from.
     pub root: PathBuf,
     /// Sorted by name; at least one training view has an image.
     pub views: Vec<View>,
-    /// In the cameras' world; empty where the dataset has none.
+    /// In the cameras' world; empty if the dataset has none.
     pub points: Vec<Point>,
-    /// What was left out, one line each: the photograph and why.
+    /// Photographs that were left out, each with the reason on one line.
     pub skipped: Vec<String>,
 }
 
 /// A photograph's place in the dataset.
 #[derive(Clone, Debug)]
 pub struct View {
-    /// The photograph's file name without extension, behind that of its folder where several folders have such a file
+    /// The photograph's file name without extension, prefixed with its folder if several folders contain such a file
     /// (`a_001`); unique.
     pub name: String,
     /// Whether it is trained on or scored.
     pub split: Split,
-    /// Undistorted, at the loaded resolution; where the photograph's Exif turns it, this is of the pixels as they are stored
-    /// unless the dataset's sizes say otherwise.
+    /// Undistorted, at the loaded resolution. If the photograph's Exif rotates it, the camera is that of the pixels as
+    /// stored, unless the dataset's sizes indicate otherwise.
     pub camera: Camera,
-    /// How its images are turned to be what people see.
+    /// The rotation of its images for display.
     pub orientation: Orientation,
-    /// The photograph to train on; of every training view it is here, or is read anew whenever it is looked at
+    /// The photograph to train on. For every training view it is in memory, or is decoded again on every use
     /// ([`View::loaded`]).
     pub image: Option<Image>,
-    /// Where it is read from, if its own size is larger or it is not kept.
+    /// Its file, if the stored size is larger or the photograph is not kept.
     pub original: Option<Original>,
-    /// The normal-light photograph to score against, of the camera's size; test views only. As with the photograph, it is
-    /// here or read anew ([`View::loaded_reference`]).
+    /// The normal-light photograph to score against, of the camera's size; only for test views. Like the photograph, it
+    /// is in memory or decoded again ([`View::loaded_reference`]).
     pub reference: Option<Image>,
-    /// Where it is read from, if it is not kept.
+    /// Its file, if it is not kept.
     pub reference_file: Option<Original>,
-    /// Which of its pixels count, of the camera's size; none where all do.
+    /// The usable pixels, of the camera's size; `None` if all are usable.
     pub mask: Option<Mask>,
-    /// Depth from elsewhere, (H, W) of the camera's size, in units and with an offset of its own; larger is farther.
-    /// Training views only, and none where it says nothing, being the same everywhere.
+    /// An external depth map, (H, W) of the camera's size, in arbitrary units and with an arbitrary offset; larger is
+    /// farther. Only for training views, and `None` if it is constant.
     pub depth: Option<Vec<f32>>,
 }
 
 impl View {
-    /// One that has a camera, a photograph or none, and nothing else.
+    /// A view with a camera and, optionally, a photograph.
     pub fn new(name: &str, split: Split, camera: Camera, image: Option<Image>) -> Self {
         Self {
             name: name.to_owned(),
@@ -123,12 +123,12 @@ impl View {
         }
     }
 
-    /// The camera as people see its images, mirrored ones as they are stored: turned about its optical axis.
+    /// The camera for upright images, rotated about its optical axis; mirrored images stay as stored.
     pub fn upright_camera(&self) -> Camera {
         self.camera.turned(self.orientation.quarters())
     }
 
-    /// An image of its camera as people see it.
+    /// An image of its camera, upright.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn upright(&self, image: Image) -> Image {
         image.turned(self.orientation)
@@ -139,12 +139,12 @@ impl View {
         self.split == Split::Train
     }
 
-    /// Whether it is for training, be it that it is kept from it to tell when it has converged.
+    /// Whether the view is for training, including those held out to detect convergence.
     pub(crate) fn is_for_training(&self) -> bool {
         self.split != Split::Test
     }
 
-    /// The planes of one of its images, of any size, without the pixels that do not count.
+    /// The planes of one of its images, of any size, without masked pixels.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn counted<'a>(&self, image: &'a Image) -> Cow<'a, [f32]> {
         match &self.mask {
@@ -153,7 +153,7 @@ impl View {
         }
     }
 
-    /// One of its images, of any size, of which the pixels that do not count are black.
+    /// One of its images, of any size, with masked pixels black.
     pub(crate) fn blacked_out(&self, image: Image) -> Image {
         match &self.mask {
             Some(mask) => mask.blacked_out(image),
@@ -161,25 +161,25 @@ impl View {
         }
     }
 
-    /// Whether there is a photograph, kept or to be read anew.
+    /// Whether there is a photograph, kept or to be decoded again.
     pub(crate) fn has_photograph(&self) -> bool {
         self.image.is_some() || self.original.is_some()
     }
 
-    /// Whether there is a reference image, kept or to be read anew.
+    /// Whether there is a reference image, kept or to be decoded again.
     pub(crate) fn has_reference(&self) -> bool {
         self.reference.is_some() || self.reference_file.is_some()
     }
 
-    /// The photograph at the size of the view's camera; none where the view has none.
+    /// The photograph at the size of the view's camera; `None` if the view has none.
     ///
     /// # Errors
-    /// [`Error::Input`] where it was not kept and its file can no longer be read.
+    /// [`Error::Input`] if it was not kept and its file can no longer be read.
     pub fn loaded(&self) -> Result<Option<Cow<'_, Image>>> {
         self.kept_or_read(self.image.as_ref(), self.original.as_ref())
     }
 
-    /// The reference image, of the same size; none where the view has none.
+    /// The reference image, of the same size; `None` if the view has none.
     ///
     /// # Errors
     /// As [`View::loaded`].
@@ -200,16 +200,16 @@ impl View {
         }
     }
 
-    /// Width and height of what [`View::photograph`] gives; none where the view has no photograph.
+    /// Width and height of [`View::photograph`]; `None` if the view has none.
     pub(crate) fn own_size(&self) -> Option<UVec2> {
         let kept = self.image.as_ref().map(|image| UVec2::new(image.width, image.height));
         self.original.as_ref().map(Original::size).or(kept)
     }
 
-    /// The photograph as its camera took it, undistorted and not shrunk; none where the view has none.
+    /// The undistorted photograph at its original size; `None` if the view has none.
     ///
     /// # Errors
-    /// [`Error::Input`] where it was shrunk on loading and its file can no longer be read.
+    /// [`Error::Input`] if it was downscaled on loading and its file can no longer be read.
     pub fn photograph(&self) -> Result<Option<Cow<'_, Image>>> {
         match &self.original {
             Some(original) => original.load().map(Cow::Owned).map(Some),
@@ -218,14 +218,14 @@ impl View {
     }
 }
 
-/// What a view is for.
+/// The use of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Split {
     /// Trained on.
     Train,
     /// Held out, for scores.
     Test,
-    /// A training photograph that is kept from training, to tell when it has converged.
+    /// A training photograph that is held out to detect convergence.
     HeldOut,
 }
 
@@ -238,7 +238,7 @@ pub struct Photograph {
     pub split: Split,
     /// The dark photograph.
     pub input: PathBuf,
-    /// The normal-light photograph to score against; test views only.
+    /// The normal-light photograph to score against; only for test views.
     pub reference: Option<PathBuf>,
     /// The mask.
     pub(crate) mask: Option<MaskFile>,
@@ -249,26 +249,26 @@ pub struct Photograph {
 pub struct Point {
     /// World space.
     pub position: DVec3,
-    /// Indices into [`Dataset::views`] of those that see it, ascending; may be empty.
+    /// Ascending indices into [`Dataset::views`] of the views that see it; may be empty.
     pub views: Vec<u32>,
 }
 
-/// Folders that hold the dark input where a normal-light twin lies beside them.
+/// Folders of the dark photographs in datasets that also have normal-light ones.
 const DARK_FOLDERS: [&str; 2] = ["low", "images_low"];
-/// Folders that may hold the normal-light twin.
+/// Folders that may contain the normal-light photographs.
 const NORMAL_FOLDERS: [&str; 4] = ["high", "val", "test", "images"];
-/// Folders that may hold depth maps.
+/// Folders that may contain depth maps.
 const DEPTH_FOLDERS: [&str; 2] = ["depth", "depth_maps"];
 
 impl Dataset {
     /// Loads the dataset below `root`.
     ///
-    /// Frames whose file is absent or does not decode are named in [`Dataset::skipped`]; test views stay as poses.
+    /// Frames whose file is missing or cannot be decoded are named in [`Dataset::skipped`]; test views stay as poses.
     ///
     /// # Errors
-    /// [`Error::Usage`] for a downscale that makes no sense; [`Error::Input`] naming the folder or file where there is
-    /// no dataset, no training photograph left, a file cut short, two views of one name, an unsupported camera model,
-    /// or a photograph whose size contradicts its camera.
+    /// [`Error::Usage`] for an invalid downscale; [`Error::Input`] with the folder or file if there is no dataset, no
+    /// usable training photograph, a truncated file, a duplicate name, an unsupported camera model, or a photograph
+    /// whose size contradicts its camera.
     ///
     /// ```no_run
     /// use nightsplat::{Dataset, LoadOptions};
@@ -282,7 +282,7 @@ impl Dataset {
         Self::load_and_look(root.as_ref(), options, None)
     }
 
-    /// The same; `look` sees every training photograph as it is stored while it is in memory.
+    /// As [`Dataset::load`]; `look` is called with every training photograph as stored while it is in memory.
     ///
     /// # Errors
     /// As [`Dataset::load`].
@@ -309,7 +309,7 @@ impl Dataset {
             );
             return Err(Error::input(root, problem));
         }
-        // Behind what may end it: an error is said alone.
+        // After everything that may fail: an error is reported alone.
         warn(&remarks);
         let views = with_held_out(views, options.hold_out);
         let points = points(&layout, &views, &clouds)?;
@@ -329,30 +329,31 @@ impl Dataset {
         Ok(dataset)
     }
 
-    /// What says which views are held out, in words.
+    /// The rule that selects the held-out views, in words.
     pub(crate) fn split_rule(root: &Path, options: &LoadOptions) -> String {
         let layout = Layout::of(root).ok();
         let listings = layout.as_ref().map(Layout::listings).unwrap_or_default();
         let has_test = listings.iter().any(|(_, split)| *split == Some(Split::Test));
         let root = layout.as_ref().map_or(root, |layout| &layout.root);
         match options.test_every {
-            Some(0) => "none, as asked for".to_owned(),
-            Some(every) => format!("every {every}th by name, as asked for"),
+            Some(0) => "none, as requested".to_owned(),
+            Some(every) => format!("every {every}th by name, as requested"),
             None if has_test => "as the transforms files say".to_owned(),
             None if split::test_list(root).is_some() => "as test.txt says".to_owned(),
             None => format!("every {TEST_EVERY}th by name"),
         }
     }
 
-    /// Whether `root` is a folder that [`Dataset::load`] finds cameras in.
+    /// Whether `root` is a folder in which [`Dataset::load`] finds cameras.
     pub(crate) fn is_at(root: &Path) -> bool {
         Layout::of(root).is_ok_and(|layout| layout.has_listing())
     }
 
-    /// Of the models that COLMAP left in the folders of `folder` the one that places the most photographs, with their names.
+    /// Of the models that COLMAP wrote into the subfolders of `folder`, the one with the most registered photographs,
+    /// with their names.
     ///
     /// # Errors
-    /// [`Error::Input`] where a model is damaged.
+    /// [`Error::Input`] if a model is damaged.
     pub(crate) fn largest_model(folder: &Path) -> Result<Option<(PathBuf, Vec<String>)>> {
         let models = colmap::models_in(folder, &["cameras", "images", "points3D"]);
         let Some((model, _)) = colmap::largest(&models, |_| true)? else { return Ok(None) };
@@ -363,25 +364,25 @@ impl Dataset {
     /// The calibrated lenses of a COLMAP model.
     ///
     /// # Errors
-    /// [`Error::Input`] where the model is damaged.
+    /// [`Error::Input`] if the model is damaged.
     #[cfg(feature = "cli")]
     pub(crate) fn lenses(model: &Path) -> Result<Vec<Lens>> {
         Ok(colmap::read_cameras(model)?.into_values().collect())
     }
 
-    /// The folder that holds what an archive holds: its one folder where there is nothing beside.
+    /// The folder with the contents of an archive: its only folder, if there is nothing else.
     ///
     /// # Errors
-    /// [`Error::Input`] where it is no archive that can be read.
+    /// [`Error::Input`] if it is not a readable archive.
     #[cfg(feature = "cli")]
     pub(crate) fn folder_of(archive: &Path) -> Result<PathBuf> {
         Ok(Layout::of(archive)?.root)
     }
 
-    /// The files of the views below `root`, sorted by name, without reading a pixel.
+    /// The files of the views below `root`, sorted by name, without decoding any.
     ///
     /// # Errors
-    /// As [`Dataset::load`], but for what is wrong with pixels.
+    /// As [`Dataset::load`], except for problems of pixels.
     pub(crate) fn photographs(root: &Path, options: &LoadOptions) -> Result<Vec<Photograph>> {
         let (photographs, skipped, remarks) = Self::listed(root, options)?;
         warn(&remarks);
@@ -391,7 +392,7 @@ impl Dataset {
         Ok(photographs)
     }
 
-    /// The same, what was left out, and what is to be said of the folder.
+    /// As [`Dataset::photographs`], with the photographs left out and remarks on the folder.
     pub(crate) fn listed(
         root: &Path,
         options: &LoadOptions,
@@ -411,10 +412,10 @@ impl Dataset {
     }
 }
 
-/// The gains of the photographs; `None` where the options ask for none.
+/// The gains of the photographs; `None` without a white balance.
 ///
 /// # Errors
-/// There is no such photograph, or nothing neutral to be measured in it.
+/// The photograph is missing, or has nothing neutral to measure.
 fn white_balance_gains(
     root: &Path,
     sources: &[Source],
@@ -426,7 +427,7 @@ fn white_balance_gains(
     options.white_balance.as_ref().map(|balance| balance.gains(root, photographs())).transpose()
 }
 
-/// Which files each view reads. A training view without its photograph is left out, a test view stays as a pose.
+/// The files of each view. A training view without its photograph is left out, a test view is kept as a pose.
 fn sources(
     root: &Path,
     frames: &[ListedView],
@@ -436,15 +437,16 @@ fn sources(
 ) -> Vec<Source> {
     let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
     let training_folders: BTreeSet<&str> = training.map(ListedView::folder).collect();
-    // What is listed as one view's is no reference image of another's.
+    // A file that is listed for one view is not the reference image of another.
     let listed: HashSet<&PathBuf> = frames.iter().filter_map(|frame| frame.file.as_ref()).collect();
     let mut sources = Vec::new();
     for frame in frames {
         let split = frame.split.unwrap_or(Split::Train);
-        // A test listing names the normal-light photographs (LOM, RealX3D) unless training frames lie there too.
+        // A test listing names the normal-light photographs (LOM, RealX3D), unless training frames are in the same
+        // folder.
         let lists_input = split == Split::Train || training_folders.contains(frame.folder());
         let input = match &options.images {
-            // Where the user says where they lie, nothing is guessed.
+            // If the user gives their folder, nothing is guessed.
             Some(_) => frame.file.clone(),
             None => frame.input(root, lists_input, files),
         };
@@ -482,19 +484,19 @@ fn sources(
 }
 
 impl ListedView {
-    /// The folder it is listed in.
+    /// The folder of the listed path.
     fn folder(&self) -> &str {
         self.listed.rsplit_once('/').map_or("", |(folder, _)| folder)
     }
 
-    /// The photograph of the same name in another folder: at the same place below it, or directly in it.
+    /// The photograph of the same name in another folder: at the same relative path, or directly in it.
     fn find(&self, folder: &Path, files: &Files) -> Option<PathBuf> {
         files
             .find(folder, names::below_first(&self.listed))
             .or_else(|| files.find(folder, &self.name))
     }
 
-    /// The dark photograph; the listed file counts as that where nothing darker lies beside it.
+    /// The dark photograph; the listed file, unless there is a darker one next to it.
     fn input(&self, root: &Path, lists_input: bool, files: &Files) -> Option<PathBuf> {
         if self.folder().split('/').any(|part| DARK_FOLDERS.contains(&part)) {
             return self.file.clone();
@@ -503,7 +505,7 @@ impl ListedView {
         beside.or_else(|| self.file.clone().filter(|_| lists_input))
     }
 
-    /// The depth map: the one that is listed; named like the photograph, or that behind `depth_`.
+    /// The depth map: the listed one, or one with the photograph's name or that name with the prefix `depth_`.
     fn depth_file(&self, root: &Path, folder: Option<&Path>, files: &Files) -> Option<PathBuf> {
         if folder.is_none() && self.depth.is_some() {
             return self.depth.clone();
@@ -517,7 +519,7 @@ impl ListedView {
         })
     }
 
-    /// The normal-light photograph: the listed file where it is not the input, else one of that name beside it.
+    /// The normal-light photograph: the listed file if it is not the input, else one of the same name next to it.
     fn reference(&self, root: &Path, input: Option<&PathBuf>, files: &Files) -> Option<PathBuf> {
         let beside =
             NORMAL_FOLDERS.iter().filter_map(|folder| self.find(&root.join(folder), files));

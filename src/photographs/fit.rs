@@ -6,15 +6,16 @@
 //! pairs -> joint histogram of (t, y) -> Levenberg-Marquardt on its columns, reweighted after Huber -> constants
 //! ```
 //!
-//! A histogram's column holds all pixels of one t, so that the cost of a fit does not depend on how many there are.
-//! Bounds hold by construction (each constant is a logistic function of what is solved for), monotonicity by a penalty
-//! that grows until it holds. Residuals beyond `huber` times their scale (1.4826 times their median size) weigh as much
-//! less as they are larger (Huber 1964). Photographs weigh as [`Weighting`] says.
+//! A column of the histogram contains all pixels of one t, so the cost of a fit does not depend on their number. Bounds
+//! are satisfied by construction (each constant is a logistic function of an unbounded unknown), monotonicity by a
+//! penalty that grows until it is satisfied. Residuals beyond `huber` times their scale (1.4826 times their median
+//! magnitude) are weighted down in proportion (Huber 1964). [`Weighting`] sets the weights of photographs.
 //!
-//! Standard errors are those of Huber's estimator (Huber 1973) for an effective number of values: pixels of one photograph
-//! err together, and their intraclass correlation rho, from the photographs' mean residuals, makes N values in groups of m
-//! as good as N / (1 + (m - 1) rho). They assume that photographs are independent, that the model is right, and that errors
-//! differ between photographs by a shift only; of a single photograph rho is unknown and counts as 0.
+//! Standard errors are those of Huber's estimator (Huber 1973) for an effective number of values: errors of pixels in
+//! one photograph are correlated, and with their intraclass correlation rho, from the photographs' mean residuals, N
+//! values in groups of m are equivalent to N / (1 + (m - 1) rho) independent ones. This assumes that photographs are
+//! independent, that the model is correct, and that errors differ between photographs only by a shift; for a single
+//! photograph, rho is unknown and taken as 0.
 
 mod confidence;
 mod histogram;
@@ -39,50 +40,52 @@ pub use self::validate::{Fold, HeldOut, cross_validate};
 use crate::photographs::tone::{Family, ToneCurve, ToneSettings};
 use crate::{Error, Result};
 
-/// Which values of a photograph are fitted.
+/// The values of a photograph that are fitted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Channels {
-    /// Red, green and blue, each a value: what the curve is applied to.
+    /// Red, green and blue as separate values, as the curve is applied.
     #[default]
     Rgb,
     /// The luminance.
     Luminance,
 }
 
-/// What each photograph weighs in a fit.
+/// The weights of photographs in a fit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Weighting {
-    /// Every pixel the same: the least mean squared error.
+    /// Every pixel has the same weight: the least mean squared error.
     #[default]
     Pixels,
-    /// One over the mean of its squared residuals, found with the constants: the likeliest constants where photographs
-    /// differ in how far they are from any curve. There may be several such fits, each close to some of the photographs.
+    /// The inverse of the photograph's mean squared residual, found together with the constants: the maximum likelihood
+    /// if photographs differ in their distance from any curve. There may be several such fits, each close to some of
+    /// the photographs.
     Photographs,
 }
 
-/// How a curve is fitted.
+/// Options of a fit.
 #[derive(Clone, Copy, Debug)]
 pub struct FitOptions {
-    /// Which values are fitted.
+    /// The fitted values.
     pub channels: Channels,
-    /// What each photograph weighs.
+    /// The weights of photographs.
     pub weighting: Weighting,
-    /// How many photographs the family's own constants count as: the fit is drawn to them, the less the more pairs.
+    /// Weight of the family's own constants, as a number of photographs: the fit is drawn towards them, less so with
+    /// more pairs.
     pub prior: f64,
-    /// Residuals beyond this many times their scale weigh less; infinite for plain least squares.
+    /// Residuals beyond this many times their scale are weighted down; infinite for plain least squares.
     pub huber: f64,
     /// Columns of the histogram.
     pub bins: usize,
-    /// Whether the curve may not pass 1 anywhere.
+    /// Whether the curve must stay at or below 1 everywhere.
     pub bounded: bool,
-    /// Whether black level and gain, alpha and c, are fitted with the constants of a family on t.
+    /// Whether black level and gain, alpha and c, are fitted with the constants of a family of t.
     pub adapt: bool,
 }
 
 impl Default for FitOptions {
-    /// 1.345 is Huber's for 95 % efficiency where errors are normal.
+    /// 1.345 is Huber's value for 95 % efficiency if errors are normal.
     fn default() -> Self {
         Self {
             channels: Channels::Rgb,
@@ -98,7 +101,7 @@ impl Default for FitOptions {
 
 impl FitOptions {
     fn check(&self) -> Result<()> {
-        // Positive phrasing: a NaN fails the test too.
+        // Written so that a NaN fails.
         let is_positive = self.huber > 0.0;
         if !is_positive {
             return Err(Error::Usage(format!(
@@ -124,49 +127,49 @@ pub struct Estimate {
     pub name: &'static str,
     /// Its value.
     pub value: f64,
-    /// Its standard error; none at a bound, or where the pairs do not determine the constants one by one.
+    /// Its standard error; `None` at a bound, or if the pairs do not determine each constant.
     pub standard_error: Option<f64>,
-    /// Whether it lies at one of its bounds.
+    /// Whether it is at one of its bounds.
     pub at_bound: bool,
 }
 
 /// A family fitted to pairs.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Fit {
-    /// The curve with the fitted constants, as `--curve` takes it.
+    /// The curve with the fitted constants, for `--curve`.
     pub settings: ToneSettings,
-    /// What was fitted.
+    /// The fitted constants.
     pub constants: Vec<Estimate>,
-    /// The values fitted to: pixels times channels.
+    /// The number of fitted values: pixels times channels.
     pub values: f64,
-    /// As many independent ones would say as much.
+    /// The equivalent number of independent values.
     pub effective_values: f64,
-    /// The root of the mean squared residual, of values in [0, 1].
+    /// Root mean squared residual, for values in [0, 1].
     pub rmse: f64,
-    /// The median and the 95th percentile of the residuals' sizes, under the photographs' weights.
+    /// The median and the 95th percentile of the residuals' magnitudes, with the photographs' weights.
     pub residual_quantiles: [f64; 2],
-    /// Where residuals begin to weigh less; none without robust weights.
+    /// The residual beyond which weights decrease; `None` without robust weights.
     pub huber_delta: Option<f64>,
-    /// The mean of Huber's loss under the photographs' weights; of half the squares without robust weights.
+    /// The mean Huber loss with the photographs' weights; without robust weights, half the mean square.
     pub robust_loss: f64,
-    /// The share of the references' variance that the curve explains; none where there is no variance.
+    /// The share of the references' variance that the curve explains; `None` if they have no variance.
     pub r_squared: Option<f64>,
-    /// Whether the curve never falls on the values of t there are, nor up to t = 3.
+    /// Whether the curve never falls, over the pairs' range of t and up to t = 3.
     pub rises: bool,
-    /// Whether it never passes 1 there.
+    /// Whether it never exceeds 1 in that range.
     pub bounded: bool,
-    /// The mean of the pairs' PSNRs over all channels, dB: of this fit, of the family's own constants, of AP3.
+    /// The mean PSNR of the pairs over all channels, dB: for this fit, for the family's own constants, and for AP3.
     pub psnr: Scores,
 }
 
-/// The same score of three curves.
+/// A score of three curves.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Scores {
-    /// The fitted constants.
+    /// With the fitted constants.
     pub fitted: f64,
-    /// The constants in the family's row.
+    /// With the constants in the family's row.
     pub frozen: f64,
-    /// AP3 with its own.
+    /// Of AP3 with its own constants.
     pub ap3: f64,
 }
 
@@ -189,7 +192,7 @@ impl Scores {
     }
 }
 
-/// The mean of the pairs' PSNRs over all channels, dB.
+/// The mean PSNR of the pairs over all channels, dB.
 fn mean_psnr(settings: &ToneSettings, pairs: &[&Pair]) -> f64 {
     pairs.iter().map(|pair| psnr(settings, pair)).sum::<f64>() / pairs.len() as f64
 }
@@ -200,12 +203,12 @@ fn mean_squared_error(settings: &ToneSettings, pairs: &[&Pair]) -> f64 {
     pairs.iter().map(error).sum::<f64>() / pairs.len() as f64
 }
 
-/// Fits the family's constants to the pairs: for curves that adapt to a photograph also black level (alpha) and gain
-/// (c, g0), for those that scale by a mean its aim theta.
+/// Fits the family's constants to the pairs; for curves that adapt to a photograph, also black level (alpha) and gain
+/// (c, g0); for those that scale by a mean, also the target mean theta.
 ///
 /// # Errors
-/// [`Error::Usage`] where the options make no sense or the family has nothing to fit; [`Error::Input`] where the pairs
-/// hold fewer different values than there are constants.
+/// [`Error::Usage`] if the options are invalid or the family has nothing to fit; [`Error::Input`] if the pairs contain
+/// fewer different values than there are constants.
 pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Result<Fit> {
     options.check()?;
     let model = Model::new(family, options)?;
@@ -219,7 +222,7 @@ pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Re
     );
     if columns < needed {
         let problem = format!(
-            "all pairs together hold {columns} different values of t, too few for the {needed} constants of `{}`; \
+            "all pairs together have {columns} different values of t, too few for the {needed} constants of `{}`; \
              take photographs that are not of one colour",
             family.name
         );
@@ -254,15 +257,15 @@ pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Re
     })
 }
 
-/// What is left of the references, pair by pair.
+/// The residuals of the references, pair by pair.
 struct Residuals {
     count: f64,
     squares: f64,
-    /// The same, each pair times its weight.
+    /// Squared residuals, each pair times its weight.
     weighted_squares: f64,
-    /// Of the reference values.
+    /// Variance of the reference values.
     variance: f64,
-    /// Of each pair, how many values it has and the mean of its residuals times the root of its weight.
+    /// For each pair, its number of values, and its mean residual times the root of its weight.
     means: Vec<(f64, f64)>,
 }
 

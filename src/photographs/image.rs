@@ -1,8 +1,8 @@
-//! Photographs as planar float images, and the files they come from and go to.
+//! Photographs as planar float images, and their files.
 //!
-//! Values are sRGB-encoded, as an 8-bit file stores them divided by 255. A file in another colour space is converted when it
-//! is read (`colour`). EXR files hold linear light by convention; they are encoded on the way in and decoded on the way out
-//! (IEC 61966-2-1, linear toe included, the power law continued above 1).
+//! Values are sRGB-encoded, as an 8-bit file stores them divided by 255. A file in another colour space is converted
+//! when it is read (`colour`). EXR files contain linear light by convention; they are encoded on reading and decoded on
+//! writing (IEC 61966-2-1, including the linear toe, with the power law continued above 1).
 
 #[cfg(feature = "io")]
 mod budget;
@@ -49,9 +49,9 @@ pub(crate) use mask::MaskFile;
 pub use orientation::Orientation;
 use rayon::prelude::*;
 
-/// A colour image: planes of red, green and blue, sRGB-encoded, [0, 1] but for EXR input, which may exceed 1.
+/// A colour image: planes of red, green and blue, sRGB-encoded, in [0, 1]; values from EXR files may exceed 1.
 ///
-/// The centre of the pixel in column `x` and row `y` lies at `(x + 0.5, y + 0.5)`.
+/// The centre of the pixel in column `x` and row `y` is at `(x + 0.5, y + 0.5)`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Image {
     /// Pixels per row.
@@ -69,7 +69,7 @@ fn from_interleaved(width: u32, height: u32, values: &[f32]) -> Image {
     Image { width, height, data }
 }
 
-/// Middle grey in linear light: the mean of a photograph that is exposed as a meter has it.
+/// Middle grey in linear light: the mean of a photograph that is exposed by a light meter.
 pub const MIDDLE_GREY: f32 = 0.18;
 
 /// The sRGB encoding of a linear-light value; inverse of [`linear_from_srgb`].
@@ -101,13 +101,12 @@ impl Image {
         Self { width, height, data }
     }
 
-    /// How many photographs of so many pixels are to be decoded and looked at side by side: as many as leave memory for
-    /// other things.
+    /// How many photographs of this number of pixels may be decoded at once, within a memory budget.
     #[cfg(feature = "io")]
     pub(crate) fn decoded_at_once(pixels: u64) -> usize {
-        /// Of what is at work at once.
+        /// Memory budget, bytes.
         const MOST: u64 = 1 << 30;
-        /// Pixels as a file has them, as floats, and once more in another order.
+        /// Pixels in the file's format, as floats, and reordered.
         const BYTES_PER_PIXEL: u64 = 40;
         usize::try_from(MOST / (BYTES_PER_PIXEL * pixels.max(1))).unwrap_or(usize::MAX).max(1)
     }
@@ -123,9 +122,9 @@ impl Image {
         [0, 1, 2].map(|plane| self.data[plane * self.pixel_count() + index])
     }
 
-    /// The image at another size: every output pixel is the mean of the area it covers (a box filter, in float).
+    /// The image at another size: every output pixel is the mean of the area it covers (a box filter, in floats).
     ///
-    /// At an integer factor that is the mean of whole pixels. Sides below 1 count as 1.
+    /// At an integer factor this is the mean of whole pixels. Sides below 1 count as 1.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let (width, height) = (width.max(1), height.max(1));
         if (width, height) == (self.width, self.height) {
@@ -167,7 +166,7 @@ impl Area {
     }
 }
 
-/// In units of 1/output input pixels, so that every boundary is an integer and integer factors are exact.
+/// In units of 1/output input pixels: every boundary is then an integer, and integer factors are exact.
 fn area_weights(input: u32, output: u32) -> Vec<Area> {
     let (input, output) = (u64::from(input), u64::from(output));
     let area = |index: u64| {
@@ -197,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn the_transfer_functions_invert_each_other_and_meet_at_the_toe() {
+    fn the_transfer_functions_are_inverses_and_continuous_at_the_toe() {
         for step in 0..=4000 {
             let srgb = step as f32 / 1000.0;
             assert!(

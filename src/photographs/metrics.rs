@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use crate::photographs::image::{Image, Mask};
 use crate::{Error, Result};
 
-/// What one render scores, or the mean over several.
+/// The scores of a render, or means over several.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Scores {
     /// PSNR of the mean squared error over all channels, dB.
@@ -16,7 +16,7 @@ pub struct Scores {
     pub psnr_channel_mean: f64,
     /// Mean structural similarity.
     pub ssim: f64,
-    /// The distance to a network's eye, where its weights are at hand.
+    /// LPIPS, if the weights of its network are available.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
 }
@@ -25,7 +25,7 @@ impl Scores {
     /// Every score of `render` against `reference`.
     ///
     /// # Errors
-    /// [`Error::Usage`] where the images differ in size.
+    /// [`Error::Usage`] if the images differ in size.
     pub fn of(render: &Image, reference: &Image) -> Result<Self> {
         Ok(Self {
             psnr: psnr(render, reference)?,
@@ -35,10 +35,10 @@ impl Scores {
         })
     }
 
-    /// Every score over the pixels that count alone; see [`counted`].
+    /// Every score of the unmasked pixels; see [`counted`].
     ///
     /// # Errors
-    /// As [`Scores::of`]; no pixel counts.
+    /// Those of [`Scores::of`], or every pixel is masked.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn of_counted(
         render: &Image,
@@ -62,7 +62,7 @@ impl Scores {
         })
     }
 
-    /// The mean of each score; none of nothing.
+    /// Mean of each score; `None` if empty.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn mean(scores: &[Self]) -> Option<Self> {
         let mean =
@@ -80,8 +80,7 @@ impl Scores {
     }
 }
 
-/// The render, and in place of what a mask of its size hides the reference: a measure of what is around a pixel sees no
-/// difference there.
+/// The render with the reference at masked pixels: a metric with a window sees no difference there.
 pub fn counted<'a>(render: &'a Image, reference: &Image, mask: Option<&Mask>) -> Cow<'a, Image> {
     let Some(mask) = mask else { return Cow::Borrowed(render) };
     let weights = mask.weights.iter().cycle();
@@ -93,16 +92,16 @@ pub fn counted<'a>(render: &'a Image, reference: &Image, mask: Option<&Mask>) ->
 /// Peak signal-to-noise ratio over all pixels and channels, dB; infinite for equal images.
 ///
 /// # Errors
-/// [`Error::Usage`] where the images differ in size.
+/// [`Error::Usage`] if the images differ in size.
 pub fn psnr(render: &Image, reference: &Image) -> Result<f64> {
     let errors = channel_mean_squared_errors(render, reference)?;
     Ok(decibels(mean(&errors)))
 }
 
-/// As [`psnr`], over the pixels that count alone.
+/// [`psnr`] of the unmasked pixels.
 ///
 /// # Errors
-/// As there.
+/// Those of [`psnr`], or every pixel is masked.
 pub fn psnr_of_counted(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<f64> {
     let Some(mask) = mask else { return psnr(render, reference) };
     Ok(decibels(mean(&weighted_errors(
@@ -112,19 +111,19 @@ pub fn psnr_of_counted(render: &Image, reference: &Image, mask: Option<&Mask>) -
     )?)))
 }
 
-/// The mean of the PSNRs of the three channels, dB: what the paper's code computes, never below [`psnr`].
+/// The mean of the PSNRs of the three channels, dB: as the paper's code computes it, never below [`psnr`].
 ///
 /// # Errors
-/// [`Error::Usage`] where the images differ in size.
+/// [`Error::Usage`] if the images differ in size.
 pub fn psnr_channel_mean(render: &Image, reference: &Image) -> Result<f64> {
     Ok(mean(&channel_mean_squared_errors(render, reference)?.map(decibels)))
 }
 
-/// Mean structural similarity over all pixels and channels (Wang et al. 2004): an 11x11 Gaussian window with sigma
-/// 1.5 and zero padding, C1 = 0.01^2, C2 = 0.03^2, as in 3DGS.
+/// Mean structural similarity over all pixels and channels (Wang et al. 2004): an 11x11 Gaussian window with sigma 1.5
+/// and zero padding, C1 = 0.01^2, C2 = 0.03^2, as in 3DGS.
 ///
 /// # Errors
-/// [`Error::Usage`] where the images differ in size.
+/// [`Error::Usage`] if the images differ in size.
 pub fn ssim(render: &Image, reference: &Image) -> Result<f64> {
     let pairs = channels(render, reference)?;
     let width = render.width as usize;
@@ -138,7 +137,7 @@ fn channels<'a>(render: &'a Image, reference: &'a Image) -> Result<[(&'a [f32], 
     let ((width, height), other) = (size(render), size(reference));
     if (width, height) != other {
         return Err(Error::Usage(format!(
-            "the render is {width}x{height} and the reference {}x{}; only images of one size can be compared",
+            "the render is {width}x{height} and the reference {}x{}; they must have the same size",
             other.0, other.1
         )));
     }
@@ -158,7 +157,7 @@ fn channel_mean_squared_errors(render: &Image, reference: &Image) -> Result<[f64
     Ok(channels(render, reference)?.map(mean_squared_error))
 }
 
-/// The mean squared error of each channel, of the pixels that count.
+/// The mean squared error of each channel over the unmasked pixels.
 fn weighted_errors(render: &Image, reference: &Image, mask: &Mask) -> Result<[f64; 3]> {
     if mask.hides_all() {
         return Err(Error::Usage(
@@ -208,7 +207,7 @@ fn ssim_map(a: &[f32], b: &[f32], width: usize) -> Vec<f64> {
     (0..a.len()).map(ssim).collect()
 }
 
-/// Taps of the window to either side of the centre.
+/// Taps of the window on either side of the centre.
 const RADIUS: usize = 5;
 
 /// The normalised 1D window.

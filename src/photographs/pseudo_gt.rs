@@ -4,8 +4,8 @@
 //! stored photograph, parameters -> pseudo_gt -> target
 //! ```
 //!
-//! The host derives the parameters from the statistics of the photograph ([`ToneSettings::tone_mapping`]). A photograph beyond the
-//! device's limits comes in tiles.
+//! The host derives the parameters from the statistics of the photograph ([`ToneSettings::tone_mapping`]). A photograph
+//! beyond the device's limits is processed in tiles.
 
 mod encoded;
 mod photographs;
@@ -19,7 +19,7 @@ use crate::kernels::{self, ToneParameters};
 use crate::photographs::tone::ToneSettings;
 use crate::{Error, Result};
 
-/// The bits that a stored value may have.
+/// The supported numbers of bits per stored value.
 const CODE_BITS: [u32; 3] = [8, 16, 32];
 
 /// Decodes photographs and applies a tone curve.
@@ -27,10 +27,10 @@ const CODE_BITS: [u32; 3] = [8, 16, 32];
 pub struct PseudoGt {
     gpu: Gpu,
     settings: ToneSettings,
-    /// Of what is stored in 8, 16 and 32 bits, once there is some: with the curve, and decoding alone.
+    /// For values stored in 8, 16 and 32 bits, created when needed: with a curve, and for decoding alone.
     with_curve: [OnceLock<Pipeline<kernels::pseudo_gt::Kernel>>; 3],
     decoders: [OnceLock<Pipeline<kernels::pseudo_gt::Kernel>>; 3],
-    /// The curve's beside its parameters: knots of a table, or what a profile is made of.
+    /// Data of the curve in addition to its parameters: the knots of a table, or a profile.
     numbers: Buffer<f32>,
     knot_count: u32,
     no_parameters: Buffer<ToneParameters>,
@@ -41,7 +41,7 @@ impl PseudoGt {
     /// Builds the kernels for one curve.
     ///
     /// # Errors
-    /// The settings leave the curve undefined ([`ToneSettings::check`]), or the device is out of memory.
+    /// The curve is undefined with these settings ([`ToneSettings::check`]), or the device is out of memory.
     pub fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
         settings.check()?;
         let numbers = match (&settings.table, &settings.profile) {
@@ -89,9 +89,9 @@ impl PseudoGt {
         self.dispatch(pass, stored, image.len(), Some((parameters, view)), target)
     }
 
-    /// Records the pseudo-GT of a stored photograph, decoded and under the curve of `parameters[view]`, where one is named; or
-    /// what is stored, decoded. `target`, (3, pixels), is as long or longer. What is stored as it is and has no curve needs no
-    /// pass: the result is the buffer that holds it.
+    /// Records the pseudo-GT of a stored photograph: decoded, and tone-mapped with `parameters[view]` if that is given.
+    /// `target`, (3, pixels), may be longer. Values that are neither coded nor tone-mapped need no pass: their own
+    /// buffer is returned.
     ///
     /// # Errors
     /// `target` is shorter, `parameters` ends before `view`, or the device refuses the kernel.
@@ -165,7 +165,7 @@ impl PseudoGt {
     }
 }
 
-/// What of a photograph a dispatch binds.
+/// The parts of a photograph that a dispatch binds.
 struct EncodedSlices<'a> {
     code_bits: u32,
     codes: &'a Buffer<u32>,

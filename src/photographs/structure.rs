@@ -1,12 +1,12 @@
-//! The structure of a pseudo-GT: how strongly its colours change from pixel to pixel, whatever the illumination.
+//! The structure of a pseudo-GT: the strength of its colour edges, independent of illumination.
 //!
 //! ```text
 //! pseudo-GT -> ciconv_rows -> ciconv_columns -> ciconv_moments -> ciconv_normalize -> structure
 //! ```
 //!
 //! The invariant W of `CIConv` (Lengyel et al. 2021) at the fixed scale 0.8, its logarithm normalised over the view and
-//! clamped to [0, 1]: 0 where edges are weaker than the mean, 1 from one standard deviation above it. It is constant over
-//! a training, so once per view is enough.
+//! clamped to [0, 1]: 0 where edges are weaker than the mean, 1 from one standard deviation above it. It does not
+//! change during training, so it is computed once per view.
 
 use glam::{UVec2, Vec2, Vec3};
 

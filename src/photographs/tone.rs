@@ -1,4 +1,4 @@
-//! Tone curves: a dark photograph in, the pseudo-GT that training aims at out.
+//! Tone curves: from a dark photograph to its pseudo-GT, the target of training.
 //!
 //! Every curve acts on sRGB-encoded values as stored, divided by 255, without linearisation:
 //!
@@ -7,15 +7,15 @@
 //! linear  x theta / mean(x)
 //! ASE     delta0 + (1 - delta0) (1 - exp(-g t))              g = g0 + c Y
 //! AP3     delta0 + b (0.0720 t^3 - 0.4376 t^2 + 0.9948 t)    b = 1 + c Y
-//! others  delta0 + b f(t)                                    delta0 = 0, b = 1 unless told
+//! others  delta0 + b f(t)                                    delta0 = 0, b = 1 by default
 //! auto    delta + (1 - delta) [(1 - lambda) s(x) + lambda x s(Y) / Y]    s(x) = 1 - exp(-k x), delta = 0.075
 //! ```
 //!
-//! clamped to [0, 1], where t = x / p90, Y is the mean luminance, and the black level
-//! delta0 = alpha (1 - p10 / p90)^beta is high where shadows are crushed. The statistics are those of
-//! one photograph, or the means over a scene's, see [`Statistics`]. The gain k of the automatic curve, whose Y is the pixel's,
-//! follows from the luminance of all photographs, see [`Exposure`]; so may that of every other curve. [`FAMILIES`] is the table of all curves; a [`Table`]
-//! of values from a file is a curve too, and so is a camera's [`Profile`].
+//! clamped to [0, 1], where t = x / p90, Y is the mean luminance, and the black level delta0 = alpha (1 - p10 /
+//! p90)^beta is high if shadows are crushed. The statistics are those of one photograph, or means over a scene
+//! ([`Statistics`]). In the automatic curve, Y is the pixel's luminance, and the gain k follows from the luminance of
+//! all photographs ([`Exposure`]); the gain of every other curve can, too. [`FAMILIES`] is the table of all curves; a
+//! [`Table`] of values from a file and a camera [`Profile`] are curves, too.
 
 mod exposure;
 mod families;
@@ -56,18 +56,18 @@ use crate::{Error, Result};
 use std::fmt;
 use std::str::FromStr;
 
-/// The name of the curve that a table of values makes.
+/// The name of the curve given by a table of values.
 const TABLE_NAME: &str = "table";
 
-/// The name of the curve whose gain the photographs give.
+/// The name of the curve with automatic gain.
 const AUTO_NAME: &str = "auto";
 
-/// The name of the curve that a camera profile makes.
+/// The name of the curve given by a camera profile.
 const PROFILE_NAME: &str = "profile";
 
 impl ToneCurve {
-    /// The curve's row in the table; of a [`Table`] or a [`Profile`] that of `none`, as it has no formula, and of the
-    /// automatic curve that of `ase`, which is its formula on grey.
+    /// The curve's row in the table. A [`Table`] or a [`Profile`] has no formula, and the row of `none`; the automatic
+    /// curve has the row of `ase`, its formula for grey.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn family(self) -> &'static Family {
         &FAMILIES[match self {
@@ -93,9 +93,9 @@ impl ToneCurve {
         self as u32
     }
 
-    /// The curve at t = x / white, in [0, 1], as exact as f64 allows.
+    /// The curve at t = x / white, in [0, 1], in f64.
     ///
-    /// `lum_preserve` and `per_channel` are straight lines here: what they do depends on more than one value.
+    /// `lum_preserve` and `per_channel` are straight lines here: they depend on more than one value.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn value(self, t: f64, offset: f64, gain: f64, constants: &[f64]) -> f64 {
         let constants = families::padded(constants);
@@ -108,7 +108,7 @@ impl ToneCurve {
         tone_curve(self.constant(), x, parameters)
     }
 
-    /// Whether each value of the target depends on one value of the photograph alone, by a formula.
+    /// Whether each value of the target is a formula of one value of the photograph.
     pub(crate) fn is_formula(self) -> bool {
         !matches!(
             self,
@@ -133,7 +133,7 @@ impl FromStr for ToneCurve {
     type Err = Error;
 
     fn from_str(name: &str) -> Result<Self> {
-        // Every name is in small letters; papers write AP3.
+        // Names are in lower case; papers write AP3.
         let small = name.to_ascii_lowercase();
         match small.as_str() {
             TABLE_NAME => return Ok(Self::Table),

@@ -1,11 +1,11 @@
-//! White balance that the user knows: a gain for each channel of the photographs.
+//! White balance set by the user: a gain for each channel of the photographs.
 //!
 //! ```text
-//! x' = encode(g decode(x))        g: of its channel; decode, encode: of sRGB
+//! x' = encode(g decode(x))        g: gain of the channel; decode, encode: sRGB transfer functions
 //! ```
 //!
-//! The colour of the light multiplies linear light, so the gains do too (von Kries), before anything is measured and before
-//! the tone curve: after a curve the same cast would differ with brightness. Values above 1 stay, the curve ends them.
+//! The illuminant multiplies linear light, and so do the gains (von Kries), before measurements and before the tone
+//! curve: after a curve, a colour cast would depend on brightness. Values above 1 are kept until the curve clips them.
 
 use std::fmt;
 use std::path::Path;
@@ -18,18 +18,18 @@ use serde::{Deserialize, Serialize};
 use super::image::{Image, linear_from_srgb, srgb_from_linear};
 use crate::{Error, Result};
 
-/// How the photographs are balanced.
+/// The source of the white balance.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum WhiteBalance {
     /// Gains of red, green and blue in linear light.
     Gains([f64; 3]),
-    /// The colour temperature of the light, kelvin; 6504 changes nothing.
+    /// The colour temperature of the illuminant, kelvin; 6504 changes nothing.
     Kelvin(f64),
-    /// A grey card or another neutral area of a photograph as it is stored: the view, then x, y, width and height in pixels.
+    /// A grey card or another neutral area of a photograph as stored: the view, then x, y, width and height in pixels.
     Area(String, [u32; 4]),
-    /// The grey patches of a chart of 6 x 4 patches (ColorChecker): the view, then the corners of the chart as it is stored,
-    /// from the dark skin patch round by the blue-green, the black and the white one, x and y in pixels.
+    /// The grey patches of a chart of 6 x 4 patches (ColorChecker): the view, then the corners of the chart as stored,
+    /// at the dark skin, bluish green, black and white patch, x and y in pixels.
     Chart(String, [[f64; 2]; 4]),
 }
 
@@ -37,23 +37,23 @@ pub enum WhiteBalance {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WhiteBalanceGains(pub [f32; 3]);
 
-/// Colour temperatures that the approximation of the Planckian locus covers and sRGB holds, kelvin.
+/// Colour temperatures within the range of the Planckian locus's approximation and the gamut of sRGB, kelvin.
 const TEMPERATURES: std::ops::RangeInclusive<f64> = 2000.0..=25_000.0;
-/// The temperature at which nothing changes: that of D65.
+/// The temperature of D65, for which nothing changes.
 const NEUTRAL: f64 = 6504.0;
-/// Gains within these bounds are of a light that a photograph shows.
+/// Plausible gains.
 const GAINS: std::ops::RangeInclusive<f64> = 1e-3..=1e3;
 
 impl WhiteBalance {
-    /// What a white balance is written as.
-    pub(crate) const FORM: &'static str = "R,G,B of 0.001 to 1000, a colour temperature of 2000 to 25000 (kelvin), VIEW,x,y,w,h of a \
-                                    neutral area in whole pixels, or VIEW,x1,y1,..,x4,y4, the corners of a colour chart";
+    /// The syntax of a white balance.
+    pub(crate) const FORM: &'static str = "R,G,B of 0.001 to 1000, a colour temperature of 2000 to 25000 (kelvin), \
+        VIEW,x,y,w,h of a neutral area in whole pixels, or VIEW,x1,y1,..,x4,y4, the corners of a colour chart";
 
-    /// The gains, measured where they have to be in one of the photographs of `root`, each with its name.
+    /// The gains, measured in one of the named photographs of `root` if necessary.
     ///
     /// # Errors
-    /// [`Error::Usage`] where its area is outside, black or clipped; [`Error::Input`] where there is no such photograph, or it
-    /// cannot be read.
+    /// [`Error::Usage`] if the area is outside, black or clipped; [`Error::Input`] if there is no such photograph, or
+    /// it cannot be read.
     pub(crate) fn gains<'a>(
         &self,
         root: &Path,
@@ -81,11 +81,11 @@ impl WhiteBalance {
         Ok(gains)
     }
 
-    /// The mean linear light of what is neutral in a photograph.
+    /// The mean linear light of the neutral areas of a photograph.
     fn mean_of(&self, image: &Image) -> Result<DVec3> {
-        /// Brighter values are clipped, or next to it.
+        /// Brighter values are clipped or almost clipped.
         const CLIPPED: f32 = 0.98;
-        /// A mean below this is black: half a code value of 8 bits.
+        /// A lower mean is black: half an 8-bit code value.
         const BLACK: f64 = 0.5 / 255.0 / 12.92;
         let refused = |problem: &str| Err(Error::Usage(format!("white balance {self}: {problem}")));
         let pixels = self.pixels();
@@ -93,7 +93,7 @@ impl WhiteBalance {
         if !pixels.iter().flatten().all(is_inside) {
             let (width, height) = (image.width, image.height);
             return refused(&format!(
-                "it leaves the photograph, which is {width}x{height} as it is stored"
+                "it exceeds the photograph, which is {width}x{height} as stored"
             ));
         }
         let mut sum = DVec3::ZERO;
@@ -103,7 +103,7 @@ impl WhiteBalance {
             let usable =
                 |colour: &[f32; 3]| colour.iter().all(|value| (0.0..CLIPPED).contains(value));
             let colours: Vec<[f32; 3]> = colours.filter(usable).collect();
-            // Of a clipped patch the rest is a choice of its dark pixels.
+            // The rest of a partly clipped patch would be biased to its dark pixels.
             if 2 * colours.len() < patch.len() {
                 continue;
             }
@@ -113,16 +113,16 @@ impl WhiteBalance {
             count += colours.len() as f64;
         }
         if count == 0.0 {
-            return refused("it is clipped; take an area that is not white");
+            return refused("it is clipped; choose an area that is not white");
         }
         let mean = sum / count;
         if mean.min_element() < BLACK {
-            return refused("a channel of it is black; take a brighter area");
+            return refused("a channel of it is black; choose a brighter area");
         }
         Ok(mean)
     }
 
-    /// The pixels of each neutral patch, column and row; they may lie outside the photograph.
+    /// The pixels of each neutral patch, column and row; they may be outside the photograph.
     fn pixels(&self) -> Vec<Vec<[u32; 2]>> {
         match self {
             Self::Gains(_) | Self::Kelvin(_) => vec![],
@@ -135,9 +135,9 @@ impl WhiteBalance {
     }
 }
 
-/// Samples of the middle of a patch of the chart's last row, columns and rows of pixels.
+/// Samples of the middle of a patch in the chart's last row, column and row in pixels.
 fn grey_patch(corners: [[f64; 2]; 4], patch: u32) -> Vec<[u32; 2]> {
-    /// Samples each way.
+    /// Samples in each direction.
     const SAMPLES: u32 = 16;
     let map = homography(corners);
     let sample = |index: u32| {
@@ -145,14 +145,15 @@ fn grey_patch(corners: [[f64; 2]; 4], patch: u32) -> Vec<[u32; 2]> {
             .map(|at| 0.3 + 0.4 * (f64::from(at) + 0.5) / f64::from(SAMPLES));
         let place =
             map * DVec3::new((f64::from(patch) + part[0]) / 6.0, (3.0 + part[1]) / 4.0, 1.0);
-        // A place left of or above the photograph becomes one far right or below.
+        // A position left of or above the photograph is moved beyond its right or bottom edge.
         let pixel = |value: f64| if value >= 0.0 { value as u32 } else { u32::MAX };
         [pixel(place.x / place.z), pixel(place.y / place.z)]
     };
     (0..SAMPLES * SAMPLES).map(sample).collect()
 }
 
-/// The projective map of the unit square, from (0, 0) round by (1, 0), to these corners (Heckbert 1989, 2.2.3).
+/// The projective map of the unit square to these corners, in the order (0, 0), (1, 0), (1, 1), (0, 1) (Heckbert 1989,
+/// 2.2.3).
 fn homography(corners: [[f64; 2]; 4]) -> DMat3 {
     let [a, b, c, d] = corners.map(DVec2::from_array);
     let (right, down, excess) = (b - c, d - c, a - b + c - d);
@@ -163,7 +164,7 @@ fn homography(corners: [[f64; 2]; 4]) -> DMat3 {
     DMat3::from_cols(across.extend(g), along.extend(h), a.extend(1.0))
 }
 
-/// The linear sRGB of a black body (Kang et al. 2002), of luminance 1.
+/// The linear sRGB of a black body (Kang et al. 2002), with luminance 1.
 fn light(kelvin: f64) -> DVec3 {
     let t = 1e3 / kelvin;
     let x = if kelvin <= 4000.0 {
@@ -194,9 +195,9 @@ fn neutralising(linear: DVec3) -> WhiteBalanceGains {
 }
 
 impl WhiteBalanceGains {
-    /// Balances a photograph.
+    /// Applies the gains to a photograph.
     pub(crate) fn apply(self, image: &mut Image) {
-        /// Values that a thread changes in one go.
+        /// Values per task of a thread.
         const VALUES: usize = 1 << 14;
         let pixels = image.pixel_count().max(1);
         for (plane, gain) in image.data.chunks_exact_mut(pixels).zip(self.0) {
@@ -237,7 +238,7 @@ fn parsed(text: &str) -> Option<WhiteBalance> {
         }
         _ => {}
     }
-    // A view's name may hold commas, or be a number.
+    // A view's name may contain commas, or be a number.
     let numbers_after_view = |count: usize| {
         let (view, rest) = fields.split_at_checked(fields.len().checked_sub(count)?)?;
         let numbers: Option<Vec<f64>> = rest.iter().map(|field| field.parse().ok()).collect();
@@ -249,7 +250,7 @@ fn parsed(text: &str) -> Option<WhiteBalance> {
         return is_chart.then_some(WhiteBalance::Chart(view, [a, b, c, d]));
     }
     let (view, numbers) = numbers_after_view(4)?;
-    // No photograph is larger, and an area is listed pixel by pixel.
+    // No photograph is larger; areas are listed pixel by pixel.
     let is_whole = |number: &f64| (0.0..=65_536.0).contains(number) && number.fract() == 0.0;
     let [x, y, width, height] = *numbers else { return None };
     let is_area = numbers.iter().all(is_whole) && width > 0.0 && height > 0.0;
@@ -291,7 +292,7 @@ mod tests {
 
     use super::*;
 
-    /// A photograph whose pixels reflect some of a light, in linear light.
+    /// A photograph of a reflectance under a light, in linear light.
     fn lit(light: [f32; 3], reflectance: impl Fn(u32, u32) -> f32) -> Image {
         Image::from_fn(60, 40, |x, y| {
             light.map(|light| srgb_from_linear(light * reflectance(x, y)))
@@ -311,7 +312,7 @@ mod tests {
         Ok(balance.gains(Path::new("photos"), [("v1", path.as_path())])?.0)
     }
 
-    /// Largest over smallest channel of a pixel in linear light.
+    /// Ratio of the largest to the smallest channel of a pixel in linear light.
     fn cast(image: &Image, x: u32, y: u32) -> f32 {
         let colour = image.pixel(x, y).map(linear_from_srgb);
         colour.iter().copied().fold(0.0, f32::max) / colour.iter().copied().fold(1.0, f32::min)
@@ -333,8 +334,8 @@ mod tests {
     }
 
     #[test]
-    fn a_chart_that_is_seen_aslant_gives_its_greys() {
-        // Only where the greys of the chart lie the photograph is neutral but for the light.
+    fn a_chart_in_perspective_gives_its_greys() {
+        // Only the greys of the chart are neutral under the light.
         let corners = [[10.0, 5.0], [50.0, 8.0], [46.0, 32.0], [14.0, 35.0]];
         let map = homography(corners).inverse();
         let light = [0.3, 0.2, 0.1];
@@ -352,10 +353,10 @@ mod tests {
     }
 
     #[test]
-    fn a_temperature_is_that_of_the_light() {
+    fn gains_neutralise_the_light_of_a_temperature() {
         let of = |kelvin: f64| WhiteBalance::Kelvin(kelvin).gains(Path::new(""), []).unwrap().0;
         assert!(of(6504.0).iter().all(|gain| (gain - 1.0).abs() < 1e-3), "{:?}", of(6504.0));
-        // Illuminant A, 2856 K: x = .44757, y = .40745, beside D65.
+        // Illuminant A, 2856 K: x = 0.44757, y = 0.40745, relative to D65.
         let [red, green, blue] = of(2856.0);
         let (x, y) = (0.447_57, 0.407_45);
         let xyz = [x / y, 1.0, (1.0 - x - y) / y];
@@ -366,7 +367,7 @@ mod tests {
         ];
         let expected = [linear[1] / linear[0], linear[1] / linear[2]];
         for (own, expected) in [red / green, blue / green].into_iter().zip(expected) {
-            // D65 lies beside the locus of black bodies.
+            // D65 is not on the Planckian locus.
             assert!((own / expected - 1.0).abs() < 0.08, "{own} {expected}");
         }
         assert!(of(10_000.0)[0] > 1.0 && of(10_000.0)[2] < 1.0);
@@ -383,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_again() {
+    fn a_written_white_balance_is_read_back() {
         for text in [
             "1.5,1,0.8",
             "5200",
@@ -398,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn what_makes_no_sense_is_refused_in_a_line() {
+    fn an_invalid_white_balance_is_refused_in_a_line() {
         for text in [
             "",
             "1,2",
@@ -425,9 +426,9 @@ mod tests {
         let image = lit([1.0, 0.5, 0.0], |x, _| if x < 30 { 0.0 } else { 2.0 });
         for (text, part) in [
             ("v2,1,2,3,4", "no photograph is called `v2`"),
-            ("v1,58,2,3,4", "leaves the photograph, which is 60x40"),
-            ("v1,1,65536,3,4", "leaves the photograph"),
-            ("v1,-5,0,40,0,40,30,-5,30", "leaves the photograph"),
+            ("v1,58,2,3,4", "exceeds the photograph, which is 60x40"),
+            ("v1,1,65536,3,4", "exceeds the photograph"),
+            ("v1,-5,0,40,0,40,30,-5,30", "exceeds the photograph"),
             ("v1,1,2,3,4", "is black"),
             ("v1,40,2,3,4", "is clipped"),
         ] {

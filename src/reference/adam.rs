@@ -33,8 +33,7 @@ pub(super) fn from_halves(word: u32) -> [f32; 2] {
     [word & 0xffff_0000, word << 16].map(f32::from_bits)
 }
 
-/// Both moments after the step as on the device, where no product and sum are fused, and the random number of their
-/// rounding.
+/// Both moments after the step as on the device, without fused multiply-adds, and the random number of their rounding.
 pub(super) fn moments_after(step: u32, [p, g, m, v]: [f32; 4]) -> ([f32; 2], u32) {
     let g = clamp_gradient(g);
     let m = BETA1 as f32 * m + (1.0 - BETA1) as f32 * g;
@@ -58,7 +57,7 @@ fn updated<T: Real>(params: &Params, column: usize, before: [f32; 4]) -> [T; 3] 
     let [p, m, v] = stepped::<T>([params.rates[plane], params.second_correction], before);
     let [low, high] = [LOG_SCALE_MIN, LOG_SCALE_MAX].map(|bound| of(bound as f32));
     let bounded = match plane == Attribute::LogScales as usize {
-        // Phrased so that a NaN stays one.
+        // Written so that a NaN stays one.
         true if p < low => low,
         true if p > high => high,
         _ => p,
@@ -102,7 +101,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// Twice the running error, as the reference rounds too. Half moments are rounded identically.
+    /// Twice the running error, since the reference rounds too. Half moments are rounded identically.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let Slices { parameters, gradients, first_moments, second_moments, both_moments, status } =
             slices;

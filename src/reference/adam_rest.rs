@@ -4,14 +4,14 @@ use crate::kernels::adam_rest::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::half::{LARGEST_HALF, SMALLEST_HALF};
 use crate::splats::packed_sh::value;
 
-/// A multiple of the unit of halves at a number, up or down as `chance` has it; its bits as a half.
+/// Rounds to a multiple of the half's unit, up or down depending on `chance`; returns the bits of a half.
 fn rounded_by_chance(x: f32, chance: u32) -> u16 {
     let (smallest, largest) = (SMALLEST_HALF as f32, LARGEST_HALF as f32);
     let exponent = x.to_bits() & 0x7f80_0000;
     let below = exponent < smallest.to_bits();
     let unit = if below { smallest } else { f32::from_bits(exponent - (10 << 23)) };
     let share = (chance >> 19) as f32 / 8192.0;
-    // A multiple is a half: the nearest is itself.
+    // A multiple is a half, so rounding to nearest keeps it.
     crate::splats::packed_sh::nearest(((x / unit + share).floor() * unit).clamp(-largest, largest))
 }
 
@@ -47,8 +47,8 @@ impl Reference for Kernel {
         }
     }
 
-    /// A number at the border of being rounded up may be rounded down. Moments are rounded alike everywhere, but for
-    /// subnormal ones, which may be flushed.
+    /// A value close to the threshold of rounding up may be rounded down. Moments are rounded equally everywhere,
+    /// except for subnormal ones, which may be flushed to zero.
     fn tolerances(_: &Params, constants: &Constants, _: Slices<'_>) -> Tolerances {
         let parameters = Tolerance::Halves;
         if constants.half_moments {

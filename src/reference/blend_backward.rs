@@ -104,9 +104,9 @@ fn for_each_tile(
     }
 }
 
-/// Adds to `bounds` the error bound of one pixel's contribution to the records: the light still to come has the error
-/// of the render, which 1 / (1 - alpha) magnifies; the rest is relative to the magnitude of the contribution, which
-/// counts in full where a rounding decides whether it exists.
+/// Adds to `bounds` the error bound of one pixel's contribution to the records. The remaining light has the error of
+/// the render, magnified by 1 / (1 - alpha); the rest is relative to the magnitude of the contribution, which counts in
+/// full if a rounding decides whether it exists.
 fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mut [f64]) {
     let (channels, tile) =
         (constants.channels as usize, UVec2::new(constants.tile_width, constants.tile_height));

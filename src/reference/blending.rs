@@ -1,7 +1,7 @@
 //! The rounding model of the blending kernels: the error of one pixel in single precision.
 //!
 //! sigma is a sum whose terms round a few times each; exp adds 3 + 2 sigma units; an alpha changes the pixel by at most
-//! 2 max|c| T. Products and sums over the list add a rounding per splat. Where a rounding decides whether a splat is
+//! 2 max|c| T. Products and sums over the list add a rounding per splat. If a rounding decides whether a splat is
 //! blended, capped or the last, either outcome is accepted: the difference is part of the bound.
 
 use glam::{DVec2, UVec2};
@@ -16,7 +16,7 @@ pub(super) struct PixelModel {
     pub(super) fragments: Vec<(Fragment, f64)>,
     /// The bound of a channel's error, over the largest magnitude of a colour; also that of the transmittance.
     pub(super) error: f64,
-    /// A rounding decides about a splat.
+    /// Whether a rounding decides about a splat.
     pub(super) is_fragile: bool,
 }
 

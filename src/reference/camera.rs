@@ -11,7 +11,7 @@ use crate::kernels::camera::{CAMERA_FISHEYE, CAMERA_WIDTH};
 use fisheye::Fisheye;
 use pinhole::Pinhole;
 
-/// A view as the buffer of cameras describes it.
+/// A camera as in the buffer of cameras.
 #[derive(Clone, Debug)]
 pub struct Camera {
     /// The rotation from world to view.
@@ -24,7 +24,7 @@ pub struct Camera {
     pub principal_point: DVec2,
     /// Pixels.
     pub size: DVec2,
-    /// Where it shows what, in units of the focal lengths.
+    /// The projection, in units of the focal lengths.
     pub model: Model,
 }
 
@@ -37,7 +37,7 @@ pub enum Model {
     Fisheye(Fisheye),
 }
 
-/// What a model makes of a point: all in units of the focal lengths.
+/// The projection of a point, in units of the focal lengths.
 #[derive(Clone, Copy, Debug)]
 pub struct ImagePoint {
     /// Relative to the principal point.
@@ -82,7 +82,7 @@ impl Camera {
         -(self.rotation.transpose() * self.translation)
     }
 
-    /// The depth of a point of the view; not positive where the model does not see it.
+    /// The depth of a point in view coordinates; not positive if the model does not see it.
     pub fn depth(&self, point: DVec3) -> f64 {
         match &self.model {
             Model::Pinhole(_) => point.z,
@@ -108,7 +108,7 @@ impl Camera {
         }
     }
 
-    /// The gradient of the point, from that of its pixel and those of the rows of [`Camera::jacobian`].
+    /// The gradient of the point, from those of its pixel and of the rows of [`Camera::jacobian`].
     pub fn backward(&self, point: DVec3, d_pixel: DVec2, d_rows: [DVec3; 2]) -> DVec3 {
         let d_place = self.focal * d_pixel;
         let d_rows = [self.focal.x * d_rows[0], self.focal.y * d_rows[1]];
@@ -118,9 +118,8 @@ impl Camera {
         }
     }
 
-    /// The gradient of the camera, from those of what it makes of a point: of a shift of all points in the view, which
-    /// is
-    /// `d_shift`, and of their turn about the camera, of focal lengths, principal point and distortion.
+    /// The gradient of the camera, from those of a point's projection: translation of all points in view space
+    /// (`d_shift`), their rotation about the camera, focal lengths, principal point and distortion.
     #[cfg(feature = "testing")]
     pub fn gradient(
         &self,
@@ -145,7 +144,7 @@ impl Camera {
         std::array::from_fn(|_| numbers.next().unwrap_or_default())
     }
 
-    /// How much deeper a point is that lies beside another by an offset, to first order.
+    /// The first-order change of depth between a point and another at an offset.
     pub(super) fn depth_change(&self, point: DVec3, offset: DVec3) -> f64 {
         match &self.model {
             Model::Pinhole(_) => offset.z,
@@ -153,7 +152,7 @@ impl Camera {
         }
     }
 
-    /// The point at another depth.
+    /// The point moved to another depth.
     pub(super) fn at_depth(&self, point: DVec3, depth: f64) -> DVec3 {
         match &self.model {
             Model::Pinhole(_) => point.truncate().extend(depth),

@@ -13,7 +13,7 @@ use crate::kernels::camera_backward::{Constants, Kernel, Params, Slices, Toleran
 
 const WIDTH: usize = CAMERA_WIDTH as usize;
 
-/// A Gaussian's share of the gradient of the camera, from those of its mean and of the splat that it became.
+/// A Gaussian's share of the gradient of the camera, from the gradients of its mean and of its splat.
 pub fn camera_backward(
     camera: &Camera,
     gaussian: &Gaussian,
@@ -30,8 +30,8 @@ pub fn camera_backward(
     camera.gradient(point, camera.rotation * d_mean, d_mean2d, d_rows)
 }
 
-/// The inputs of Gaussian `i` as numbers, and how far each may be off: mean, rotation, scales, conic, the gradients of
-/// the mean, of the splat's mean and of its conic.
+/// The inputs of Gaussian `i` with their error bounds: mean, rotation, scales, conic, the gradients of the mean, of the
+/// splat's mean and of its conic.
 fn inputs(params: &Params, constants: &Constants, slices: &Slices<'_>, i: usize) -> [Vec<f64>; 2] {
     const OFF: f64 = 256.0 * UNIT;
     let n = params.gaussian_count as usize;
@@ -83,7 +83,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// Backward stability, as that of `project_backward`.
+    /// Backward stability, as in `project_backward`.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let n = params.gaussian_count as usize;
         let camera = Camera::from(&slices.cameras[params.camera_index as usize]);

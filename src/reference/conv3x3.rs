@@ -1,4 +1,4 @@
-//! The 3x3 convolution in double precision; the kernel's reference rounds what it returns.
+//! The 3x3 convolution in double precision; the kernel's reference rounds the results.
 
 use super::rounding::UNIT;
 use super::widen;
@@ -13,7 +13,7 @@ pub(super) fn for_each_tap(
     for y in 0..height {
         for x in 0..width {
             for tap in 0..9 {
-                // One row and one column of padding: what wraps around is outside as well.
+                // One row and one column of padding: indices that wrap around are outside as well.
                 let (from_x, from_y) =
                     ((x + tap % 3).wrapping_sub(1), (y + tap / 3).wrapping_sub(1));
                 if from_x < width && from_y < height {
@@ -74,7 +74,7 @@ pub fn activate(activation: u32, x: f64) -> f64 {
     }
 }
 
-/// The sums before activation; of the terms' magnitudes, where `term` makes those of the factors.
+/// The sums before activation, or sums of the terms' magnitudes if `term` returns those of the factors.
 pub(super) fn sums(
     params: &Params,
     is_transposed: bool,
@@ -95,7 +95,7 @@ pub(super) fn sums(
     }
 }
 
-/// The rounding error of a sum of products in any order: one rounding of the magnitude of each term.
+/// The rounding error of a sum of products in any order: one rounding of each term's magnitude.
 pub(super) fn sum_error(params: &Params, magnitude: f64) -> f64 {
     f64::from(9 * params.in_channels + 2) * UNIT * magnitude
 }
@@ -109,7 +109,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// No activation magnifies an error; the sigmoid adds those of an exponential, an addition and a division.
+    /// No activation amplifies an error; the sigmoid adds those of an exponential, an addition and a division.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let Slices { values, source, target } = slices;
         let magnitudes = sums(params, constants.transposed, values, source, f64::abs);

@@ -1,4 +1,4 @@
-//! The convolution of `conv3x3` without an activation, of packed factors, in double precision.
+//! The convolution of `conv3x3` without activation, from packed factors, in double precision.
 
 use super::conv3x3::sums;
 use super::packed::{self, largest, scale, sum_error};

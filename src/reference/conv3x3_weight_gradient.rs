@@ -6,7 +6,7 @@ use super::widen;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::conv3x3_weight_gradient::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// The gradients of the weights (out, in, 3, 3), then of the biases (out), that the pixels for which `counts` make.
+/// The gradients of the weights (out, in, 3, 3), then of the biases (out), over the pixels for which `counts` is true.
 pub fn weight_gradient(
     size: [usize; 2],
     [inputs, outputs]: [usize; 2],
@@ -33,7 +33,7 @@ pub fn weight_gradient(
     d_layer
 }
 
-/// The gradients of every strip; sums of magnitudes, where `term` makes those of the factors.
+/// The gradients of every strip, or sums of magnitudes if `term` returns those of the factors.
 pub(super) fn strips(
     params: &Params,
     rows: u32,
@@ -63,7 +63,7 @@ impl Reference for Kernel {
         partials.iter_mut().zip(strips).for_each(|(partial, sum)| *partial = sum as f32);
     }
 
-    /// A rounding for each pixel of the strip.
+    /// One rounding per pixel of the strip.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let magnitudes = strips(params, constants.rows, slices.source, slices.d_target, f64::abs);
         let error = f64::from(constants.rows * params.size.x + 2) * UNIT;

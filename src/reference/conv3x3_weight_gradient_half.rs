@@ -1,4 +1,4 @@
-//! The partial sums of `conv3x3_weight_gradient`, of packed factors, in double precision.
+//! The partial sums of `conv3x3_weight_gradient` from packed factors, in double precision.
 
 use super::conv3x3_weight_gradient::strips;
 use super::packed::{self, largest, scale, sum_error};
@@ -7,7 +7,8 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::conv3x3_weight_gradient;
 use crate::kernels::conv3x3_weight_gradient_half::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// Of weights the scaled sums of packed factors, of biases those in single precision: of `term` of each factor.
+/// The scaled sums of packed factors for the weights, and single-precision sums for the biases, of `term` of each
+/// factor.
 fn sums(
     params: &Params,
     constants: &Constants,
@@ -27,13 +28,13 @@ fn sums(
     sums
 }
 
-/// How many of a strip's sums are those of weights, and how many there are.
+/// The number of a strip's sums for weights, and for weights and biases.
 fn lengths(params: &Params) -> [usize; 2] {
     let weights = 9 * params.in_channels * params.out_channels;
     [weights, weights + params.out_channels].map(|n| n as usize)
 }
 
-/// What the sum of two packed factors is divided by.
+/// The divisor of the sum of two packed factors.
 fn unit(slices: &Slices<'_>) -> f64 {
     scale(slices.largest_source[0]) * scale(slices.largest_d_target[0])
 }
@@ -56,7 +57,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// The sums of products; those of biases round once for each pixel.
+    /// The sums of products; those of biases round once per pixel.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let (unit, [source, d_target]) = (unit(&slices), factors(params, &slices));
         let maps = [&source[..], &d_target, slices.d_target_single];

@@ -1,10 +1,10 @@
-//! A strided convolution with a ReLU in double precision; the kernel's reference rounds what it returns.
+//! A strided convolution with a ReLU in double precision; the kernel's reference rounds the results.
 
 use super::rounding::UNIT;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::conv_strided::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// The sums before the ReLU, or those of the terms' magnitudes, where `term` makes those of the factors.
+/// The sums before the ReLU, or sums of the terms' magnitudes if `term` returns those of the factors.
 fn sums(params: &Params, values: &[f32], source: &[f32], term: impl Fn(f64) -> f64) -> Vec<f64> {
     let Params { size, target_size, in_channels, out_channels, window, stride, padding, offset } =
         *params;
@@ -43,7 +43,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// A rounding for each term's magnitude, in whatever order they are added; a ReLU magnifies nothing.
+    /// One rounding of each term's magnitude, in any order of additions; a ReLU amplifies no error.
     fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
         let Slices { values, source, .. } = slices;
         let terms = params.window * params.window * params.in_channels + 2;

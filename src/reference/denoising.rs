@@ -12,7 +12,7 @@ struct Terms {
 }
 
 impl Terms {
-    /// With sums of magnitudes for the gradients, where `term` makes those of their terms.
+    /// With sums of magnitudes for the gradients, if `term` returns those of their terms.
     fn new(params: &Params, slices: &Slices<'_>, term: impl Fn(f64) -> f64) -> Self {
         let Slices { denoised, render, .. } = slices;
         let (width, values) = (params.width as usize, 3 * (params.width * params.height) as usize);
@@ -44,7 +44,7 @@ impl Terms {
 }
 
 impl Reference for Kernel {
-    /// The whole sums go into the first partials: how many there are is the device's choice.
+    /// The whole sums go into the first partials: the number of partials is chosen by the device.
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let terms = Terms::new(params, &slices, |x| x);
         let Slices { d_denoised, d_render, mse_partials, tv_partials, .. } = slices;

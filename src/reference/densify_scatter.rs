@@ -36,7 +36,7 @@ pub(super) struct Child {
     pub(super) is_new: bool,
 }
 
-/// The children that belong to a batch of new Gaussians, of all `count` Gaussians: the batch's offset and length.
+/// The children in a batch of new Gaussians, given by its offset and length, of all `count` Gaussians.
 pub(super) fn copies<'a>(
     count: usize,
     actions: &'a [u32],
@@ -149,9 +149,9 @@ impl Reference for Kernel {
         }
     }
 
-    /// Drawn positions have the error of a cosine, magnified by scales and the radius of the draw, 5.8 at most; those
-    /// of a half the errors of an exponential and of the axes, its opacity that of the logarithm of a quotient.
-    /// Everything else is copied.
+    /// Drawn positions have the error of a cosine, magnified by scales and the radius of the draw, at most 5.8;
+    /// positions of a half have the errors of an exponential and of the axes, its opacity that of the logarithm of a
+    /// quotient. Everything else is copied.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
         let mut bounds = vec![0.0; slices.new_parameters.len()];

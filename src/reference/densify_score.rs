@@ -22,9 +22,9 @@ fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
     }
 }
 
-/// An estimate of the mean squared change of a view by a split, in units of the squared contrast of what the Gaussian
-/// covers: the fraction of the view that it covers, times the square of its opacity and of the relative change of
-/// depth.
+/// An estimate of the mean squared change of a view by a split, in units of the squared contrast of the area that the
+/// Gaussian covers: the fraction of the view that it covers, times the square of its opacity and of the relative change
+/// of depth.
 pub(super) fn view_change(near: f64, camera: &Camera, gaussian: &Gaussian) -> f64 {
     let opacity = sigmoid(gaussian.raw_opacity);
     let scale = DMat3::from_diagonal(gaussian.log_scale.exp());
@@ -105,10 +105,10 @@ impl Reference for Kernel {
         }
     }
 
-    /// A division has an error of five roundings, and the reference's one: as many units of a key, which is made of
-    /// bits, and a unit is up to two roundings. At the threshold they decide whether there is a candidate. The same
-    /// holds where a view would change by about the bound: within a thousandth of it, the precision of exponentials,
-    /// differences of depths and the edges of splats wherever a parameter is below about 1 000.
+    /// A division has an error of five roundings, and the reference's of one: as many units of a key, which is made of
+    /// bits, and a unit is up to two roundings. At the threshold, they decide whether there is a candidate. The same
+    /// applies if a view would change by about the bound, within a thousandth of it: the precision of exponentials,
+    /// differences of depths and edges of splats for parameters below about 1 000.
     fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
         const ROUNDINGS: f64 = 6.0;
         let (threshold, bound) =

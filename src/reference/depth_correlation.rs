@@ -1,4 +1,4 @@
-//! The Pearson loss, in any number.
+//! The Pearson loss, in any number type.
 
 use glam::Vec2;
 
@@ -8,7 +8,7 @@ use crate::kernels::DepthGradient;
 use crate::kernels::depth_correlation::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
 use crate::photographs::tone::Real;
 
-/// P, and what multiplies a - mean a and b - mean b in its gradient with respect to a.
+/// P, and the factors of a - mean a and b - mean b in its gradient with respect to a.
 #[derive(Clone, Copy, Debug)]
 pub struct Pearson<T> {
     /// 1 - correlation.

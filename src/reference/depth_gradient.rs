@@ -2,7 +2,7 @@ use super::rounding::{Rounded, values};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::depth_gradient::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// The gradient of every pixel: what each region around it gives.
+/// The gradient of every pixel: the sum over the regions that contain it.
 fn d_depths(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
     let (size, count) = (params.size, params.region_count as usize);
     let regions = || slices.regions.iter().zip(slices.gradients).take(count);

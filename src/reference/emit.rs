@@ -54,8 +54,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// Where an edge of the ellipse is within rounding of an edge of a tile, the Gaussian may or may not cover the
-    /// tile.
+    /// If an edge of the ellipse is within rounding of an edge of a tile, the Gaussian may or may not cover the tile.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let mut tiles = vec![0.0; slices.tiles.len()];
         let mut intersection_ranges = vec![0.0; 2 * slices.intersection_ranges.len()];

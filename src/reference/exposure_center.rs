@@ -1,16 +1,16 @@
-//! Numbers that are centred over the views.
+//! Values that are centred over the views.
 
 use crate::gpu::Reference;
 use crate::kernels::exposure::EXPOSURE_WIDTH;
 use crate::kernels::exposure_center::{BOUND, Constants, Kernel, Params, QUANTA, Slices};
 
-/// The number in whole quanta, within bounds.
+/// The value in whole quanta, within bounds.
 fn quanta(x: f32) -> i64 {
     let bound = BOUND as f32;
     (x.clamp(-bound, bound) * QUANTA as f32).round_ties_even() as i64
 }
 
-/// Centres every number of (views, `EXPOSURE_WIDTH`) so that its sum over the views is exactly 0.
+/// Centres every value of (views, `EXPOSURE_WIDTH`) so that its sum over the views is exactly 0.
 pub fn center(exposures: &mut [f32]) {
     let width = EXPOSURE_WIDTH as usize;
     let view_count = (exposures.len() / width) as i64;

@@ -19,7 +19,7 @@ pub struct Gaussian {
     pub log_scale: DVec3,
     /// Before the sigmoid.
     pub raw_opacity: f64,
-    /// Blended values beside colour.
+    /// Blended values in addition to colour.
     pub features: Vec<f64>,
     /// All stored SH coefficients, degree 0 first, RGB.
     pub sh: Vec<DVec3>,

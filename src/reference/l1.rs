@@ -3,7 +3,7 @@ use super::rounding::{Rounded, chain};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::l1::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// a - b of every value; 0 outside the interior.
+/// a - b of every value; 0 outside the loss region.
 fn differences(
     params: &Params,
     constants: &Constants,
@@ -19,7 +19,7 @@ fn differences(
 }
 
 impl Reference for Kernel {
-    /// The whole sum goes into the first partial: how many there are is the device's choice.
+    /// The whole sum goes into the first partial: the number of partials is chosen by the device.
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let differences: Vec<Rounded> = differences(params, constants, &slices).collect();
         for (d, difference) in slices.d_render.iter_mut().zip(&differences) {

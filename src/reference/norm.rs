@@ -1,4 +1,4 @@
-//! The norm of one channel, in any number: statistics of the image itself, biased variance, affine, `ReLU`.
+//! The norm of one channel, in any number type: statistics of the image itself, biased variance, affine, `ReLU`.
 
 use super::rounding::{Gated, Rounded};
 use crate::kernels::ChannelStatistics;
@@ -45,7 +45,7 @@ impl<T: Real> Statistics<T> {
 }
 
 impl<T: Real> Affine<T> {
-    /// gamma n + beta: what the `ReLU` sees.
+    /// gamma n + beta: the input of the `ReLU`.
     pub fn apply(&self, normalised: T) -> T {
         self.gamma * normalised + self.beta
     }

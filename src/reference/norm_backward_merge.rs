@@ -15,7 +15,7 @@ fn sums(params: &Params, constants: &Constants, partials: &[Vec2]) -> Vec<[Round
     (0..params.channel_count as usize).map(channel).collect()
 }
 
-/// Where the gradients of gamma and beta lie that the sums of a channel are added to, with these.
+/// The indices of the gradients of gamma and beta to which a channel's sums are added, with the sums.
 fn added(params: &Params, channel: usize, sums: [Rounded; 2]) -> [(usize, Rounded); 2] {
     let at = params.offset as usize + channel;
     [(at, sums[1]), (at + params.channel_count as usize, sums[0])]

@@ -1,4 +1,4 @@
-//! A map of features, packed.
+//! Feature maps, packed.
 
 use glam::UVec2;
 
@@ -24,7 +24,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// The half above or below.
+    /// The next half above or below.
     fn tolerances(_: &Params, _: &Constants, _: Slices<'_>) -> Tolerances {
         Tolerances { packed: Tolerance::Halves }
     }

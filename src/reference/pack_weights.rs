@@ -28,7 +28,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// The half above or below.
+    /// The next half above or below.
     fn tolerances(_: &Params, _: &Constants, _: Slices<'_>) -> Tolerances {
         Tolerances { packed: Tolerance::Halves }
     }

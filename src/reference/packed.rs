@@ -58,7 +58,7 @@ pub(super) fn weights([from, to]: [u32; 2], packed: &[Eight]) -> Vec<f32> {
 }
 
 /// The error of a sum of this many products of packed factors, given the sum of magnitudes of the terms and the largest
-/// magnitudes, all scaled. A matrix unit may truncate where an addition rounds, and flush subnormal numbers.
+/// magnitudes, all scaled. A matrix unit may truncate instead of rounding additions, and flush subnormal numbers.
 pub(super) fn sum_error(count: u32, magnitude: f64, largest: [f64; 2]) -> f64 {
     let count = f64::from(count);
     let cut = 4.0 * (count + 2.0) * super::rounding::UNIT * magnitude;
@@ -77,7 +77,7 @@ mod tests {
     use super::nearest;
 
     #[test]
-    fn every_half_is_nearest_to_what_it_stands_for_and_so_is_what_is_close() {
+    fn every_half_is_nearest_to_its_value_and_to_close_values() {
         let value = |half: u32| f16::from_bits(half as u16).to_f64();
         for half in (0..0x1_0000).filter(|half| !value(*half).is_nan()) {
             let own = value(half);

@@ -8,7 +8,7 @@ use crate::kernels::parameter_terms::{Constants, Kernel, Params, Slices, Toleran
 use crate::photographs::tone::Real;
 use crate::splats::attributes::Attribute;
 
-/// A value that a term sums up, and its derivative with respect to the parameter, in any number.
+/// A value that a term sums, and its derivative with respect to the parameter, in any number type.
 fn opacity<T: Real>(raw: T) -> [T; 2] {
     let one = T::of(1.0);
     let opacity = one / (one + (-raw).exp());
@@ -30,7 +30,7 @@ fn extremes<T: PartialOrd + Copy>(log_scales: [T; 3]) -> [usize; 2] {
 }
 
 /// The three weights, of opacity, standard deviation and anisotropy, times the means over the Gaussians with these
-/// planes, and the gradient. `log_ratio` is the logarithm of the ratio that costs nothing.
+/// planes, and the gradient. `log_ratio` is the logarithm of the largest ratio without a loss.
 #[cfg(feature = "testing")]
 pub fn parameter_terms(
     planes: &[f64],
@@ -72,7 +72,7 @@ fn scales(gaussian_count: usize) -> Range<usize> {
     first..first + 3 * gaussian_count
 }
 
-/// The values of the terms, and what the gradients become.
+/// The values of the terms, and the updated gradients.
 struct Outcome {
     opacities: Vec<Rounded>,
     scales: Vec<Rounded>,
@@ -117,7 +117,7 @@ fn outcome(params: &Params, slices: &Slices<'_>) -> Outcome {
 }
 
 impl Reference for Kernel {
-    /// The whole sums go into the first partials: how many there are is the device's choice.
+    /// The whole sums go into the first partials: the number of partials is chosen by the device.
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let Outcome { opacities, scales, ratios, gradients } = outcome(params, &slices);
         for (own, gradient) in slices.gradients.iter_mut().zip(gradients) {

@@ -14,7 +14,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// The product may be fused into the addition, or round before it.
+    /// The product may be fused into the addition, or rounded before it.
     fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
         let Slices { illumination, d_target, d_denoised, .. } = slices;
         let bound = |i: usize| {

@@ -14,20 +14,20 @@ use crate::kernels::project::{CULLED, Constants, Kernel, Params, Slices, Toleran
 use crate::kernels::splat::{ALPHA_MIN, DILATION};
 use crate::kernels::{self, ProjectedSplat};
 
-/// What one Gaussian is on the image plane.
+/// The projection of one Gaussian onto the image plane.
 #[derive(Clone, Debug)]
 pub struct Projection {
-    /// Its light.
+    /// Mean, conic and opacity.
     pub splat: Splat,
     /// Pixels: the box around the ellipse alpha = 1/255.
     pub half_extent: DVec2,
-    /// RGB; not below zero, but for raw colours.
+    /// RGB; not below zero, except for raw colours.
     pub color: DVec3,
-    /// As the camera model counts it, world units.
+    /// In the camera model's definition, world units.
     pub depth: f64,
 }
 
-/// Projects one Gaussian with SH up to `sh_degree`; `None` where it is culled. Raw colours are the bare SH sum.
+/// Projects one Gaussian with SH up to `sh_degree`; `None` if it is culled. Raw colours are the bare SH sum.
 pub fn project_gaussian(
     camera: &Camera,
     near: f64,
@@ -71,7 +71,7 @@ pub fn project_gaussian(
 }
 
 impl Projection {
-    /// As the kernel stores it.
+    /// In the layout of the kernel.
     fn stored(&self) -> ProjectedSplat {
         ProjectedSplat {
             mean2d: self.splat.mean2d.as_vec2(),
@@ -90,7 +90,7 @@ impl Projection {
     }
 }
 
-/// By what visible Gaussians are sorted.
+/// The key by which visible Gaussians are sorted.
 fn depth_key(depth: f32, near: f32) -> u32 {
     let nearest = near.max(NEAREST as f32);
     let beyond = depth.max(nearest).to_bits() - nearest.to_bits();
@@ -108,11 +108,11 @@ fn tile_count(size: UVec2, constants: &Constants, splat: &ProjectedSplat) -> u32
     (top..bottom).map(row).sum()
 }
 
-/// A view, and the Gaussians in it.
+/// A view and its Gaussians.
 struct ProjectionInputs<'a> {
     params: &'a Params,
     constants: &'a Constants,
-    /// Of the image, pixels.
+    /// Size of the image, pixels.
     size: UVec2,
     camera: Camera,
     planes: Planes,
@@ -133,8 +133,9 @@ impl<'a> ProjectionInputs<'a> {
         project_gaussian(&self.camera, near.into(), sh_degree, raw_colors, gaussian)
     }
 
-    /// How far each of [`Projection::numbers`] may be off: the kernel gives them for a Gaussian that is off by a few
-    /// roundings, exponentials included, and rounds them a few times. None where that decides whether it is culled.
+    /// The error bound of each of [`Projection::numbers`]: the kernel computes them for a Gaussian that is off by a few
+    /// roundings, including exponentials, and rounds them a few times. `None` if that decides whether the Gaussian is
+    /// culled.
     fn errors(&self, gaussian: &Gaussian) -> Option<[f64; 12]> {
         let Gaussian { mean, quat, log_scale, raw_opacity, .. } = gaussian;
         let far = mean.length() + self.camera.center().length();
@@ -246,7 +247,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// A Gaussian at the border of being culled may be; one whose ellipse borders on a tile may cover it.
+    /// A Gaussian close to the culling limit may be culled; one whose ellipse is close to a tile may cover it.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let scene = ProjectionInputs::new(params, constants, slices.cameras);
         let parameters = scene.planes.floats(slices.parameters, constants.half_rest);
@@ -271,7 +272,7 @@ impl Reference for Kernel {
             let count = tile_count(scene.size, constants, &splat);
             let [fewest, most] = scene.tile_counts(&splat, &errors);
             tile_counts[i] = (count - count.min(fewest)).max(most.max(count) - count).into();
-            // The keys of positive numbers are as far apart as these in sixteenths of units of the last place.
+            // The keys of positive numbers differ by sixteenths of their difference in units in the last place.
             let depth = projection.depth as f32;
             let last_place = f64::from(depth.next_up()) - f64::from(depth);
             depth_keys[i] = match (fewest, most) {

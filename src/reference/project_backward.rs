@@ -22,15 +22,15 @@ pub struct DSplat {
     pub mean2d: DVec2,
     /// (xx, xy, yy), pixels^2.
     pub conic: DVec3,
-    /// Of the opacity after the sigmoid.
+    /// With respect to the opacity after the sigmoid.
     pub opacity: f64,
-    /// RGB; zero where the colour was clamped.
+    /// RGB; zero if the colour was clamped.
     pub color: DVec3,
-    /// Of what is blended beside colour.
+    /// With respect to the features.
     pub features: Vec<f64>,
 }
 
-/// The gradients of a Gaussian's attributes from those of the splat it became.
+/// The gradients of a Gaussian's attributes from those of its splat.
 pub fn project_gaussian_backward(
     camera: &Camera,
     sh_degree: u32,
@@ -69,7 +69,7 @@ pub fn project_gaussian_backward(
     }
 }
 
-/// From the gradient of a conic to those of the rows of U, of which cov2d = U U^T + 0.3 I, and of the logarithms of the
+/// From the gradient of a conic to those of the rows of U, where cov2d = U U^T + 0.3 I, and of the logarithms of the
 /// scales.
 pub(super) fn conic_backward(
     conic: DVec3,
@@ -123,7 +123,7 @@ fn outer_product(column: DVec3, row: DVec3) -> DMat3 {
 /// Numbers of a record before its channels.
 const HEAD: usize = RECORD_HEAD as usize;
 
-/// A view, and the Gaussians in it.
+/// A view and its Gaussians.
 struct ProjectionInputs<'a> {
     params: &'a Params,
     constants: &'a Constants,
@@ -139,7 +139,7 @@ impl<'a> ProjectionInputs<'a> {
         Self { params, constants, camera, planes }
     }
 
-    /// What arrives at the splat of Gaussian `i` as `record` says, where clamped colours pass nothing on.
+    /// The gradients in the `record` of Gaussian `i`; clamped colours have none.
     fn d_splat(&self, colors: &[Vec3], record: &[f64], i: usize) -> DSplat {
         let color = colors[stored_color(self.constants.channels) / 3 * i];
         let is_free = |c: usize| self.constants.raw_colors || color[c] > 0.0;
@@ -157,8 +157,8 @@ impl<'a> ProjectionInputs<'a> {
         project_gaussian_backward(&self.camera, self.params.sh_degree, gaussian, splat, d_splat)
     }
 
-    /// What roundings make of the gradient of a quaternion where the terms cancel, as they do for a sphere, which has
-    /// none: its entries are sums of products whose magnitudes these are.
+    /// The rounding error of a quaternion's gradient, whose terms can cancel, as for a sphere, which has no gradient:
+    /// its entries are sums of products with these magnitudes.
     fn quat_error(&self, gaussian: &Gaussian, splat: &Splat, d_splat: &DSplat) -> f64 {
         let ([a, b, c], d) = (splat.conic.abs().to_array(), d_splat.conic.abs());
         let d_xx = a * a * d.x + a * b * d.y + b * b * d.z;
@@ -171,7 +171,7 @@ impl<'a> ProjectionInputs<'a> {
         512.0 * UNIT * scale * scale * t.dot(d_u) / gaussian.quat.length().max(1e-12)
     }
 
-    /// What the statistics of density control grow by.
+    /// The increment of the statistics of density control.
     fn damped_norm(&self, gaussian: &Gaussian, d_splat: &DSplat) -> f64 {
         let Params { damping_weight, damping_depth, .. } = *self.params;
         let (weight, depth) =
@@ -182,8 +182,8 @@ impl<'a> ProjectionInputs<'a> {
     }
 }
 
-/// The sum of the records of a Gaussian with these slots. Those of few slots are added up in f32 in the kernel's very
-/// order; those of many by the lanes of a subgroup, in an order that is the device's.
+/// The sum of the records of a Gaussian with these slots. Those of few slots are added in f32 in the kernel's exact
+/// order; those of many by the lanes of a subgroup, in an order that depends on the device.
 pub(super) fn summed_record(
     channels: u32,
     intersection_ids: UVec2,
@@ -221,7 +221,7 @@ impl Reference for Kernel {
             ..
         } = slices;
         let Slices { status, gradients, grad_norm_sums, visit_counts, .. } = slices;
-        // Of all Gaussians, as the device may look at them in any order.
+        // Of all Gaussians, since the device may process them in any order.
         let before = status[0];
         let scene = ProjectionInputs::new(params, constants, slices.cameras);
         let parameters = scene.planes.floats(parameters, constants.half_rest);
@@ -246,7 +246,7 @@ impl Reference for Kernel {
         }
     }
 
-    /// Backward stability: the kernel gives what the reference gives for inputs that are off by some roundings each.
+    /// Backward stability: the kernel returns the reference's result for inputs that are off by some roundings each.
     /// Attributes also pass through sums and exponentials with terms of order one, means through the view.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         const OFF: f64 = 256.0 * UNIT;

@@ -10,7 +10,7 @@ pub fn residual(render: f64, stage_input: f64, update: f64) -> f64 {
 }
 
 impl Reference for Kernel {
-    /// In single precision, as the kernel: the clamp's gradient hangs on the bits.
+    /// In single precision, like the kernel: the gradient of the clamp depends on the bits.
     fn run(
         params: &Params,
         constants: &Constants,

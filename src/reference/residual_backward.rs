@@ -3,8 +3,8 @@
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::residual_backward::{Constants, Kernel, Params, Slices, Tolerances};
 
-/// The gradient `d` of the result of [`super::residual::residual`] before the clamp, which passes it within 0 and 1,
-/// bounds included: the gradient of `R_0`, and the negative of those of I and u.
+/// The gradient of [`super::residual::residual`] with respect to its value before the clamp, which passes it within 0
+/// and 1, including the bounds: the gradient of `R_0`, and the negative of those of I and u.
 pub fn clamp_backward(difference: f64, d: f64) -> f64 {
     if (0.0..=1.0).contains(&difference) { d } else { 0.0 }
 }

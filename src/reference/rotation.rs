@@ -1,4 +1,4 @@
-//! Quaternions (w, x, y, z) as `include/rotation.glsl` has them, in f64.
+//! Quaternions (w, x, y, z) as in `include/rotation.glsl`, in f64.
 
 use glam::{DMat3, DVec4};
 
@@ -18,7 +18,7 @@ pub fn rotation(q: DVec4) -> DMat3 {
     ])
 }
 
-/// A quaternion of unit length; the identity where the length is not a positive number.
+/// A quaternion of unit length; the identity if the length is not a positive number.
 pub fn unit_quat(q: DVec4) -> DVec4 {
     let norm = q.length();
     if norm > 1e-12 { q / norm } else { DVec4::X }

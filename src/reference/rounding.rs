@@ -1,5 +1,5 @@
-//! Rounding error in single precision: numbers with an error bound, as the Vulkan specification ("Precision of core
-//! SPIR-V instructions") bounds each operation. Fused multiply-adds round once less.
+//! Rounding error in single precision: numbers with an error bound, from the bounds of each operation in the Vulkan
+//! specification ("Precision of core SPIR-V instructions"). Fused multiply-adds round once less.
 
 use std::cmp::Ordering;
 use std::ops::{Add, Div, Mul, Neg, Sub};
@@ -14,13 +14,12 @@ pub const UNIT: f64 = f32::EPSILON as f64 / 2.0;
 /// The largest absolute error of a sine or cosine.
 pub(super) const TRIGONOMETRIC: f64 = 1.0 / 2048.0;
 
-/// The most roundings of one term while a subgroup sums `count`: in a lane's run of them, then across the lanes, of
-/// which there are 4 to 128.
+/// The most roundings of one term while a subgroup sums `count`: within a lane, then across the 4 to 128 lanes.
 pub(super) fn chain(count: usize) -> f64 {
     count as f64 / 4.0 + 128.0
 }
 
-/// Forward error of `f` to first order, where each of its inputs has its error.
+/// First-order forward error of `f`, given the errors of its inputs.
 pub(super) fn sensitivity(
     inputs: &[f64],
     errors: &[f64],
@@ -52,7 +51,7 @@ impl Rounded {
         Self { value: value.into(), error: 0.0 }
     }
 
-    /// After `count` roundings more.
+    /// After `count` more roundings.
     pub(super) fn rounded(self, count: f64) -> Self {
         Self { error: self.error + count * UNIT * (self.value.abs() + self.error), ..self }
     }
@@ -184,9 +183,9 @@ impl Neg for Rounded {
     }
 }
 
-/// A number that a condition can select.
+/// A value that a condition can select.
 pub trait Gated: Real {
-    /// Itself where `y` is above 0, else 0.
+    /// The value itself if `y` is above 0, else 0.
     fn where_positive(self, y: Self) -> Self;
 }
 
@@ -216,7 +215,7 @@ impl Real for Rounded {
         argument.rounded(6.0 + 4.0 * (self.value.abs() + self.error))
     }
 
-    /// A series where x is small, else 1 - exp(-x).
+    /// A series if x is small, else 1 - exp(-x).
     fn one_minus_exp(self) -> Self {
         let value = -(-self.value).exp_m1();
         let slope = (self.error - self.value).exp();
@@ -228,7 +227,7 @@ impl Real for Rounded {
         Self { error: argument.error + own, ..argument }.rounded(1.0)
     }
 
-    /// A series where x is small, else ln(1 + x).
+    /// A series if x is small, else ln(1 + x).
     fn ln_1p(self) -> Self {
         if self.value < 0.01 {
             let argument = Self::from_argument(self.value.ln_1p(), self.error, 1.0);
@@ -279,14 +278,14 @@ mod tests {
     use crate::base::random::Stream;
     use crate::photographs::tone::Real;
 
-    /// A formula with every operation, in any number.
+    /// A formula with every operation, in any number type.
     fn formula<T: Real>(x: T, y: T) -> T {
         let root = (x * x + y * y).sqrt();
         (x - y) / (T::of(0.3) + root) + (-root).exp() * root.one_minus_exp() - x.power(y).ln_1p()
     }
 
     #[test]
-    fn single_precision_stays_within_the_bound_and_the_bound_near_it() {
+    fn single_precision_stays_within_a_tight_bound() {
         let stream = Stream::new(1, 2);
         let (mut largest, mut loosest) = (0.0_f64, 0.0_f64);
         for i in 0..10_000 {

@@ -1,4 +1,4 @@
-//! Real spherical harmonics to degree 3 and their derivatives, as `include/sh.glsl` has them, in f64.
+//! Real spherical harmonics to degree 3 and their derivatives, as in `include/sh.glsl`, in f64.
 
 use glam::DVec3;
 

@@ -15,7 +15,7 @@ impl Reference for Kernel {
                 table[part * digit_count + digit] += 1;
             }
         }
-        // Where there is nothing to sort, no workgroup is the last.
+        // Without items, no workgroup is the last.
         if params.folds_spine != 0 && partition_count > 0 {
             make_prefix_sums(table, digit_totals, digit_count, partition_count);
         }

@@ -11,7 +11,7 @@ pub(super) fn stored_record(channels: u32) -> usize {
     (RECORD_HEAD + channels).next_multiple_of(3) as usize
 }
 
-/// Floats of a splat's values as stored, likewise.
+/// Floats of a splat's values as stored: in vectors of three, padded with zeros.
 pub(super) fn stored_color(channels: u32) -> usize {
     channels.next_multiple_of(3) as usize
 }
@@ -88,13 +88,13 @@ pub(super) fn extent_error(opacity: f32) -> f64 {
     48.0 * UNIT + 1.1 / 2_097_152.0 / f64::from(splat_level(opacity))
 }
 
-/// Twice the sigma at which alpha falls to 1/255, a hair high.
+/// Twice the sigma at which alpha falls to 1/255, slightly too large.
 pub fn splat_level(opacity: f32) -> f32 {
     2.002 * (255.0 * opacity).ln() + 1e-3
 }
 
-/// The columns of pixels [first, last] whose centres lie in the ellipse somewhere between the pixel rows `top` and
-/// `bottom`; empty where last < first.
+/// The columns of pixels [first, last] whose centres are in the ellipse somewhere between the pixel rows `top` and
+/// `bottom`; empty if last < first.
 pub fn splat_columns(splat: &ProjectedSplat, top: f32, bottom: f32) -> [i32; 2] {
     let ProjectedSplat { mean2d, conic, opacity, half_extent: extent } = *splat;
     let y0 = top + 0.5 - mean2d.y;
@@ -116,7 +116,7 @@ pub fn splat_columns(splat: &ProjectedSplat, top: f32, bottom: f32) -> [i32; 2] 
     [(left - 0.5).ceil() as i32, (right - 0.5).floor() as i32]
 }
 
-/// The tile columns [x, y) that the splat meets in a row of tiles of an image `width` pixels wide.
+/// The tile columns [x, y) that the splat intersects in a row of tiles of an image `width` pixels wide.
 pub fn splat_tiles(splat: &ProjectedSplat, tile_row: u32, width: u32, tile: UVec2) -> [u32; 2] {
     let top = (tile_row * tile.y) as f32;
     let [first, last] = splat_columns(splat, top, top + (tile.y - 1) as f32);
@@ -127,7 +127,7 @@ pub fn splat_tiles(splat: &ProjectedSplat, tile_row: u32, width: u32, tile: UVec
     [first as u32 / tile.x, last as u32 / tile.x + 1]
 }
 
-/// The rows of tiles [x, y) that the splat's box meets in an image `height` pixels high.
+/// The rows of tiles [x, y) that the splat's box intersects in an image `height` pixels high.
 pub fn splat_tile_rows(splat: &ProjectedSplat, height: u32, tile: UVec2) -> [u32; 2] {
     let top = (splat.mean2d.y - splat.half_extent.y).clamp(0.0, height as f32);
     let bottom = (splat.mean2d.y + splat.half_extent.y).clamp(0.0, height as f32);

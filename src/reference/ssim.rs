@@ -1,4 +1,4 @@
-//! SSIM and the gradient of L1 + SSIM, in any number; the kernel's reference rounds what it returns.
+//! SSIM and the gradient of L1 + SSIM, in any number type; the kernel's reference rounds the results.
 
 use glam::UVec2;
 
@@ -56,7 +56,7 @@ fn ssim_of_moments<T: Real>(a: T, b: T, aa: T, bb: T, ab: T) -> Ssim<T> {
     let a1 = two * a * b + c1;
     let a2 = two * (ab - a * b) + c2;
     let b1 = a * a + b * b + c1;
-    // The variances are not negative: only the cancellation of large bright values reaches the floor.
+    // Variances are not negative: only cancellation of large bright values reaches the floor.
     let b2 = (aa - a * a + bb - b * b).at_least(T::of(0.0)) + c2;
     let scale = one / (b1 * b2);
     let value = a1 * a2 * scale;
@@ -88,7 +88,7 @@ pub fn gradient(
     (0..a.len()).map(at).collect()
 }
 
-/// dSSIM/da at one pixel, from the blurred derivatives. A value that no window asks of passes nothing on, were it NaN.
+/// dSSIM/da at one pixel, from the blurred derivatives. A value outside all windows has no gradient, even if it is NaN.
 fn d_ssim<T: Real>(a: T, b: T, [mean, square, product]: [T; 3]) -> T {
     let own = if square == T::of(0.0) { square } else { T::of(2.0) * a * square };
     mean + own + b * product
@@ -103,10 +103,10 @@ fn rounded_blur(size: [usize; 2], plane: &[Rounded]) -> Vec<Rounded> {
     values.into_iter().zip(errors).map(|(value, error)| Rounded { value, error }).collect()
 }
 
-/// What the kernel makes of a value of the render.
+/// The results of the kernel for a value of the render.
 struct Outcome {
     gradient: Rounded,
-    /// a - b and SSIM; zero where they do not count.
+    /// a - b and SSIM; zero outside the loss region.
     difference: Rounded,
     ssim: Rounded,
 }
@@ -153,7 +153,7 @@ fn outcomes_of_channel(params: &Params, a: &[Rounded], b: &[Rounded]) -> Vec<Out
     (0..a.len()).map(outcome).collect()
 }
 
-/// The gradients, with those of the terms before where they are added to.
+/// The gradients, added to those of earlier terms if they are accumulated.
 fn accumulated<'a>(
     outcomes: &'a [Outcome],
     constants: &Constants,
@@ -167,7 +167,7 @@ fn accumulated<'a>(
 }
 
 impl Reference for Kernel {
-    /// The whole sums go into the first partials: how many there are is the device's choice.
+    /// The whole sums go into the first partials: the number of partials is chosen by the device.
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let (outcomes, before) = (outcomes(params, &slices), slices.d_render.to_vec());
         for (to, d) in slices.d_render.iter_mut().zip(accumulated(&outcomes, constants, &before)) {

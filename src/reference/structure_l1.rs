@@ -3,7 +3,7 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::structure_l1::{Constants, Kernel, Params, Slices, Tolerances};
 
 impl Reference for Kernel {
-    /// The whole sum goes into the first partial: how many there are is the device's choice.
+    /// The whole sum goes into the first partial: the number of partials is chosen by the device.
     fn run(
         params: &Params,
         _: &Constants,

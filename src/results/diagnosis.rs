@@ -13,7 +13,7 @@ const PICTURE_WIDTH: u32 = 240;
 /// Number of views with images, spread evenly.
 const SHOWN: usize = 12;
 
-/// A column of the table of photographs: name, decimals, meaning with its unit, and values that are a problem.
+/// A column of the table of photographs: name, decimals, meaning with its unit, and bad values.
 type Measure = (&'static str, usize, &'static str, &'static str);
 
 /// The columns, in the order of [`values`].
@@ -51,7 +51,7 @@ const MEASURES: [Measure; 14] = [
     (
         "chroma noise",
         3,
-        "the same of the colour differences R - Y and B - Y",
+        "standard deviation of the colour differences R - Y and B - Y in the target",
         "above 0.02: visible in the targets",
     ),
     ("blur", 1, "width of edges, pixels", "1.6 times the median: motion or focus"),
@@ -166,7 +166,7 @@ pub(crate) fn page(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
     let stride = views.len().div_ceil(SHOWN).max(1);
     let mut comparisons = vec![];
     for view in views.iter().step_by(stride) {
-        // Skip photographs that can no longer be read.
+        // A photograph that can no longer be read is skipped.
         let Ok(Some(image)) = view.loaded() else { continue };
         let image = image.as_ref();
         let target =

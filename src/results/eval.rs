@@ -1,5 +1,5 @@
-//! Scores a model on the test views of its dataset: against their reference images, or where there are none against what
-//! the model was trained to show of them.
+//! Scores a model on the test views of its dataset: against their reference images or, without any, against their
+//! targets.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -27,26 +27,26 @@ pub use transmittance::{
     MAX_RESIDUAL_TRANSMITTANCE, ResidualTransmittance, hole_warning, warn_of_holes,
 };
 
-/// What test views are scored against.
+/// The images that test views are scored against.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ReferenceKind {
     /// Normal-light photographs.
     #[default]
     References,
-    /// What the run's own curve makes of the test views' photographs.
+    /// The photographs of the test views, tone-mapped with the run's curve.
     PseudoGt,
-    /// The test views' photographs: there is no curve, they are the targets.
+    /// The photographs of the test views: without a curve, they are the targets.
     Photographs,
 }
 
 impl ReferenceKind {
-    /// What a score is to be read with; none against references, as scores are understood.
+    /// Note for readers of a score; `None` for references, the usual meaning of a score.
     pub fn label(self) -> Option<&'static str> {
         match self {
             Self::References => None,
             Self::PseudoGt => Some(
-                "against their own pseudo-GT, as there are no reference images: how well the model shows its targets, not how \
-                 right these are; runs of different curves do not compare",
+                "against their own pseudo-GT, as there are no reference images: how well the model reproduces its \
+                 targets, not how right these are; runs of different curves do not compare",
             ),
             Self::Photographs => Some(
                 "against the photographs themselves, as there are no reference images and no curve",
@@ -54,7 +54,7 @@ impl ReferenceKind {
         }
     }
 
-    /// In a word or two, within a line.
+    /// Short name, for use within a line.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::References => "reference images",
@@ -64,28 +64,28 @@ impl ReferenceKind {
     }
 }
 
-/// What the test views of a dataset are scored against.
+/// The images that the test views of a dataset are scored against.
 #[derive(Debug, Default)]
 pub struct ScoreReference {
-    /// Which kind that is.
+    /// Their kind.
     pub against: ReferenceKind,
-    /// What makes them, where they are no reference images.
+    /// Makes the targets, unless there are reference images.
     targets: Option<TestTargets>,
-    /// What it made, by view, of photographs that are kept as well.
+    /// Targets made so far, by view, if photographs are cached as well.
     made: BTreeMap<String, Image>,
 }
 
 impl ScoreReference {
-    /// The reference images where a test view has one; without any, the targets that `tone apply` gives the test views in the
-    /// scene of the training photographs.
+    /// The reference images of the test views that have one; without any, the targets that `tone apply` gives the test
+    /// views, with the statistics of the training photographs.
     ///
     /// # Errors
-    /// Every photograph is as good as black, one can no longer be read, or the device is out of memory or lost.
+    /// Every photograph is almost black, one can no longer be read, or the device is out of memory or lost.
     pub fn of(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
         Self::made_by(tone, dataset, || TestTargets::new(gpu, tone, dataset))
     }
 
-    /// The same where the scene of the training photographs is known.
+    /// [`ScoreReference::of`] with given statistics of the training photographs.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -108,7 +108,7 @@ impl ScoreReference {
         Ok(Self { against, targets, made: BTreeMap::new() })
     }
 
-    /// Which kind it will be.
+    /// The kind that [`ScoreReference::of`] chooses.
     pub fn kind(tone: &ToneSettings, dataset: &Dataset) -> ReferenceKind {
         let has_references = dataset.test_views().any(View::has_reference);
         let has_photographs = dataset.test_views().any(View::has_photograph);
@@ -119,7 +119,7 @@ impl ScoreReference {
         }
     }
 
-    /// How many of the dataset's test views it has something for.
+    /// The number of test views that can be scored.
     pub fn view_count(&self, dataset: &Dataset) -> usize {
         let has_target = match self.against {
             ReferenceKind::References => View::has_reference,
@@ -128,7 +128,7 @@ impl ScoreReference {
         dataset.test_views().filter(|view| has_target(view)).count()
     }
 
-    /// What a view is held to, in 8 bits.
+    /// The image that a view is scored against, in 8 bits.
     fn target(&mut self, view: &View) -> Result<Option<Image>> {
         let Some(targets) = &mut self.targets else {
             return Ok(view.loaded_reference()?.map(|reference| quantized(&reference)));
@@ -143,36 +143,36 @@ impl ScoreReference {
     }
 }
 
-/// What a test view scores.
+/// The scores of a test view.
 #[derive(Clone, Debug)]
 pub struct ViewScore {
     /// The view's name.
     pub name: String,
-    /// The scores of what the model shows: R_K, or R_0 where it has no denoiser.
+    /// Scores of the final image: R_K, or R_0 without a denoiser.
     pub scores: Scores,
-    /// Those of R_0, where the model has a denoiser.
+    /// Scores of R_0, if the model has a denoiser.
     pub r0: Option<Scores>,
-    /// Those behind the gain and bias of each channel that bring the render nearest to what it should be, where it was asked.
+    /// Scores after the least-squares gain and bias of each channel, if requested.
     pub aligned: Option<Scores>,
-    /// How much of the background shows; none of what is no render.
+    /// The background that shows through; `None` if the image is not a render.
     pub residual_transmittance: Option<ResidualTransmittance>,
-    /// What it was scored against.
+    /// What the view was scored against.
     pub against: ReferenceKind,
 }
 
-/// The two pictures that a view's scores compare, in 8 bits as they are saved.
+/// The two images that a view's scores compare, in 8 bits as they are saved.
 #[derive(Debug)]
 pub struct ScoredImages<'a> {
     /// The view.
     pub view: &'a View,
-    /// What the model shows of it.
+    /// The model's image of it.
     pub render: Image,
-    /// What it should be.
+    /// The image that it is compared with.
     pub target: Image,
 }
 
 impl ScoredImages<'_> {
-    /// LPIPS over the pixels that count.
+    /// LPIPS of the unmasked pixels.
     ///
     /// # Errors
     /// Those of [`Lpips::distance`].
@@ -182,16 +182,17 @@ impl ScoredImages<'_> {
         lpips.distance(gpu, &metrics::counted(render, target, mask.as_deref()), target)
     }
 
-    /// The scores behind the gain and bias of each channel that bring the render nearest to what it should be.
+    /// The scores after the gain and bias of each channel that minimise the squared error to the target.
     ///
     /// # Errors
-    /// None for what [`score_by`] shows.
+    /// None for images from [`score_by`].
     pub fn aligned(&self) -> Result<Scores> {
         let affine = Affine::least_squares(&self.render, &self.target)?;
         Scores::of(&quantized(&affine.applied(&self.render)), &self.target)
     }
 
-    /// Writes `renders/NAME.png` and `references/NAME.png` below `folder`; what is no reference image, to `targets`.
+    /// Writes `renders/NAME.png` and `references/NAME.png` in `folder`; `targets/NAME.png` if there are no reference
+    /// images.
     ///
     /// # Errors
     /// The folder cannot be written.
@@ -203,7 +204,7 @@ impl ScoredImages<'_> {
         for (name, image) in [("renders", &self.render), (targets, &self.target)] {
             let folder = folder.join(name);
             std::fs::create_dir_all(&folder)
-                .map_err(|error| Error::output(&folder, format!("cannot be made ({error})")))?;
+                .map_err(|error| Error::output(&folder, format!("cannot be created ({error})")))?;
             let path = folder.join(format!("{}.png", self.view.name));
             self.view.upright(image.clone()).save_png8(path)?;
         }
@@ -211,18 +212,19 @@ impl ScoredImages<'_> {
     }
 }
 
-/// A finished model on the device, ready to be rendered.
+/// A finished model on the device, ready to render.
 #[derive(Debug)]
 pub struct ModelRenderer {
     gaussians: DeviceGaussians,
     renderer: Renderer,
     networks: Option<Networks>,
-    /// Where the Gaussians lie.
+    /// The training frame, in which the Gaussians are.
     frame: TrainingFrame,
 }
 
 impl ModelRenderer {
-    /// Uploads the model of a run of `config`; `networks` belong to it. The run's tile is taken where it suits the device.
+    /// Uploads the model of a run of `config`, with its `networks`. The run's tile size is used if the device supports
+    /// it.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -247,7 +249,7 @@ impl ModelRenderer {
         })
     }
 
-    /// What the view's camera sees, before a black background.
+    /// Renders a view over a black background.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -255,7 +257,7 @@ impl ModelRenderer {
         self.render_camera(&view.camera)
     }
 
-    /// What any camera of the dataset's world sees, before a black background.
+    /// Renders a camera in the dataset's world over a black background.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -265,7 +267,7 @@ impl ModelRenderer {
         Rendered::new(&mut self.renderer, &self.gaussians, camera, &options, networks)
     }
 
-    /// One layer of what a camera sees; a feature of one channel is repeated.
+    /// Renders one layer; a feature of one channel is repeated in all three.
     ///
     /// # Errors
     /// The model has no such layer, or the device is out of memory or lost.
@@ -296,7 +298,7 @@ impl ModelRenderer {
         Ok(Image { width, height, data: (0..3).flat_map(plane).collect() })
     }
 
-    /// What the model does have, for a message.
+    /// The layers that the model has, for a message.
     fn layers(&self) -> String {
         let denoised = self.networks.as_ref().is_some_and(Networks::has_denoiser);
         let features = self.shape().features.specs().map(|spec| spec.name);
@@ -314,14 +316,14 @@ impl ModelRenderer {
     }
 }
 
-/// What can be seen of a model.
+/// The images that can be rendered from a model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RenderLayer {
     /// R_0, the Gaussians' colours.
     Rgb,
-    /// R_K, behind the denoiser.
+    /// R_K, the output of the denoiser.
     Denoised,
-    /// The depth feature, in units of its own.
+    /// The depth feature, in its own units.
     Depth,
     /// The structure feature.
     Structure,
@@ -348,7 +350,7 @@ impl RenderLayer {
         }
     }
 
-    /// Whether its values are colour, sRGB-encoded, rather than numbers.
+    /// Whether its values are sRGB-encoded colours.
     pub(crate) fn is_color(self) -> bool {
         matches!(self, Self::Rgb | Self::Denoised)
     }
@@ -365,11 +367,11 @@ impl FromStr for RenderLayer {
     }
 }
 
-/// Scores every test view that has a reference image; `render` draws a view. Both images are clamped and rounded to 8
-/// bits first, so that what is scored is what is saved.
+/// Scores every test view that has a reference image; `render` renders a view. Both images are clamped and rounded to 8
+/// bits first, as they are saved.
 ///
 /// # Errors
-/// Those of `render`; a reference image that is not kept can no longer be read.
+/// Those of `render`; a reference image that is not cached can no longer be read.
 #[cfg(feature = "testing")]
 pub fn score(
     dataset: &Dataset,
@@ -378,10 +380,11 @@ pub fn score(
     score_by(&mut ScoreReference::default(), dataset, render, |_, _| Ok(()))
 }
 
-/// As [`score`], by any yardstick; `look` sees the pictures of each view, which are gone behind it.
+/// [`score`] against any reference; `inspect` is called with the images of each view.
 ///
 /// # Errors
-/// As there, and those of `look`; a photograph that is not kept can no longer be read, or the device is out of memory or lost.
+/// Those of [`score`] and `inspect`; a photograph that is not cached can no longer be read, or the device is out of
+/// memory or lost.
 pub fn score_by(
     score_reference: &mut ScoreReference,
     dataset: &Dataset,
@@ -409,7 +412,7 @@ pub fn score_by(
     Ok(scored)
 }
 
-/// `metrics.json`: means and views, and what the run took; null where that, or a mean, is not known. [`add_lpips`] adds LPIPS.
+/// `metrics.json`: means, views, and the resources of the run; unknown values are null. [`add_lpips`] adds LPIPS.
 pub fn metrics(
     scored: &[ViewScore],
     seconds: impl Into<Option<f64>>,
@@ -443,32 +446,32 @@ pub fn metrics(
     metrics
 }
 
-/// Where `metrics.json` says what the scores are against, where that is no reference image.
+/// Key in `metrics.json` for what the scores are against, unless it is reference images.
 pub const AGAINST: &str = "against";
 
-/// What the scores are to be read with, where they are against no reference images.
+/// Note for readers of the scores, unless they are against reference images.
 pub fn label(scored: &[ViewScore]) -> Option<&'static str> {
     scored.first().and_then(|view| view.against.label())
 }
 
-/// Where `metrics.json` says what the targets know of references, where they know any.
+/// Key in `metrics.json` for what the targets take from reference images, if anything.
 pub const WITH_REFERENCE: &str = "with_reference";
 
-/// The line beside scores of targets that know references.
+/// The note next to scores whose targets depend on reference images.
 pub fn with_reference(known: &str) -> String {
     format!(
-        "with reference: the targets follow {known}; not comparable with scores that know no reference"
+        "with reference: the targets depend on {known}; not comparable with scores without reference"
     )
 }
 
-/// Says in `metrics.json` of targets that know references what they know.
+/// Adds [`WITH_REFERENCE`] to `metrics.json` if the targets depend on reference images.
 pub fn add_reference(metrics: &mut Value, tone: &ToneSettings) {
     if let Some(known) = tone.knows_references() {
         metrics[WITH_REFERENCE] = json!(known);
     }
 }
 
-/// Adds LPIPS to the mean and the views of `metrics.json` under the key of its measure, and says which measure that is.
+/// Adds the mean LPIPS and that of each view to `metrics.json`, with the name of the measure.
 pub fn add_lpips(metrics: &mut Value, scored: &[ViewScore], measure: Measure) {
     let key = measure.key();
     let Measure { network, range } = measure;
@@ -484,10 +487,10 @@ pub fn add_lpips(metrics: &mut Value, scored: &[ViewScore], measure: Measure) {
     }
 }
 
-/// Says in `metrics.json` of a model with learned exposures at which one the test views were scored, as no photograph of
-/// theirs was trained on: at the neutral one, the mean of the training views. Beside it stand the scores behind the affine
-/// of each channel that brings each render nearest to its reference image, which is what others report; they know the
-/// reference and compare with nothing else here.
+/// Adds to `metrics.json` of a model with learned exposures the exposure at which the test views were scored: the
+/// neutral one, the mean of the training views, since no exposure is learned for test views. Also adds the scores after
+/// a least-squares affine correction of each channel to the reference image, as other work reports them; these use the
+/// reference and are not comparable with other scores here.
 pub fn add_exposure(metrics: &mut Value, scored: &[ViewScore]) {
     let aligned = || scored.iter().filter_map(|view| Some((&view.name, view.aligned?)));
     let scores: Vec<Scores> = aligned().map(|(_, scores)| scores).collect();
@@ -495,20 +498,20 @@ pub fn add_exposure(metrics: &mut Value, scored: &[ViewScore]) {
         aligned().map(|(name, scores)| (name.clone(), entry(&scores, None))).collect();
     metrics["exposure"] = json!("neutral: the mean of the training views'");
     metrics["aligned_with_reference"] = json!({
-        "what": "behind the least-squares gain and bias of each channel of each test view against its reference image",
+        "what": "after the least-squares gain and bias of each channel of each test view against its reference image",
         "mean": Scores::mean(&scores).map(|mean| entry(&mean, None)),
         "views": views,
     });
 }
 
-/// The mean scores, and those of R_0 where the model has a denoiser.
+/// The mean scores, and the mean scores of R_0 if the model has a denoiser.
 pub fn means(scored: &[ViewScore]) -> (Option<Scores>, Option<Scores>) {
     let all: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
     let r0: Vec<Scores> = scored.iter().filter_map(|view| view.r0).collect();
     (Scores::mean(&all), Scores::mean(&r0))
 }
 
-/// A score as JSON, that of R_0 in it; infinite PSNR, of equal images, has no JSON number and is null.
+/// A score as JSON, with that of R_0; the infinite PSNR of equal images is null.
 fn entry(scores: &Scores, r0: Option<&Scores>) -> Value {
     let mut entry = json!({
         "psnr": scores.psnr,
@@ -521,7 +524,7 @@ fn entry(scores: &Scores, r0: Option<&Scores>) -> Value {
     entry
 }
 
-/// Clamped to [0, 1] and rounded to multiples of 1/255. A NaN becomes 0.
+/// Clamps to [0, 1] and rounds to multiples of 1/255. A NaN becomes 0.
 pub(crate) fn quantized(image: &Image) -> Image {
     let data = image.data.iter().map(|&v| (v.clamp(0.0, 1.0) * 255.0).round().max(0.0) / 255.0);
     Image { width: image.width, height: image.height, data: data.collect() }

@@ -90,7 +90,7 @@ impl EvalPage {
         ];
         let title = format!("{}: {psnr:.2} dB, SSIM {ssim:.3}", score.name);
         self.views.push((psnr, Comparison { title, pictures }));
-        // Of many views, the worst are shown.
+        // Only the worst views are shown.
         self.views.sort_by(|a, b| a.0.total_cmp(&b.0));
         self.views.truncate(SHOWN);
     }
@@ -119,7 +119,7 @@ impl EvalPage {
     }
 }
 
-/// Loss and intermediate scores against the step, as far as they were logged.
+/// Loss and intermediate scores against the step, from the logs of the run.
 fn history(run: &Path) -> Vec<String> {
     let log = std::fs::read_to_string(run.join("train.csv")).unwrap_or_default();
     let point = |line: &str| {

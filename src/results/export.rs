@@ -1,8 +1,8 @@
-//! A model in the formats of others: SPZ, glTF, SOG, and a page that holds a viewer of its own.
+//! Exports of a model: SPZ, glTF, SOG, and a page with its own viewer.
 //!
-//! Each takes the Gaussians as `model.ply` holds them: in the colours that viewers show and with `OpenCV`'s axes, y down and
-//! z forward. They are the *lit* model, as bright as its targets; a dark one would band, as SPZ keeps a colour in steps of
-//! 1.9 of 255.
+//! Each exports the Gaussians as they are in `model.ply`: in the colours that viewers expect and with `OpenCV`'s axes,
+//! y down and z forward. The model is as bright as its targets; a dark one would show banding, as SPZ quantises colours
+//! to steps of 1.9 / 255.
 
 pub mod glb;
 pub mod page;
@@ -21,12 +21,12 @@ use crate::splats::model::Model;
 use crate::splats::scene::{Facts, Gaussians, ply};
 use crate::{Error, Result};
 
-/// What a model can be written as.
+/// Model file formats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
-    /// The layout that every viewer opens, with a header that says where it comes from.
+    /// The layout that every viewer opens, with provenance in its header.
     Ply,
-    /// A tenth of the size; eight bits a number.
+    /// A tenth of the size, mostly 8 bits per value.
     Spz(spz::Version),
     /// glTF with `KHR_gaussian_splatting`.
     Glb,
@@ -38,7 +38,7 @@ impl Format {
     /// The format that a file's extension names.
     ///
     /// # Errors
-    /// [`Error::Usage`] where it names none.
+    /// [`Error::Usage`] for any other extension.
     pub fn of(path: &Path) -> Result<Self> {
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
         match extension.as_str() {
@@ -47,7 +47,7 @@ impl Format {
             "glb" => Ok(Self::Glb),
             "sog" => Ok(Self::Sog),
             _ => {
-                let problem = "has the extension of no model; name it .ply, .spz, .glb or .sog";
+                let problem = "has no extension of a model file; name it .ply, .spz, .glb or .sog";
                 Err(Error::Usage(format!("{} {problem}", path.display())))
             }
         }
@@ -63,7 +63,7 @@ impl Format {
         let bytes = match self {
             Self::Ply => {
                 let mut lines = provenance.lines();
-                // The origin that a reader adds is of the turned world.
+                // The origin is added by the reader in the rotated world.
                 let turned = provenance.rotation != DQuat::IDENTITY;
                 let line = provenance.world_line(gaussians, false).filter(|_| turned);
                 lines.extend(line.map(|line| format!("dataset's {line}")));
@@ -79,8 +79,8 @@ impl Format {
 }
 
 impl Model {
-    /// Writes the model in the format that the file's extension names: `.ply`, `.spz`, `.glb` or `.sog`. The file states
-    /// the near plane, the alpha limit, the colours and the origin.
+    /// Writes the model in the format that the file's extension names: `.ply`, `.spz`, `.glb` or `.sog`. The file
+    /// states the near plane, the alpha limit, the colours and the origin.
     ///
     /// # Errors
     /// As [`Gaussians::save`].
@@ -89,7 +89,7 @@ impl Model {
         self.save_as(path, Format::of(path)?)
     }
 
-    /// Writes the model in a format, whatever the file is called.
+    /// Writes the model in a format, regardless of the file's extension.
     ///
     /// # Errors
     /// As [`Gaussians::save`].
@@ -103,38 +103,38 @@ impl Gaussians {
     /// Writes the Gaussians in the format that the file's extension names: `.ply`, `.spz`, `.glb` or `.sog`.
     ///
     /// # Errors
-    /// The extension names none, the model does not fit the format, or the file cannot be written; nothing half-written is
+    /// The extension names none, the model does not fit the format, or the file cannot be written; no partial file is
     /// left.
     pub fn save(&self, path: impl AsRef<Path>) -> Result<()> {
         let path = path.as_ref();
         self.save_as(path, Format::of(path)?)
     }
 
-    /// Writes the model in a format, whatever the file is called.
+    /// Writes the model in a format, regardless of the file's extension.
     ///
     /// # Errors
-    /// As [`Gaussians::save`].
+    /// Those of [`Gaussians::save`].
     pub fn save_as(&self, path: impl AsRef<Path>, format: Format) -> Result<()> {
         format.write(self, &Provenance::default(), path.as_ref())
     }
 }
 
-/// Where a model comes from: what a file says of itself.
+/// Provenance of a model, stored in exported files.
 #[derive(Clone, Debug, Default)]
 pub struct Provenance {
-    /// The folder's name of the dataset.
+    /// The name of the dataset's folder.
     pub dataset: String,
-    /// The curve by which its photographs were lifted.
+    /// The tone curve of its targets.
     pub curve: String,
-    /// The exposure that it shows, in words.
+    /// The exposure of the model, in words.
     pub exposure: String,
-    /// By which its world was turned, [`Gaussians::rotated`].
+    /// The rotation that was applied by [`Gaussians::rotated`].
     pub rotation: DQuat,
-    /// What a renderer must know; the origin is that of the Gaussians.
+    /// Settings that a renderer requires; the origin is that of the Gaussians.
     pub facts: Facts,
 }
 
-/// The program, as files name it.
+/// The program's name and version in files.
 pub const GENERATOR: &str = concat!("nightsplat ", env!("CARGO_PKG_VERSION"));
 
 impl Provenance {
@@ -155,13 +155,13 @@ impl Provenance {
 }
 
 impl Provenance {
-    /// What a renderer must know, with the origin.
+    /// The facts for a file of `gaussians`, with their origin.
     fn facts_of(&self, gaussians: &Gaussians) -> Facts {
         Facts { origin: gaussians.origin, ..self.facts }
     }
 
-    /// What a file's positions are in the dataset's world, where they are not the same: a line for a header. `half_turned`: the
-    /// file's axes are those of OpenGL.
+    /// A header line that maps the file's positions to the dataset's world, if they differ. `half_turned`: the file's
+    /// axes are those of OpenGL.
     fn world_line(&self, gaussians: &Gaussians, half_turned: bool) -> Option<String> {
         let back = self.rotation.inverse();
         let position = if self.rotation != DQuat::IDENTITY {
@@ -185,12 +185,12 @@ impl Provenance {
     }
 }
 
-/// The sign that each basis function above degree 0 takes when y and z change theirs, in the order of the coefficients.
+/// The sign of each spherical harmonic above degree 0 under the half turn about x, in the order of the coefficients.
 const HALF_TURN: [f32; 15] =
     [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
 
-/// The same model turned about x by half a turn: `OpenCV`'s axes become those of OpenGL, y up and z backward. A half turn
-/// changes signs alone, so that every number stays exact.
+/// The model rotated by half a turn about x: from `OpenCV`'s axes to OpenGL's, y up and z backward. Only signs change,
+/// so every value stays exact.
 pub(crate) fn half_turn(gaussians: &Gaussians) -> Gaussians {
     let mut turned = gaussians.clone();
     for mean in turned.means_mut() {
@@ -209,7 +209,7 @@ pub(crate) fn half_turn(gaussians: &Gaussians) -> Gaussians {
     turned
 }
 
-/// The rotation as a unit quaternion (w, x, y, z); the identity where it has no length.
+/// The rotation as a unit quaternion (w, x, y, z); the identity if its length is 0.
 fn unit([w, x, y, z]: [f32; 4]) -> [f32; 4] {
     let length = (w * w + x * x + y * y + z * z).sqrt();
     if length > 1e-12 { [w, x, y, z].map(|part| part / length) } else { [1.0, 0.0, 0.0, 0.0] }
@@ -219,9 +219,9 @@ fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// The opacity before the sigmoid that a byte of 255 times the opacity stands for; finite at both ends.
+/// The opacity before the sigmoid that a byte represents; finite for 0 and 255.
 fn raw_opacity(byte: u8) -> f32 {
-    // The middle of what is rounded to 0, and to 255.
+    // The middle of the interval that rounds to 0, or to 255.
     let opacity = f32::from(byte).clamp(0.25, 254.75) / 255.0;
     (opacity / (1.0 - opacity)).ln()
 }
@@ -230,7 +230,7 @@ fn gzip(bytes: &[u8]) -> Result<Vec<u8>> {
     gzip_with(bytes, None)
 }
 
-/// With a comment in the header, which readers skip.
+/// Gzip with a comment in the header, which readers skip.
 fn gzip_with(bytes: &[u8], comment: Option<String>) -> Result<Vec<u8>> {
     let builder = comment.into_iter().fold(GzBuilder::new(), GzBuilder::comment);
     let mut encoder = builder.write(vec![], Compression::best());
@@ -245,7 +245,7 @@ pub(crate) mod tests {
     use crate::splats::harmonics::sh_basis;
     use crate::splats::scene::Shape;
 
-    /// Gaussians of ordinary values, drawn.
+    /// Random Gaussians of ordinary values.
     pub(crate) fn drawn(count: usize, sh_degree: u32) -> Gaussians {
         let mut gaussians = Gaussians::zeros(count, Shape::from(sh_degree));
         let stream = Stream::new(7, 11);
@@ -275,7 +275,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn every_format_says_where_the_origin_of_its_positions_lies() {
+    fn every_format_states_the_origin_of_its_positions() {
         let mut model = drawn(4, 1);
         model.origin = DVec3::new(4_499_999.6, 519_997.7, -10_001.8);
         let provenance = Provenance::default();
@@ -292,7 +292,7 @@ pub(crate) mod tests {
         let mut archive = zip::ZipArchive::new(std::io::Cursor::new(sog)).unwrap();
         let meta = std::io::read_to_string(archive.by_name("meta.json").unwrap()).unwrap();
         assert!(meta.contains(&format!("world = (x, y, z) + {numbers}")), "{meta}");
-        // Of a model that was turned, the world is that of before.
+        // The line maps to the world before the rotation.
         let rotation = DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
         let provenance = Provenance { rotation, ..Provenance::default() };
         let rotated = model.rotated(rotation);
@@ -316,7 +316,7 @@ pub(crate) mod tests {
         assert!(!has(&glb::encode(&model, &Provenance::default()).unwrap(), "world ="));
     }
 
-    /// Asserts that `turned` is `model`, turned.
+    /// Asserts that `turned` is `model` after the rotation.
     fn assert_turned(turned: &Gaussians, model: &Gaussians, turn: DMat3) {
         let rotation = |[w, x, y, z]: [f32; 4]| {
             let quat = DQuat::from_xyzw(x.into(), y.into(), z.into(), w.into());

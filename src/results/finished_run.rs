@@ -23,11 +23,11 @@ pub(crate) struct FinishedRun {
 }
 
 impl FinishedRun {
-    /// Loads configuration, model and dataset; dataset and device default to the run's. Warns where the run is
-    /// incomplete or the dataset has changed.
+    /// Loads configuration, model and dataset; dataset and device default to the run's. Warns if the run is incomplete
+    /// or the dataset has changed.
     ///
     /// # Errors
-    /// The folder holds no run with a model, its dataset is gone, or there is no such device.
+    /// The folder contains no run with a model, its dataset is missing, or there is no such device.
     pub(crate) fn open(
         folder: &Path,
         dataset: Option<&Path>,
@@ -36,10 +36,10 @@ impl FinishedRun {
         Self::open_with(folder, dataset, device, |_| {})
     }
 
-    /// As [`Self::open`], with a change of the configuration.
+    /// [`Self::open`] with a change of the configuration.
     ///
     /// # Errors
-    /// As [`Self::open`].
+    /// Those of [`Self::open`].
     pub(crate) fn open_with(
         folder: &Path,
         dataset: Option<&Path>,
@@ -88,7 +88,7 @@ impl FinishedRun {
         })
     }
 
-    /// Opens a model file, which holds few settings of its training.
+    /// Opens a model file, which has few settings of its training.
     fn open_model(
         path: &Path,
         dataset: Option<&Path>,
@@ -109,18 +109,18 @@ impl FinishedRun {
     }
 }
 
-/// The error for a model file without the photographs that a command needs.
+/// The error for a model file, if a command needs photographs.
 pub(crate) fn needs_photographs(path: &Path) -> Error {
     Error::input(path, "is a model file without a run; pass its photographs with --dataset")
 }
 
-/// Whether a path names a model file in place of a run.
+/// Whether a path names a model file instead of a run.
 pub(crate) fn is_model(path: &Path) -> bool {
     let is_named = |name: &OsStr| ["ply", "spz", "sog"].iter().any(|known| name == *known);
     path.is_file() || (!path.is_dir() && path.extension().is_some_and(is_named))
 }
 
-/// The settings to render a model file with; those of its training are unknown, but for what it states.
+/// The settings to render a model file with: the defaults, except for those that it states.
 pub(crate) fn config_of_file(
     gaussians: &Gaussians,
     facts: &Facts,
@@ -129,7 +129,7 @@ pub(crate) fn config_of_file(
     let mut config = TrainConfig {
         dataset: dataset.unwrap_or(Path::new("")).to_owned(),
         sh_degree: gaussians.shape.sh_degree,
-        // Without references, the photographs are compared with.
+        // Without reference images, renders are compared with the photographs.
         tone: ToneSettings::new(ToneCurve::None),
         ..TrainConfig::default()
     };

@@ -11,23 +11,24 @@ use crate::splats::model::{FileKind, Model};
 use crate::splats::scene::{Facts, Gaussians, ply};
 
 impl Model {
-    /// Reads a model: a PLY in the INRIA layout, of any trainer, SPZ, SOG, or a run directory. A file is recognised by its
-    /// content, not by its name.
+    /// Reads a model: a PLY in the INRIA layout, of any trainer, SPZ, SOG, or a run directory. A file is recognised by
+    /// its content, not by its name.
     ///
-    /// The near plane, the alpha limit and the colours are those that the file states (`comment nightsplat near 0.1`), or
-    /// the configuration of the run, and else those of [`RenderSettings::default`](crate::RenderSettings::default).
+    /// The near plane, the alpha limit and the colours are those that the file states (`comment nightsplat near 0.1`)
+    /// or those of the run's configuration; otherwise those of
+    /// [`RenderSettings::default`](crate::RenderSettings::default).
     ///
     /// # Errors
-    /// [`Error::Input`] where the file is missing, no model, cut short or not finite, or states nonsense; the run has not been
-    /// trained to its end or a checkpoint.
+    /// [`Error::Input`] if the file is missing, not a model, truncated or not finite, or states an invalid fact, or if
+    /// the run neither finished nor reached a checkpoint.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
         let (gaussians, facts) = read(path.as_ref())?;
         Ok(Self::of_shown(gaussians, &facts))
     }
 }
 
-/// The Gaussians in the colours that viewers show, and what the file or the configuration of the run states of them. Warns
-/// where that does not include the near plane.
+/// The Gaussians in the colours that viewers show, and the facts that the file or the run's configuration states. Warns
+/// if the near plane is missing.
 pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
     if path.is_dir() {
         let config = run::load_config(path)?;
@@ -38,11 +39,11 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
         Some(FileKind::Ply) => ply::parse(&bytes),
         Some(FileKind::Spz) => spz::decode(&bytes),
         Some(FileKind::Sog) => sog::decode(&bytes),
-        None => Err("is no model: it is not PLY, SPZ or SOG".to_owned()),
+        None => Err("is not a model: neither PLY, SPZ nor SOG".to_owned()),
     };
     let (gaussians, facts) = parsed.map_err(|problem| Error::input(path, problem))?;
     if facts.near.is_none() {
-        tracing::warn!("{}: does not state its near plane; the default is taken", path.display());
+        tracing::warn!("{}: does not state its near plane; the default is used", path.display());
     }
     Ok((gaussians, facts))
 }

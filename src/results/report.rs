@@ -1,4 +1,4 @@
-//! One self-contained HTML page of a run: tables, plots and pictures side by side, without external resources.
+//! A self-contained HTML page of a run: tables, plots and images, without external resources.
 
 use std::fmt::Write as _;
 
@@ -19,7 +19,7 @@ mod plot;
 mod table;
 mod traces;
 
-/// A page. Every text is escaped; `plots` are SVG as [`plot`] and [`bars`] give it.
+/// A page. All text is escaped; `plots` are SVG from [`plot`] and [`bars`].
 #[derive(Clone, Debug, Default)]
 pub struct Report {
     /// The heading, also the window's title.
@@ -28,9 +28,9 @@ pub struct Report {
     pub intro: Vec<String>,
     /// Links under the introduction: address and text.
     pub links: Vec<[String; 2]>,
-    /// Rows of pictures, in order.
+    /// Rows of images, in order.
     pub comparisons: Vec<Comparison>,
-    /// What is so, in words, in order.
+    /// Tables of text, in order.
     pub facts: Vec<Facts>,
     /// Tables of numbers, in order.
     pub tables: Vec<Table>,
@@ -38,16 +38,16 @@ pub struct Report {
     pub plots: Vec<String>,
 }
 
-/// A table of words.
+/// A table of text.
 #[derive(Clone, Debug, Default)]
 pub struct Facts {
     /// The caption.
     pub title: String,
-    /// A name and what is said of it, in each row.
+    /// A name and its value in each row.
     pub rows: Vec<[String; 2]>,
 }
 
-/// Pictures of one view side by side.
+/// Images of one view side by side.
 #[derive(Clone, Debug, Default)]
 pub struct Comparison {
     /// The view's name.
@@ -56,14 +56,14 @@ pub struct Comparison {
     pub pictures: Vec<Picture>,
 }
 
-/// A picture with what is said beneath it.
+/// An image with a caption.
 #[derive(Clone, Debug)]
 pub struct Picture {
     /// What it shows.
     pub caption: String,
-    /// Its scores in a few words; may be empty.
+    /// Its scores in a few words, or empty.
     pub scores: String,
-    /// The picture itself, embedded as an 8-bit PNG.
+    /// The image, embedded as an 8-bit PNG.
     pub image: Image,
 }
 
@@ -78,13 +78,13 @@ impl Picture {
 }
 
 impl Report {
-    /// The page as HTML: facts, pictures, tables, plots.
+    /// The page as HTML: text, images, tables, plots.
     pub fn html(&self) -> String {
         let facts: String = self.facts.iter().map(Facts::html).collect();
         self.page(&(facts + &self.pictures_html() + &self.tables_html() + &self.plots_html()))
     }
 
-    /// The same with the plots first and the tables last.
+    /// The page as HTML with the plots first and the tables last.
     pub fn html_plots_first(&self) -> String {
         self.page(&(self.plots_html() + &self.pictures_html() + &self.tables_html()))
     }
@@ -112,7 +112,7 @@ impl Report {
              <title>{title}</title>\n<style>\n{}</style>\n</head>\n<body>\n<h1>{title}</h1>\n",
             include_str!("report/style.css")
         );
-        // Writing to a string cannot fail, so the results below hold nothing.
+        // Writing to a string cannot fail, so the results below are ignored.
         for paragraph in &self.intro {
             let _ = writeln!(html, "<p>{}</p>", escape(paragraph));
         }
@@ -158,7 +158,7 @@ impl Comparison {
     }
 }
 
-/// Text as HTML and SVG show it, also inside a quoted attribute.
+/// Escapes text for HTML and SVG, also within a quoted attribute.
 pub(crate) fn escape(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for character in text.chars() {

@@ -1,4 +1,4 @@
-//! A training run from its first step to its last file: what the command does, without its progress bar.
+//! A training run from the first step to the last file: the `train` command without its progress bar.
 
 mod backup;
 mod directory;

@@ -47,10 +47,10 @@ impl RunFacts {
         let first = dataset.train_views().next();
         let planned = plan.map(|plan| plan.curve.why.clone());
         let why = match config.tone.curve {
-            ToneCurve::None if planned.is_none() => "as asked for: the photographs are the targets",
-            ToneCurve::Auto => "as bright as the photographs ask for",
+            ToneCurve::None if planned.is_none() => "as requested: the photographs are the targets",
+            ToneCurve::Auto => "brightness chosen from the photographs",
             ToneCurve::None => "",
-            _ => "as asked for",
+            _ => "as requested",
         };
         Self {
             dataset: config.dataset.display().to_string(),
@@ -78,7 +78,7 @@ impl RunFacts {
         let length = match (self.held_out_views, self.effective_cooldown_steps) {
             (0, 0) => format!("{} steps", self.steps),
             (0, settling) => {
-                format!("{} steps, of which the last {settling} are the cooldown", self.steps)
+                format!("{} steps, the last {settling} are the cooldown", self.steps)
             }
             (views, settling) => format!(
                 "at most {} steps: training stops early once {views} held-out view{} converged, after a \

@@ -1,4 +1,4 @@
-//! A video of rendered frames, by the user's ffmpeg, or as an animated PNG.
+//! A video of rendered frames: by the user's ffmpeg, or an animated PNG.
 
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use crate::{Error, Result};
 /// Makes a video of `files`.
 ///
 /// # Errors
-/// ffmpeg is missing, and the message has the command to run later; it fails, or the file cannot be written.
+/// ffmpeg is missing, and the message has the command to run later; ffmpeg fails; or the file cannot be written.
 pub(crate) fn make(video: &Path, folder: &Path, files: &[PathBuf], fps: u16) -> Result<()> {
     let extension = video.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     if ["png", "apng"].contains(&extension.as_str()) {

@@ -31,7 +31,7 @@ impl ViewExposures {
         Err(Error::input(run, problem))
     }
 
-    /// Changes the exposure of a render of `view` from the model's to that of the target.
+    /// Changes a render of `view` from the model's exposure to that of the view's target.
     pub(crate) fn applied(&self, view: &str, mut image: Image) -> Image {
         let number = |value: &serde_json::Value| value.as_f64();
         let exposure = match self {

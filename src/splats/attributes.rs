@@ -17,7 +17,7 @@ pub enum Attribute {
     RawOpacities,
     /// SH coefficients of degree 0, RGB; the colour is 0.5 + [`SH_C0`](crate::splats::scene::SH_C0) times this.
     Dc,
-    /// Blended values beside colour, in the order of [`FEATURES`](crate::splats::scene::FEATURES).
+    /// Blended values in addition to colour, in the order of [`FEATURES`](crate::splats::scene::FEATURES).
     Features,
     /// SH coefficients above degree 0, coefficient-major, RGB.
     Rest,
@@ -115,7 +115,7 @@ pub const ATTRIBUTES: [AttributeSpec; 7] = [
         attribute: Attribute::Features,
         name: "features",
         width: Width::Features,
-        content: "what is blended beside colour",
+        content: "blended values in addition to colour",
         learning_rate: 1.25e-4,
         ply: Ply::Features,
         ply_place: 3,

@@ -28,8 +28,8 @@ pub struct Batch {
     columns: usize,
 }
 
-/// A batch starts at a multiple of this many Gaussians: so its binding starts where every device allows, whatever the
-/// element size.
+/// A batch starts at a multiple of this many Gaussians: its binding is then aligned on every device, for any element
+/// size.
 const ALIGNMENT: usize = 64;
 
 impl Batches {
@@ -42,7 +42,7 @@ impl Batches {
         Self { planes, size }
     }
 
-    /// The same Gaussians with `columns` words each in place of their floats.
+    /// The layout of the same Gaussians with `columns` words each instead of their floats.
     pub(crate) fn with_columns(self, columns: usize) -> Self {
         Self { planes: PlaneCounts { columns, ..self.planes }, ..self }
     }
@@ -118,7 +118,7 @@ impl Batches {
         Ok(planes)
     }
 
-    /// The index of a float of a buffer among the planes of all Gaussians.
+    /// The index of a float of a buffer in the planes of all Gaussians.
     pub fn place_of(&self, float: usize) -> usize {
         let mut before = 0;
         for part in self.parts() {
@@ -130,7 +130,7 @@ impl Batches {
         float
     }
 
-    /// Ranges of a buffer, in order, with the ranges of the planes of all Gaussians that they hold.
+    /// Ranges of a buffer, in order, with the corresponding ranges of the planes of all Gaussians.
     fn parts(&self) -> impl Iterator<Item = Range<usize>> + use<> {
         let PlaneCounts { gaussians: count, columns, features } = self.planes;
         self.iter().flat_map(move |batch| {
@@ -151,7 +151,7 @@ impl Batch {
         self.rows(planes, self.columns)
     }
 
-    /// The same, mutable.
+    /// [`Self::planes`], mutable.
     ///
     /// # Errors
     /// The buffer is shorter.
@@ -174,7 +174,7 @@ impl Batch {
         rows.into().range(self.range(each))
     }
 
-    /// The same, mutable.
+    /// [`Self::rows`], mutable.
     ///
     /// # Errors
     /// The buffer is shorter.
@@ -190,12 +190,12 @@ impl Batch {
         self.first * each..(self.first + self.count) * each
     }
 
-    /// Its number of Gaussians, as kernels count.
+    /// Its number of Gaussians in 32 bits, for kernels.
     pub fn gaussian_count(&self) -> u32 {
         self.count as u32
     }
 
-    /// The number of Gaussians before it, as kernels count.
+    /// The number of Gaussians before it in 32 bits, for kernels.
     pub fn first_gaussian(&self) -> u32 {
         self.first as u32
     }

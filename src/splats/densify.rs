@@ -6,7 +6,7 @@
 //! ```
 //!
 //! The device decides; the host reads four counters and allocates. The new Gaussians are written one plane set after
-//! the other into the spare buffer, at first that of the last step's gradients: no memory beyond what training holds.
+//! the other into the spare buffer, at first that of the last step's gradients: a round needs no additional memory.
 //! Buffers grow with headroom, so most rounds allocate nothing.
 
 use std::iter;
@@ -32,11 +32,11 @@ use crate::{Error, Result};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DensityControl {
-    /// Split into two halves along the longest axis that together cover what it covered: the render hardly changes.
+    /// Split into two halves along the longest axis, which together cover the same area: the render hardly changes.
     #[default]
     Conserving,
-    /// As LITA-GS: a small one is cloned to a position drawn from it, a large one is replaced by two smaller ones at
-    /// drawn positions. Opacities are never reset and large Gaussians are not pruned.
+    /// As LITA-GS: a small one is cloned to a random position within it, a large one is replaced by two smaller ones at
+    /// random positions. Opacities are never reset, and large Gaussians are not pruned.
     Paper,
 }
 
@@ -55,14 +55,14 @@ impl FromStr for DensityControl {
     }
 }
 
-/// Which Gaussians are densified and which are pruned.
+/// Thresholds and limits of density control.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DensifySettings {
     /// How they are densified.
     pub control: DensityControl,
     /// Mean norm of the screen-space gradient, in normalised device units, above which a Gaussian is densified.
     pub gradient_threshold: f64,
-    /// Standard deviation up to which the paper's control clones, in world units; beyond, it splits.
+    /// Standard deviation up to which the paper's control clones, in world units; larger Gaussians are split.
     pub split_scale: f64,
     /// Fainter Gaussians are pruned, in (0, 1).
     pub min_opacity: f64,
@@ -74,7 +74,8 @@ pub struct DensifySettings {
     pub seed: u64,
 }
 
-/// State per Gaussian beside its parameters: Adam's moments, statistics since the last round, and a spare buffer.
+/// State per Gaussian in addition to its parameters: Adam's moments, statistics since the last round, and a spare
+/// buffer.
 #[derive(Debug)]
 pub struct DensifyInputs<'a> {
     /// Carried over to the new Gaussians.
@@ -92,10 +93,9 @@ pub struct DensifyInputs<'a> {
 pub struct Round {
     /// The step that it follows.
     pub step: u64,
-    /// Rounds that are left, this one included. Each may use its share of the headroom below the limit; 1 uses all of
-    /// it.
+    /// Remaining rounds, including this one. Each may use its share of the headroom below the limit; 1 uses all of it.
     pub rounds_left: u64,
-    /// The most Gaussians that memory and views allow; [`DensifySettings::max_gaussians`] holds as well.
+    /// The most Gaussians that memory and views allow; [`DensifySettings::max_gaussians`] applies as well.
     pub most: usize,
 }
 
@@ -103,8 +103,8 @@ pub struct Round {
 const TRIALS: usize = 5;
 
 /// The largest mean squared change of a camera's view by one split, in units of the squared contrast of what the
-/// Gaussian covers, as `view_change` in `densify_score.comp` estimates it. It keeps a split from changing a view of 30
-/// dB by 0.1 dB where the contrast is 0.3 (docs/benchmarks.md).
+/// Gaussian covers, as `view_change` in `densify_score.comp` estimates it. It prevents a split from changing a view of
+/// 30 dB by 0.1 dB at a contrast of 0.3 (docs/benchmarks.md).
 pub const LARGEST_CHANGE: f32 = 2e-4;
 
 /// The result of a round.
@@ -167,11 +167,11 @@ impl Scratch {
 }
 
 impl Densifier {
-    /// Builds the kernels. A Gaussian is not split where that would change the view of one of `cameras`, in world
-    /// space; the paper's control ignores them.
+    /// Builds the kernels. A Gaussian is not split if that would change the view of one of `cameras`, in world space;
+    /// the paper's control ignores them.
     ///
     /// # Errors
-    /// A setting makes no sense, or the device refuses a pipeline.
+    /// A setting is invalid, or the device refuses a pipeline.
     pub fn new(gpu: &Gpu, settings: DensifySettings, cameras: &[Camera]) -> Result<Self> {
         let DensifySettings { gradient_threshold, split_scale, min_opacity, .. } = settings;
         for (name, value, upper) in [
@@ -212,8 +212,8 @@ impl Densifier {
     /// gradients first, and at last with none.
     ///
     /// # Errors
-    /// A buffer is shorter than the Gaussians need, `keeps` fails, or the device is out of memory: the Gaussians are
-    /// unchanged then. Or the device is lost.
+    /// A buffer is shorter than the Gaussians need, `keeps` fails, or the device is out of memory (the Gaussians are
+    /// then unchanged) or lost.
     pub fn densify(
         &mut self,
         gaussians: &mut DeviceGaussians,
@@ -247,7 +247,7 @@ impl Densifier {
         Err(Error::Usage("density control: the last trial of a round splits nothing".to_owned()))
     }
 
-    /// Memory of a round beside the Gaussians, in bytes per Gaussian.
+    /// Memory of a round in addition to the Gaussians, in bytes per Gaussian.
     pub(crate) fn bytes_per_gaussian(&self) -> usize {
         5 * size_of::<u32>() + self.sort.bytes_per_item()
     }
@@ -374,7 +374,7 @@ impl Densifier {
         })
     }
 
-    /// Commits the scattered parameters and carries the moments over: the buffer of each plane set becomes the spare of
+    /// Commits the scattered parameters and transfers the moments: the buffer of each plane set becomes the spare of
     /// the next.
     fn commit(
         &self,
@@ -428,7 +428,7 @@ impl Densifier {
         old.iter().flat_map(|from| new.iter().map(move |to| (from, to))).collect()
     }
 
-    /// Replacements of all buffers where one is too short for `count` Gaussians, allocated before any is freed.
+    /// Replacements of all buffers if one is too short for `count` Gaussians, allocated before any is freed.
     fn spare_buffers(
         &self,
         gaussians: &DeviceGaussians,
@@ -439,7 +439,7 @@ impl Densifier {
         let DeviceGaussians { layout, parameters, .. } = gaussians;
         let (columns, capacity) = (layout.floats().columns, capacity(count, limit));
         let buffer = |columns| self.gpu.uninit_in_windows("planes", capacity * columns);
-        // Parameters with halves are shorter than planes of floats, and cannot take their place.
+        // Parameters with halves are shorter than planes of floats, and cannot replace them.
         let (turns, words) = match layout.sh_rest {
             StorageFormat::Single => (Some(parameters), None),
             StorageFormat::Half => (None, Some(buffer(layout.words())?)),
@@ -462,7 +462,7 @@ impl Densifier {
 
 /// Buffers for more Gaussians.
 struct SpareBuffers {
-    /// One for each plane set, the gradients included; empty where the existing ones suffice.
+    /// One for each plane set, including the gradients; empty if the existing ones suffice.
     planes: Vec<Buffer<f32>>,
     /// The target of parameters with halves.
     words: Option<Buffer<f32>>,
@@ -478,7 +478,7 @@ impl SpareBuffers {
     }
 }
 
-/// The capacity to allocate for `count` Gaussians: half as many again, within the limit.
+/// The capacity to allocate for `count` Gaussians: 1.5 times as many, within the limit.
 pub(crate) fn capacity(count: usize, limit: usize) -> usize {
     (count + count / 2).min(limit).max(count)
 }
@@ -496,7 +496,7 @@ fn report(count: usize, counters: &[u32]) -> DensifyReport {
     }
 }
 
-/// A kernel that runs beyond a buffer reads its neighbours: refuse before anything is recorded.
+/// A kernel that exceeds a buffer reads other data, so lengths are checked before anything is recorded.
 fn check(gaussians: &DeviceGaussians, inputs: &DensifyInputs<'_>) -> Result<()> {
     let DeviceGaussians { layout, parameters, .. } = gaussians;
     let DensifyInputs { moments, grad_norm_sums, visit_counts, .. } = inputs;

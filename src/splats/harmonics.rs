@@ -1,4 +1,4 @@
-//! Real spherical harmonics to degree 3 on the host, in f64, and their coefficients in turned axes.
+//! Real spherical harmonics to degree 3 on the host, in f64, and their rotation.
 
 use std::f64::consts::TAU;
 
@@ -36,17 +36,17 @@ pub fn sh_basis(degree: u32, d: DVec3) -> [f64; 16] {
     basis
 }
 
-/// What coefficients above degree 0 become when everything is turned: row k, column j is the part of coefficient j in
-/// the new coefficient k. Degrees do not mix.
+/// The rotation of coefficients above degree 0: row k, column j is the contribution of coefficient j to the new
+/// coefficient k. Degrees do not mix.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct HarmonicRotation([[f64; 15]; 15]);
 
 impl HarmonicRotation {
-    /// Of a rotation that takes directions to where they then point.
+    /// The matrix of a rotation of directions.
     ///
-    /// The basis is orthonormal over the sphere, so that a part is the integral of the product of a turned basis
-    /// function and another one. These are polynomials of degree 6: four rings after Gauss and Legendre of eight
-    /// directions each are exact.
+    /// The basis is orthonormal over the sphere, so an entry is the integral of the product of a rotated basis function
+    /// and another one. These are polynomials of degree 6, for which Gauss-Legendre quadrature with four rings of eight
+    /// directions is exact.
     pub(crate) fn new(rotation: DMat3) -> Self {
         const RINGS: [(f64, f64); 4] = [
             (-0.861_136_311_594_052_6, 0.347_854_845_137_453_85),
@@ -76,7 +76,7 @@ impl HarmonicRotation {
         Self(parts)
     }
 
-    /// Turns the coefficients above degree 0 of one Gaussian: 0, 3, 8 or 15.
+    /// Rotates the coefficients above degree 0 of one Gaussian: 0, 3, 8 or 15.
     pub(crate) fn turn(&self, rest: &mut [glam::Vec3]) {
         let before: Vec<DVec3> = rest.iter().map(|value| value.as_dvec3()).collect();
         for (value, parts) in rest.iter_mut().zip(&self.0) {

@@ -54,7 +54,7 @@ impl Moments {
         })
     }
 
-    /// All of them, for a step of Adam.
+    /// Borrows all of them for a step of Adam.
     pub fn slice_mut(&mut self) -> Moments<SliceMut<'_, f32>> {
         match self {
             Self::Single { first, second } => {
@@ -64,7 +64,7 @@ impl Moments {
         }
     }
 
-    /// Those of a batch of Gaussians.
+    /// Borrows those of a batch of Gaussians.
     ///
     /// # Errors
     /// The planes are shorter.
@@ -147,7 +147,7 @@ impl<'a> Moments<SliceMut<'a, f32>> {
     }
 }
 
-/// The planes that a step of [`Adam`] updates; each holds `column_count * gaussian_count` floats or more.
+/// The planes that a step of [`Adam`] updates; each has at least `column_count * gaussian_count` floats.
 #[derive(Debug)]
 pub struct AdamBuffers<'a> {
     /// The parameters.
@@ -177,7 +177,7 @@ pub struct Adam {
     gpu: Gpu,
     /// Kernels for 32-bit moments and, built on first use, for 16-bit ones.
     floats: [OnceLock<Pipeline<adam::Kernel>>; 2],
-    /// The same for packed SH coefficients.
+    /// The kernels for packed SH coefficients.
     halves: [OnceLock<Pipeline<adam_rest::Kernel>>; 2],
 }
 
@@ -193,8 +193,8 @@ impl Adam {
         Ok(adam)
     }
 
-    /// Records step number `step`, from 1, over `planes`, which may be the first of more. Nothing changes while the
-    /// first word of `status` is nonzero.
+    /// Records step number `step`, from 1, over `planes`, which may be a part of all. Nothing changes while the first
+    /// word of `status` is nonzero.
     ///
     /// # Errors
     /// A buffer is too short, the step is 0, or the device refuses the kernel.
@@ -236,10 +236,10 @@ impl Adam {
         )
     }
 
-    /// The same for the packed SH coefficients above degree 0 of `planes`.
+    /// [`Adam::record`] for the packed SH coefficients above degree 0 of `planes`.
     ///
     /// # Errors
-    /// As [`Adam::record`].
+    /// Those of [`Adam::record`].
     pub fn record_halves(
         &self,
         pass: &mut Recorder<'_>,
@@ -296,7 +296,7 @@ impl Adam {
     }
 }
 
-/// A kernel that runs beyond a buffer writes into its neighbours: refuse before anything is recorded.
+/// A kernel that exceeds a buffer overwrites other data, so lengths are checked before anything is recorded.
 fn check(
     step: u64,
     status: &Buffer<u32>,

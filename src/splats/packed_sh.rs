@@ -1,4 +1,4 @@
-//! SH coefficients above degree 0 in 16 bits, two in a word of the planes, as in include/half.glsl.
+//! SH coefficients above degree 0 in 16 bits, two per word of the planes, as in include/half.glsl.
 
 use serde::{Deserialize, Serialize};
 
@@ -70,7 +70,7 @@ impl PackedSh {
     }
 }
 
-/// The value of a half. None is subnormal, infinite or NaN.
+/// The value of a half, which must not be subnormal, infinite or NaN.
 pub(crate) fn value(half: u16) -> f32 {
     let (sign, magnitude) = (u32::from(half >> 15), u32::from(half & 0x7fff));
     let shifted = if magnitude == 0 { 0 } else { (magnitude << 13) + ((127 - 15) << 23) };
@@ -97,7 +97,7 @@ mod tests {
     use crate::splats::attributes::{PlaneCounts, column_count};
 
     #[test]
-    fn every_half_comes_back_and_numbers_become_the_nearest() {
+    fn every_half_is_restored_and_numbers_round_to_the_nearest() {
         for half in (0..=u16::MAX).filter(|half| matches!(half & 0x7fff, 0 | 0x0400..=0x7bff)) {
             assert_eq!(nearest(value(half)), half, "{half:#x}");
             let next = half + 1;
@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn planes_of_every_degree_come_back() {
+    fn planes_of_every_degree_are_restored() {
         for (degree, words) in (0..=3).zip([16, 21, 28, 39]) {
             for count in [0, 1, 5] {
                 let columns = column_count(2, degree);

@@ -5,8 +5,8 @@
 //!     -> [loss] -> blend_backward -> project_backward
 //! ```
 //!
-//! Counts stay on the device. Where the intersections of a view exceed the reserved memory, a status flag is set,
-//! nothing is rendered or updated, and the host grows the buffers and repeats the step ([`Renderer::grow`]).
+//! Counts stay on the device. If the intersections of a view exceed the reserved memory, a status flag is set, nothing
+//! is rendered or updated, and the host grows the buffers and repeats the step ([`Renderer::grow`]).
 
 mod buffers;
 mod cameras;

@@ -29,12 +29,12 @@ pub use crate::kernels::sh::MAX_SH_DEGREE;
 /// The constant basis function of the spherical harmonics, to eight digits: an ulp below the shaders'.
 pub const SH_C0: f32 = 0.282_094_79;
 
-/// The attributes of a scene's Gaussians beside the ellipsoid and its opacity.
+/// The attributes of a scene's Gaussians in addition to ellipsoid and opacity.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Shape {
     /// The SH degree with allocated coefficients, 0 to 3.
     pub sh_degree: u32,
-    /// What is blended beside colour.
+    /// Blended values in addition to colour.
     pub features: Features,
 }
 
@@ -88,7 +88,7 @@ impl Gaussians {
         Self { count, shape, parameters: vec![0.0; count * width(shape)], origin: DVec3::ZERO }
     }
 
-    /// Where an attribute lies in [`Gaussians::parameters`].
+    /// The range of an attribute in [`Gaussians::parameters`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn plane(&self, attribute: Attribute) -> Range<usize> {
         let (column, width) = self.columns(attribute);
@@ -100,8 +100,8 @@ impl Gaussians {
         planes(self.shape.features.width(), width(self.shape))[attribute as usize]
     }
 
-    /// The same Gaussians transformed from the training frame to the world, relative to an origin that f32 can
-    /// represent: [`TrainingFrame::file_origin`].
+    /// The Gaussians transformed from the training frame to the world, relative to an origin that f32 can represent:
+    /// [`TrainingFrame::file_origin`].
     #[cfg(feature = "io")]
     pub(crate) fn to_world(&self, frame: &TrainingFrame) -> Self {
         let origin = frame.file_origin();
@@ -124,7 +124,7 @@ impl Gaussians {
         Self { origin: DVec3::ZERO, ..self.moved(position, frame.scale.ln()) }
     }
 
-    /// The same with another SH degree: new coefficients are zero, those beyond it are dropped.
+    /// The Gaussians with another SH degree: new coefficients are zero, those beyond it are dropped.
     pub fn with_sh_degree(&self, sh_degree: u32) -> Self {
         let mut other = Self::zeros(self.count, Shape { sh_degree, ..self.shape });
         other.origin = self.origin;
@@ -137,7 +137,7 @@ impl Gaussians {
         other
     }
 
-    /// The same with these features: new ones are zero, others are dropped.
+    /// The Gaussians with these features: new ones are zero, others are dropped.
     pub(crate) fn with_features(&self, features: Features) -> Self {
         let mut other = Self::zeros(self.count, Shape { features, ..self.shape });
         other.origin = self.origin;
@@ -159,7 +159,7 @@ impl Gaussians {
         other
     }
 
-    /// The lowest SH degree that holds all nonzero coefficients.
+    /// The lowest SH degree that includes all nonzero coefficients.
     pub(crate) fn sh_degree_in_use(&self) -> u32 {
         let own = rest_coefficients(self.shape.sh_degree);
         let used = |rest: &[Vec3]| rest.iter().rposition(|c| *c != Vec3::ZERO).map_or(0, |k| k + 1);
@@ -180,10 +180,10 @@ impl Gaussians {
         moved
     }
 
-    /// The same model in a world that is turned about its origin: direction `d` becomes `rotation * d`.
+    /// The model in a world that is rotated about its origin: direction `d` becomes `rotation * d`.
     ///
-    /// [`Gaussians::save`] takes the direction -y for up, as cameras that are held level in `OpenCV`'s axes have it;
-    /// a model whose `up` is another one is turned by `DQuat::from_rotation_arc(up, DVec3::NEG_Y)` first.
+    /// [`Gaussians::save`] assumes the up direction -y, as for level cameras with `OpenCV`'s axes; rotate a model with
+    /// another `up` by `DQuat::from_rotation_arc(up, DVec3::NEG_Y)` first.
     pub fn rotated(&self, rotation: DQuat) -> Self {
         let mut rotated = self.clone();
         rotated.origin = rotation * self.origin;
@@ -215,7 +215,7 @@ impl Gaussians {
     }
 }
 
-/// Accessors of every plane, as the elements that it is made of.
+/// Accessors of every plane, with its element type.
 macro_rules! accessors {
     ($($(#[$doc:meta])* $attribute:ident: $read:ident, $write:ident -> $element:ty,)*) => {
         impl Gaussians {$(
@@ -244,7 +244,7 @@ accessors! {
     RawOpacities: raw_opacities, raw_opacities_mut -> f32,
     /// SH coefficients of degree 0, RGB, (count).
     Dc: dc, dc_mut -> Vec3,
-    /// Blended values beside colour, (count, features).
+    /// Blended values in addition to colour, (count, features).
     Features: features, features_mut -> f32,
     /// SH coefficients above degree 0, RGB, (count, (degree + 1)^2 - 1).
     Rest: rest, rest_mut -> Vec3,

@@ -2,8 +2,8 @@
 //!
 //! Both are reduce-then-scan: an upsweep sums partitions of consecutive items, the last of its workgroups scans the
 //! sums (the spine), and a downsweep finishes within the partitions. A decoupled look-back would need one kernel
-//! instead of two, but also forward-progress guarantees that Vulkan does not give. One subgroup owns a partition, so no
-//! kernel waits at a barrier, and results are bit-identical on every device and in every run. A dispatch has a
+//! instead of two, but also forward-progress guarantees that Vulkan does not provide. One subgroup owns a partition, so
+//! no kernel waits at a barrier, and results are bit-identical on every device and in every run. A dispatch has a
 //! workgroup for every partition of the buffers' capacity; those beyond the count return at once.
 
 mod radix;
@@ -36,7 +36,7 @@ impl Count<'_> {
     }
 }
 
-/// The common length of `lens`, as the kernels take it.
+/// The common length of `lens` in 32 bits, for kernels.
 ///
 /// # Errors
 /// The lengths differ, or exceed 32 bits.

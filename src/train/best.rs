@@ -4,13 +4,13 @@ use super::Trainer;
 use super::model::Model;
 use crate::Result;
 
-/// A tensor of a checkpoint: its name, its shape and its values.
+/// A tensor of a checkpoint: name, shape and values.
 pub(super) type Tensor = (String, Vec<usize>, Vec<f32>);
 
 /// The learned parameters, without optimizer state, as tensors of a checkpoint.
 pub(super) type Snapshot = Vec<Tensor>;
 
-/// Whether a tensor of a checkpoint holds parameters.
+/// Whether a tensor of a checkpoint contains parameters.
 fn is_parameters(name: &str) -> bool {
     name.ends_with(".parameters")
 }

@@ -1,6 +1,6 @@
-//! The cache of training photographs on the device; those that do not fit wait in a spool file.
+//! The cache of training photographs on the device; those that do not fit are in a spool file.
 //!
-//! The file holds the device's bytes, so the cache changes no bit of the model. It is unnamed where the system allows
+//! The file contains the device's bytes, so the cache changes no bit of the model. It is unnamed if the system allows
 //! it, and disappears with the run.
 
 use std::collections::BTreeSet;
@@ -40,14 +40,14 @@ impl std::str::FromStr for CacheSize {
         let bytes = number
             .parse::<f64>()
             .map(|number| number * 2.0_f64.powi(unit.map_or(0, |(_, power)| *power).cast_signed()));
-        // Positive phrasing: a NaN fails the test too. A small number without a unit is meant in gibibytes.
+        // Written so that a NaN fails. A small number without a unit probably means gibibytes.
         match bytes {
             Ok(bytes) if plain == upper && unit.is_none() && bytes > 0.0 && bytes < MIN_BYTES => {
                 Err(Error::Usage(format!("`{text}` is in bytes; write its unit, as in {text}G")))
             }
             Ok(bytes) if (0.0..1e18).contains(&bytes) => Ok(Self(bytes as u64)),
             _ => Err(Error::Usage(format!(
-                "`{text}` is no size of memory; write it with its unit, as in 512M, 4G or 1.5G"
+                "`{text}` is not a size of memory; write it with its unit, as in 512M, 4G or 1.5G"
             ))),
         }
     }
@@ -79,21 +79,21 @@ impl From<CacheSize> for String {
 }
 
 impl CacheSize {
-    /// Bytes of decoded photographs that the host may keep: `size`, or a quarter of `most` or of its memory; `None` if
-    /// unknown.
+    /// Bytes of decoded photographs that the host may keep: `size`, or a quarter of `most` or of the host's memory;
+    /// `None` if unknown.
     pub(super) fn on_host(size: Option<Self>, most: Option<Self>) -> Option<u64> {
         let most = || most.map(|Self(bytes)| bytes).or_else(host_memory);
         size.map(|Self(bytes)| bytes).or_else(|| Some((SHARE * most()? as f64) as u64))
     }
 
-    /// Bytes that the device may keep: `size`, or a quarter of `most` or of its memory.
+    /// Bytes that the device may keep: `size`, or a quarter of `most` or of the device's memory.
     pub(super) fn on_device(size: Option<Self>, most: Option<Self>, gpu: &Gpu) -> u64 {
         let most = most.map_or(gpu.properties().memory, |Self(bytes)| bytes);
         size.map_or((SHARE * most as f64) as u64, |Self(bytes)| bytes)
     }
 }
 
-/// The host's memory in bytes; `None` if the system does not tell.
+/// The host's memory in bytes; `None` if the system does not report it.
 fn host_memory() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
@@ -117,7 +117,7 @@ pub(super) struct Cache {
     spool: Option<Arc<Spool>>,
 }
 
-/// The place of a photograph in the cache.
+/// The index of a photograph in the cache.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Slot(usize);
 
@@ -159,7 +159,7 @@ impl Cache {
         Ok(Slot(place))
     }
 
-    /// The bytes of a photograph on the device.
+    /// The size of a photograph on the device, in bytes.
     pub(super) fn bytes(&self, Slot(place): Slot) -> u64 {
         self.kept[place].bytes
     }
@@ -169,8 +169,7 @@ impl Cache {
     /// # Errors
     /// It is not resident.
     pub(super) fn on_device(&self, Slot(place): Slot) -> Result<&Encoded> {
-        let absent =
-            || Error::Usage("a photograph that is trained on is not on the device".to_owned());
+        let absent = || Error::Usage("a training photograph is not on the device".to_owned());
         self.kept[place].on_device.as_deref().ok_or_else(absent)
     }
 
@@ -186,7 +185,7 @@ impl Cache {
         }
     }
 
-    /// Whether all photographs are resident for good.
+    /// Whether all photographs stay resident.
     pub(super) fn holds_all(&self) -> bool {
         self.spool.is_none()
     }
@@ -262,7 +261,7 @@ struct InFile {
     offset: u64,
     code_bits: u32,
     value_count: usize,
-    /// The numbers of words of codes and of the table that follows them.
+    /// The number of words of codes, and of the table that follows them.
     lens: [usize; 2],
 }
 
@@ -347,7 +346,7 @@ mod tests {
     use crate::train::PhotographBits;
 
     #[test]
-    fn sizes_are_read_as_people_write_them() {
+    fn sizes_are_read_with_and_without_units() {
         for (text, bytes, printed) in [
             ("4G", 4 << 30, "4G"),
             ("512m", 512 << 20, "512M"),
@@ -367,7 +366,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_the_cache_holds_every_photograph_comes_back_bit_for_bit() {
+    fn every_photograph_is_restored_bit_for_bit_whatever_the_cache_size() {
         let gpu = gpu();
         let pseudo_gt = PseudoGt::new(&gpu, &ToneSettings::default()).unwrap();
         let decoded = |photograph: &Encoded| {
@@ -381,7 +380,7 @@ mod tests {
             .unwrap();
             plain.unwrap().wait().unwrap()
         };
-        // Few values are coded in 8 bits, more in 16, many not at all.
+        // Few values are coded in 8 bits, more in 16, many are not coded.
         let values = |photograph: usize| -> Vec<f32> {
             let different = [7, 700, 100_000][photograph % 3];
             (0..9000).map(|i| ((i * 31 + photograph) % different) as f32 / 1e5).collect()

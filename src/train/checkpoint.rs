@@ -1,7 +1,7 @@
 //! Checkpoints, from which a run resumes bit for bit.
 //!
 //! Random numbers are functions of seed and step, so a checkpoint holds only the state after a step: all learned
-//! parameters with their moments, and the statistics of density control. A header tells whether the file is complete
+//! parameters with their moments, and the statistics of density control. A header shows whether the file is complete
 //! and belongs to the run.
 
 use std::collections::HashMap;
@@ -173,7 +173,7 @@ impl Trainer {
             for (name, (_, shape, values)) in &named {
                 views.push(view(name, shape, Dtype::F32, bytemuck::cast_slice(values))?);
             }
-            // With the permissions of other files: safetensors writes for the owner alone.
+            // With the permissions of other files: safetensors makes it readable by the owner alone.
             let permissions = std::fs::File::create(path)?.metadata()?.permissions();
             safetensors::serialize_to_file(views, Some(metadata), path)
                 .map_err(std::io::Error::other)?;
@@ -310,7 +310,7 @@ impl Trainer {
         }
     }
 
-    /// The same for Gaussians with `columns` columns.
+    /// [`Self::not_finite`] for Gaussians with `columns` columns.
     fn not_finite_in(&self, at: usize, columns: usize) -> Error {
         let (plane, gaussian) = self.model.place_of(at, columns);
         Error::ParameterNotFinite { step: self.step, plane, gaussian }

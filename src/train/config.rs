@@ -1,4 +1,4 @@
-//! Everything that a training run depends on: the command line, a TOML file and the run directory say it alike.
+//! Everything that a training run depends on, the same on the command line, in a TOML file and in the run directory.
 
 mod exposure;
 mod stop;
@@ -38,14 +38,14 @@ pub use stop::{NotFinite, StopConfig};
 /// Pixels of a patch; smaller ones have more border than content.
 pub(super) const MIN_PATCH: u64 = 256;
 
-/// What is seen where no splat is.
+/// The background of a render.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Background {
     /// Black, as in the paper.
     #[default]
     Black,
-    /// Another colour every step: dark surfaces cannot hide in the background.
+    /// Another colour every step, so that dark surfaces cannot be left empty.
     Random,
 }
 
@@ -85,8 +85,8 @@ pub struct TrainConfig {
     mask_borders: bool = true => Rule::Flag;
     /// White balance of the photographs before they are measured: gains R,G,B of linear light; the colour temperature
     /// of the light in kelvin; VIEW,x,y,w,h, a neutral area of one photograph in pixels as stored; or
-    /// VIEW,x1,y1,..,x4,y4, the corners of a chart of 24 patches, from the dark skin patch round by the blue-green, the
-    /// black and the white one.
+    /// VIEW,x1,y1,..,x4,y4, the corners of a chart of 24 patches: at the dark skin, bluish green, black and white
+    /// patch.
     white_balance: Option<WhiteBalance> = None, "none" => WHITE_BALANCE, "--white-balance WHITE";
     /// Undistort fisheye photographs to pinhole ones, cropped to 60 degrees off the axis, instead of training with the
     /// fisheye model; other distorted photographs are always undistorted.
@@ -102,7 +102,8 @@ pub struct TrainConfig {
     patch_pixels: Option<u64> = None, "the most that the device can bind"
         => Rule::at_least(MIN_PATCH), in "pixels", "--patch-pixels N";
     /// Use every Nth view by name as a test view, instead of the dataset's split; 0: no test views.
-    test_every: Option<usize> = None, "the dataset's split, else every 8th" => Rule::COUNT, in "views", "--test-every N";
+    test_every: Option<usize> = None, "the dataset's split, else every 8th"
+        => Rule::COUNT, in "views", "--test-every N";
     /// Memory for photographs on the device and on the host, such as 4G; the rest is kept on disk, which takes time but
     /// changes no result.
     cache: Option<CacheSize> = None, "a quarter of each memory" => MEMORY, in "bytes", "--cache SIZE";
@@ -162,7 +163,7 @@ sections {
     schedule: Schedule;
     /// Density control.
     density: DensityConfig;
-    /// Parts of the model beside colour.
+    /// Parts of the model in addition to colour.
     model: ModelConfig;
     /// Loss terms on the parameters of the Gaussians.
     loss: ParameterWeights;
@@ -398,8 +399,8 @@ impl TrainConfig {
             });
         }
         if self.exposure.learn == OnOff::On && self.model.tonemapper {
-            let rule = "off with a tonemapper, which fits the dark photographs: a gain of the targets does not describe \
-                        their exposures";
+            let rule = "off with a tonemapper, which fits the dark photographs: a gain of the targets does not \
+                        describe their exposures";
             let (key, value) = ("exposure.learn".to_owned(), "on".to_owned());
             return Err(Error::Setting { key, value, rule: rule.to_owned() });
         }
@@ -413,14 +414,14 @@ mod tests {
     use crate::splats::attributes::Attribute;
 
     #[test]
-    fn a_configuration_survives_its_toml() {
+    fn a_configuration_is_read_back_from_its_toml() {
         let config = TrainConfig { seed: 3, background: Background::Random, ..Default::default() };
         let text = config.to_toml().unwrap();
         assert_eq!(toml::from_str::<TrainConfig>(&text).unwrap(), config);
     }
 
     #[test]
-    fn what_excludes_each_other_is_named_by_its_key() {
+    fn settings_that_exclude_each_other_are_named_by_key() {
         let mut config = TrainConfig::default();
         (config.exposure.learn, config.model.tonemapper) = (OnOff::On, true);
         let message = config.check().unwrap_err().to_string();
@@ -431,7 +432,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_make_no_sense_are_refused_by_name() {
+    fn invalid_values_are_refused_by_key() {
         let refused = |config: TrainConfig| config.check().unwrap_err().to_string();
         assert!(refused(TrainConfig { steps: 0, ..Default::default() }).contains("steps is 0"));
         assert!(

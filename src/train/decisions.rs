@@ -1,7 +1,7 @@
 //! Decisions of the held-out views: the end of growth, the highest SH degree, and convergence.
 //!
-//! Each is made at a known step from the model at that step, so the same run decides the same; a checkpoint holds the
-//! decisions and their data.
+//! Each is made at a known step from the model at that step, so a repeated run decides the same; a checkpoint contains
+//! the decisions and their data.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,7 +15,7 @@ const PATIENCE: usize = 4;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct Round {
     step: u64,
-    /// The score of the held-out views in thousandths of a dB, an integer so that files keep it exactly.
+    /// The score of the held-out views in thousandths of a dB, an integer to be exact in files.
     score: i64,
     gaussians: usize,
 }
@@ -40,10 +40,10 @@ pub(super) struct Decisions {
     /// Every score of the held-out views so far.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(super) scores: Vec<Score>,
-    /// The step at which the run converged, after which it cools down and ends.
+    /// The step at which the run converged; it then cools down and ends.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) converged: Option<u64>,
-    /// The run was resumed with another number of steps, and takes them all.
+    /// The run was resumed with another number of steps, and trains all of them.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub(super) goes_on: bool,
     /// Scoring of the held-out views is due.
@@ -58,7 +58,7 @@ pub(super) struct Decisions {
 }
 
 impl Decisions {
-    /// Whether growth ends at the last round, since it gained less than `growth_gain` dB for each doubling of the
+    /// Whether growth ends at the last round because it gained less than `growth_gain` dB for each doubling of the
     /// Gaussians.
     fn gains_too_little(&self, growth_gain: f64) -> bool {
         let Some(before) = self.rounds.len().checked_sub(PATIENCE) else { return false };
@@ -103,7 +103,7 @@ impl Trainer {
         self.renderer.set_sh_degree(degree)
     }
 
-    /// The limit of Gaussians by the held-out views, decided before every round of density control.
+    /// The limit of Gaussians from the held-out views, decided before every round of density control.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -137,8 +137,8 @@ impl Trainer {
         Ok(self.convergence.decisions.gaussians.unwrap_or(usize::MAX))
     }
 
-    /// Whether the SH degree in use is judged after this step: the next would raise it, or would if there were a higher
-    /// one.
+    /// Whether the SH degree in use is evaluated after this step: the next step would raise it, or would if there were
+    /// a higher degree.
     pub(super) fn decides_degree_at(&self, step: u64) -> bool {
         let interval = self.config.schedule.sh_degree_interval.max(1);
         self.config.stop.degree_gain > 0.0
@@ -190,13 +190,13 @@ mod tests {
     #[test]
     fn growth_ends_once_four_rounds_gain_too_little_for_what_they_add() {
         let grown = [(20_000, 100), (20_100, 150), (20_150, 200), (20_180, 300), (20_190, 400)];
-        // .19 dB for two doublings.
+        // 0.19 dB for two doublings.
         assert!(decisions(&grown).gains_too_little(0.1));
         assert!(!decisions(&grown).gains_too_little(0.09));
         assert!(!decisions(&grown[..4]).gains_too_little(0.1));
         let fallen = [(20_000, 100), (20_900, 120), (19_000, 140), (19_000, 150), (19_500, 160)];
         assert!(!decisions(&fallen).gains_too_little(0.5), "the best round counts");
         let full = [(20_000, 100); 5];
-        assert!(!decisions(&full).gains_too_little(0.5), "what does not grow need not gain");
+        assert!(!decisions(&full).gains_too_little(0.5), "without growth no gain is needed");
     }
 }

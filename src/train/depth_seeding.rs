@@ -25,8 +25,8 @@ use crate::splats::scene::{Gaussians, SH_C0, width};
 const VIEWS: usize = 16;
 /// Sampled pixels for each Gaussian.
 const PIXELS_EACH: usize = 4;
-/// The fewest pixels of a view for each Gaussian: with more Gaussians, small views may score lower after thousands of
-/// steps.
+/// The fewest pixels of a view for each Gaussian: with more Gaussians, the scores of small views may be lower after
+/// thousands of steps.
 const MIN_PIXELS_EACH: usize = 8;
 /// The least alpha at which a pixel has a depth.
 const MIN_COVER: f32 = 0.5;
@@ -54,7 +54,7 @@ impl Trainer {
         self.config.density.depth_seeding.min(most / MIN_PIXELS_EACH)
     }
 
-    /// The number of Gaussians, or their number after seeding if that is still to come.
+    /// The number of Gaussians, or their number after a seeding that is still to come.
     pub(super) fn count_once_filled(&self) -> usize {
         let (count, first) = (self.model.count(), self.config.schedule.first_round());
         let fills = self.step < first && self.seeds_at(first) && self.densifies_at(first);
@@ -71,7 +71,7 @@ impl Trainer {
             return Ok(());
         }
         let old = self.gaussians_in_frame()?;
-        // The next check of the parameters reports those that are not finite.
+        // Non-finite parameters are reported by the next check.
         if !old.means().iter().all(|mean| mean.is_finite()) {
             return Ok(());
         }
@@ -82,7 +82,7 @@ impl Trainer {
         let picked: Vec<DepthSample> =
             order.into_iter().take(more).map(|i| depth_samples[i]).collect();
         tracing::info!(
-            "step {}: {} Gaussians seeded at rendered depths beside {}",
+            "step {}: {} Gaussians seeded at rendered depths, in addition to {}",
             self.step,
             picked.len(),
             old.count
@@ -124,7 +124,7 @@ impl Trainer {
         Ok(depth_samples)
     }
 
-    /// Renders, in place of colours, the alpha-weighted depth and the accumulated alpha.
+    /// Renders the alpha-weighted depth and the accumulated alpha instead of colours.
     fn depths(
         &self,
         renderer: &mut Renderer,
@@ -186,7 +186,7 @@ fn seen(camera: &Camera, depths: &Image, target: &Image, mask: Option<&Image>) -
     (0..pixels).filter_map(depth_sample).collect()
 }
 
-/// The old Gaussians, followed by those of the samples with the features of the nearest old one.
+/// The old Gaussians, then those of the samples, with the features of their nearest old Gaussian.
 fn joined(old: &Gaussians, new: &[DepthSample], start: &Initialization) -> Result<Gaussians> {
     let means = old.means().iter().map(|mean| mean.as_dvec3());
     let positions: Vec<DVec3> =
@@ -238,8 +238,8 @@ mod tests {
     }
 
     #[test]
-    fn a_pixel_is_where_its_expected_depth_says_unless_little_covers_it_or_a_mask_hides_it() {
-        // Weighted depth and alpha: alpha 1/2 at depth 4 has depth 4.
+    fn a_pixel_is_placed_at_its_expected_depth_unless_it_is_thinly_covered_or_masked() {
+        // Weighted depth 2 and alpha 1/2 give depth 4.
         let image = |data: &[f32]| Image { width: 2, height: 1, data: data.to_vec() };
         let target = image(&[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]);
         let shown =
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn a_coarse_camera_has_about_as_many_pixels_as_asked_for_and_at_least_one() {
+    fn a_coarse_camera_has_about_as_many_pixels_as_requested_and_at_least_one() {
         for (pixels, size) in [(0, (1, 1)), (50, (10, 5)), (200, (20, 10)), (9999, (20, 10))] {
             let coarse = coarse(&camera(20, 10), pixels);
             assert_eq!((coarse.width, coarse.height), size, "{pixels}");
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn what_joins_leaves_the_others_as_they_are_and_takes_the_features_of_the_nearest() {
+    fn new_gaussians_take_the_features_of_the_nearest_and_leave_the_others_unchanged() {
         let features = Features { structure: true, ..Features::NONE };
         let shape = Shape { sh_degree: 1, features };
         let mut old = Gaussians::zeros(2, shape);

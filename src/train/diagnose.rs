@@ -6,7 +6,7 @@
 //! cameras, points -> overlap, exposures ------------------------┘
 //! ```
 //!
-//! Only training photographs are measured, never references, on the host, in seconds.
+//! Only training photographs are measured, never references. It runs on the host, in seconds.
 
 mod geometry;
 mod noise;
@@ -68,21 +68,21 @@ pub struct ViewDiagnosis {
     pub code_values: usize,
     /// `None` if no part is flat and unclipped.
     pub noise: Option<Noise>,
-    /// As the tone curve shows it, with that of whole codes and of JPEG; none of a black or a tiny photograph.
+    /// In the target, including quantisation and JPEG artefacts; `None` for a black or tiny photograph.
     pub noise_in_target: Option<TargetNoise>,
     /// The blur of the edges, as a standard deviation in pixels; `None` without edges.
     pub blur: Option<f64>,
-    /// The standard deviation of log2 light over large regions, due to lamps and windows.
+    /// The standard deviation of log2 light over large regions, caused by lamps and windows.
     pub unevenness: f64,
-    /// The number of the dataset's points that it shows.
+    /// The number of the dataset's points that the view sees.
     pub points: usize,
-    /// The mean fraction of the other training views that see the points it shows.
+    /// The mean fraction of the other training views that see this view's points.
     pub overlap: f64,
-    /// It is black, and left out of training.
+    /// Whether it is black, and left out of training.
     pub is_black: bool,
 }
 
-/// The diagnosis of all training photographs but black ones; means over the views unless stated.
+/// The diagnosis of all training photographs except black ones; means over the views unless stated otherwise.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 #[allow(missing_docs, reason = "as in `ViewDiagnosis`")]
 pub struct SceneDiagnosis {
@@ -92,13 +92,14 @@ pub struct SceneDiagnosis {
     pub mean_luminance: f64,
     pub cubic_mean: f64,
     pub light: f64,
-    /// 0.18 / the mean light.
+    /// 0.18 over the mean light.
     pub darkening: f64,
     /// The brightness of the targets over that of the photographs; below 1.5 no curve is needed.
     pub brightening: f64,
     /// The gain of `--curve auto`, for encoded values.
     pub gain: f64,
-    /// The standard deviation of the views' exposures, in stops; if the points do not tell, of their gains.
+    /// The standard deviation of the views' exposures, in stops; of their gains, if the points do not determine
+    /// exposures.
     pub exposure_spread: f64,
     /// Whether the spread is measured at shared points.
     pub spread_is_measured: bool,
@@ -150,7 +151,7 @@ impl Diagnosis {
     /// Loads a dataset and diagnoses its training photographs, as stored, while they are decoded.
     ///
     /// # Errors
-    /// As [`Dataset::load`], or every photograph is black.
+    /// Those of [`Dataset::load`], or every photograph is black.
     pub fn load(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
         let looked_at = Mutex::new(HashMap::new());
         let look = |name: &str, image: &Image, mask: Option<&Mask>| {
@@ -172,7 +173,7 @@ impl Diagnosis {
         Self::with_photographs(dataset, options, HashMap::new())
     }
 
-    /// From photographs by name; missing ones are read.
+    /// From photographs by name; those that are missing are read.
     fn with_photographs(
         dataset: &Dataset,
         options: &LoadOptions,
@@ -196,7 +197,7 @@ impl Diagnosis {
         let photographs: Vec<Photograph> = photographs.collect();
         let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);
         let Some(exposure) = exposure else {
-            let problem = "every training photograph is as good as black (99 % of its pixels are below 2 of 255); \
+            let problem = "every training photograph is almost black (99 % of its pixels are below 2 of 255); \
                            expose longer";
             return Err(Error::input(&dataset.root, problem));
         };

@@ -10,7 +10,7 @@ use crate::Result;
 use crate::base::hash::{self, Hasher};
 
 /// Settings that affect no result beyond rounding: the dataset's path, saving and logging, time limits, and values that
-/// a run finds itself.
+/// a run determines itself.
 const FREE: [&str; 17] = [
     "dataset",
     "device",
@@ -34,7 +34,7 @@ const FREE: [&str; 17] = [
 impl TrainConfig {
     /// The first setting that differs from `other`'s, with both values: `tone.alpha = 0.1, not 0.12`. Settings that
     /// change no step beyond rounding do not count: the number of steps, paths, scoring and saving, device and tiles.
-    /// Nor does a lower limit of the Gaussians, so that a run that outgrows its machine can resume.
+    /// Nor does a lower limit of the Gaussians, so that a run that ran out of memory can resume.
     pub(crate) fn difference(&self, other: &Self) -> Option<String> {
         const ALSO: [&str; 5] = ["steps", "reference", "stop.every", "stop.gain", "stop.margin"];
         let values = [self, other].map(values);
@@ -78,7 +78,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_difference_is_named_unless_it_changes_no_step() {
+    fn a_difference_is_named_if_it_changes_a_step() {
         let config = TrainConfig::default();
         let free = TrainConfig {
             steps: 9,
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn what_toml_cannot_hold_is_a_difference() {
+    fn a_value_that_toml_cannot_represent_is_a_difference() {
         let huge = TrainConfig { seed: u64::MAX, ..TrainConfig::default() };
         assert!(huge.difference(&TrainConfig::default()).is_some());
         assert!(TrainConfig::default().difference(&huge).is_some());

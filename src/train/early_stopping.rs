@@ -3,8 +3,8 @@
 //! ```text growth -> converged, or the last steps begin -> cooldown: no density control, learning rates decay -> end
 //! ```
 //!
-//! Scores fluctuate with the views seen last and with every round of density control. So they are never taken right
-//! after a round, and a run never ends where it converged, but after a cooldown.
+//! Scores fluctuate with the most recent views and with every round of density control. So they are never taken right
+//! after a round, and a run that has converged ends only after a cooldown.
 
 use serde::{Deserialize, Serialize};
 
@@ -20,7 +20,7 @@ use crate::photographs::tone::SceneTone;
 /// Steps after a round of density control in which the held-out views are not scored.
 const SETTLING_DISTANCE: u64 = 50;
 
-/// Why a run has ended.
+/// The reason for the end of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum EndReason {
@@ -33,7 +33,7 @@ pub enum EndReason {
 /// The end of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ended {
-    /// Why.
+    /// The reason.
     pub reason: EndReason,
     /// Its last step.
     pub step: u64,
@@ -95,7 +95,7 @@ impl Trainer {
         early.map_or(self.config.steps, |early| early.min(self.config.steps))
     }
 
-    /// The step at which the run converged, if it ends for that.
+    /// The step at which the run converged, if that ends it.
     fn converged(&self) -> Option<u64> {
         self.convergence.decisions.converged.filter(|_| !self.convergence.decisions.goes_on)
     }
@@ -182,7 +182,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// The first of the best scores since views have their full size: that of the kept model.
+    /// The first of the best scores since views have their full size; its model is kept.
     fn best_score(&self) -> Option<Score> {
         let [_, whole] = self.config.schedule.resolution_steps;
         let scores = self.convergence.decisions.scores.iter().filter(|score| score.step >= whole);
@@ -191,7 +191,7 @@ impl Trainer {
 
     /// Ends the run with its best model: if the last score is lower than the best by more than
     /// [`StopConfig::margin`](super::StopConfig::margin), the model of the best is restored. No steps may follow; to
-    /// continue, save a checkpoint before.
+    /// continue later, save a checkpoint first.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_ends_worse_than_it_was_goes_back_and_one_within_the_margin_does_not() {
+    fn a_run_that_ends_worse_is_restored_and_one_within_the_margin_is_not() {
         for (margin, best_step) in [(0.25, 12), (90.0, 20)] {
             let mut trainer = scored(margin);
             let best = trainer.gaussians().unwrap();
@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn the_best_model_survives_a_kill() {
+    fn the_best_model_survives_a_killed_process() {
         let mut trainer = scored(0.25);
         let file = tempfile::NamedTempFile::new().unwrap();
         let best = trainer.gaussians().unwrap();

@@ -148,9 +148,9 @@ impl Targets<'_> {
         self.pseudo_gt.tone_mapped(photograph, &tone_mapping)
     }
 
-    /// The affine of the target for `stops` of the photograph in linear light: it brings the target of the photograph
-    /// without these stops nearest to the target of the photograph as it is. A curve that follows each photograph
-    /// compensates much of the difference.
+    /// The affine of the target for `stops` of the photograph in linear light: it maps the target of the photograph
+    /// without these stops to the target of the photograph as it is, by least squares. A curve that follows each
+    /// photograph compensates much of the difference.
     fn affine_of_stops(&mut self, name: &str, stops: f64) -> Result<Affine> {
         let views = &self.dataset.views;
         let place = views.binary_search_by(|view| view.name.as_str().cmp(name));
@@ -164,7 +164,7 @@ impl Targets<'_> {
         let [neutral, own] =
             [&neutral, &*photograph].map(|photograph| self.target(photograph, &view.camera));
         let affine = Affine::least_squares(&neutral?, &own?)?;
-        // A photograph of one colour has no affine.
+        // A photograph of one colour determines no affine.
         let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);
         Ok(if is_exposure { affine } else { Affine::IDENTITY })
     }

@@ -56,7 +56,7 @@ impl Views {
         let frame = config.frame.unwrap_or_default();
         let points = self.points(dataset, config, &frame);
         let kept = &sampled(points, config, gpu);
-        // The position of each view of the dataset among those trained on.
+        // The position of each view of the dataset among the training views.
         let mut places = vec![None; dataset.views.len()];
         self.photographs().for_each(|view| places[view.index] = Some(view.place));
         let mut targets = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Targets);
@@ -86,7 +86,7 @@ impl Views {
         Ok(gaussians)
     }
 
-    /// Warns of every view that contains the mean of none of the first Gaussians, given in the frame: its pose is
+    /// Warns of every view that contains the mean of none of the first Gaussians (in the training frame): its pose is
     /// probably wrong.
     pub(super) fn warn_of_empty_views(&self, gaussians: &Gaussians) {
         let means: Vec<DVec3> = gaussians.means().iter().map(|mean| mean.as_dvec3()).collect();
@@ -135,16 +135,16 @@ impl<'a> ImageBatches<'a> {
             let images = views.pictures(gpu, pseudo_gt, place..last + 1, kind)?;
             *made = (place..).zip(images).collect();
         }
-        let gone = || Error::Usage(format!("there is no photograph {place} to train on"));
+        let gone = || Error::Usage(format!("there is no training photograph {place}"));
         made.remove(&place).ok_or_else(gone)
     }
 }
 
-/// Initialises features so that the parts of the model start as the identity: structure 0, and illumination as each
-/// point's colour in the dark photographs over that in the targets. Depth, which is trained by correlation, stays
+/// Initialises features such that the parts of the model start as the identity: structure with 0, and illumination with
+/// each point's colour in the dark photographs over that in the targets. Depth, which is trained by correlation, stays
 /// random.
 fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
-    /// Darker targets tell nothing about the illumination.
+    /// Darker targets do not determine the illumination.
     const DARKEST: f32 = 1.0 / 255.0;
     let features = gaussians.shape.features;
     let places = |feature| {
@@ -160,8 +160,8 @@ fn begin_as_identity(gaussians: &mut Gaussians, colors: &[Vec3], low: &[Vec3]) {
     }
 }
 
-/// A permutation of the numbers below `count` with neighbours far apart, so that a search through a sorted list samples
-/// all of it early.
+/// A permutation of the numbers below `count` that separates neighbours, so that a search through a sorted list soon
+/// samples all of it.
 fn scattered(count: usize) -> impl Iterator<Item = usize> {
     const GOLDEN: f64 = 0.618_033_988_75;
     let divides_both = |step: usize| {
@@ -182,7 +182,7 @@ fn scattered(count: usize) -> impl Iterator<Item = usize> {
     })
 }
 
-/// The points that begin as Gaussians: an even sample where they are more than there may be.
+/// The points that become Gaussians: an even sample if there are more than the limit.
 fn sampled<'a>(points: Cow<'a, [Point]>, config: &TrainConfig, gpu: &Gpu) -> Cow<'a, [Point]> {
     let fitting = config.render_settings().peak_gaussians(gpu);
     let (of, count) = (points.len(), points.len().min(config.max_gaussians).min(fitting));
@@ -194,13 +194,13 @@ fn sampled<'a>(points: Cow<'a, [Point]>, config: &TrainConfig, gpu: &Gpu) -> Cow
     } else {
         format!("{} binds no more", gpu.properties().name)
     };
-    tracing::warn!("{count} of {of} points, an even sample, begin as Gaussians: {limit}");
+    tracing::warn!("{count} of {of} points, an even sample, become Gaussians: {limit}");
     let seed = Stream::new(config.seed, streams::POINTS).bits(1);
     even_sample(of, count, seed).into_iter().map(|index| points[index].clone()).collect()
 }
 
-/// `count` of the indices below `of`, ascending, spread evenly: one at random of each of `count` stretches of equal
-/// length. A scan lists neighbours in rows, and a fixed stride would meet the same place of each row.
+/// `count` of the indices below `of`, ascending, evenly spread: a random one from each of `count` equal intervals. A
+/// laser scan lists points in rows, and a fixed stride would select the same columns of every row.
 fn even_sample(of: usize, count: usize, seed: u64) -> Vec<usize> {
     if count >= of {
         return (0..of).collect();
@@ -219,7 +219,7 @@ mod tests {
     use super::{even_sample, scattered};
 
     #[test]
-    fn a_sample_is_even_and_follows_no_period_of_the_list() {
+    fn a_sample_is_even_and_has_no_period() {
         for (of, count) in [(60_000, 6000), (10, 9), (7, 7), (7, 12), (5, 1), (3, 0)] {
             let sample = even_sample(of, count, 3);
             assert_eq!(sample.len(), count.min(of));
@@ -233,14 +233,14 @@ mod tests {
             }
             assert_eq!(sample, even_sample(of, count, 3));
         }
-        // Rows of ten: a stride of ten would meet one column.
+        // Rows of ten: a stride of ten would select a single column.
         let mut columns = [0; 10];
         even_sample(10_000, 1000, 0).into_iter().for_each(|at| columns[at % 10] += 1);
         assert!(columns.iter().all(|&count| count > 50), "{columns:?}");
     }
 
     #[test]
-    fn scattered_numbers_are_all_there_and_neighbours_far_apart() {
+    fn scattered_numbers_are_a_permutation_with_neighbours_far_apart() {
         for count in [0, 1, 2, 3, 4, 6, 10, 97, 1000] {
             let numbers: Vec<usize> = scattered(count).collect();
             let near = numbers.windows(2).filter(|two| two[0].abs_diff(two[1]) < count / 4).count();

@@ -15,7 +15,7 @@ use crate::splats::densify::{Densifier, DensifyReport, DensifySettings, DensityC
 use crate::splats::render::RenderOptions;
 use crate::splats::scene::GaussianSlice;
 
-/// The most dB that a round may cost the probes before it is tried again with fewer splits. The training views as a
+/// The most dB that a round may cost on the probes before it is repeated with fewer splits. The training views as a
 /// whole may lose somewhat more.
 const MAX_LOST: f64 = 0.2;
 
@@ -30,7 +30,7 @@ pub(super) struct Growth {
 }
 
 impl Trainer {
-    /// Whether density control acts after this step: never in the cooldown, nor within the last interval of the run.
+    /// Whether density control acts after this step: not in the cooldown, nor within the last interval of the run.
     pub(super) fn densifies_at(&self, step: u64) -> bool {
         let schedule = &self.config.schedule;
         let is_in_time = step + schedule.densify_interval <= self.config.steps;
@@ -66,7 +66,7 @@ impl Trainer {
         self.reserve()
     }
 
-    /// A round of density control with as many splits as the probes tolerate.
+    /// A round of density control with as many splits as the probes allow.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -88,8 +88,8 @@ impl Trainer {
         Ok(report)
     }
 
-    /// The largest number of Gaussians that fits, at least their present number, and the limiting resource. A view may
-    /// have twice the intersections per Gaussian of the last one.
+    /// The largest number of Gaussians that fits, at least the present number, and the limiting resource. A view may
+    /// have twice as many intersections per Gaussian as the last one.
     fn capacity(&self, intersections: u32) -> (usize, &'static str) {
         let pixels = |size: UVec2| f64::from(size.x) * f64::from(size.y);
         let largest = self.supervision.views.sizes().into_iter().map(pixels).fold(0.0, f64::max);
@@ -109,7 +109,7 @@ impl Trainer {
         (capacity.max(count), why)
     }
 
-    /// The limit of Gaussians by the setting and by the buffers that the renderer binds.
+    /// The limit of Gaussians from the setting and from the buffers that the renderer binds.
     pub(super) fn max_renderable(&self) -> usize {
         let renderable = self.config.render_settings().peak_gaussians(&self.gpu);
         self.config.max_gaussians.min(renderable)
@@ -117,7 +117,7 @@ impl Trainer {
 }
 
 /// The share of a round's splits to keep if all of them cost `lost` dB. The cost grows with the square root of the
-/// share, since the splits with the largest gradients cost most; with a margin of a tenth.
+/// share, since the splits with the largest gradients cost most; a margin of a tenth is included.
 fn share_that_stays(lost: f64) -> f64 {
     if lost > MAX_LOST { (0.9 * MAX_LOST / lost).powi(2) } else { 1.0 }
 }
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn no_round_costs_the_training_views_much() {
+    fn no_round_costs_the_training_views_more_than_the_bound() {
         for seed in 1..=3 {
             let folder = tempfile::tempdir().unwrap();
             let options = SyntheticOptions {
@@ -218,7 +218,7 @@ mod tests {
     /// The scenes that `NIGHTSPLAT_SCENES` names, at full, half and quarter size, with three seeds.
     #[test]
     #[ignore = "takes hours: `scripts/stress.py growth`"]
-    fn no_round_of_a_real_scene_costs_the_training_views_much() {
+    fn no_round_of_a_real_scene_costs_the_training_views_more_than_the_bound() {
         let scenes = std::env::var("NIGHTSPLAT_SCENES").expect("NIGHTSPLAT_SCENES names scenes");
         let sizes = std::env::var("NIGHTSPLAT_DOWNSCALES").unwrap_or_else(|_| "4,2,1".to_owned());
         let seeds = std::env::var("NIGHTSPLAT_SEEDS").unwrap_or_else(|_| "1,2,3".to_owned());

@@ -58,7 +58,7 @@ impl SettingsLayer {
     /// Every setting of a TOML text.
     ///
     /// # Errors
-    /// The text is not TOML, or has an unknown key or an invalid value; with its line.
+    /// The text is not TOML, or has an unknown key or an invalid value. The message has the line.
     pub fn of_toml(text: &str, origin: &Origin) -> Result<Self> {
         let table: Table = text.parse().map_err(|error: toml::de::Error| {
             let at = error.span().map(|span| line_at(text, span.start));
@@ -76,16 +76,16 @@ impl SettingsLayer {
     /// The settings of a file.
     ///
     /// # Errors
-    /// The file cannot be read; and as [`Self::of_toml`].
+    /// The file cannot be read; and those of [`Self::of_toml`].
     pub fn load(path: &Path) -> Result<Self> {
         let layer = Self::of_toml(&input::text(path)?, &Origin::File(path.to_owned()));
         layer.map_err(|problem| Error::input(path, problem.to_string()))
     }
 
-    /// `KEY=VALUE`, such as `tone.alpha=0.1`.
+    /// Adds `KEY=VALUE`, such as `tone.alpha=0.1`.
     ///
     /// # Errors
-    /// It has no `=`; and as [`Self::say`].
+    /// There is no `=`; and those of [`Self::say`].
     pub fn assign(&mut self, assignment: &str) -> Result<()> {
         let (key, value) = assignment.split_once('=').ok_or_else(|| {
             let problem =
@@ -95,7 +95,7 @@ impl SettingsLayer {
         self.say(key.trim(), value.trim(), Origin::Set)
     }
 
-    /// Adds a setting with its value as on a command line: TOML, or text without quotes.
+    /// Adds a setting with a value as on a command line: TOML, or text without quotes.
     ///
     /// # Errors
     /// The key is unknown, or the value invalid.
@@ -117,7 +117,7 @@ impl SettingsLayer {
     /// Adds a setting with its value.
     ///
     /// # Errors
-    /// The key is no setting, or the setting does not take the value.
+    /// The key is unknown, or the value invalid.
     pub fn push(&mut self, key: &str, value: Value, origin: Origin) -> Result<()> {
         let key = old_keys::current(key);
         // The constants of a curve can be set one by one.
@@ -156,7 +156,7 @@ pub struct Settings(BTreeMap<String, (Value, Origin)>);
 
 impl Settings {
     pub(super) fn merge(&mut self, layer: &SettingsLayer) {
-        // The settings of a curve are applied after the curve, in whatever order they stand.
+        // The settings of a curve are applied after the curve, in any order.
         let order = |key: &str| match key {
             "tone.curve" => 0,
             "tone.auto_gain" => 1,
@@ -320,7 +320,7 @@ pub fn values(config: &TrainConfig) -> Result<BTreeMap<String, Value>> {
     Ok(SettingsLayer::of(config)?.0.into_iter().map(|(key, value, _)| (key, value)).collect())
 }
 
-/// A whole number as people write large ones: 5000, 5k, 1e4, 1.5M.
+/// A whole number, also in short forms: 5000, 5k, 1e4, 1.5M.
 pub(crate) fn whole(text: &str) -> Option<i64> {
     let factor = |letter| match letter {
         'k' | 'K' => Some(1e3),
@@ -330,7 +330,7 @@ pub(crate) fn whole(text: &str) -> Option<i64> {
     let factor = text.chars().last().and_then(factor);
     let digits = if factor.is_some() { &text[..text.len() - 1] } else { text };
     let number = digits.parse::<f64>().ok()? * factor.unwrap_or(1.0);
-    // Beyond 2^53 not every whole number is a double.
+    // Beyond 2^53, not every whole number is a double.
     (number.fract() == 0.0 && number.abs() < 9e15).then_some(number as i64)
 }
 
@@ -368,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn a_setting_is_set_and_nothing_else() {
+    fn an_assignment_changes_one_setting_and_nothing_else() {
         let config = with(&[
             "tone.alpha=0.25",
             "density.gradient_threshold = 1e-4",
@@ -397,7 +397,7 @@ mod tests {
     }
 
     #[test]
-    fn a_whole_number_may_be_written_short() {
+    fn a_whole_number_has_short_forms() {
         for (text, number) in [("5k", 5000), ("1e4", 10_000), ("1.5k", 1500), ("2M", 2_000_000)] {
             assert_eq!(with(&[&format!("steps={text}")]).unwrap().steps, number, "{text}");
         }
@@ -408,7 +408,7 @@ mod tests {
     }
 
     #[test]
-    fn another_curve_comes_with_its_own_constants_wherever_the_layer_names_it() {
+    fn another_curve_has_its_own_constants_wherever_the_layer_names_it() {
         let ase = with(&["tone.gain_c=2", "tone.curve=ase"]).unwrap();
         assert_eq!(ase.tone, ToneSettings { gain_c: 2.0, ..ToneSettings::new(ToneCurve::Ase) });
         let mut settings = Settings::default();
@@ -434,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_in_a_file_has_its_line() {
+    fn an_error_in_a_file_has_its_line() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("config.toml");
         for (text, parts) in [
@@ -455,7 +455,7 @@ mod tests {
     }
 
     #[test]
-    fn a_written_configuration_says_who_says_each_value_and_reads_as_it_is() {
+    fn a_written_configuration_has_the_origin_of_each_value_and_is_read_back() {
         let mut settings = Settings::default();
         settings.merge(
             &SettingsLayer::of_toml("steps = 700\n[stop]\nviews = 0", &Origin::Preset("fast"))

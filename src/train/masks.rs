@@ -1,5 +1,5 @@
-//! Masks of the training views. At masked pixels the render is replaced by its target, so that no term has a difference
-//! or a gradient there, neither for the Gaussians nor for the statistics of density control.
+//! Masks of the training views. At masked pixels, the render is replaced by its target: no term has a difference or a
+//! gradient there, neither for the Gaussians nor for the statistics of density control.
 
 use glam::UVec2;
 
@@ -11,7 +11,7 @@ use crate::kernels::{mask_gradient, mask_render};
 use crate::photographs::dataset::Dataset;
 use crate::splats::scene::COLOR_CHANNELS;
 
-/// The masks of the views, and the kernels that apply them; a view without a mask costs nothing.
+/// The masks of the views and the kernels that apply them; a view without a mask costs nothing.
 #[derive(Debug)]
 pub(super) struct Masks {
     /// By the number of the view; (H, W).
@@ -86,12 +86,12 @@ impl Masks {
     }
 }
 
-/// The kernels that apply a mask to an image that is compared with a target.
+/// The kernels that apply a mask to an image before it is compared with a target.
 #[derive(Debug)]
 pub(super) struct Masking {
     render: Pipeline<mask_render::Kernel>,
     gradient: Pipeline<mask_gradient::Kernel>,
-    /// The masked image; (3, H, W) of the largest.
+    /// The masked image; (3, H, W) of the largest view.
     shown: Buffer<f32>,
 }
 
@@ -108,7 +108,7 @@ impl Masking {
         })
     }
 
-    /// `render`, (3, H, W), with the target where `weights`, (H, W), mask it.
+    /// `render`, (3, H, W), with the target at pixels that `weights`, (H, W), mask.
     ///
     /// # Errors
     /// The pass cannot be recorded.

@@ -59,7 +59,7 @@ pub(super) fn measured(
 /// The measurements of a view, already known if its photograph was measured while it was decoded.
 ///
 /// # Errors
-/// As [`tone_map_source`].
+/// Those of [`tone_map_source`].
 pub(super) fn measured_of(
     view: &View,
     full_resolution: bool,
@@ -76,11 +76,11 @@ pub(super) fn measured_of(
     Ok(measured.map(|measured| measured.seen_by(&view.camera)))
 }
 
-/// What is measured of a view and becomes its target: the photograph as its camera took it where it is lifted before it
-/// is shrunk, else as it was loaded; none where the view has none.
+/// The image from which the target of a view is made: the photograph at full resolution if it is tone-mapped before it
+/// is resized, else as it was loaded; `None` if the view has no photograph.
 ///
 /// # Errors
-/// As [`View::photograph`].
+/// Those of [`View::photograph`].
 pub(super) fn tone_map_source(
     view: &View,
     full_resolution: bool,

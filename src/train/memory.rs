@@ -1,7 +1,7 @@
 //! Memory of a training: estimated before the first step, and limited as the model grows.
 //!
-//! Limits use counts alone, never the system's current state: growth stops at the same number of Gaussians in every
-//! run, resumed or not.
+//! Limits depend on counts alone, never on the current state of the system: growth stops at the same number of
+//! Gaussians in every run, resumed or not.
 
 use glam::UVec2;
 use serde::Serialize;
@@ -17,13 +17,13 @@ use crate::splats::scene::{Layout, Shape};
 const PROGRAM: f64 = 256.0 * 1024.0 * 1024.0;
 /// Bytes of density control's statistics for each Gaussian.
 const STATISTICS: f64 = 8.0;
-/// Plane sets on the host while a checkpoint or model is written.
+/// Copies of all planes on the host while a checkpoint or model is written.
 const HOST_PLANE_SETS: f64 = 3.0;
 /// The factor of capacity that a growing model allocates.
 const HEADROOM: f64 = 1.5;
 /// The share of memory for activations that could be recomputed.
 const ACTIVATIONS: f64 = 0.25;
-/// The factor of intersections per Gaussian that a view may have over the last one.
+/// How many times more intersections per Gaussian a view may have than the last one.
 pub(super) const MARGIN: f64 = 2.0;
 
 /// The estimated memory of a training, in bytes.
@@ -37,9 +37,9 @@ pub struct MemoryEstimate {
     pub host: u64,
     /// The largest number of Gaussians that the run can reach.
     pub peak_gaussians: usize,
-    /// Peak device memory on the way there.
+    /// Peak device memory until then.
     pub peak_device: u64,
-    /// Peak host memory on the way there.
+    /// Peak host memory until then.
     pub peak_host: u64,
 }
 
@@ -109,7 +109,8 @@ impl Trainer {
         limit.min(doubled.unwrap_or(usize::MAX)).max(count)
     }
 
-    /// Keeps activations that the denoiser's backward pass would otherwise recompute, within their share of the memory.
+    /// Keeps the activations that the denoiser's backward pass would otherwise recompute, within their share of the
+    /// memory.
     pub(super) fn keep_activations(&mut self, sizes: &[UVec2]) -> Result<()> {
         let most = (ACTIVATIONS * self.max_bytes()) as u64;
         match &mut self.supervision.networks {
@@ -142,7 +143,7 @@ impl Trainer {
         limit.map_or(usize::MAX, |limit| self.fitting(limit - self.fixed_bytes, each, 0.0))
     }
 
-    /// The number of Gaussians that fits the host's limit: their copies and, on a software device, themselves.
+    /// The number of Gaussians that fits the host's limit: as copies and, on a software device, as device buffers.
     pub(super) fn fitting_in_ram(&self, each: f64) -> usize {
         let Some(CacheSize(limit)) = self.config.max_ram else { return usize::MAX };
         let copies = HOST_PLANE_SETS * self.host_plane();
@@ -153,7 +154,7 @@ impl Trainer {
         (rest / copies).max(0.0) as usize
     }
 
-    /// The number of Gaussians that fits in `bytes`, including growth and saving, at `more` bytes each.
+    /// The number of Gaussians that fits in `bytes`, including growth and saving, with `more` bytes each.
     fn fitting(&self, bytes: f64, each: f64, more: f64) -> usize {
         let (per, beside) = (self.per_gaussian(), more + self.intersection_bytes(each));
         let saved = bytes / (per.saving(1.0) + beside);
@@ -174,7 +175,7 @@ impl Trainer {
         self.per_gaussian_of(Shape { sh_degree, ..now })
     }
 
-    /// Bytes of a plane set per Gaussian on the host, with every SH degree.
+    /// Host bytes per Gaussian of one copy, with every SH degree.
     fn host_plane(&self) -> f64 {
         self.per_gaussian_of(self.model.whole_shape()).plane
     }
@@ -210,7 +211,7 @@ impl PerGaussian {
         count * (self.model + self.working)
     }
 
-    /// Bytes while `count` Gaussians are read back, a plane set at a time.
+    /// Bytes while `count` Gaussians are read back, one copy at a time.
     fn saving(&self, count: f64) -> f64 {
         self.steady(count) + count * self.plane
     }
@@ -229,21 +230,21 @@ impl PerGaussian {
         peak.max(self.saving(capacity))
     }
 
-    /// Bytes of a round from `before` to `count` Gaussians, when both exist.
+    /// Bytes during a round from `before` to `count` Gaussians, while both exist.
     fn growing(&self, before: f64, count: f64) -> f64 {
         (before + count) * self.model + before * self.working
     }
 }
 
-/// The intersections of `gaussians` Gaussians, if `count` have `met` and both cover the same area: smaller ones meet
-/// their own tile and those beyond their edges.
+/// The intersections of `gaussians` Gaussians, if `count` have `met` and both cover the same area: smaller ones
+/// intersect their own tile and those beyond their edges.
 fn met_by(gaussians: f64, met: f64, count: f64) -> f64 {
     let each = met / count.max(1.0);
     let beyond = (each.sqrt() - 1.0).max(0.0) * (count / gaussians).sqrt().min(1.0);
     gaussians * each.min((1.0 + beyond).powi(2))
 }
 
-/// The resident memory of the process in bytes; `None` if the system does not tell.
+/// The resident memory of the process in bytes; `None` if the system does not report it.
 fn resident() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = text.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;

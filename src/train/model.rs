@@ -37,7 +37,7 @@ pub(super) struct Model {
     pub(super) moments: Moments,
     /// The configured SH degree.
     sh_degree: u32,
-    /// Of the parameters' size.
+    /// Of the same size as the parameters.
     pub(super) gradients: Buffer<f32>,
     /// One value per Gaussian.
     pub(super) grad_norm_sums: Buffer<f32>,
@@ -45,7 +45,7 @@ pub(super) struct Model {
 }
 
 impl Model {
-    /// Uploads Gaussians with memory for the SH degree `in_use`, or for their own if that is higher.
+    /// Uploads Gaussians with memory for the SH degree `in_use`, or for their own degree if that is higher.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -69,7 +69,7 @@ impl Model {
         })
     }
 
-    /// The tensor of the parameters in a checkpoint.
+    /// The name of the parameters' tensor in a checkpoint.
     pub(super) const PARAMETERS: &str = "gaussians.parameters";
 
     /// The SH degree of Gaussians with this number of words of parameters.
@@ -182,7 +182,7 @@ impl Model {
     /// Records the terms on parameters, which add to the gradients.
     ///
     /// # Errors
-    /// As [`ParameterTerms::record`].
+    /// Those of [`ParameterTerms::record`].
     pub(super) fn record_terms(
         &mut self,
         (gpu, pass): (&Gpu, &mut Recorder<'_>),
@@ -198,8 +198,8 @@ impl Model {
         terms.record(pass, inputs, gradients, log)
     }
 
-    /// One round of density control, if `keeps` accepts the new parameters ([`Densifier::densify`]); the statistics
-    /// restart.
+    /// One round of density control, if `keeps` accepts the new parameters ([`Densifier::densify`]); the statistics are
+    /// reset.
     ///
     /// # Errors
     /// Those of `keeps`, or the device is out of memory or lost.
@@ -283,9 +283,9 @@ mod tests {
     use crate::gpu::testing::gpu;
     use crate::splats::scene::Features;
 
-    /// Otherwise the next round of density control would have to allocate again.
+    /// Without the capacity, the next round of density control would allocate again.
     #[test]
-    fn another_sh_degree_keeps_the_room_and_what_the_planes_hold() {
+    fn another_sh_degree_keeps_the_capacity_and_the_contents_of_the_planes() {
         let gpu = gpu();
         let shape = Shape { sh_degree: 3, features: Features::NONE };
         for rest in [StorageFormat::Single, StorageFormat::Half] {

@@ -12,7 +12,7 @@ use crate::photographs::image::Image;
 use crate::splats::scene::{COLOR_CHANNELS, Feature, Features};
 use crate::{Error, Result};
 
-/// The networks of a model, with the crop of the render that they take.
+/// The networks of a model, and the crop of the render that is their input.
 #[derive(Debug)]
 pub struct Networks {
     gpu: Gpu,
@@ -30,7 +30,7 @@ impl Networks {
     /// The networks of the enabled parts, with initial weights, for renders of Gaussians with these features.
     ///
     /// # Errors
-    /// The Gaussians lack a feature that a network takes, or the device is out of memory.
+    /// The Gaussians lack a feature that a network requires, or the device is out of memory.
     pub(crate) fn new(
         gpu: &Gpu,
         model: &ModelConfig,
@@ -43,7 +43,7 @@ impl Networks {
         ];
         for (is_on, feature, network, name) in takes {
             if is_on && features.channels_of(feature).is_none() {
-                let problem = format!("the Gaussians have no {name}, which the {network} takes");
+                let problem = format!("the Gaussians have no {name}, which the {network} requires");
                 return Err(Error::Usage(problem));
             }
         }
@@ -76,7 +76,7 @@ impl Networks {
     /// Reserves memory for crops up to `size`.
     ///
     /// # Errors
-    /// The device is out of memory, or a map exceeds the size that it binds.
+    /// The device is out of memory, or a feature map exceeds the size that it binds.
     pub(super) fn reserve(&mut self, size: UVec2) -> Result<()> {
         let values = COLOR_CHANNELS * size.x as usize * size.y as usize;
         if self.colors.len() < values {
@@ -131,13 +131,13 @@ impl Networks {
         Ok(Image { width: size.x, height: size.y, data })
     }
 
-    /// Whether the device binds the maps of a view of `size`.
+    /// Whether the device can bind the feature maps of a view of `size`.
     pub(super) fn fits(&self, size: UVec2) -> bool {
         self.denoiser.as_ref().is_none_or(|own| Denoiser::fits_on(&self.gpu, own.settings(), size))
             && (self.tonemapper.is_none() || Tonemapper::fits_on(&self.gpu, size))
     }
 
-    /// The receptive radius of the denoiser in pixels, except for its norms, which see the whole crop.
+    /// The radius of the denoiser's receptive field in pixels, without its norms, which cover the whole crop.
     pub(super) fn margin(&self) -> u32 {
         self.denoiser.as_ref().map_or(0, Denoiser::margin)
     }
@@ -156,7 +156,7 @@ impl Networks {
     /// Reads the weights of every network.
     ///
     /// # Errors
-    /// The file is missing or damaged, or holds networks of another configuration.
+    /// The file is missing, damaged, or of another configuration.
     pub(crate) fn load(&mut self, path: &Path) -> Result<()> {
         let gpu = self.gpu.clone();
         let mut parameters: Vec<&mut Parameters> = self.parameters_mut().collect();

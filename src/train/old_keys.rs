@@ -1,4 +1,4 @@
-//! Former names of settings: files of earlier versions and `--set` may use them for one more release.
+//! Former names of settings, accepted in files and by `--set` for one more release.
 
 /// Former key, key.
 const RENAMED: [(&str, &str); 9] = [
@@ -13,7 +13,7 @@ const RENAMED: [(&str, &str); 9] = [
     ("tone.lift_first", "tone.full_resolution"),
 ];
 
-/// The key of a setting, which may be given by its former name.
+/// The current key of a setting, which may be given by its former name.
 pub(super) fn current(key: &str) -> &str {
     RENAMED.iter().find(|(former, _)| *former == key).map_or(key, |(_, key)| key)
 }
@@ -25,7 +25,7 @@ mod tests {
     use crate::train::settings::setting;
 
     #[test]
-    fn a_configuration_with_former_names_is_read_as_one_with_the_names_of_today() {
+    fn a_configuration_with_former_names_is_read_as_one_with_current_names() {
         let former = "[schedule]\nboost = 2.0\nboost_steps = 7\nsettle_steps = 9\nsettle_rate = 0.5\n\
             [start]\nthinnest = 0.5\n[density]\nfill = 70\n[model.network]\nform = \"paper\"\n\
             [tone]\nfamily = \"ap3\"\nlift_first = true\n";
@@ -41,7 +41,7 @@ mod tests {
     }
 
     #[test]
-    fn a_former_name_leads_to_a_setting_and_names_none_itself() {
+    fn a_former_name_maps_to_a_setting_and_is_not_one_itself() {
         for (former, key) in RENAMED {
             assert!(setting(key).is_some() && setting(former).is_none(), "{former}: {key}");
         }

@@ -1,4 +1,4 @@
-//! Parts of the model beside colour: those of LITA-GS, each with its switch.
+//! Parts of the model in addition to colour: those of LITA-GS, each of which can be on or off.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -73,7 +73,7 @@ impl FromStr for Part {
 
 settings! {
 "model."
-/// The parts of a model beside colour, and their constants. The default is colour alone.
+/// The parts of a model in addition to colour, and their constants. The default is colour alone.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ModelConfig {
     /// A network that removes noise from the render.
@@ -98,7 +98,7 @@ pub struct ModelConfig {
 sections {
     /// The size of the denoiser, and the variant of the networks.
     network: DenoiserSettings;
-    /// Weights of the terms beside (1 - w) L1 + w (1 - SSIM).
+    /// Weights of the terms in addition to (1 - w) L1 + w (1 - SSIM).
     weights: Weights;
     /// Adam's learning rates of the networks.
     rates: NetworkRates;
@@ -139,7 +139,7 @@ impl ModelConfig {
         }
     }
 
-    /// Logs where boxes or crops exceed the views.
+    /// Logs boxes or crops that are larger than the views.
     pub(super) fn log_parts(&self, sizes: &[UVec2]) {
         let shortest = sizes.iter().map(|size| size.min_element()).min().unwrap_or_default();
         let boxes = DepthBoxes::new(UVec2::splat(shortest), self.depth_box);
@@ -213,7 +213,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_part_brings_its_channels() {
+    fn each_part_adds_its_channels() {
         let mut model = ModelConfig::default();
         model.set_parts(&Part::ALL);
         assert_eq!(model.features().channels(), 8, "no noise map");
@@ -233,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_that_makes_no_sense_is_refused_by_name() {
+    fn an_invalid_rate_is_refused_by_name() {
         let mut model = ModelConfig::default();
         model.rates.denoiser = f64::NAN;
         assert!(model.check().unwrap_err().to_string().contains("rates.denoiser"));

@@ -1,6 +1,7 @@
 //! Patches: photographs too large for the device train in parts.
 //!
-//! A step trains on one patch, as on a view. Measurements, target and exposure belong to the whole photograph.
+//! A step trains on one patch as if it were a view. Measurements, target and exposure are those of the whole
+//! photograph.
 
 use std::ops::Range;
 
@@ -21,7 +22,7 @@ impl TrainConfig {
     /// The patches of a view: a single one if the device and [`TrainConfig::patch_pixels`] allow it.
     pub(crate) fn patches(&self, gpu: &Gpu, camera: &Camera) -> Vec<Patch> {
         let (settings, model) = (self.render_settings(), &self.model);
-        // Networks on crops bind only the crops.
+        // Networks on crops only bind the crops.
         let sees_all = model.denoiser_crop == 0;
         let denoiser = (sees_all && model.denoiser).then_some(model.network);
         let tonemapper = sees_all && model.tonemapper;
@@ -34,8 +35,8 @@ impl TrainConfig {
 }
 
 impl Trainer {
-    /// A smaller patch size, if the first Gaussians have too many intersections with the present one; `None` if they do
-    /// not, or smaller patches do not help.
+    /// A smaller patch size if the first Gaussians have too many intersections with the present one; `None` otherwise,
+    /// or if smaller patches do not help.
     pub(super) fn fewer_patch_pixels(&mut self) -> Result<Option<u64>> {
         let of_photograph = |patch: &Patch| Patch::from(&patch.camera).pixel_count();
         let patches = || self.supervision.views.whole().iter().map(|view| (view.place, view.patch));
@@ -56,14 +57,14 @@ impl Trainer {
 }
 
 impl Views {
-    /// Logs the photographs that train in patches.
+    /// Logs the photographs that are trained in patches.
     pub(super) fn log_patches(&self, gpu: &Gpu) {
         let mut cut = self.photographs().filter(|view| !view.patch.is_whole());
         let Some(TrainView { name, place, patch, .. }) = cut.next() else { return };
         let own = self.whole().iter().filter(|view| view.place == *place).count();
         let (Camera { width, height, .. }, UVec2 { x, y }) = (patch.camera, patch.size);
         tracing::warn!(
-            "{} of {} photographs are trained on in patches, as {} or patch_pixels takes no more at once: {name}, \
+            "{} of {} photographs are trained in patches, due to {} or patch_pixels: {name}, \
              {width}x{height}, in {own} of about {x}x{y}",
             1 + cut.count(),
             self.photographs().count(),
@@ -74,10 +75,10 @@ impl Views {
     /// The target of a photograph, at its full size.
     ///
     /// # Errors
-    /// As [`Views::pictures`].
+    /// Those of [`Views::pictures`].
     pub(super) fn picture(&self, gpu: &Gpu, pseudo_gt: &PseudoGt, place: usize) -> Result<Image> {
         let pictures = self.pictures(gpu, pseudo_gt, place..place + 1, ImageKind::Targets)?;
-        let gone = || Error::Usage(format!("there is no photograph {place} to train on"));
+        let gone = || Error::Usage(format!("there is no training photograph {place}"));
         pictures.into_iter().next().ok_or_else(gone)
     }
 
@@ -145,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_device_binds_says_how_many_patches_a_photograph_has() {
+    fn the_device_limits_determine_the_number_of_patches() {
         let gpu = gpu();
         if gpu.properties().max_storage_buffer_range != 1 << 27 {
             eprintln!("not run: this device binds {}", gpu.properties().max_storage_buffer_range);

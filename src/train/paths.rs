@@ -16,8 +16,8 @@ impl TrainConfig {
         self
     }
 
-    /// The configuration of a run in `folder`: relative paths, in older or edited files, start there or, with a
-    /// warning, in the current folder if they exist only there.
+    /// The configuration of a run in `folder`: relative paths, in older or edited files, are relative to it or, with a
+    /// warning, to the current folder if they exist only there.
     pub(crate) fn with_paths_from(mut self, folder: &Path) -> Self {
         for path in self.paths().into_iter().filter(|path| path.is_relative()) {
             let from_run = folder.join(&*path);
@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_relative_path_begins_at_the_run_and_a_recorded_one_is_absolute() {
+    fn a_relative_path_starts_at_the_run_and_a_recorded_one_is_absolute() {
         let folder = tempfile::tempdir().unwrap();
         std::fs::create_dir(folder.path().join("photos")).unwrap();
         let config = TrainConfig { dataset: "photos".into(), ..TrainConfig::default() };

@@ -11,7 +11,7 @@ use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, LoadOptions};
 use crate::{Error, Result};
 
-/// Requested settings of a run beside its plan, from the weakest to the strongest.
+/// Requested settings of a run in addition to its plan, from the lowest precedence to the highest.
 #[derive(Clone, Debug, Default)]
 pub struct RequestedSettings {
     /// The preset; `None`: the defaults, which are balanced.
@@ -65,7 +65,7 @@ impl RequestedSettings {
         if let Some(plan) = plan {
             // Any requested tone setting decides the curve.
             let names_a_curve = requested.iter().any(|layer| layer.names("tone."));
-            // Exposures and the tonemapper exclude each other, and a plan never asks for both.
+            // Exposures and the tonemapper exclude each other, and a plan never enables both.
             let has_tonemapper = get("model.tonemapper") == Some(&Value::Boolean(true));
             let mut layer = plan.layer()?;
             layer.0.retain(|(key, ..)| match key.as_str() {
@@ -141,7 +141,7 @@ impl Preset {
 }
 
 impl Trainer {
-    /// A trainer on the dataset in a folder, with settings as config.toml holds them; a diagnosis of the photographs
+    /// A trainer on the dataset in a folder, with settings in the format of config.toml; a diagnosis of the photographs
     /// decides the rest.
     ///
     /// # Errors
@@ -155,8 +155,8 @@ impl Trainer {
         Self::new(gpu, run.config, &run.dataset)
     }
 
-    /// A trainer as of `nightsplat train --preset`: the photographs are diagnosed, unless the preset states everything.
-    /// `dataset` is loaded with [`Preset::load_options`].
+    /// A trainer as of `nightsplat train --preset`: the photographs are diagnosed, unless the preset sets everything.
+    /// `dataset` must be loaded with [`Preset::load_options`].
     ///
     /// # Errors
     /// The dataset cannot be used, or the device is out of memory or lost.

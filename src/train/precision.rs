@@ -39,20 +39,20 @@ pub enum PhotographBits {
     /// 32.
     #[serde(rename = "32")]
     Single,
-    /// At most 16: multiples of 1/65535 where that is not exact.
+    /// At most 16: multiples of 1/65535 unless the values are exact in fewer bits.
     #[serde(rename = "16")]
     Sixteen,
-    /// 8: multiples of 1/255 where that is not exact.
+    /// 8: multiples of 1/255 unless the values are exact.
     #[serde(rename = "8")]
     Eight,
 }
 
-/// Uploads photographs in the requested bits.
+/// Uploads photographs with the requested bits.
 #[derive(Debug)]
 pub(super) struct Encoder {
     gpu: Gpu,
     bits: PhotographBits,
-    /// The multiples of 1/255 and of 1/65535, made when needed.
+    /// The multiples of 1/255 and of 1/65535, created when needed.
     grids: [Option<Arc<Buffer<f32>>>; 2],
 }
 
@@ -90,7 +90,7 @@ impl Encoder {
             PhotographBits::Sixteen => 1,
             _ => return plain(&self.gpu),
         };
-        // A grid from 0 to 1 cannot hold values beyond it, nor NaN.
+        // A grid from 0 to 1 cannot represent values beyond it, nor NaN.
         if !values.iter().all(|value| (0.0..=1.0).contains(value)) {
             return plain(&self.gpu);
         }
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn exact_gives_every_bit_back_in_as_few_bits_as_it_can() {
+    fn exact_restores_every_bit_from_as_few_bits_as_possible() {
         for len in [66, 1023, 1026, 1029, 2052] {
             let values = photograph(len, 2);
             let (back, kept) = kept(PhotographBits::Exact, &values);
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn a_grid_is_off_by_half_a_step_at_most_and_leaves_alone_what_lies_beyond() {
+    fn a_grid_rounds_by_at_most_half_a_step_and_keeps_values_beyond_it() {
         let stream = Stream::new(7, 2);
         let values: Vec<f32> = (0..60_000).map(|i| stream.uniform(i) as f32).collect();
         for (asked, expected, step) in
@@ -223,7 +223,7 @@ mod tests {
             let beyond = [&values[..], &[1.5; 3]].concat();
             assert_eq!(self::kept(asked, &beyond), (beyond, 32));
         }
-        // An 8-bit photograph lies on the grid, and 16 bits hold what 8 cannot.
+        // An 8-bit photograph is on the grid, and 16 bits represent what 8 cannot.
         let codes = photograph(60_005, 200)[5..].to_vec();
         assert_eq!(kept(PhotographBits::Eight, &codes), (codes, 8));
         let fine = photograph(60_003, 5_000);

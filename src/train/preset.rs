@@ -1,4 +1,4 @@
-//! Presets: trades of time for quality, and the constants that the paper and its code state for a benchmark.
+//! Presets: trade-offs of time and quality, and the constants of the paper and its code for a benchmark.
 //!
 //! They are files in `presets/`: the settings of config.toml that differ from the defaults.
 
@@ -12,7 +12,7 @@ use super::layers::{Origin, SettingsLayer};
 use crate::photographs::tone::ToneCurve;
 use crate::{Error, Result};
 
-/// A trade of time for quality, or a benchmark of the paper.
+/// A trade-off of time and quality, or a benchmark of the paper.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Preset {
     /// A first look.
@@ -23,7 +23,7 @@ pub enum Preset {
     Balanced,
     /// The best score.
     Best,
-    /// The paper's curve, length and density control; nothing is diagnosed.
+    /// The paper's curve, number of steps and density control, without a diagnosis.
     Paper,
     /// LOM: `bike`, `buu`, `chair`, `shrub`, `sofa`.
     Lom,
@@ -60,8 +60,8 @@ impl Preset {
         }
     }
 
-    /// The preset's differences from the defaults, as TOML; a benchmark has those of the paper and more, which depend
-    /// on curve and scene.
+    /// The preset's differences from the defaults, as TOML; a benchmark has those of the paper and additional ones that
+    /// depend on curve and scene.
     pub(crate) fn toml(self) -> &'static str {
         match self {
             Self::Draft => include_str!("presets/draft.toml"),
@@ -98,7 +98,7 @@ impl Preset {
     /// the scene that the dataset's folder is named after, that file's.
     ///
     /// # Errors
-    /// None for the presets that there are.
+    /// None for the existing presets.
     pub(super) fn layer(self, curve: Option<ToneCurve>, dataset: &Path) -> Result<SettingsLayer> {
         let origin = Origin::Preset(self.name());
         let mut layer = SettingsLayer::of_toml(self.toml(), &origin)?;
@@ -196,7 +196,7 @@ mod tests {
     const PAPER: [Preset; 4] = [Preset::Paper, Preset::Lom, Preset::RealX3d, Preset::Mip360Varying];
 
     #[test]
-    fn the_paper_and_its_benchmarks_have_its_density_control_and_nothing_else_has() {
+    fn only_the_paper_and_its_benchmarks_have_its_density_control() {
         for preset in Preset::ALL {
             let config = applied(preset, "x", ToneCurve::Ap3);
             let is_paper = config.density.control == DensityControl::Paper;
@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn balanced_is_the_default_and_paper_is_the_paper_beside_the_bare_method() {
+    fn balanced_is_the_default_and_paper_is_the_paper_added_to_the_bare_method() {
         assert_eq!(
             applied(Preset::Balanced, "x", ToneCurve::Auto),
             TrainConfig { dataset: "data/x".into(), ..TrainConfig::default() }
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn a_preset_sets_what_it_says_and_leaves_the_rest() {
+    fn a_preset_changes_only_its_own_settings() {
         let mut config = TrainConfig { seed: 4, ..Default::default() };
         config.schedule.means_rate_steps = 7;
         Preset::Draft.apply(&mut config).unwrap();
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_of_the_code_brings_its_own_constants() {
+    fn a_scene_of_the_papers_code_has_its_own_constants() {
         let shrub = applied(Preset::Lom, "shrub", ToneCurve::Ap3);
         assert_eq!((shrub.steps, shrub.ssim_weight, shrub.model.network.stages), (5_000, 0.4, 6));
         assert_eq!(shrub.schedule.initial_rates[Attribute::Means], 2.5e-4);

@@ -16,9 +16,12 @@ use crate::base::settings::Setting;
 /// Never.
 pub fn reference() -> Result<String> {
     let mut text = "# Settings\n\n\
-        Every setting of a training run, by its key in `config.toml` and for `train --set KEY=VALUE`, with its option if it has\n\
-        one. Precedence, weakest first: default, preset, plan, `--config FILE`, options, `--set`. `train --explain` prints each\n\
-        setting with its value and origin, as does `config.toml` of a run. This page is generated from the command's table.\n"
+        Every setting of a training run, by its key in `config.toml` and for `train --set KEY=VALUE`, with its \
+        option if it has\n\
+        one. Precedence, weakest first: default, preset, plan, `--config FILE`, options, `--set`. \
+        `train --explain` prints each\n\
+        setting with its value and origin, as does `config.toml` of a run. This page is generated from the \
+        command's table.\n"
         .to_owned();
     let values = values(&TrainConfig::default())?;
     let mut section = None;

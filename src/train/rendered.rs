@@ -23,7 +23,7 @@ impl Rendered {
     /// denoiser's norms over each patch.
     ///
     /// # Errors
-    /// As [`Renderer::render_image`]; the device is out of memory for the view or the networks.
+    /// Those of [`Renderer::render_image`]; the device is out of memory for the view or the networks.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn new<'a>(
         renderer: &mut Renderer,

@@ -1,4 +1,4 @@
-//! The table of all settings: keys, values, and errors for others.
+//! The table of all settings: keys, values, and errors for invalid ones.
 
 use std::sync::LazyLock;
 
@@ -48,7 +48,7 @@ pub fn setting(key: &str) -> Option<&'static Setting> {
     SETTINGS.iter().find(|row| row.key == key)
 }
 
-/// The keys and values of a table; a table that is the value of a setting stays one.
+/// The keys and values of a table; a table that is the value of a setting is kept.
 pub(super) fn flat(prefix: &str, table: Table) -> Vec<(String, Value)> {
     let of = |(name, value): (String, Value)| {
         let key = format!("{prefix}{name}");
@@ -67,7 +67,7 @@ fn is_section(name: &str) -> bool {
     SETTINGS.iter().any(|row| row.key.strip_prefix(name).is_some_and(|rest| rest.starts_with('.')))
 }
 
-/// Whether a rule takes a value.
+/// Whether a rule accepts a value.
 pub(super) fn takes(rule: &Rule, value: &Value) -> bool {
     match (rule, value) {
         (Rule::Flag, Value::Boolean(_)) | (Rule::Table(_), Value::Table(_)) => true,
@@ -88,7 +88,7 @@ pub(super) fn number(value: &Value) -> Option<f64> {
     value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64))
 }
 
-/// The text as a TOML value; `None` if it is not a single one.
+/// The text as a TOML value; `None` if it is not a single value.
 pub(super) fn value(text: &str) -> Option<Value> {
     let mut table: Table = toml::from_str(&format!("value = {text}")).ok()?;
     (table.len() == 1).then(|| table.remove("value")).flatten()
@@ -115,7 +115,8 @@ pub(super) fn unknown(key: &str) -> Error {
     Error::Usage(format!("no setting is called `{key}`{hint}"))
 }
 
-/// The Levenshtein distance of two names less the length of their common prefix, so that half a name is near the whole.
+/// The Levenshtein distance of two names minus the length of their common prefix, so that half a name is close to the
+/// whole.
 fn distance(from: &str, to: &str) -> i64 {
     let alike = from.chars().zip(to.chars()).take_while(|(from, to)| from == to).count();
     let to: Vec<char> = to.chars().collect();
@@ -172,12 +173,12 @@ mod tests {
     }
 
     #[test]
-    fn every_setting_of_a_configuration_has_one_row_and_every_row_is_one() {
+    fn every_setting_of_a_configuration_has_one_row_and_every_row_is_a_setting() {
         let keys: Vec<&str> = SETTINGS.iter().map(|row| row.key.as_ref()).collect();
         let rows: BTreeSet<&str> = keys.iter().copied().collect();
         assert_eq!(keys.len(), rows.len(), "a key has two rows");
         let mut written: BTreeSet<String> = values(&whole()).unwrap().into_keys().collect();
-        // These come with a curve.
+        // These belong to a curve.
         written.extend(["tone.constants", "tone.table", "tone.profile"].map(str::to_owned));
         assert_eq!(written, rows.into_iter().map(str::to_owned).collect());
         let options: Vec<_> =
@@ -190,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn every_default_follows_its_rule_and_every_word_of_a_rule_is_one_that_its_type_has() {
+    fn every_default_obeys_its_rule_and_every_word_of_a_rule_is_a_value_of_its_type() {
         for (key, value) in values(&whole()).unwrap() {
             let row = setting(&key).unwrap();
             assert!(takes(&row.rule, &value), "{key} = {value}: {}", row.rule);
@@ -206,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn a_setting_that_is_left_out_by_default_is_set_and_refused_by_its_own_name() {
+    fn a_setting_without_a_default_is_set_and_refused_by_its_own_name() {
         assert_eq!(with(&["frame.scale=2"]).unwrap().frame.unwrap().scale, 2.0);
         assert_eq!(
             with(&["stop.not_finite=skip-view"]).unwrap().stop.not_finite,
@@ -220,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_that_is_none_or_out_of_its_range_is_refused_wherever_it_stands() {
+    fn an_invalid_number_is_refused_in_every_setting() {
         let mut count = 0;
         for row in SETTINGS.iter() {
             let wrong: &[&str] = match row.rule {
@@ -242,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn a_key_that_is_no_setting_is_named_with_the_nearest_of_its_section() {
+    fn an_unknown_key_is_refused_with_the_nearest_of_its_section() {
         for (key, nearest) in [
             ("tone.alhpa", "tone.alpha"),
             ("alpha", "tone.alpha"),

@@ -60,7 +60,7 @@ impl TrainConfig {
 
     /// The SH degree in use at a step, at most `highest`.
     pub(super) fn sh_degree_at(&self, step: u64, highest: u32) -> u32 {
-        // With fewer degrees, the first steps would train a given model to do without them.
+        // With fewer degrees, the first steps would train a given model to do without the higher ones.
         if self.init.is_some() { highest } else { self.schedule.sh_degree(step, highest) }
     }
 }
@@ -69,12 +69,12 @@ impl Trainer {
     /// A trainer for [`Trainer::restore`], which does not read [`TrainConfig::init`].
     ///
     /// # Errors
-    /// As [`Trainer::new`].
+    /// Those of [`Trainer::new`].
     pub(crate) fn to_restore(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
         Self::on_patches(gpu, config, dataset, None)
     }
 
-    /// Restarts with smaller patches if the first Gaussians exceed the device on the present ones.
+    /// Restarts with smaller patches if the first Gaussians exceed the device's limits with the present ones.
     pub(super) fn on_patches(
         gpu: &Gpu,
         mut config: TrainConfig,
@@ -105,7 +105,7 @@ impl Trainer {
         config.disable_missing_parts(dataset);
         config.frame.get_or_insert_with(|| dataset.frame());
         thread::scope(|scope| {
-            // Pipelines compile on another thread while the views are uploaded and measured.
+            // Pipelines are compiled on another thread while the views are uploaded and measured.
             let own = config.clone();
             let beside = scope
                 .spawn(move || Ok((Kernels::new(gpu, &own, dataset)?, Fingerprint::of(dataset)?)));
@@ -156,7 +156,7 @@ impl Trainer {
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = config.render_settings().channels() * pixels.unwrap_or_default();
         let pictures = views.largest_view_values();
-        // Only networks use the photograph beside the target.
+        // Only networks use the photograph in addition to the target.
         let photographs = if networks.is_some() { pictures } else { 0 };
         let supervision = Supervision {
             views,
@@ -215,7 +215,7 @@ fn given(gaussians: &Gaussians, config: &TrainConfig) -> Result<Gaussians> {
 
 /// Training views on which the cost of a round of density control is measured.
 const PROBES: usize = 8;
-/// The pixels of one; all take at most 100 MB of the host.
+/// Pixels of each; all take at most 100 MB of host memory.
 const MAX_PROBE_PIXELS: usize = 1 << 20;
 
 fn probes(
@@ -228,7 +228,7 @@ fn probes(
     if config.density.control == DensityControl::Paper {
         return Ok(TargetViews::default());
     }
-    // No larger than the views that steps render.
+    // At most as large as the views that steps render.
     let largest = sizes.iter().map(|size| size.element_product() as usize).max();
     let pixels = largest.unwrap_or_default().min(MAX_PROBE_PIXELS);
     let frame = config.frame.unwrap_or_default();

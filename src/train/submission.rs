@@ -74,14 +74,14 @@ struct Submitted {
 }
 
 impl Trainer {
-    /// Fixes the number of submissions in flight, and of steps in each; `None`: as suits the device.
+    /// Fixes the number of submissions in flight, and the steps of each; `None`: chosen by timing.
     #[doc(hidden)]
     pub fn set_batching(&mut self, in_flight: usize, steps: Option<u64>) {
         self.submissions.batching =
             StepBatching { in_flight: in_flight.max(1), steps, ..StepBatching::default() };
     }
 
-    /// Trains up to `until`, to the next step of density control, or for about half a second.
+    /// Trains up to `until`, up to the next step of density control, or for about half a second.
     ///
     /// If that fails after finished steps, these are reported first and the next call returns the error, so that
     /// reports match the model.
@@ -108,7 +108,7 @@ impl Trainer {
         self.control()
     }
 
-    /// Trains up to `until`, to the next step with a due action, or for about half a second.
+    /// Trains up to `until`, up to the next step with an action due, or for about half a second.
     pub(super) fn train_steps(&mut self, until: u64, reports: &mut Vec<StepReport>) -> Result<()> {
         self.allocate_sh_degree()?;
         let (begin, mut next) = (Instant::now(), self.step + 1);
@@ -149,7 +149,7 @@ impl Trainer {
         self.convergence.decisions.degree_due =
             !reports.is_empty() && self.decides_degree_at(self.step);
         if !reports.is_empty() && self.densifies_at(self.step) {
-            // Due whether or not there is memory for it.
+            // The round is due whether or not there is memory for it.
             self.convergence.decisions.density_due = Some(0);
             self.convergence.decisions.density_due = Some(self.renderer.intersections()?);
         }
@@ -217,7 +217,7 @@ impl Trainer {
         Ok(Submitted { steps, at: Instant::now(), log, status })
     }
 
-    /// Waits for a submission and reports its steps; false if one has to be redone.
+    /// Waits for a submission and reports its steps; false if one must be redone.
     fn finish(&mut self, submitted: Submitted, reports: &mut Vec<StepReport>) -> Result<bool> {
         let Submitted { steps, at, log, status } = submitted;
         let (log, status) = (log.wait()?, Status::from_words(&status.wait()?));
@@ -225,7 +225,7 @@ impl Trainer {
         self.submissions.batching.measure(at, count);
         // Steps from the first failed one on have changed nothing.
         let done = log.iter().take(count as usize).take_while(|losses| losses.status == 0).count();
-        // This flag is raised after the loss: by the step before the first that saw it.
+        // This flag is raised after the loss: by the step before the first one that saw it.
         let done = if status.gradient_not_finite { done.saturating_sub(1) } else { done };
         let milliseconds =
             self.submissions.batching.step.as_secs_f64() * 1e3 * count as f64 / done.max(1) as f64;
@@ -268,7 +268,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Leaves out the view of a step, which is undone; false if it is the last view.
+    /// Leaves out the view of an undone step; false if it is the last view.
     fn leave_out_view_of(&mut self, step: u64) -> Result<bool> {
         let place = self.view_of(step).place;
         if !self.supervision.views.leave_out(place) {

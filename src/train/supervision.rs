@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! stored photograph -> pseudo-GT pass -> target ┐
-//! render -> exposure -> mask ------------------ ┴-> colour terms -> mask -> exposure, backwards -> d_render
+//! render -> exposure -> mask ------------------ ┴-> colour terms -> mask -> exposure, backward -> d_render
 //! render and features -> networks -> their terms -------------------------------------------------^
 //! ```
 
@@ -102,7 +102,7 @@ impl Supervision {
     /// Records the terms on parameters, which add to the gradients of the model.
     ///
     /// # Errors
-    /// As [`Supervision::compare`].
+    /// Those of [`Supervision::compare`].
     pub(super) fn regularise(
         &mut self,
         (gpu, pass): (&Gpu, &mut Recorder<'_>),
@@ -115,10 +115,10 @@ impl Supervision {
         model.record_terms((gpu, pass), terms, &mut LogSlot { log: &mut self.log, slot, status })
     }
 
-    /// Records Adam's step of the learned parameters beside the Gaussians.
+    /// Records Adam's step of the learned parameters other than the Gaussians.
     ///
     /// # Errors
-    /// As [`Supervision::compare`].
+    /// Those of [`Supervision::compare`].
     pub(super) fn update(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -136,7 +136,7 @@ impl Supervision {
         }
     }
 
-    /// The learned parameters beside the Gaussians, for Adam and checkpoints.
+    /// The learned parameters other than the Gaussians, for Adam and checkpoints.
     pub(super) fn learnables(&mut self) -> impl Iterator<Item = &mut dyn Learnable> {
         let networks = self.networks.iter_mut().flat_map(|terms| terms.networks.parameters_mut());
         let networks = networks.map(|parameters| parameters as &mut dyn Learnable);

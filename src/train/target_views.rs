@@ -35,8 +35,8 @@ struct TargetView {
 }
 
 impl TargetViews {
-    /// The views with their targets, made as those of training views. Views that are black or masked entirely are left
-    /// out, with a warning.
+    /// The views with their targets, made as for training views. Views that are entirely black or masked are left out,
+    /// with a warning.
     ///
     /// # Errors
     /// A photograph can no longer be read, or the device is out of memory or lost.
@@ -53,7 +53,7 @@ impl TargetViews {
             if counted.is_empty() || is_black(&LuminanceHistogram::of(&counted)) {
                 let name = &view.name;
                 tracing::warn!(
-                    "view {name} is black or masked entirely: the model is not scored on it"
+                    "view {name} is entirely black or masked: the model is not scored on it"
                 );
                 continue;
             }
@@ -68,7 +68,7 @@ impl TargetViews {
     /// are resized to about that.
     ///
     /// # Errors
-    /// As [`TargetViews::new`].
+    /// Those of [`TargetViews::new`].
     pub(super) fn probes(
         pseudo_gt: &PseudoGt,
         dataset: &Dataset,
@@ -137,7 +137,7 @@ fn clamped(image: &Image) -> Image {
     Image { data, ..*image }
 }
 
-/// The target of a view, made as those of the training views.
+/// The target of a view, made as for training views.
 fn target_of(
     pseudo_gt: &PseudoGt,
     view: &View,
@@ -168,7 +168,7 @@ impl TestTargets {
         Self::in_scene(gpu, tone, &scene)
     }
 
-    /// As [`TestTargets::new`], for training photographs that are already measured.
+    /// [`TestTargets::new`] for training photographs that are already measured.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -209,12 +209,12 @@ impl Trainer {
         self.held_out_psnr_of_degree(self.sh_degree(self.step))
     }
 
-    /// As [`Trainer::held_out_psnr`], with an SH degree.
+    /// [`Trainer::held_out_psnr`] with a given SH degree.
     pub(super) fn held_out_psnr_of_degree(&mut self, sh_degree: u32) -> Result<Option<f64>> {
         Ok(self.psnr_of_held_out(sh_degree)?.map(|[colors, _]| colors))
     }
 
-    /// The mean PSNR, dB, of R_0 and of the output, R_K where the model has a denoiser; `None` if no view is held out.
+    /// The mean PSNR, dB, of R_0 and of the output (R_K if the model has a denoiser); `None` if no view is held out.
     fn psnr_of_held_out(&mut self, sh_degree: u32) -> Result<Option<[f64; 2]>> {
         let views = std::mem::take(&mut self.convergence.held_out);
         let scores = views.mean_psnr(&[], |camera| self.render_of_degree(camera, sh_degree));
@@ -222,13 +222,13 @@ impl Trainer {
         scores
     }
 
-    /// Resets the denoiser to the identity if it hardly improves the held-out views, or else some training views, over
-    /// R_0. For the end of a run; the paper's denoiser stays.
+    /// Resets the denoiser to the identity if it hardly improves the held-out views (or, without any, some training
+    /// views) over R_0. Called at the end of a run; the paper's denoiser is kept.
     ///
     /// # Errors
     /// The device is out of memory or lost.
     pub(crate) fn drop_unused_degree(&mut self) -> Result<()> {
-        /// In dB; less, on few views, is chance.
+        /// In dB; on few views, smaller gains are chance.
         const MIN_GAIN: f64 = 0.05;
         if !self.supervision.networks.as_ref().is_some_and(NetworkTerms::follow_target) {
             return Ok(());
@@ -249,7 +249,7 @@ impl Trainer {
             tracing::info!("the denoiser gains {gain:.2} dB on targets");
             return Ok(());
         }
-        tracing::info!("the denoiser gains nothing on targets ({gain:.2} dB) and is left out");
+        tracing::info!("the denoiser gains nothing on targets ({gain:.2} dB) and is dropped");
         match self.supervision.networks.as_mut().and_then(|terms| terms.networks.denoiser.as_mut())
         {
             Some(denoiser) => denoiser.become_identity(),

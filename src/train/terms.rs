@@ -17,7 +17,7 @@ use crate::networks::{Denoiser, NetworkVariant};
 use crate::splats::scene::{COLOR_CHANNELS, Feature};
 use crate::{Error, Result};
 
-/// The images of a view that the networks are trained against, (3, H, W) each.
+/// The images of a view that are targets of the networks, (3, H, W) each.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Photographs<'a> {
     /// The mask, (H, W); `None`: all pixels count.
@@ -61,7 +61,7 @@ struct CropMask {
 }
 
 impl CropMask {
-    /// As [`Masking::shown`].
+    /// [`Masking::shown`] for a crop.
     fn shown(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -72,7 +72,7 @@ impl CropMask {
         self.masking.shown(pass, &self.weights, size, output, held_to)
     }
 
-    /// As [`Masking::hide`], for colours.
+    /// [`Masking::hide`] for the colours of a crop.
     fn hide(&self, pass: &mut Recorder<'_>, size: UVec2, d_output: &mut Buffer<f32>) -> Result<()> {
         self.masking.hide(pass, &self.weights, (size, COLOR_CHANNELS), d_output)
     }
@@ -137,8 +137,8 @@ impl NetworkTerms {
         Ok(Some(terms))
     }
 
-    /// Keeps the activations of every stage of the denoiser, for crops of views of these sizes, if that takes at most
-    /// `most` bytes and the device has them.
+    /// Keeps the activations of every stage of the denoiser, for crops of views of these sizes, if they take at most
+    /// `most` bytes and the device has that memory.
     ///
     /// # Errors
     /// The device was lost.
@@ -184,7 +184,7 @@ impl NetworkTerms {
         Ok(())
     }
 
-    /// The radius of the terms of a pixel, in pixels.
+    /// The radius of the terms around a pixel, in pixels.
     fn margin(&self) -> u32 {
         let denoiser = self.networks.denoiser.as_ref().map_or(0, Denoiser::margin);
         let tonemapper = self.networks.tonemapper.as_ref();
@@ -196,7 +196,7 @@ impl NetworkTerms {
         self.variant == NetworkVariant::Identity && self.networks.has_denoiser()
     }
 
-    /// Records the networks' step: adds to `dL/dR_0` and writes the planes of noise and illumination in `d_render`,
+    /// Records the networks' step: adds to `dL/dR_0`, and writes the planes of noise and illumination in `d_render`,
     /// (channels, H, W).
     pub(super) fn record(
         &mut self,

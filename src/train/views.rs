@@ -35,7 +35,7 @@ pub(super) struct TrainView {
     pub(super) index: usize,
     /// Its part of the photograph, in the frame.
     pub(super) patch: Patch,
-    /// The given depth, (H, W), if the dataset's has another size.
+    /// The given depth, (H, W), if the dataset's map has another size.
     depth: Option<Vec<f32>>,
     /// The stored image from which its target is made in every step: planar (3, H, W), sRGB-encoded.
     stored: Slot,
@@ -211,10 +211,10 @@ impl Views {
         pseudo_gt.record(pass, self.cache.on_device(view.stored)?, self.curve(view), scratch)
     }
 
-    /// As [`Self::record_target`], for the dark photograph of a view, if that is kept.
+    /// [`Self::record_target`] for the dark photograph of a view, if that is kept.
     ///
     /// # Errors
-    /// As there.
+    /// Those of [`Self::record_target`].
     pub(super) fn record_photograph<'a>(
         &'a self,
         pass: &mut Recorder<'_>,
@@ -277,8 +277,8 @@ impl Views {
         Ok(Arc::new(target))
     }
 
-    /// The view of a step at a level: every epoch takes each view once, in its own order, and the next one twice for
-    /// one that is left out.
+    /// The view of a step at a level: every epoch takes each view once, in its own order; the view after one that is
+    /// left out is taken twice.
     pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> ViewId {
         let views = &self.levels[level];
         let (order, place) = self.epochs.of_step(seed, step, views.len());
@@ -363,9 +363,9 @@ struct LevelImage<'a> {
     photograph: Image,
     /// Its target, if the curve was applied at another size.
     target: Option<Image>,
-    /// Whether the photograph is kept beside the target.
+    /// Whether the photograph is kept in addition to the target.
     keeps_photograph: bool,
-    /// The depth, if it is not the dataset's.
+    /// The depth, if it differs from the dataset's map.
     depth: Option<Vec<f32>>,
 }
 
@@ -395,7 +395,7 @@ impl LevelImage<'_> {
     }
 }
 
-/// A size halved once for each level, as far as its shorter side allows.
+/// The size halved once per level, as far as its shorter side allows.
 fn shrunk(size: UVec2, level: u32) -> UVec2 {
     let suits = |&level: &u32| level == 0 || (size >> level).min_element() >= SHORTEST_SIDE;
     (0..=level).rev().find(suits).map_or(size, |level| size >> level)

@@ -33,7 +33,7 @@ fn every_curve_is_listed_with_its_formula_and_source() {
 }
 
 #[test]
-fn values_are_those_of_the_formula() {
+fn values_agree_with_the_formula() {
     let values = printed("gamma hable-2010 linear ap3 --table --at 0.25,1");
     let row = |name: &str| {
         let line = values.lines().find(|line| line.starts_with(name)).unwrap();
@@ -70,7 +70,7 @@ fn curves_are_drawn_with_the_statistics_of_a_dataset() {
 }
 
 #[test]
-fn a_plot_without_names_shows_six_curves_and_says_how_to_choose_others() {
+fn a_plot_without_names_shows_six_curves_and_explains_how_to_choose_others() {
     let folder = tempfile::tempdir().unwrap();
     let svg = folder.path().join("curves.svg");
     let message = printed(&format!("--plot {}", svg.display()));

@@ -1,4 +1,4 @@
-//! `nightsplat doctor`, as a script runs it, and on machines that lack something.
+//! `nightsplat doctor` in scripts, and on machines that lack something.
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -8,7 +8,7 @@ use serde_json::Value;
 use crate::common::command::{command, refused_with, succeed};
 
 #[test]
-fn json_holds_every_requirement_of_every_device_and_the_choice() {
+fn json_has_every_requirement_of_every_device_and_the_choice() {
     let printed: Value = serde_json::from_str(&succeed("doctor --json")).unwrap();
     let devices = printed["devices"].as_array().unwrap();
     let chosen = &devices[printed["chosen"].as_u64().unwrap() as usize];
@@ -27,7 +27,7 @@ fn json_holds_every_requirement_of_every_device_and_the_choice() {
 }
 
 #[test]
-fn a_schedulers_variables_that_name_no_device_are_one_line() {
+fn scheduler_variables_without_a_device_are_refused_in_one_line() {
     for (variable, value) in [("CUDA_VISIBLE_DEVICES", "99"), ("ROCR_VISIBLE_DEVICES", "GPU-ff")] {
         let message = [&format!("{variable}={value}"), "which Vulkan does not have", "--device"];
         for command in ["doctor", "bench"] {
@@ -42,7 +42,7 @@ fn a_schedulers_variables_that_name_no_device_are_one_line() {
 }
 
 #[test]
-fn a_subgroup_that_the_device_does_not_have_is_one_line_with_those_that_it_has() {
+fn an_unsupported_subgroup_size_is_refused_in_one_line_with_the_supported_ones() {
     let printed: Value = serde_json::from_str(&succeed("doctor --json")).unwrap();
     let chosen = &printed["devices"][printed["chosen"].as_u64().unwrap() as usize];
     let sizes = chosen["subgroup_sizes"].as_array().unwrap();
@@ -73,9 +73,9 @@ fn an_empty_list_of_gpus_leaves_the_software_device() {
 
 #[test]
 #[cfg(target_os = "linux")]
-fn without_a_loader_the_remedy_is_said() {
+fn without_a_loader_the_remedy_is_printed() {
     let folder = tempfile::tempdir().unwrap();
-    // The linker finds this file first, and it is no library.
+    // The linker finds this file first, and it is not a library.
     std::fs::write(folder.path().join("libvulkan.so.1"), "").unwrap();
     let environment = [("LD_LIBRARY_PATH", folder.path().to_str().unwrap())];
     let remedy = ["there is no Vulkan loader", "apt install libvulkan1"];

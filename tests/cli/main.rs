@@ -1,4 +1,4 @@
-//! The built binary, as a shell runs it: what it writes, what it prints, and what it says of bad input.
+//! The built binary as a shell runs it: its files, its output, and its errors for bad input.
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -24,7 +24,7 @@ mod tone_command;
 mod tuning;
 use common::command::{refused, succeed};
 
-/// Work that the tests share, done once: a small set and a short run on it.
+/// Work shared by the tests, done once: a small dataset and a short run on it.
 struct Fixture {
     folder: tempfile::TempDir,
 }
@@ -55,7 +55,7 @@ impl Fixture {
     }
 }
 
-/// A copy of the fixture's set, to spoil.
+/// A copy of the fixture's dataset, to damage.
 fn copied_set() -> tempfile::TempDir {
     fn copy(from: &Path, to: &Path) {
         fs::create_dir_all(to).unwrap();
@@ -90,7 +90,7 @@ fn file_names(folder: impl AsRef<Path>) -> Vec<String> {
 }
 
 #[test]
-fn a_run_directory_has_its_four_files_and_metrics_their_shape() {
+fn a_run_directory_has_its_files_and_metrics_have_their_keys() {
     let run = fixture().path("run");
     for name in ["config.toml", "metrics.json", "model.ply", "train.csv"] {
         assert!(run.join(name).is_file(), "{name}");
@@ -139,9 +139,9 @@ fn a_run_directory_has_its_four_files_and_metrics_their_shape() {
 }
 
 #[test]
-fn one_seed_gives_one_model_whatever_the_references_show() {
+fn a_seed_gives_one_model_for_any_references() {
     let set = copied_set();
-    // Every reference pixel changes, and the model's bits may not.
+    // Every reference pixel changes, but the model's bits must not.
     for name in file_names(set.path().join("high")) {
         let path = set.path().join("high").join(name);
         let mut image = Image::load(&path).unwrap();
@@ -155,7 +155,7 @@ fn one_seed_gives_one_model_whatever_the_references_show() {
     let means = [fixture().path("run"), run.clone()]
         .map(|run| json(run.join("metrics.json"))["mean"].clone());
     assert_ne!(means[0], means[1], "the scores ought to change with the references");
-    // A finished run becomes the configuration of the next, which replaces it.
+    // A finished run is the configuration of the next, which replaces it.
     let config = fixture().path("run/config.toml");
     succeed(&format!(
         "train {root} --out {} --config {} --overwrite",
@@ -177,7 +177,7 @@ fn one_seed_gives_one_model_whatever_the_references_show() {
 }
 
 #[test]
-fn eval_agrees_with_train_and_saves_what_it_scored() {
+fn eval_agrees_with_train_and_saves_the_scored_images() {
     let fixture = fixture();
     let run = fixture.path("run");
     let printed: Value =
@@ -213,7 +213,7 @@ fn eval_agrees_with_train_and_saves_what_it_scored() {
 }
 
 #[test]
-fn eval_scores_lpips_where_it_is_given_the_weights() {
+fn eval_scores_lpips_with_given_weights() {
     let fixture = fixture();
     let weights = fixture.path("weights.safetensors");
     let eval = format!("eval {} --lpips {}", fixture.run(), weights.display());
@@ -267,7 +267,7 @@ fn a_set_without_references_and_photographs_of_test_views_scores_nothing() {
 #[test]
 fn every_pose_of_a_split_is_rendered_with_or_without_an_image() {
     let set = copied_set();
-    // A test view of which nothing is left but its pose.
+    // A test view that has only its pose.
     for folder in ["low", "high"] {
         fs::remove_file(set.path().join(folder).join("008.png")).unwrap();
     }
@@ -331,14 +331,14 @@ fn tone_maps_a_folder_and_prints_its_statistics() {
 }
 
 #[test]
-fn doctor_lists_the_devices_and_what_they_offer() {
+fn doctor_lists_the_devices_and_their_features() {
     let report = succeed("doctor");
     assert!(report.contains("yes  timelineSemaphore") && report.contains("Vulkan 1."), "{report}");
     assert!(report.contains("ready: trains on ") && report.contains("colmap  "), "{report}");
 }
 
 #[test]
-fn bench_checks_and_times_every_kernel_of_a_step_and_names_the_others() {
+fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
     let small = "bench --json --repeats 1 --width 64 --height 48 --gaussians 300";
     let printed: Value = serde_json::from_str(&succeed(small)).unwrap();
     assert!(
@@ -356,7 +356,7 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_names_the_others() {
         .iter()
         .map(|name| name.as_str().unwrap())
         .collect();
-    // A small sort folds its spine into another pass; how small depends on the device.
+    // A small sort folds its spine into another pass; the threshold depends on the device.
     let everywhere = not_covered.iter().copied().filter(|&name| name != "sort_spine");
     let everywhere: Vec<&str> = everywhere.collect();
     let elsewhere = [
@@ -386,7 +386,7 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_names_the_others() {
 }
 
 #[test]
-fn demo_touches_no_folder_of_somebody_else() {
+fn demo_changes_no_foreign_folder() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("thesis.tex"), "mine").unwrap();
     refused(&format!("demo --out {}", folder.path().display()), 1, &["not empty", "--out"]);
@@ -425,7 +425,7 @@ fn a_closed_pipe_ends_a_command_quietly() {
 }
 
 #[test]
-fn completions_know_the_words_of_options() {
+fn completions_include_the_values_of_options() {
     let script = succeed("completions bash");
     for words in ["balanced", "ap3", "tonemapper", "lita"] {
         assert!(script.contains(words), "no `{words}` in the completions");
@@ -443,7 +443,7 @@ fn man_pages_keep_the_lines_of_their_examples() {
 }
 
 #[test]
-fn help_is_one_screen_for_each_command_and_help_all_has_every_option_in_lines_that_fit() {
+fn help_fits_a_screen_and_help_all_has_every_option_in_lines_that_fit() {
     let commands = [
         "",
         "train",
@@ -474,7 +474,7 @@ fn help_is_one_screen_for_each_command_and_help_all_has_every_option_in_lines_th
         commands.iter().all(|command| help.contains(command.split(' ').next().unwrap())),
         "{help}"
     );
-    // The first two columns are names; those for developers follow below.
+    // The first two columns are names; the commands for developers follow below.
     let listed = help.lines().skip_while(|line| *line != "Commands:").skip(1);
     let listed = listed.take_while(|line| !line.is_empty());
     let names: Vec<&str> = listed

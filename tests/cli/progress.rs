@@ -1,4 +1,4 @@
-//! What `train` says while it trains, for people, logs and schedulers.
+//! Progress output of `train`, for people, logs and schedulers.
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use crate::common::command::{command, refused, succeed};
 
-/// Standard output and error of a short run of six steps that is scored after the third.
+/// Standard output and error of a short run of six steps that is also scored after the third.
 fn trained(more: &str) -> (String, String) {
     let folder = tempfile::tempdir().unwrap();
     let (set, out) = (folder.path().join("set"), folder.path().join("run"));
@@ -21,7 +21,7 @@ fn trained(more: &str) -> (String, String) {
 }
 
 #[test]
-fn without_a_terminal_scores_on_the_way_are_lines() {
+fn without_a_terminal_intermediate_scores_are_lines() {
     for form in ["", "--progress plain"] {
         let (stdout, stderr) = trained(form);
         assert!(stderr.contains("step 3: ") && stderr.contains("PSNR"), "{stderr}");
@@ -51,6 +51,6 @@ fn json_is_a_line_for_each_event_and_nothing_else() {
 }
 
 #[test]
-fn an_unknown_form_is_refused_with_those_that_there_are() {
+fn an_unknown_form_is_refused_with_the_list_of_forms() {
     refused("train photos --out run --progress loud", 2, &["bar", "plain", "json", "none"]);
 }

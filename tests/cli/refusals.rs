@@ -1,4 +1,4 @@
-//! What the binary says of bad input.
+//! Errors of the binary for bad input.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use crate::common::command::{command, refused, refused_with, run};
 use crate::{copied_set, fixture};
 
-/// Training on `root` must fail in one line and leave no run that looks complete.
+/// Training on `root` must fail with one line and leave no run that looks complete.
 fn refuses_to_train(root: &Path, options: &str, code: i32, parts: &[&str]) {
     let run = root.join("run");
     refused(&format!("train {} --out {} {options}", root.display(), run.display()), code, parts);
@@ -15,7 +15,7 @@ fn refuses_to_train(root: &Path, options: &str, code: i32, parts: &[&str]) {
     }
 }
 
-/// Training on `root` must succeed and say all of `parts` on standard error.
+/// Training on `root` must succeed and print all of `parts` on standard error.
 fn trains_and_says(root: &Path, parts: &[&str]) {
     let out = root.join("run");
     let (_, stderr) =
@@ -32,7 +32,7 @@ fn edit(path: PathBuf, change: impl FnOnce(String) -> String) {
 }
 
 #[test]
-fn a_set_that_is_not_there_or_has_no_photographs_is_named() {
+fn a_missing_dataset_and_one_without_photographs_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let nowhere = folder.path().join("nowhere");
     let run = folder.path().join("run");
@@ -49,7 +49,7 @@ fn a_set_that_is_not_there_or_has_no_photographs_is_named() {
 }
 
 #[test]
-fn a_listing_cut_short_is_named() {
+fn a_truncated_listing_is_named() {
     let set = copied_set();
     edit(set.path().join("transforms_train.json"), |text| text[..text.len() / 2].to_owned());
     refuses_to_train(set.path(), "", 3, &["transforms_train.json", "cut short"]);
@@ -64,7 +64,7 @@ fn absent_and_broken_photographs_are_left_out_by_name() {
 }
 
 #[test]
-fn two_views_of_one_name_are_refused() {
+fn two_views_with_one_name_are_refused() {
     let set = copied_set();
     edit(set.path().join("transforms_train.json"), |text| {
         text.replace("low/002.png", "low/001.png")
@@ -72,7 +72,7 @@ fn two_views_of_one_name_are_refused() {
     refuses_to_train(set.path(), "", 3, &["two views are named 001"]);
 }
 
-/// The fixture's set as COLMAP leaves one, after a change of its cameras and images.
+/// The fixture's dataset as a COLMAP model, after a change of its cameras and images.
 fn colmap_set(
     cameras: impl FnOnce(String) -> String,
     images: impl FnOnce(String) -> String,
@@ -91,14 +91,14 @@ fn colmap_set(
 }
 
 #[test]
-fn a_colmap_model_trains_and_what_is_wrong_with_one_is_named() {
+fn a_colmap_model_trains_and_a_damaged_one_is_named() {
     let same = |text: String| text;
     trains_and_says(colmap_set(same, same).path(), &[]);
 
     let set = colmap_set(|text| text.replace(" PINHOLE ", " EUCM "), same);
     refuses_to_train(set.path(), "", 3, &["EUCM"]);
 
-    // Every pose: no view is left. One pose: the others go on.
+    // With every pose damaged, no view is left. With one, the others are used.
     let spoil = |count: usize| {
         move |text: String| {
             let mut left = count;
@@ -120,7 +120,7 @@ fn a_colmap_model_trains_and_what_is_wrong_with_one_is_named() {
     refuses_to_train(set.path(), "", 3, &["is 64x48 but its camera is 64x64"]);
 
     let set = colmap_set(same, same);
-    // A count of ten thousand points, and then nothing.
+    // A count of ten thousand points, without points.
     let mut points = 10_000_u64.to_le_bytes().to_vec();
     points.extend([0; 20]);
     fs::remove_file(set.path().join("sparse/0/points3D.txt")).unwrap();
@@ -129,13 +129,13 @@ fn a_colmap_model_trains_and_what_is_wrong_with_one_is_named() {
 }
 
 #[test]
-fn a_run_directory_is_neither_replaced_unasked_nor_made_where_it_cannot_be() {
+fn a_run_directory_is_not_replaced_without_a_request_nor_created_in_a_file() {
     let fixture = fixture();
     let before = fs::read(fixture.path("run/metrics.json")).unwrap();
     refused(
         &format!("train {} --out {}", fixture.set(), fixture.run()),
         1,
-        &["already holds a run", "--overwrite"],
+        &["already contains a run", "--overwrite"],
     );
     assert_eq!(before, fs::read(fixture.path("run/metrics.json")).unwrap());
     let file = fixture.path("set/low/000.png");
@@ -147,7 +147,7 @@ fn a_run_directory_is_neither_replaced_unasked_nor_made_where_it_cannot_be() {
 }
 
 #[test]
-fn misuse_is_said_in_one_line_with_exit_code_2() {
+fn misuse_is_one_line_with_exit_code_2() {
     let set = fixture().set();
     let train =
         |options: &str, parts: &[&str]| refuses_to_train(Path::new(&set), options, 2, parts);
@@ -187,14 +187,14 @@ fn options_of_other_trainers_get_a_hint() {
 }
 
 #[test]
-fn a_limit_of_memory_without_its_unit_is_refused() {
+fn a_memory_limit_without_a_unit_is_refused() {
     let set = fixture().set();
     refuses_to_train(Path::new(&set), "--max-vram 4", 2, &["--max-vram", "4G or 1.5G"]);
     refuses_to_train(Path::new(&set), "--set max_ram=100", 2, &["max_ram", "with its unit"]);
 }
 
 #[test]
-fn what_cannot_be_written_is_refused_before_anything_is_read() {
+fn an_output_that_cannot_be_written_is_refused_before_anything_is_read() {
     let file = fixture().path("set/low/000.png").display().to_string();
     for command in [
         "train /nonexistent/set --out OUT/run",
@@ -211,13 +211,15 @@ fn what_cannot_be_written_is_refused_before_anything_is_read() {
 }
 
 #[test]
-fn a_number_of_steps_may_be_written_short() {
+fn the_number_of_steps_has_short_forms_and_the_alias_iterations() {
     let folder = tempfile::tempdir().unwrap();
     let train = format!("train {} --out {}", fixture().set(), folder.path().join("run").display());
-    for (steps, line) in [("1e4", "steps = 10000  (--steps)"), ("5k", "steps = 5000  (--steps)")] {
-        let (message, _) = run(&format!("{train} --explain --steps {steps}"), 0);
-        assert!(message.contains(line), "{message}");
+    for (option, steps) in [("--steps 1e4", 10_000), ("--steps 5k", 5000), ("--iterations 7", 7)] {
+        let (message, _) = run(&format!("{train} --explain {option}"), 0);
+        assert!(message.contains(&format!("steps = {steps}  (--steps)")), "{option}: {message}");
     }
+    let twice = format!("{train} --steps 5 --iterations 7");
+    refused(&twice, 2, &["--steps", "multiple times"]);
 }
 
 #[test]
@@ -235,7 +237,7 @@ fn a_configuration_with_an_unknown_key_names_it() {
 }
 
 #[test]
-fn every_setting_is_explained_with_who_says_it_and_nothing_is_trained() {
+fn every_setting_is_explained_with_its_origin_and_nothing_is_trained() {
     let folder = tempfile::tempdir().unwrap();
     let (file, run) = (folder.path().join("a.toml"), folder.path().join("run"));
     fs::write(&file, "near = 0.2\nsteps = 3\n").unwrap();
@@ -264,7 +266,7 @@ fn every_setting_is_explained_with_who_says_it_and_nothing_is_trained() {
 }
 
 #[test]
-fn no_device_and_an_unknown_one_are_said_with_the_remedy() {
+fn an_unknown_device_and_no_device_are_refused_with_the_remedy() {
     let set = fixture().set();
     refuses_to_train(Path::new(&set), "--device voodoo", 4, &["voodoo", "there are: "]);
     refuses_to_train(Path::new(&set), "--device 99", 4, &["number 99", "there are: "]);
@@ -276,11 +278,11 @@ fn no_device_and_an_unknown_one_are_said_with_the_remedy() {
 }
 
 #[test]
-fn what_validation_says_fails_the_command() {
+fn a_validation_message_fails_the_command() {
     if !cfg!(debug_assertions) {
         return crate::common::not_run("commands are validated in debug builds alone");
     }
-    // Advice on best practices, to which nothing here is held, finds something in every run.
+    // Advice on best practices, which the code does not follow, is reported in every run.
     let advice = "VK_VALIDATION_FEATURE_ENABLE_BEST_PRACTICES_EXT";
     let photograph = crate::common::fixture("lom/low/000.png");
     let out = tempfile::tempdir().unwrap();
@@ -292,7 +294,7 @@ fn what_validation_says_fails_the_command() {
 }
 
 #[test]
-fn what_is_no_finished_run_is_refused_by_eval_and_render() {
+fn eval_and_render_refuse_a_folder_without_a_finished_run() {
     let folder = tempfile::tempdir().unwrap();
     let run = folder.path().display();
     for command in ["eval", "render --split all --out x"] {
@@ -306,7 +308,7 @@ fn what_is_no_finished_run_is_refused_by_eval_and_render() {
         config.replace(&fixture().set(), &moved.display().to_string()),
     )
     .unwrap();
-    refused(&format!("eval {run}"), 3, &["model.ply", "did not finish"]);
+    refused(&format!("eval {run}"), 3, &["model.ply", "neither finished"]);
     let model = fs::read(fixture().path("run/model.ply")).unwrap();
     fs::write(folder.path().join("model.ply"), &model).unwrap();
     refused(&format!("eval {run}"), 3, &["config.toml", "moved", "--dataset"]);

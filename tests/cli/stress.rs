@@ -1,8 +1,8 @@
 //! Hostile inputs: whole training steps, every pass against its CPU reference in f64, and the outcome of each.
 //!
-//! The table is [`cases::CASES`]: an input, its outcome in words, and the outcome in a form that is checked. A row
-//! fails where it is anything else. A few rows stand for all; the whole table, printed, is `cargo test --release
-//! --test cli whole_table -- --ignored --nocapture`.
+//! The table is [`cases::CASES`]: an input, its outcome in words, and the expected outcome in a checkable form. A row
+//! fails on any other outcome. The tests run a selection; the whole table, printed, is `cargo test --release --test cli
+//! whole_table -- --ignored --nocapture`.
 
 mod cases;
 mod hostile;
@@ -24,7 +24,7 @@ use nightsplat::{kernels, reference};
 use cases::{CASES, Case, Effort, Expect};
 use hostile::Hostile;
 
-/// Runs every second one of the quick rows, so that the cores share them.
+/// Runs every second of the quick rows, so that the cores share them.
 fn run_half(half: usize) {
     let quick = CASES.iter().filter(|case| case.effort == Effort::Quick);
     assert_as_expected(quick.skip(half).step_by(2).map(|case| case.run(&gpu())).collect());
@@ -39,18 +39,18 @@ fn assert_as_expected(rows: Vec<Row>) {
 }
 
 #[test]
-fn what_comes_of_a_hostile_input_is_what_the_table_says() {
+fn hostile_inputs_have_the_outcomes_of_the_table() {
     run_half(0);
 }
 
 #[test]
-fn what_comes_of_another_hostile_input_is_what_the_table_says() {
+fn other_hostile_inputs_have_the_outcomes_of_the_table() {
     run_half(1);
 }
 
 #[test]
 #[ignore = "minutes: of `make stress`"]
-fn what_comes_of_the_whole_table_is_what_it_says() {
+fn all_hostile_inputs_have_the_outcomes_of_the_whole_table() {
     let mut rows = vec![];
     let mut out = std::io::stdout();
     writeln!(out, "input | view | Gaussians | error | of kernel | render | gradient | outcome")
@@ -70,10 +70,10 @@ fn every_input_of_the_table_is_named_once() {
     assert!(names.windows(2).all(|pair| pair[0] != pair[1]));
 }
 
-/// Number of Gaussians times pixels beyond which the whole render is not compared in f64, which visits all of them.
+/// Number of Gaussians times pixels beyond which the whole render is not compared in f64, which evaluates all of them.
 const MAX_FRAGMENTS: usize = 40_000_000;
 
-/// What came of a case.
+/// The outcome of a case.
 struct Row {
     name: &'static str,
     outcome: &'static str,
@@ -82,18 +82,19 @@ struct Row {
     gaussians: usize,
     /// Of the last step.
     loss: Option<f64>,
-    /// The kernel with the largest error in units of what roundings explain, and that; none where nothing was compared.
+    /// The kernel with the largest error in units of its rounding bound, and that error; `None` if nothing was
+    /// compared.
     error: Option<(&'static str, f64)>,
     /// The largest difference between the render and that of the f64 references, relative to values above 1.
     render_error: Option<f64>,
-    /// The largest gradient; infinite where one is not finite.
+    /// The largest gradient; infinite if one is not finite.
     gradient: Option<f64>,
     /// The actual outcome, if it is not the expected one.
     problem: Option<String>,
 }
 
 impl Row {
-    /// As docs/extremes.md lists it.
+    /// The row in the format of docs/extremes.md.
     fn line(&self) -> String {
         let number =
             |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.1e}"));
@@ -113,7 +114,7 @@ impl Row {
 }
 
 impl Case {
-    /// Trains on it, every pass checked, and looks at what came of it.
+    /// Trains on it, with every pass checked, and inspects the outcome.
     fn run(&self, gpu: &Gpu) -> Row {
         let mut row = Row {
             name: self.name,
@@ -163,7 +164,7 @@ impl Case {
         let Some(mut trainer) = begun else { return Ok(()) };
         let before = trainer.gaussians_in_frame()?;
         row.gaussians = before.count;
-        // A step that overflows its memory is done again.
+        // A step that overflows its memory is repeated.
         while trainer.steps_done() < config.steps {
             let next = trainer.steps_done() + 1;
             checked(&mut || {
@@ -175,7 +176,7 @@ impl Case {
         let after = trainer.gaussians_in_frame()?;
         let gradients = trainer.gradients()?;
         let largest = |values: &[f32]| {
-            // Positive phrasing: a NaN is as bad as infinity.
+            // Written so that a NaN counts as infinity.
             let magnitude = |value: &f32| {
                 if value.is_finite() { f64::from(value.abs()) } else { f64::INFINITY }
             };
@@ -213,7 +214,7 @@ impl Case {
     }
 }
 
-/// A splat whose alpha lies at 1/255 may count or not, and two may.
+/// A splat whose alpha is close to 1/255 may count or not, and there may be two.
 const MAX_RENDER_ERROR: f64 = 2.0 / 255.0;
 
 /// Every parameter of some Gaussians.
@@ -226,8 +227,8 @@ fn of_gaussians(gaussians: &Gaussians, wanted: &Range<usize>) -> Vec<f32> {
     own.copied().collect()
 }
 
-/// The largest difference between what the trainer shows and what the references do in f64, without tiles; none where
-/// that takes too long.
+/// The largest difference between the trainer's render and that of the references in f64, without tiles; `None` if that
+/// takes too long.
 fn render_error(
     trainer: &mut Trainer,
     config: &TrainConfig,
@@ -259,7 +260,7 @@ fn render_error(
         let (expected, _) = blend_pixel(&splats, &colors, &[0.0; 3], center, alpha_max);
         for (actual, expected) in render.pixel(x, y).into_iter().zip(expected) {
             let error = (f64::from(actual) - expected).abs() / expected.abs().max(1.0);
-            // Positive phrasing: a NaN is no small error.
+            // Written so that a NaN is not a small error.
             largest = if error <= largest { largest } else { error };
         }
     }

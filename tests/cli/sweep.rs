@@ -1,4 +1,4 @@
-//! A sweep trains every point once, survives being killed, and ranks what it finds the same way every time.
+//! A sweep trains every point once, survives being killed, and always ranks its points in the same way.
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -12,7 +12,7 @@ use serde_json::Value;
 
 use crate::common::command::{command, refused, run};
 
-/// The smallest set with views to score.
+/// The smallest dataset with views to score.
 fn set() -> &'static Path {
     static SET: OnceLock<tempfile::TempDir> = OnceLock::new();
     SET.get_or_init(|| {
@@ -47,12 +47,12 @@ impl Sweep {
         fs::read_to_string(self.path(name)).unwrap()
     }
 
-    /// What must not depend on how the sweep came to its end.
+    /// The results that must not depend on how the sweep was run.
     fn leaderboard(&self) -> [String; 3] {
         ["leaderboard.csv", "leaderboard.md", "index.html"].map(|name| self.read(name))
     }
 
-    /// The names of the points that are left.
+    /// The names of the remaining points.
     fn names(&self) -> Vec<String> {
         let name = |line: &String| {
             let out = line.split("--out ").nth(1).unwrap().split(' ').next().unwrap();
@@ -61,17 +61,17 @@ impl Sweep {
         self.left().iter().map(name).collect()
     }
 
-    /// The command lines of the points that are left.
+    /// The command lines of the remaining points.
     fn left(&self) -> Vec<String> {
         let (lines, _) = run(&format!("{} --dry-run", self.arguments), 0);
         lines.lines().map(str::to_owned).collect()
     }
 }
 
-/// As when a new version is installed while a sweep is under way.
+/// As when a new version is installed during a sweep.
 #[cfg(target_os = "linux")]
 #[test]
-fn a_sweep_outlives_the_file_of_its_program() {
+fn a_sweep_survives_the_replacement_of_its_program() {
     let sweep = Sweep::new("--steps 2 --curves linear,ase");
     let program = sweep.folder.path().with_extension("program");
     fs::copy(command("").get_program(), &program).unwrap();
@@ -90,7 +90,7 @@ fn a_sweep_outlives_the_file_of_its_program() {
 }
 
 #[test]
-fn a_finished_point_is_never_trained_twice_and_a_killed_one_is() {
+fn a_finished_point_is_never_trained_twice_and_a_killed_one_is_resumed() {
     let sweep = Sweep::new("--steps 2 --seeds 2,1 --curves linear,ase");
     let points =
         ["curve=linear,seed=2", "curve=linear,seed=1", "curve=ase,seed=2", "curve=ase,seed=1"];
@@ -146,7 +146,7 @@ fn a_finished_point_is_never_trained_twice_and_a_killed_one_is() {
 }
 
 #[test]
-fn a_sweep_killed_twice_ends_as_one_that_a_scheduler_ran() {
+fn a_sweep_killed_twice_ends_like_one_run_by_a_scheduler() {
     let options = "--steps 60 --curves ap3,linear --gain 0.5";
     let scheduled = Sweep::new(options);
     for line in scheduled.left() {
@@ -166,7 +166,7 @@ fn a_sweep_killed_twice_ends_as_one_that_a_scheduler_ran() {
             assert!(begin.elapsed() < Duration::from_secs(60), "{log} never came");
             std::thread::sleep(Duration::from_millis(5));
         }
-        // The training itself lives on, and the next sweep must not write beside it.
+        // The training process itself continues, and the next sweep must not write at the same time.
         process.kill().unwrap();
         process.wait().unwrap();
     }
@@ -236,7 +236,7 @@ fn tables_and_all_curves_are_grids() {
 }
 
 #[test]
-fn more_values_may_join_and_another_sweep_may_not() {
+fn values_may_be_added_to_a_sweep_but_not_another_sweep() {
     let sweep = Sweep::new("--steps 1 --curves ap3");
     run(&sweep.arguments, 0);
     let wider = Sweep { arguments: sweep.arguments.replace("ap3", "ap3,linear"), ..sweep };
@@ -250,7 +250,7 @@ fn more_values_may_join_and_another_sweep_may_not() {
     run(&format!("synth {} --views 9 --width 24 --height 16", two.path().display()), 0);
     let other = arguments.replace(set().to_str().unwrap(), two.path().to_str().unwrap());
     refused(&other, 1, &["another", "--out"]);
-    // A folder of something else.
+    // A foreign folder.
     fs::remove_file(wider.path("sweep.toml")).unwrap();
     refused(arguments, 1, &["leaderboard.csv", "no sweep wrote", "--out"]);
 }
@@ -283,7 +283,7 @@ fn misuse_is_refused_before_anything_is_trained() {
     let (_, message) = run(&arguments, 3);
     assert!(message.contains("is not a folder") && !nowhere.exists(), "{message}");
 
-    // A set of one photograph has none to score.
+    // A dataset of one photograph has none to score.
     let one = tempfile::tempdir().unwrap();
     run(&format!("synth {} --views 2 --width 24 --height 16", one.path().display()), 0);
     for name in ["transforms_test.json", "transforms_val.json"] {
@@ -300,9 +300,9 @@ fn misuse_is_refused_before_anything_is_trained() {
     assert!(!sweep.path("sweep.toml").exists());
 }
 
-/// What `train --preset` does, with every figure on every page.
+/// The same trainings as `train --preset`, with every figure on every page.
 #[test]
-fn presets_are_trained_by_their_plans_scored_on_the_way_and_compared() {
+fn presets_are_trained_by_their_plans_scored_during_training_and_compared() {
     let sweep =
         Sweep::of(set(), "--table presets --presets draft,paper,balanced --steps 6 --eval-every 2");
     let points = ["preset=draft", "preset=paper", "preset=balanced"];
@@ -331,7 +331,7 @@ fn presets_are_trained_by_their_plans_scored_on_the_way_and_compared() {
     assert!(sweep.read("preset=paper/log.txt").contains("--plan none"));
     assert!(sweep.path("preset=draft/plan.toml").is_file());
 
-    // As if it had been killed while a point was trained: that one is trained anew, to the same bits.
+    // As if it had been killed while a point was trained: that point is trained again, to the same bits.
     let model = |point: &str| fs::read(sweep.path(point).join("model.ply")).unwrap();
     let trained = |point: &str| {
         fs::metadata(sweep.path(point).join("model.ply")).unwrap().modified().unwrap()
@@ -358,7 +358,7 @@ fn presets_are_trained_by_their_plans_scored_on_the_way_and_compared() {
 }
 
 #[test]
-fn without_references_the_held_out_views_own_targets_are_what_is_scored_against() {
+fn without_references_test_views_are_scored_against_their_own_targets() {
     let copy = tempfile::tempdir().unwrap();
     let status = Command::new("cp").arg("-r").arg(set()).arg(copy.path()).status().unwrap();
     assert!(status.success());
@@ -377,7 +377,7 @@ fn without_references_the_held_out_views_own_targets_are_what_is_scored_against(
 }
 
 #[test]
-fn old_names_say_the_new_ones() {
+fn old_command_names_print_the_new_ones() {
     for (old, new) in [
         ("ablate photos --out out --steps 2", "sweep DATASET --out DIR --table parts"),
         ("tradeoff --help", "sweep DATASET --out DIR --table presets"),

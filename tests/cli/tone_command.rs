@@ -39,7 +39,7 @@ fn dark(width: u32, height: u32) -> Image {
 }
 
 #[test]
-fn a_folder_is_mapped_by_name_and_what_cannot_be_read_is_left_out() {
+fn a_folder_is_mapped_by_name_and_unreadable_files_are_left_out() {
     let dir = tempfile::tempdir().unwrap();
     let photographs = dir.path().join("photographs");
     std::fs::create_dir(&photographs).unwrap();
@@ -78,7 +78,7 @@ fn a_folder_is_mapped_by_name_and_what_cannot_be_read_is_left_out() {
 }
 
 #[test]
-fn exr_keeps_what_8_bits_round_and_clipping_is_counted() {
+fn exr_is_not_rounded_and_clipping_is_counted() {
     let dir = tempfile::tempdir().unwrap();
     let photograph = dir.path().join("one.png");
     let mut image = dark(10, 10);
@@ -152,7 +152,7 @@ fn bad_input_is_named_in_one_line() {
 #[test]
 fn a_photograph_that_exceeds_a_binding_is_mapped_in_tiles() {
     let device = nightsplat::gpu::Gpu::new(&Default::default()).unwrap();
-    // lavapipe binds 128 MiB; this takes 139 MB as floats.
+    // lavapipe binds 128 MiB; these are 139 MB of floats.
     if device.properties().max_storage_buffer_range > 139_000_000 {
         return crate::common::not_run(format_args!("{} binds more", device.properties().name));
     }
@@ -174,7 +174,7 @@ fn a_photograph_that_exceeds_a_binding_is_mapped_in_tiles() {
     }
 }
 
-/// A low and a normal-light folder of three photographs.
+/// A dark and a normal-light folder of three photographs.
 fn pairs(dir: &Path) -> [PathBuf; 2] {
     let folders = ["dark", "bright"].map(|name| dir.join(name));
     for (folder, gain) in folders.iter().zip([1.0, 6.0]) {
@@ -189,7 +189,7 @@ fn pairs(dir: &Path) -> [PathBuf; 2] {
 }
 
 #[test]
-fn references_give_scores_and_the_page_draws_the_distributions() {
+fn references_give_scores_and_the_page_shows_the_distributions() {
     let dir = tempfile::tempdir().unwrap();
     let [low, high] = pairs(dir.path());
     let page = dir.path().join("page.html");
@@ -231,7 +231,7 @@ fn references_give_scores_and_the_page_draws_the_distributions() {
     }
     assert!(json["views"]["b"]["after"]["skewness"].is_number());
 
-    // One of another size is no reference.
+    // A file of another size is not a reference.
     dark(9, 9).save_png8(high.join("b.png")).unwrap();
     let error = apply(&args).unwrap_err().to_string();
     assert!(error.contains("b.png") && error.contains("9x9") && error.contains("45x30"), "{error}");
@@ -264,7 +264,7 @@ fn scene_statistics_give_every_photograph_one_curve() {
 }
 
 #[test]
-fn a_dataset_is_measured_on_its_training_and_scored_on_its_test_views() {
+fn a_dataset_is_measured_on_training_views_and_scored_on_test_views() {
     let dir = tempfile::tempdir().unwrap();
     let set = dir.path().join("set");
     let options = nightsplat::photographs::dataset::synthetic::SyntheticOptions {
@@ -285,7 +285,7 @@ fn a_dataset_is_measured_on_its_training_and_scored_on_its_test_views() {
 }
 
 #[test]
-fn values_that_are_no_numbers_are_counted_and_left_out_of_the_statistics() {
+fn values_that_are_not_finite_are_counted_and_excluded_from_the_statistics() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("gaps.exr");
     let value = |x: usize| {
@@ -361,16 +361,16 @@ fn an_unknown_curve_is_misuse_and_lists_the_curves() {
     assert!(matches!("gama".parse::<ToneCurve>(), Err(Error::Usage(_))));
 }
 
-/// What the automatic curve makes of a folder.
+/// The output of the automatic curve for a folder.
 fn automatic(input: &Path) -> ApplyArgs {
     ApplyArgs { curve: ToneCurve::Auto.into(), out: None, ..args(input, PathBuf::new()) }
 }
 
 #[test]
-fn the_automatic_curve_says_how_bright_and_why_and_lends_its_brightness() {
+fn the_automatic_curve_reports_its_brightness_which_other_curves_can_use() {
     let dir = tempfile::tempdir().unwrap();
     let [low, _] = pairs(dir.path());
-    // Grey: the rule is about the curve of the luminance, which in colours is not the luminance of the curve.
+    // Grey: the rule is about the curve of the luminance, which for colours differs from the luminance of the curve.
     for name in ["a", "b", "c"] {
         let path = low.join(name).with_extension("png");
         let mut image = Image::load(&path).unwrap();
@@ -390,7 +390,7 @@ fn the_automatic_curve_says_how_bright_and_why_and_lends_its_brightness() {
         assert!(json["exposure"][key].is_number(), "{key}");
     }
     assert!(json["views"]["a"]["gain"].is_number() && json["exposure"]["reason"].is_string());
-    // Every curve with a gain takes the same brightness, or another that is asked for.
+    // Every curve with a gain has the same brightness, or a requested one.
     for curve in [ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Linear, ToneCurve::Gamma] {
         let lent =
             ApplyArgs { curve: curve.into(), gain: Some(GainChoice::Auto), ..automatic(&low) };
@@ -406,9 +406,9 @@ fn the_automatic_curve_says_how_bright_and_why_and_lends_its_brightness() {
 }
 
 #[test]
-fn linear_light_of_a_known_exposure_comes_out_as_bright_as_of_any_other() {
+fn targets_of_linear_light_are_equally_bright_for_any_exposure() {
     let dir = tempfile::tempdir().unwrap();
-    // Scene-referred light of two decades, as a camera RAW has it; what reaches the sensor is a part of it.
+    // Scene-referred light over two decades, as in camera RAW; the sensor receives a part of it.
     let light = |x: u32, y: u32| 10.0_f32.powf(-2.0 * ((7 * x + 11 * y) % 40) as f32 / 40.0);
     let target = |exposure: f32| {
         let [folder, out] =
@@ -428,14 +428,14 @@ fn linear_light_of_a_known_exposure_comes_out_as_bright_as_of_any_other() {
         assert!(darker.gain > exposure.gain, "{stops}: {} {}", darker.gain, exposure.gain);
         let off = (darker.target - exposure.target).abs();
         assert!(off < 0.03, "{stops}: {} {}", darker.target, exposure.target);
-        // Not the same pictures: the darkest light is on the straight piece of sRGB's curve, the rest on the power.
+        // The images differ: the darkest light is on the linear part of sRGB's curve, the rest on the power.
         let psnr = psnr(&image, &eighth).unwrap();
         assert!(psnr > 20.0, "{stops} stops below the light: {psnr} dB");
     }
 }
 
 #[test]
-fn a_well_lit_folder_stays_as_it_is_and_a_black_one_is_refused() {
+fn a_well_lit_folder_is_unchanged_and_a_black_one_refused() {
     let dir = tempfile::tempdir().unwrap();
     let folder = dir.path().join("bright");
     std::fs::create_dir(&folder).unwrap();
@@ -449,7 +449,7 @@ fn a_well_lit_folder_stays_as_it_is_and_a_black_one_is_refused() {
 
     Image::filled(40, 30, [0.004; 3]).save_png8(folder.join("a.png")).unwrap();
     let error = apply(&args).unwrap_err();
-    assert!(error.to_string().contains("as good as black"), "{error}");
+    assert!(error.to_string().contains("almost black"), "{error}");
     assert_eq!(error.exit_code(), 3);
     let refused = |args: ApplyArgs, part: &str| {
         let message = apply(&args).unwrap_err().to_string();
@@ -461,12 +461,13 @@ fn a_well_lit_folder_stays_as_it_is_and_a_black_one_is_refused() {
     refused(ApplyArgs { brightness: Some(0.5), ..of(ToneCurve::Ap3) }, "tone.brightness");
     refused(ApplyArgs { brightness: Some(2.0), ..of(ToneCurve::Auto) }, "tone.brightness");
     refused(ApplyArgs { colour: Some(-0.5), ..of(ToneCurve::Auto) }, "tone.colour");
-    refused(ApplyArgs { gain: auto, ..of(ToneCurve::LumPreserve) }, "no gain");
+    refused(ApplyArgs { gain: auto, ..of(ToneCurve::LumPreserve) }, "no automatic gain");
 }
 
-/// PSNR of the curve alone on the test views; ASE and AP3 with constants have 23.4 and 23.0 dB on the mean.
+/// PSNR of the curve, without training, on the test views; ASE and AP3 with constant gains have means of 23.4 and 23.0
+/// dB.
 #[test]
-fn the_automatic_curve_scores_as_known() {
+fn the_automatic_curve_has_its_known_scores() {
     let Some(lom) = crate::common::shared("data/lom") else { return };
     let mut mean = 0.0;
     for (scene, known) in [("chair", 25.82), ("sofa", 29.79), ("shrub", 18.86)] {

@@ -1,4 +1,4 @@
-//! `bench --tune`, the file it leaves, and the tiles that training takes from there.
+//! `bench --tune`, its file, and the tiles that training takes from it.
 
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
@@ -13,7 +13,7 @@ use nightsplat::results::run;
 use nightsplat::splats::render::RenderSettings;
 use serde_json::{Value, json};
 
-/// A folder with a set of dark photographs, whose runs look for the fastest tiles in a file beside it.
+/// A folder with a dataset of dark photographs, whose runs read the fastest tiles from a file next to it.
 struct Place(tempfile::TempDir);
 
 impl Place {
@@ -37,7 +37,7 @@ impl Place {
         (stdout, stderr)
     }
 
-    /// What a new run says on standard error, and the tile it records.
+    /// The standard error of a new run, and the tile that it records.
     fn train(&self, run: &str, more: &str) -> (String, Tile) {
         let (set, out) = (self.path("set"), self.path(run));
         let (set, out) = (set.display(), out.display());
@@ -54,25 +54,25 @@ impl Place {
     }
 }
 
-/// A file of this device that names one tile for everything.
+/// A file of this device with one tile for everything.
 fn tuning(tile: Tile) -> Value {
     let properties = gpu().properties().clone();
     let tiles = json!([{ "channels": 3, "tile": tile }]);
     json!({ "device": properties.name, "driver": properties.driver, "tiles": tiles })
 }
 
-/// What is taken where nothing was measured.
+/// The tile without measurements.
 fn built_in() -> Tile {
     RenderSettings::default().tile_on(&gpu()).unwrap()
 }
 
-/// A tile that suits the device and is not the built-in one.
+/// A tile that the device supports and that is not the built-in one.
 fn unusual() -> Tile {
     Tile { size: [16, 16], subgroups: 2 }
 }
 
 #[test]
-fn tuning_times_every_tile_that_suits_the_device_and_keeps_the_fastest() {
+fn tuning_times_every_supported_tile_and_saves_the_fastest() {
     let place = Place::new();
     let arguments = "bench --tune --json --width 64 --height 48 --gaussians 300 --repeats 1";
     let printed: Value = serde_json::from_str(&place.run(arguments).0).unwrap();
@@ -92,7 +92,7 @@ fn tuning_times_every_tile_that_suits_the_device_and_keeps_the_fastest() {
 }
 
 #[test]
-fn the_kept_tile_is_taken_unless_another_is_asked_for_and_a_resumed_run_stays_with_its_own() {
+fn the_saved_tile_is_used_unless_another_is_set_and_a_resumed_run_keeps_its_own() {
     let place = Place::new();
     assert_ne!(unusual(), built_in());
     assert_eq!(place.train("none", "--steps 1").1, built_in());
@@ -104,7 +104,7 @@ fn the_kept_tile_is_taken_unless_another_is_asked_for_and_a_resumed_run_stays_wi
     place.write(&tuning(built_in()));
     assert_eq!(place.train("kept", "--steps 3 --resume --checkpoint-every 2").1, unusual());
     place.run(&format!("eval {}", place.path("kept").display()));
-    // The command of every other test has the file switched off.
+    // In the other tests, the command's file is disabled.
     let (set, out) = (place.path("set"), place.path("off"));
     place.write(&tuning(unusual()));
     succeed(&format!("train {} --out {} --steps 1", set.display(), out.display()));
@@ -124,7 +124,7 @@ fn the_tile_is_recorded_so_that_the_same_file_gives_the_same_bits() {
 }
 
 #[test]
-fn a_file_of_another_driver_and_a_damaged_one_are_ignored_with_one_line() {
+fn a_damaged_file_and_one_of_another_driver_are_ignored_with_one_line() {
     let place = Place::new();
     let mut other = tuning(unusual());
     other["driver"] = json!("of another year");
@@ -144,7 +144,7 @@ fn a_file_of_another_driver_and_a_damaged_one_are_ignored_with_one_line() {
 }
 
 #[test]
-fn a_tile_that_does_not_suit_the_device_is_refused_with_the_remedy() {
+fn an_unsupported_tile_is_refused_with_the_remedy() {
     let place = Place::new();
     let (set, out) = (place.path("set"), place.path("run"));
     for tile in ["[3,3]", "[0,8]", "[4096,4096]", "[4294967295,4294967295]", "[16,16,3]"] {

@@ -1,4 +1,4 @@
-//! The whole renderer once more in f64 and without tiles: every splat on every pixel, front to back, and its gradients.
+//! The whole renderer in f64 and without tiles: every splat on every pixel, front to back, and its gradients.
 
 use glam::{DVec2, DVec3};
 use nightsplat::kernels::splat::RECORD_HEAD;
@@ -14,13 +14,13 @@ use nightsplat::splats::render::CameraGradient;
 use super::setup::{Rendered, Setup};
 use super::{Random, assert_close};
 
-/// A setup and the gradient of its render, (channels, H, W): the functional that is differentiated is their product.
+/// A setup and the gradient of its render, (channels, H, W): the differentiated functional is their inner product.
 pub(crate) struct Chain<'a> {
     setup: &'a Setup,
     pub(crate) d_render: Vec<f64>,
 }
 
-/// The splats of a render, front to back, with the Gaussians they come from.
+/// The splats of a render, front to back, with the indices of their Gaussians.
 struct Projected {
     ids: Vec<usize>,
     splats: Vec<Splat>,
@@ -28,7 +28,7 @@ struct Projected {
     depths: Vec<f64>,
 }
 
-/// What the renderer gives.
+/// The results of the renderer.
 pub(crate) struct Results {
     /// (channels, H, W)
     pub(crate) render: Vec<f64>,
@@ -36,11 +36,11 @@ pub(crate) struct Results {
     pub(crate) transmittances: Vec<f64>,
     /// In the order of the parameters.
     pub(crate) gradient: Vec<f64>,
-    /// By Gaussian: what is added to the statistics of density control.
+    /// By Gaussian: the increment of the statistics of density control.
     grad_norms: Vec<f64>,
     /// By channel.
     pub(crate) d_background: Vec<f64>,
-    /// That of the camera.
+    /// With respect to the camera.
     pub(crate) camera: [f64; CameraGradient::WIDTH],
 }
 
@@ -49,7 +49,7 @@ impl<'a> Chain<'a> {
     pub(crate) fn new(setup: &'a Setup) -> Self {
         let mut random = Random::new(4);
         let count = setup.channels() * setup.pixels();
-        // Numbers of f32, which is what the device is given.
+        // Values of f32, as on the device.
         let d_render = (0..count).map(|_| f64::from(random.between(-1.0, 1.0) as f32)).collect();
         Self { setup, d_render }
     }
@@ -102,7 +102,7 @@ impl<'a> Chain<'a> {
         self.loss_seen_by(&self.setup.camera(), parameters, background)
     }
 
-    /// The same of another camera.
+    /// [`Self::loss`] for another camera.
     pub(crate) fn loss_seen_by(
         &self,
         camera: &Camera,
@@ -117,7 +117,7 @@ impl<'a> Chain<'a> {
         self.pixels().map(pixel).sum()
     }
 
-    /// The render, and the gradients that the references' own backward gives.
+    /// The render, and the gradients of the references' backward pass.
     pub(crate) fn run(&self, parameters: &[f64]) -> Results {
         let camera = self.setup.camera();
         let Projected { ids, splats, colors, depths } = self.project(&camera, parameters);
@@ -165,7 +165,7 @@ impl<'a> Chain<'a> {
         results
     }
 
-    /// What arrives at a splat, where clamped colours pass nothing on.
+    /// The gradients of a splat; clamped colours have none.
     fn d_splat(&self, record: &[f64], color: &[f64]) -> DSplat {
         let is_free = |c: usize| self.setup.settings.raw_colors || color[c] > 0.0;
         let passes = |c: usize| if is_free(c) { record[RECORD_HEAD as usize + c] } else { 0.0 };
@@ -178,18 +178,18 @@ impl<'a> Chain<'a> {
         }
     }
 
-    /// The parameters, off by some roundings each.
+    /// The parameters, perturbed by some roundings each.
     pub(crate) fn jitter(&self, seed: u64) -> Vec<f64> {
         let mut random = Random::new(100 + seed);
         let mut moved = |p: f64| p + JITTER * (p.abs() + 1.0) * random.between(-1.0, 1.0);
         self.parameters().into_iter().map(&mut moved).collect()
     }
 
-    /// Renders the setup on the device, forward and backward, and panics where a result is none of this chain's.
+    /// Renders the setup on the device, forward and backward, and panics if a result differs from the chain's.
     ///
-    /// The model of what rounding may change: the device gives what the chain gives for parameters that are off by some
-    /// roundings each. So the parameters jitter, and what that moves a result by is what the device may be off by, some
-    /// times over; a pixel in which a rounding decides whether a splat counts shows itself.
+    /// The rounding model: the device's result is that of the chain for parameters that are off by some roundings each.
+    /// So the parameters are perturbed, and the change of a result, times a factor, is the allowed error of the device;
+    /// this detects pixels in which a rounding decides whether a splat counts.
     pub(crate) fn assert_agrees_with_the_device(&self, name: &str) {
         let exact = self.run(&self.parameters());
         let jittered: Vec<Results> =
@@ -226,9 +226,9 @@ impl<'a> Chain<'a> {
 
 /// Half a unit in the last place of 1.0: the relative error of one rounding.
 const ROUNDING: f64 = f32::EPSILON as f64 / 2.0;
-/// How far the parameters jitter, relative to their magnitude and one, which is that of the terms they meet in sums and
-/// exponentials: some dozens of roundings lie between a parameter and a pixel.
+/// The perturbation of parameters, relative to their magnitude and to one, which is that of the terms in sums and
+/// exponentials: some dozens of roundings are between a parameter and a pixel.
 const JITTER: f64 = 32.0 * ROUNDING;
 const JITTERS: u64 = 6;
-/// How many times what the jitter moved a result by.
+/// The allowed error, in units of the change caused by the perturbation.
 const TIMES: f64 = 4.0;

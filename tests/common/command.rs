@@ -1,11 +1,11 @@
-//! The built binary, as a shell runs it.
+//! The built binary as a shell runs it.
 
 use std::process::{Command, Output};
 
-/// `nightsplat` with arguments as a shell splits them; paths hold no spaces. Whatever validation says fails it.
+/// `nightsplat` with arguments as a shell splits them; paths must not contain spaces. Any validation message fails it.
 pub(crate) fn command(arguments: &str) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_nightsplat"));
-    // Whatever was measured on this machine for its user, tests train with the built-in tiles.
+    // Tests train with the built-in tiles, not those measured on this machine.
     let environment = [("NIGHTSPLAT_FAIL_ON_VALIDATION", "1"), ("NIGHTSPLAT_TUNE", "off")];
     command.args(arguments.split_whitespace()).envs(environment);
     command
@@ -28,12 +28,12 @@ pub(crate) fn succeed(arguments: &str) -> String {
     run(arguments, 0).0
 }
 
-/// The command must fail with this exit code and one line on standard error that has all of `parts`.
+/// The command must fail with this exit code and one line on standard error that contains all of `parts`.
 pub(crate) fn refused(arguments: &str, code: i32, parts: &[&str]) {
     refused_with(arguments, &[], code, parts);
 }
 
-/// The same under other variables.
+/// [`refused`] with environment variables.
 pub(crate) fn refused_with(
     arguments: &str,
     environment: &[(&str, &str)],

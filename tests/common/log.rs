@@ -1,4 +1,4 @@
-//! What a call warns of.
+//! Captures warnings.
 
 use std::io::Write;
 use std::sync::{Arc, Mutex};

@@ -1,4 +1,4 @@
-//! Weights of LPIPS that are made by a formula: `scripts/lpips-reference.py` makes the same.
+//! Weights of LPIPS from a formula, the same as in `scripts/lpips-reference.py`.
 
 use std::path::Path;
 
@@ -6,13 +6,13 @@ use nightsplat::networks::lpips::Network;
 
 use super::safetensors;
 
-/// Numbers of [-0.5, 0.5) by a multiplicative hash (Knuth).
+/// Values in [-0.5, 0.5) from a multiplicative hash (Knuth).
 pub(crate) fn noise(index: usize, salt: u64) -> f64 {
     let hash = ((index as u64 + 1) * 2_654_435_761 + salt * 97_531) % (1 << 32);
     hash as f64 / 2.0_f64.powi(32) - 0.5
 }
 
-/// Where a convolution stands, its output and input channels, its window.
+/// The position of a convolution, its output and input channels, its kernel size.
 type Layer = (&'static str, usize, usize, usize);
 
 const ALEXNET: &[Layer] = &[
@@ -56,7 +56,7 @@ fn tensors(network: Network) -> Vec<(String, Vec<usize>)> {
     convolutions.chain(compared.into_iter().enumerate().map(linear)).collect()
 }
 
-/// Writes weights of a network, each made by a formula from its place, `change`d.
+/// Writes weights of a network, each computed from its position, after `change`.
 pub(crate) fn write(
     network: Network,
     path: &Path,

@@ -1,4 +1,5 @@
-//! What tests share: random numbers, comparisons, kernels run by hand, the command, and what is said of tests not run.
+//! Shared by the tests: random numbers, comparisons, single kernels, the command, and reports of tests that are not
+//! run.
 
 #![allow(dead_code, unused_macros, reason = "no test binary uses everything")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
@@ -24,16 +25,16 @@ use nightsplat::base::random::Stream;
 use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 
-/// A device that no other test shares: the memory and the passes that it counts are the caller's alone.
+/// A device that no other test uses, to count memory and passes.
 pub(crate) fn own_gpu() -> Gpu {
     gpu_that_binds(gpu().properties().max_storage_buffer_range)
 }
 
-/// Runs a kernel on the device over host vectors named like its buffers, checks what it leaves against its reference,
-/// and gives back what it writes.
+/// Runs a kernel on the device with host vectors named like its buffers, checks its results against its reference, and
+/// copies them back.
 macro_rules! run_kernel {
     ($kernel:ident, $constants:expr, $params:expr, $threads:expr, [$($input:ident),*], [$($output:ident),+]) => {{
-        // Before the buffers take the vectors' names.
+        // Evaluated before the buffers shadow the vectors.
         let (params, threads) = (&$params, $threads);
         let gpu = nightsplat::gpu::testing::gpu();
         let pipeline = gpu.pipeline::<$kernel::Kernel>(&$constants).unwrap();
@@ -53,7 +54,7 @@ macro_rules! run_kernel {
     }};
 }
 
-/// The same with the kernel's CPU reference.
+/// Runs the kernel's CPU reference in the same way.
 #[allow(unused_macros, reason = "no test binary uses everything")]
 macro_rules! run_reference {
     ($kernel:ident, $constants:expr, $params:expr, [$($input:ident),*], [$($output:ident),+]) => {{
@@ -64,7 +65,7 @@ macro_rules! run_reference {
     }};
 }
 
-/// Panics with the first ten elements that `bound(index, expected)` does not allow.
+/// Panics with the first ten elements that exceed `bound(index, expected)`.
 pub(crate) fn assert_close(
     what: &str,
     actual: &[f32],
@@ -72,7 +73,7 @@ pub(crate) fn assert_close(
     bound: impl Fn(usize, f32) -> f32,
 ) {
     assert_eq!(actual.len(), expected.len(), "{what}");
-    // Positive phrasing: a NaN is a mismatch.
+    // Written so that a NaN is a mismatch.
     let is_close = |i: usize| (actual[i] - expected[i]).abs() <= bound(i, expected[i]);
     let bad: Vec<usize> = (0..actual.len()).filter(|&i| !is_close(i)).collect();
     let first = |&i: &usize| format!("[{i}] {} instead of {}", actual[i], expected[i]);
@@ -80,7 +81,7 @@ pub(crate) fn assert_close(
     assert!(bad.is_empty(), "{what}: {} of {} differ: {shown:#?}", bad.len(), actual.len());
 }
 
-/// A stream of random numbers that remembers where it is.
+/// A stream of random numbers with its position.
 pub(crate) struct Random(Stream, u64);
 
 impl Random {
@@ -114,10 +115,10 @@ pub(crate) fn widen(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&value| value.into()).collect()
 }
 
-/// Says which test, or what is left of it, is not run and why.
+/// Prints that a test, or the rest of it, is not run, and why.
 ///
-/// The harness swallows what `println!` and `eprintln!` print in a test that passes, but not what is written to the
-/// handle of standard error: this line is seen in every `cargo test`.
+/// The harness captures the output of `println!` and `eprintln!` in a passing test, but not that of the handle of
+/// standard error: this line is shown by every `cargo test`.
 #[track_caller]
 #[allow(clippy::explicit_write, reason = "`eprintln!` is what the harness swallows")]
 pub(crate) fn not_run(why: impl Display) {
@@ -126,7 +127,7 @@ pub(crate) fn not_run(why: impl Display) {
     writeln!(std::io::stderr(), "not run: {test} ({place}): {why}").unwrap();
 }
 
-/// A file or folder of the captures that may lie beside the checkout; where it does not, what needs it is not run.
+/// A file or folder of captures that may be next to the checkout; without it, the rest of the test is not run.
 #[track_caller]
 pub(crate) fn shared(name: &str) -> Option<PathBuf> {
     let path = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared")).join(name);

@@ -1,11 +1,11 @@
-//! A place for runs on a small set.
+//! A folder for runs on a small dataset.
 
 use std::fs;
 use std::path::PathBuf;
 
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 
-/// A folder with a set of nine small views in `set`, and runs beside it.
+/// A folder with a dataset of nine small views in `set`, and runs next to it.
 pub(crate) struct Place(pub(crate) tempfile::TempDir);
 
 impl Place {
@@ -26,7 +26,7 @@ impl Place {
         self.0.path().join(name)
     }
 
-    /// The arguments that train `set` into `name`.
+    /// The arguments for training on `set` into `name`.
     pub(crate) fn train(&self, name: &str, options: &str) -> String {
         let (set, out) = (self.path("set"), self.path(name));
         format!(

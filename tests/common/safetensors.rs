@@ -1,4 +1,4 @@
-//! Reads the float32 tensors of a safetensors file: a length, a JSON header, then the values. Writes them too.
+//! Reads and writes the float32 tensors of a safetensors file: a length, a JSON header, then the values.
 
 use std::collections::BTreeMap;
 use std::path::Path;

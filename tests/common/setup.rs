@@ -1,4 +1,4 @@
-//! Gaussians and a view of them, through the renderer that ships.
+//! Gaussians and a view of them, rendered by the shipped renderer.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, UVec2, Vec2};
 use nightsplat::camera::{self, CameraModel, KannalaBrandt};
@@ -16,7 +16,7 @@ use nightsplat::splats::scene::{DeviceGaussians, Features, Gaussians, Shape};
 
 use super::Random;
 
-/// A camera profile that mixes channels, and bends each in its own way.
+/// A camera profile that mixes channels, and bends each differently.
 pub(crate) fn profile() -> Profile {
     let bent = |power: f64| (0..=16).map(|i| (f64::from(i) / 16.0).powf(power)).collect();
     Profile {
@@ -29,7 +29,7 @@ pub(crate) fn profile() -> Profile {
     }
 }
 
-/// Gaussians, a view of them, and what the renderer is specialised for.
+/// Gaussians, a view of them, and the specialization of the renderer.
 #[derive(Clone)]
 pub(crate) struct Setup {
     pub(crate) count: usize,
@@ -40,12 +40,12 @@ pub(crate) struct Setup {
 }
 
 impl Setup {
-    /// `count` Gaussians inside the view of a turned pinhole with an off-centre principal point.
+    /// `count` Gaussians within the view of a rotated pinhole camera with an off-centre principal point.
     pub(crate) fn new(count: usize, size: [u32; 2], shape: impl Into<Shape>, seed: u64) -> Self {
         Self::seen_by(CameraModel::Pinhole, count, size, shape, seed)
     }
 
-    /// The same of another camera model, whose numbers are of f32.
+    /// [`Setup::new`] for another camera model, with parameters that f32 represents.
     pub(crate) fn seen_by(
         model: CameraModel,
         count: usize,
@@ -55,7 +55,7 @@ impl Setup {
     ) -> Self {
         let shape = shape.into();
         let (sin, cos) = 0.3f32.sin_cos();
-        // Every number is one of f32, which is what the kernels are given.
+        // All values are representable in f32, as for the kernels.
         let wide = |column: [f32; 3]| DVec3::from(column.map(f64::from));
         let [x, y, z] = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]].map(wide);
         let [width, height] = size;
@@ -82,7 +82,7 @@ impl Setup {
         setup
     }
 
-    /// One that projects into the image or beside it, also where slopes are clamped, some pixels wide.
+    /// A Gaussian some pixels wide that projects into the image or next to it, also where slopes are clamped.
     fn random_gaussian(&self, random: &mut Random) -> Gaussian {
         let camera = self.camera();
         let depth = random.between(1.0, 5.0);
@@ -100,8 +100,7 @@ impl Setup {
         }
     }
 
-    /// The point of the world that is seen at `pixel`, so deep in the view; behind the camera where a fisheye shows
-    /// nothing.
+    /// The world-space point at `pixel` and a depth; behind the camera if a fisheye does not see the pixel.
     pub(crate) fn at_pixel(&self, pixel: DVec2, depth: f64) -> DVec3 {
         let in_view = self.camera.in_view(pixel, depth).unwrap_or(DVec3::NEG_Z * depth);
         let camera = self.camera();
@@ -113,7 +112,7 @@ impl Setup {
         Planes { count: self.count, feature_count, sh_degree: self.settings.shape.sh_degree }
     }
 
-    /// The camera as the references know it.
+    /// The camera as the references use it.
     pub(crate) fn camera(&self) -> Camera {
         let camera::Camera { width, height, focal, principal_point, model, view_from_world } =
             self.camera;
@@ -150,14 +149,14 @@ impl Setup {
         self.camera.width as usize * self.camera.height as usize
     }
 
-    /// What is seen where no splat is.
+    /// The background.
     pub(crate) fn background(&self) -> Vec<f32> {
         let mut background = self.options.background.to_vec();
         background.resize(self.channels(), 0.0);
         background
     }
 
-    /// The Gaussians on the device.
+    /// Uploads the Gaussians.
     pub(crate) fn upload(&self) -> DeviceGaussians {
         self.gaussians().upload(&gpu()).unwrap()
     }
@@ -169,7 +168,7 @@ impl Setup {
         gaussians
     }
 
-    /// The render, with as much memory as it takes.
+    /// The render, with sufficient memory.
     pub(crate) fn render(&self) -> Rendered<'_> {
         let mut rendered = Rendered::new(self);
         let Rendered { renderer, gaussians, .. } = &mut rendered;
@@ -177,7 +176,7 @@ impl Setup {
         rendered.download()
     }
 
-    /// The render with memory for this many intersections, whether they suffice or not, and the status.
+    /// The render and the status, with memory for this number of intersections, sufficient or not.
     pub(crate) fn render_within(&self, capacity: u32) -> (Rendered<'_>, Status) {
         let mut rendered = Rendered::new(self);
         rendered.renderer.set_intersection_capacity(capacity).unwrap();
@@ -198,7 +197,7 @@ pub(crate) struct Rendered<'a> {
     pub(crate) transmittances: Vec<f32>,
 }
 
-/// What the backward pass leaves.
+/// The results of the backward pass.
 #[derive(Clone, PartialEq, Debug)]
 pub(crate) struct Gradients {
     pub(crate) parameters: Vec<f32>,
@@ -219,7 +218,7 @@ impl<'a> Rendered<'a> {
         Self { setup, gaussians, renderer, render: vec![], transmittances: vec![] }
     }
 
-    /// The forward pass alone: the flags of the status stay.
+    /// Only the forward pass; the flags of the status stay.
     pub(crate) fn forward(&mut self) {
         let Self { setup, gaussians, renderer, .. } = self;
         gpu()
@@ -271,7 +270,7 @@ impl<'a> Rendered<'a> {
     }
 }
 
-/// Features of this many channels, with the three of colour.
+/// Features with this number of channels, including the three of colour.
 pub(crate) fn features(channels: usize) -> Features {
     let features = Features { depth: channels > 3, structure: channels > 4, ..Features::NONE };
     let features = if channels > 5 { Features::ALL } else { features };
@@ -279,19 +278,19 @@ pub(crate) fn features(channels: usize) -> Features {
     features
 }
 
-/// A tile of this size that this many subgroups share.
+/// A tile of this size, shared by this number of subgroups.
 pub(crate) fn tile_of((size, subgroups): ([u32; 2], u32)) -> Tile {
     Tile { size, subgroups }
 }
 
-/// A fisheye as they are sold, in numbers of f32.
+/// A typical fisheye, with values that f32 represents.
 pub(crate) fn fisheye() -> CameraModel {
     let coefficients = [0.05f32, -0.02, 0.006, -0.001].map(f64::from);
     CameraModel::Fisheye(KannalaBrandt { coefficients })
 }
 
-/// Every size, channel count, tile and SH degree (stored, in use) that a kernel may trip over; colours are raw in those
-/// with many channels.
+/// Edge cases of size, channel count, tile and SH degree (stored, in use) for the kernels; with many channels, colours
+/// are raw.
 pub(crate) fn variants() -> Vec<Setup> {
     type Row = (usize, [u32; 2], [u32; 2], usize, ([u32; 2], u32));
     let rows: [Row; 11] = [
@@ -307,7 +306,7 @@ pub(crate) fn variants() -> Vec<Setup> {
         (64, [50, 37], [1, 1], 3, ([16, 8], 1)),
         (200, [66, 52], [2, 1], 4, ([16, 16], 1)),
     ];
-    /// Those from here on are seen by a fisheye.
+    /// The variants from this one on have a fisheye.
     const PINHOLES: usize = 9;
     let build = |(i, (count, size, [stored, used], channels, tile)): (usize, Row)| {
         let shape = Shape { sh_degree: stored, features: features(channels) };
@@ -315,7 +314,7 @@ pub(crate) fn variants() -> Vec<Setup> {
         let mut setup = Setup::seen_by(model, count, size, shape, count as u64);
         setup.options.sh_degree = used;
         setup.settings.raw_colors = channels > 4;
-        // Tiles that do not suit its subgroups a device replaces by its own.
+        // A device replaces tiles that it does not support by its own.
         setup.settings.tile =
             Some(tile_of(tile)).filter(|&tile| gpu().properties().suits_tile(tile));
         setup

@@ -1,4 +1,4 @@
-//! Small sets, and training on them.
+//! Small datasets, and training on them.
 
 use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::dataset::Dataset;
@@ -6,7 +6,7 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{StepReport, TrainConfig, Trainer};
 
-/// This many synthetic views of a size, loaded as by default.
+/// A dataset of this many synthetic views of a size, loaded with default options.
 pub(crate) fn dataset(views: usize, [width, height]: [u32; 2]) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
     synthetic::write(
@@ -17,7 +17,7 @@ pub(crate) fn dataset(views: usize, [width, height]: [u32; 2]) -> Dataset {
     Dataset::load(folder.path(), &TrainConfig::bare().load_options()).unwrap()
 }
 
-/// Trains until a step; what the steps said.
+/// Trains up to a step; returns the reports.
 pub(crate) fn advance(trainer: &mut Trainer, until: u64) -> Vec<StepReport> {
     let mut reports = vec![];
     while trainer.steps_done() < until {
@@ -26,7 +26,7 @@ pub(crate) fn advance(trainer: &mut Trainer, until: u64) -> Vec<StepReport> {
     reports
 }
 
-/// A whole training: what the steps said, and what came of it.
+/// A whole training: the reports, and the result.
 pub(crate) fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<StepReport>, Gaussians) {
     let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
     (advance(&mut trainer, config.steps), trainer.gaussians().unwrap())

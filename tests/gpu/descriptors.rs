@@ -1,4 +1,4 @@
-//! Devices without push descriptors bind sets, and nothing else is different.
+//! Devices without push descriptors bind sets, with the same results.
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -8,7 +8,7 @@ use nightsplat::kernels::relu_backward;
 
 use crate::common::command::{command, succeed};
 
-/// Trains, every part switched on, and checks the passes of a step on the way; the model's bytes.
+/// Trains with every part enabled, and checks the passes of a step; returns the model's bytes.
 fn trained(scene: &str, out: &str, push: &str) -> Vec<u8> {
     let line =
         format!("train {scene} --out {out} --steps 12 --model lita --check-every 6 --seed 3");

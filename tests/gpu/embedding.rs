@@ -1,4 +1,4 @@
-//! A host application that has its own Vulkan lends us its device, and gets it back as it was.
+//! A host application with its own Vulkan lends its device, and gets it back unchanged.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 #![expect(unsafe_code, reason = "plays a host application, which calls Vulkan itself")]
@@ -19,8 +19,8 @@ use nightsplat::splats::scene::Gaussians;
 use crate::host::{Host, Memory};
 
 #[test]
-fn a_borrowed_device_renders_the_same_and_comes_back_alive_and_clean() {
-    // A device without the extension has its descriptors in sets, and the bits are the same.
+fn a_borrowed_device_renders_the_same_and_is_returned_unchanged() {
+    // A device without the extension has its descriptors in sets; the bits are the same.
     lend_and_take_back(&[]);
     if gpu().properties().has_push_descriptors {
         lend_and_take_back(&[khr::push_descriptor::NAME]);
@@ -47,13 +47,13 @@ fn lend_and_take_back(extensions: &[&CStr]) {
     host.fill(&memory, 0x1234_5678);
     assert_eq!(memory.read(), vec![0x1234_5678; own.data.len()], "the device is not alive");
     host.free(memory);
-    // Objects that we did not destroy would be reported when the host destroys its device.
+    // Objects that the library did not destroy would be reported when the host destroys its device.
     let messages = host.destroy();
     assert!(messages.is_empty(), "validation: {messages:#?}");
 }
 
 #[test]
-fn a_host_without_a_loader_function_is_told_so() {
+fn a_host_without_a_loader_function_is_refused() {
     let host = HostDevice::default();
     // SAFETY: the first handle, which is null, is refused before any is used.
     let message = unsafe { Gpu::from_host(host) }.unwrap_err().to_string();
@@ -68,7 +68,7 @@ fn assert_same(what: &str, actual: &Image, expected: &Image) {
 }
 
 // ---------------------------------------------------------------------------
-// What is rendered
+// The scene
 
 const OPTIONS: RenderOptions = RenderOptions { sh_degree: 0, background: [0.1, 0.2, 0.3] };
 
@@ -83,7 +83,7 @@ fn camera() -> Camera {
     }
 }
 
-/// Some two hundred in front of the camera.
+/// About two hundred in front of the camera.
 fn gaussians() -> Gaussians {
     let mut gaussians = Gaussians::zeros(200, 0);
     let count = gaussians.count;
@@ -115,7 +115,7 @@ fn render(gpu: &Gpu) -> Image {
 /// Renders within a command buffer that the host begins, continues with a copy to its memory, and submits.
 fn render_into(host: &Host, gpu: &Gpu, memory: &mut Memory) {
     let on_device = gaussians().upload(gpu).unwrap();
-    // A renderer of its own, so that no earlier render can pass for this one.
+    // A separate renderer, so that no earlier render is mistaken for this one.
     let mut renderer = renderer(gpu);
     host.submit(|commands| {
         let readers = vk::PipelineStageFlags2::ALL_TRANSFER.as_raw();
@@ -123,7 +123,7 @@ fn render_into(host: &Host, gpu: &Gpu, memory: &mut Memory) {
         // SAFETY: the command buffer is recording.
         let recorded = unsafe {
             gpu.record_into(&frame, |pass| {
-                // Nothing of ours would know when the copy is there.
+                // The library cannot tell when the copy is done.
                 let message = pass.download(&on_device.parameters).unwrap_err().to_string();
                 assert!(message.contains("`parameters`"), "{message}");
                 renderer.forward(pass, &on_device, &camera(), &OPTIONS)

@@ -1,5 +1,5 @@
-//! Memory that runs out and devices that are lost, at every place where that can be: nothing is lost that was saved,
-//! and no run says that it is done where it is not.
+//! Memory that runs out and devices that are lost, at every possible place: saved work is not lost, and no run claims
+//! to be finished unless it is.
 #![cfg(feature = "io")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -23,7 +23,7 @@ fn gpu() -> Gpu {
     Gpu::with_validation(&choice.parse::<DeviceChoice>().unwrap()).unwrap()
 }
 
-/// Everything that allocates on the way, in a few steps: growth, what rises with the SH degree, networks, checkpoints.
+/// All sources of allocations in a few steps: growth, higher SH degrees, networks, checkpoints.
 fn config() -> TrainConfig {
     let mut config = TrainConfig {
         steps: 14,
@@ -44,7 +44,7 @@ fn config() -> TrainConfig {
     config
 }
 
-/// Trains into `out`; the error, where there is one, and the last step that was reported.
+/// Trains into `out`; returns the error, if any, and the last reported step.
 fn train(
     gpu: &Gpu,
     config: &TrainConfig,
@@ -62,7 +62,7 @@ fn train(
 }
 
 #[test]
-fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
+fn a_lack_of_memory_anywhere_leaves_a_checkpoint_and_no_finished_run() {
     let (gpu, dataset, config) = (gpu(), dataset(5, [24, 20]), config());
     let folder = tempfile::tempdir().unwrap();
     let straight = folder.path().join("straight");
@@ -78,7 +78,7 @@ fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
     let mut numbers: Vec<usize> = sites.into_values().flatten().collect();
     numbers.sort_unstable();
     numbers.dedup();
-    // All of them take minutes: some of those before the first step, and the last.
+    // All of them take minutes: test some of those before the first step, and the last.
     if std::env::var_os("NIGHTSPLAT_ALL_SITES").is_none() {
         let (early, late) = numbers.split_at(numbers.len().saturating_sub(8));
         let some = early.iter().step_by((early.len() / 4).max(1));
@@ -92,7 +92,7 @@ fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
         let asked = allocations(&gpu).len();
         fail_allocation(&gpu, 0);
         let Some(error) = error else {
-            // Steps may come in fewer submissions than they did before.
+            // The steps may be in fewer submissions than before.
             assert!(asked <= index, "{name} ({index}): the run says it is done");
             continue;
         };
@@ -114,7 +114,7 @@ fn memory_that_runs_out_anywhere_leaves_a_checkpoint_and_no_finished_run() {
 }
 
 #[test]
-fn a_device_that_is_lost_anywhere_leaves_the_last_checkpoint_to_go_on_from() {
+fn a_device_lost_anywhere_leaves_the_last_checkpoint_to_resume_from() {
     let (dataset, config) = (dataset(5, [24, 20]), config());
     let folder = tempfile::tempdir().unwrap();
     let straight = folder.path().join("straight");
@@ -141,7 +141,7 @@ fn a_device_that_is_lost_anywhere_leaves_the_last_checkpoint_to_go_on_from() {
     assert!(resumed > 1);
 }
 
-/// A growing run on nine views, and what it said that it was going to take.
+/// A growing run on nine views, and its memory estimate.
 fn foreseen(gpu: &Gpu, config: &TrainConfig) -> (MemoryEstimate, RunSummary) {
     let (dataset, folder) = (dataset(9, [100, 75]), tempfile::tempdir().unwrap());
     let mut foreseen = None;
@@ -155,7 +155,7 @@ fn foreseen(gpu: &Gpu, config: &TrainConfig) -> (MemoryEstimate, RunSummary) {
     (foreseen.unwrap(), trained)
 }
 
-/// Grows to all that it may have in its second round, and comes to its SH degree.
+/// Grows to its limit in the second round, and reaches its SH degree.
 fn growing() -> TrainConfig {
     let mut config = TrainConfig {
         steps: 60,
@@ -175,10 +175,10 @@ fn growing() -> TrainConfig {
 }
 
 #[test]
-fn memory_is_foreseen_to_a_fifth() {
-    // Without validation, which takes memory of its own.
+fn memory_is_estimated_to_a_fifth() {
+    // Without validation, which needs memory.
     let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
-    // With every SH degree, and with none above 0; with the activations of a denoiser's stages.
+    // With every SH degree, with none above 0, and with the activations of a denoiser's stages.
     for (sh_degree_interval, stages) in [(20, 0), (1000, 0), (1000, 3)] {
         let mut config = growing();
         config.schedule.sh_degree_interval = sh_degree_interval;
@@ -191,13 +191,13 @@ fn memory_is_foreseen_to_a_fifth() {
         let share = own.peak_device as f64 / spent.device_bytes as f64;
         assert!((0.8..=1.2).contains(&share), "{own:?}, and {spent:?} came");
         if let Some(host) = spent.host_bytes {
-            // Other tests of this process have left their peak; what is foreseen is no less than what is there.
+            // Other tests of this process have raised the peak; the estimate is at least the present memory.
             assert!(own.peak_host as f64 <= 1.2 * host as f64, "{own:?}, and {spent:?} came");
         }
     }
 }
 
-/// Two fifths of what a step takes are activations here.
+/// Two fifths of a step's memory are activations here.
 #[test]
 fn activations_are_kept_within_a_fraction_of_max_vram_and_change_no_bit_of_the_model() {
     let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
@@ -221,7 +221,7 @@ fn activations_are_kept_within_a_fraction_of_max_vram_and_change_no_bit_of_the_m
 }
 
 #[test]
-fn growth_stops_at_the_memory_that_it_may_have_and_at_the_same_number_every_time() {
+fn growth_stops_at_the_memory_limit_and_always_at_the_same_number() {
     let gpu = gpu();
     let mut config = growing();
     let vram = 7 << 20;

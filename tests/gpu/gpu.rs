@@ -1,4 +1,4 @@
-//! The device layer: choosing a device, buffers at their limits, and every way to launch work.
+//! The device layer: choosing a device, buffers at their limits, and all ways to launch work.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -18,7 +18,7 @@ fn relu_pipeline() -> Pipeline<relu_backward::Kernel> {
     gpu().pipeline(&relu_backward::Constants::default()).unwrap()
 }
 
-/// `count` ones, of which this many threads of `relu_backward` make zeros.
+/// `count` ones, where this many threads of `relu_backward` write zeros.
 fn ones_and_zeros(count: usize, threads: Threads) -> Vec<f32> {
     let (gpu, pipeline) = (gpu(), relu_pipeline());
     let activations = gpu.zeros("activations", count).unwrap();
@@ -39,7 +39,7 @@ fn ones_and_zeros(count: usize, threads: Threads) -> Vec<f32> {
 // Devices
 
 #[test]
-fn a_device_that_is_not_there_is_answered_with_those_that_are() {
+fn an_unknown_device_is_refused_with_the_list_of_devices() {
     let all = devices().unwrap();
     for (text, wanted) in [
         ("no such device", "`no such device`"),
@@ -72,9 +72,9 @@ fn every_device_is_found_by_its_uuid() {
 }
 
 #[test]
-fn what_validation_says_fails_the_process_and_names_the_test() {
-    const NAME: &str = "gpu::what_validation_says_fails_the_process_and_names_the_test";
-    // The test runs itself once more, in a process of its own, and then misuses the device.
+fn a_validation_message_fails_the_process_and_names_the_test() {
+    const NAME: &str = "gpu::a_validation_message_fails_the_process_and_names_the_test";
+    // The test runs itself again in a separate process, and then misuses the device.
     if std::env::var_os("MISUSE_THE_DEVICE").is_some() {
         return misuse(&gpu());
     }
@@ -86,7 +86,7 @@ fn what_validation_says_fails_the_process_and_names_the_test() {
     assert!(stdout.contains("1 passed"), "the test itself must not notice: {stdout}");
     assert_eq!(output.status.code(), Some(101), "{stderr}");
     let prefix = format!("{NAME}: ");
-    // Newer layers take more than a line.
+    // Newer layers print more than one line.
     let message = stderr.split_once(&prefix).unwrap_or_default().1;
     assert!(message.contains("VUID-VkBufferCreateInfo-size-00912"), "{stderr}");
 }
@@ -143,7 +143,7 @@ fn a_buffer_dropped_in_flight_lives_until_its_work_is_done() {
     let mut doomed: Buffer<u32> = gpu.uninit("doomed", LEN).unwrap();
     let submission = gpu
         .submit("in flight", |pass| {
-            // Each waits for the one before: plenty of time to drop the buffer too early.
+            // Each waits for the previous one: enough time to drop the buffer too early.
             for word in 1..=50 {
                 pass.fill(&mut doomed, word);
                 pass.copy(&doomed, &mut result);
@@ -152,7 +152,7 @@ fn a_buffer_dropped_in_flight_lives_until_its_work_is_done() {
         })
         .unwrap();
     drop(doomed);
-    // Memory freed too early would be handed out again here.
+    // Memory freed too early would be reused here.
     let newcomer = gpu.buffer("newcomer", &vec![77u32; LEN]).unwrap();
     submission.wait().unwrap();
     assert!(gpu.read(&result).unwrap().iter().all(|&word| word == 50));
@@ -160,7 +160,7 @@ fn a_buffer_dropped_in_flight_lives_until_its_work_is_done() {
 }
 
 #[test]
-fn what_a_failed_recording_drops_does_no_harm() {
+fn objects_dropped_by_a_failed_recording_are_safe() {
     let gpu = gpu();
     let mut kept = gpu.buffer("kept", &[1u32, 2, 3]).unwrap();
     let mut dropped: Buffer<u32> = gpu.zeros("dropped", 3).unwrap();
@@ -178,7 +178,7 @@ fn what_a_failed_recording_drops_does_no_harm() {
 // Recording
 
 #[test]
-fn what_submits_by_itself_is_refused_within_a_recording_and_works_behind_it() {
+fn a_submission_is_refused_within_a_recording_and_works_after_it() {
     let gpu = gpu();
     let mut renderer = Renderer::new(&gpu, RenderSettings::default()).unwrap();
     let mut inner = gpu.buffer("inner", &[1u32, 2, 3]).unwrap();
@@ -201,7 +201,7 @@ fn what_submits_by_itself_is_refused_within_a_recording_and_works_behind_it() {
     .unwrap();
     assert_eq!(gpu.read(&outer).unwrap(), [1, 2, 3]);
     renderer.reserve(100, []).unwrap();
-    // A recording that fails leaves nothing either.
+    // A failed recording leaves no state either.
     gpu.run("fails", |_| Err(Error::Usage("enough".to_owned()))).unwrap_err();
     gpu.write(&mut inner, &[9; 3]).unwrap();
     assert_eq!(gpu.read(&inner).unwrap(), [9; 3]);
@@ -215,7 +215,7 @@ fn another_thread_that_submits_waits_for_the_recording_to_end() {
     std::thread::scope(|scope| {
         let writer = gpu.run("recording", |pass| {
             pass.fill(&mut buffer, 5);
-            // It cannot be waited for in here.
+            // It cannot be waited for here.
             let thread = scope.spawn(|| gpu.write(&mut other, &[7; 3]));
             std::thread::sleep(Duration::from_millis(20));
             assert!(!thread.is_finished());
@@ -247,7 +247,7 @@ fn a_download_that_was_not_submitted_is_not_waited_for() {
 // Launching
 
 #[test]
-fn a_dispatch_runs_on_as_many_threads_as_the_extent_asks_for() {
+fn a_dispatch_runs_on_the_requested_number_of_threads() {
     for count in [1, WORKGROUP - 1, WORKGROUP, WORKGROUP + 1, 10_007] {
         let left = ones_and_zeros(count, Threads::Exactly([count as u32, 1, 1]));
         assert_eq!(left, vec![0.0; count]);
@@ -255,8 +255,8 @@ fn a_dispatch_runs_on_as_many_threads_as_the_extent_asks_for() {
 }
 
 #[test]
-fn more_workgroups_than_fit_along_x_are_folded_and_none_is_lost() {
-    // Tiles of one subgroup without splats: what a workgroup costs is next to nothing.
+fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
+    // Tiles of one subgroup without splats, since a workgroup then costs almost nothing.
     const COLUMNS: u32 = 9;
     const ROWS: u32 = 5;
     let gpu = gpu_that_launches(7);
@@ -314,7 +314,7 @@ fn more_workgroups_than_fit_along_x_are_folded_and_none_is_lost() {
 }
 
 #[test]
-fn workgroups_that_cannot_be_folded_are_refused_by_the_name_of_the_pass() {
+fn workgroups_that_cannot_be_folded_are_refused_with_the_name_of_the_pass() {
     let gpu = gpu();
     let too_many = gpu.properties().max_workgroups + 1;
     let mut gradient = gpu.zeros("gradient", 1).unwrap();

@@ -1,4 +1,4 @@
-//! Device, buffers and passes: what they promise, on devices of their own and borrowed ones, and where they fail.
+//! Device, buffers and passes: guarantees, own and borrowed devices, and failures.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 

@@ -1,4 +1,4 @@
-//! The house rules that the compiler does not check, read off the sources.
+//! House rules that the compiler does not check, asserted on the sources.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-/// The longest file that is still read once from top to bottom, in lines.
+/// The longest file, in lines, that is still easy to read.
 const MAX_LINES: usize = 600;
 
 /// Every file below `folder` with the extension, as paths relative to the repository, with their text.
@@ -35,7 +35,7 @@ fn stem(path: &Path) -> &str {
     path.file_stem().unwrap().to_str().unwrap()
 }
 
-/// The module a file of `src` belongs to: `render` for `src/splats/render.rs` and `src/splats/render/buffers.rs`.
+/// The module of a file of `src`: `render` for `src/splats/render.rs` and `src/splats/render/buffers.rs`.
 fn module(path: &Path) -> &str {
     Path::new(path.iter().nth(1).unwrap()).file_stem().unwrap().to_str().unwrap()
 }
@@ -49,7 +49,7 @@ fn layers(lib: &str) -> Vec<&str> {
     lib.lines().filter_map(entry).collect()
 }
 
-/// The parts of the line that are code: no comment. Strings may remain; they name no modules.
+/// The code of a line, without its comment. Strings may remain; they name no modules.
 pub(crate) fn code(line: &str) -> &str {
     line.split("//").next().unwrap()
 }
@@ -63,7 +63,7 @@ fn crate_paths(text: &str) -> BTreeSet<String> {
         code.match_indices("crate::").map(|(at, found)| (at, &code[at + found.len()..]))
     {
         if let Some(group) = path.strip_prefix('{') {
-            // Of each entry of the group, at any depth, the first segment at depth one.
+            // The first segment of each entry of the group, at depth one.
             let mut depth = 1;
             let mut entry = String::new();
             for character in group.chars() {
@@ -90,7 +90,7 @@ fn first_segment(path: &str) -> String {
 }
 
 #[test]
-fn paths_into_the_crate_are_found_however_they_are_written() {
+fn paths_into_the_crate_are_found_in_every_notation() {
     let text =
         "use crate::a::B;\nuse crate::{c, d::{E, f}, G}; // crate::comment\nlet x = crate::h::i();";
     let names: Vec<String> = crate_paths(text).into_iter().collect();
@@ -105,7 +105,7 @@ fn the_list_of_layers_names_every_module_once() {
     let layers = layers(&lib);
     assert_eq!(layers.iter().copied().collect::<BTreeSet<_>>(), declared);
     assert_eq!(layers.len(), declared.len(), "a module is listed twice");
-    // For hosts each is private, but for the command.
+    // For hosts each is private, except for the command.
     let private = lib.lines().filter_map(|line| line.strip_prefix("mod ")?.strip_suffix(';'));
     let hidden: BTreeSet<&str> = private.chain(["cli"]).collect();
     assert_eq!(hidden, declared);
@@ -129,7 +129,7 @@ fn a_module_uses_only_modules_above_it() {
     let layer = |name: &str| layers.iter().position(|layer| *layer == name);
     let mut broken = vec![];
     for (path, text) in files("src", "rs") {
-        // `main` stands above all modules, `lib` only lists them.
+        // `main` is above all modules, and `lib` only lists them.
         let Some(own) = layer(module(&path)) else { continue };
         for used in crate_paths(&text) {
             if layer(&used).is_some_and(|used| used > own) {
@@ -141,7 +141,7 @@ fn a_module_uses_only_modules_above_it() {
 }
 
 #[test]
-fn every_kernel_has_a_reference_of_its_name() {
+fn every_kernel_has_a_reference_with_its_name() {
     for (path, _) in files("shaders-glsl", "comp") {
         let reference = Path::new("src/reference").join(stem(&path)).with_extension("rs");
         assert!(Path::new(ROOT).join(&reference).exists(), "{} is missing", reference.display());
@@ -159,7 +159,7 @@ fn every_kernel_is_named_in_a_test() {
     }
 }
 
-/// How often the text wires the kernel by hand: names its `Buffers`, or the test macro that does.
+/// How often the text dispatches the kernel by hand: names its `Buffers`, or the test macro.
 fn wirings(text: &str, kernel: &str) -> usize {
     let code: String = text.lines().map(code).flat_map(|line| [line.trim(), " "]).collect();
     let words = |pattern: String| {
@@ -171,7 +171,7 @@ fn wirings(text: &str, kernel: &str) -> usize {
 }
 
 #[test]
-fn the_library_wires_each_kernel_in_one_place_and_no_command_wires_any() {
+fn the_library_dispatches_each_kernel_in_one_place_and_no_command_dispatches_any() {
     let sources = files("src", "rs");
     for (shader, _) in files("shaders-glsl", "comp") {
         let count = |(_, text): &(PathBuf, String)| wirings(text, stem(&shader));
@@ -184,8 +184,8 @@ fn the_library_wires_each_kernel_in_one_place_and_no_command_wires_any() {
 }
 
 #[test]
-fn a_test_wires_a_kernel_by_hand_only_where_it_tests_that_kernel() {
-    // What the recorder does is shown with kernels of the rasteriser, and each curve with the kernel that maps images.
+fn a_test_dispatches_a_kernel_by_hand_only_to_test_that_kernel() {
+    // The recorder is tested with kernels of the rasteriser, and each curve with the kernel that maps images.
     const EXEMPT: [&str; 2] = ["tests/gpu/gpu.rs", "tests/photographs/curves.rs"];
     let mut tests = files("tests", "rs");
     tests.retain(|(path, _)| !EXEMPT.iter().any(|exempt| path == Path::new(exempt)));
@@ -197,7 +197,7 @@ fn a_test_wires_a_kernel_by_hand_only_where_it_tests_that_kernel() {
 }
 
 #[test]
-fn unsafe_code_is_in_the_gpu_layer_and_the_c_interface_alone() {
+fn unsafe_code_is_only_in_the_gpu_layer_and_the_c_interface() {
     for (path, text) in files("src", "rs") {
         if matches!(module(&path), "gpu" | "capi") {
             continue;
@@ -212,7 +212,7 @@ fn unsafe_code_is_in_the_gpu_layer_and_the_c_interface_alone() {
 
 #[test]
 fn tests_start_the_command_and_look_for_captures_in_one_place() {
-    // There validation is made to fail the command, and what is absent is said.
+    // There, validation fails the command, and missing captures are reported.
     for (what, place) in [("CARGO_BIN_", "common/command.rs"), ("/../shar", "common/mod.rs")] {
         for (path, text) in files("tests", "rs") {
             let allowed = path.ends_with(place) || path.ends_with("architecture.rs");
@@ -234,7 +234,7 @@ fn a_file_can_be_read_in_one_sitting() {
 fn a_clock_that_jumps_changes_nothing_but_the_dates_of_event_files_and_whether_photographs_are_decoded_again()
  {
     let clocks = ["SystemTime", "UNIX_EPOCH", ".modified()"];
-    // A stamp of another time costs a checksum of the pixels, and no more.
+    // A changed time stamp costs only a checksum of the pixels.
     let may_ask = ["src/base/tree.rs", "src/results/run/tensorboard.rs"];
     for (path, text) in files("src", "rs") {
         let asks =

@@ -1,18 +1,18 @@
-//! No two modules use each other, at any depth: read off the sources.
+//! No two modules use each other, at any depth, asserted on the sources.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use crate::architecture::{code, files};
 
-/// A module by its names from the crate's root.
+/// A module, by its path from the crate's root.
 type Module = Vec<String>;
 
-/// What a module's file says: the paths in its code, and the items that it has from which child.
+/// A module's file: the paths in its code, and the items that it re-exports from its children.
 struct Source {
     module: Module,
     paths: Vec<Module>,
-    /// By item, the child that it comes from.
+    /// By item, the child that defines it.
     imported: BTreeMap<String, String>,
 }
 
@@ -21,7 +21,7 @@ fn module_of(path: &Path) -> Module {
     path.iter().map(|name| name.to_str().unwrap().to_owned()).collect()
 }
 
-/// The paths of a use tree: `a::{b, c::D}` is `a::b` and `a::c::D`. Gives back what follows the tree.
+/// The paths of a use tree: `a::{b, c::D}` is `a::b` and `a::c::D`. Returns the text after the tree.
 fn tree<'a>(mut text: &'a str, before: &Module, found: &mut Vec<Module>) -> &'a str {
     let mut path = before.clone();
     loop {
@@ -52,7 +52,7 @@ fn tree<'a>(mut text: &'a str, before: &Module, found: &mut Vec<Module>) -> &'a 
     }
 }
 
-/// Every path that begins with `crate`, `super` or, after `use`, with a name of the module's own.
+/// Every path that begins with `crate`, `super` or, after `use`, with one of the module's own names.
 fn paths(text: &str) -> Vec<Module> {
     let mut found = vec![];
     for root in ["crate::", "super::", "use "] {
@@ -79,7 +79,7 @@ fn read(path: &Path, text: &str) -> Source {
     Source { module: module_of(path), paths, imported }
 }
 
-/// The module that the path leads to from another one, as far as its names are modules or items of one.
+/// The module to which a path in another module leads, as far as its segments are modules or their items.
 fn resolved(from: &Module, path: &Module, sources: &BTreeMap<Module, Source>) -> Option<Module> {
     let supers = path.iter().take_while(|name| *name == "super").count();
     let (mut at, names) = match path[0].as_str() {
@@ -103,7 +103,7 @@ fn resolved(from: &Module, path: &Module, sources: &BTreeMap<Module, Source>) ->
     Some(at)
 }
 
-/// For each module, those of its siblings that it or what is below it uses.
+/// For each module, the siblings that it or its descendants use.
 fn used_siblings(sources: &BTreeMap<Module, Source>) -> BTreeMap<Module, BTreeSet<Module>> {
     let mut used: BTreeMap<Module, BTreeSet<Module>> = BTreeMap::new();
     for source in sources.values() {
@@ -119,7 +119,7 @@ fn used_siblings(sources: &BTreeMap<Module, Source>) -> BTreeMap<Module, BTreeSe
     used
 }
 
-/// Whether `to` is reached from `from`.
+/// Whether `to` is reachable from `from`.
 fn reaches(from: &Module, to: &Module, used: &BTreeMap<Module, BTreeSet<Module>>) -> bool {
     let mut seen = BTreeSet::new();
     let mut open = vec![from];

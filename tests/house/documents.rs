@@ -1,4 +1,4 @@
-//! The documents: their lengths, their links, and the options and settings that they name.
+//! The documents: their lengths, their links, and the options and settings that they mention.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -8,11 +8,11 @@ use super::architecture::files;
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-/// The longest that a document may be, in bytes.
+/// The limits of documents, in bytes.
 const MAX_BYTES: [(&str, usize); 3] =
     [("README.md", 8 << 10), ("docs/guide.md", 30 << 10), ("docs/benchmarks.md", 20 << 10)];
 
-/// Every page for people, with its text.
+/// Every document, with its text.
 fn documents() -> Vec<(PathBuf, String)> {
     let root =
         ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"].map(|name| Path::new(ROOT).join(name));
@@ -25,7 +25,7 @@ fn documents() -> Vec<(PathBuf, String)> {
         .collect()
 }
 
-/// The anchors of a page's headings, as GitHub makes them.
+/// The anchors of a page's headings, as on GitHub.
 fn anchors(page: &str) -> BTreeSet<String> {
     let slug = |heading: &str| {
         let kept = heading.trim().chars().filter(|it| it.is_alphanumeric() || "-_ ".contains(*it));
@@ -76,7 +76,7 @@ fn code(page: &str) -> impl Iterator<Item = &str> {
 
 #[cfg(feature = "cli")]
 #[test]
-fn options_that_documents_name_are_options_of_the_command() {
+fn options_in_documents_are_options_of_the_command() {
     use clap::CommandFactory;
 
     fn options(command: &clap::Command) -> BTreeSet<String> {
@@ -112,7 +112,7 @@ fn options_that_documents_name_are_options_of_the_command() {
 }
 
 #[test]
-fn settings_that_the_guide_and_the_internals_name_exist() {
+fn settings_in_the_guide_and_the_internals_exist() {
     use nightsplat::train::settings::setting;
 
     let is_key =
@@ -136,7 +136,7 @@ fn settings_that_the_guide_and_the_internals_name_exist() {
 }
 
 #[test]
-fn files_and_tests_that_documents_name_exist() {
+fn files_and_tests_in_documents_exist() {
     let folders = ["src/", "tests/", "scripts/", "examples/", "docs/", "shaders-glsl/", "build/"];
     let sources = [files("src", "rs"), files("tests", "rs")].concat();
     for (path, page) in documents() {
@@ -151,7 +151,7 @@ fn files_and_tests_that_documents_name_exist() {
                     path.display()
                 );
             }
-            // The name of a test is a sentence; shorter ones are modules.
+            // The name of a test is a sentence; shorter names are modules.
             let test = word.rsplit("::").next().unwrap();
             if word.contains("::") && test.matches('_').count() > 4 {
                 let is_test = |(_, text): &(PathBuf, String)| text.contains(&format!("fn {test}("));

@@ -1,4 +1,4 @@
-//! What is installed beside the program: completions, man pages, and the package itself.
+//! Installed files other than the program: completions, man pages, and the package itself.
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -19,7 +19,7 @@ fn every_shell_completes_every_subcommand() {
 }
 
 #[test]
-fn bash_takes_its_completions_and_completes_with_them() {
+fn bash_loads_the_completions_and_completes_with_them() {
     let Ok(version) = Command::new("bash").arg("--version").output() else {
         return crate::common::not_run("there is no bash");
     };
@@ -38,7 +38,7 @@ fn every_subcommand_has_a_man_page() {
     let page = |name: &str| fs::read_to_string(dir.join(name)).unwrap();
     let main = page("nightsplat.1");
     for command in succeed("--help").lines().skip_while(|line| *line != "Commands:").skip(1) {
-        // The first two columns; what a long help line continues with is deeper.
+        // The first two columns; continuations of long help lines are indented further.
         let Some(name) = command.strip_prefix("  ").filter(|text| !text.starts_with(' ')) else {
             break;
         };
@@ -53,12 +53,12 @@ fn every_subcommand_has_a_man_page() {
         assert!(page(&format!("nightsplat-{name}.1")).contains(".SH OPTIONS"), "{name}");
     }
     assert!(page("nightsplat-train.1").contains("\\-\\-max\\-gaussians"));
-    // A file is no folder.
+    // A file is not a folder.
     refused(&format!("man {}/nightsplat.1", dir.display()), 1, &["nightsplat.1"]);
 }
 
 #[test]
-fn the_package_has_what_it_is_built_from_and_little_else() {
+fn the_package_has_all_that_its_build_needs_and_little_else() {
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let mut list = Command::new(cargo);
     list.args(["package", "--list", "--allow-dirty", "--offline"]);

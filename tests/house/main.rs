@@ -1,4 +1,4 @@
-//! The house: what the compiler does not check, and what is installed.
+//! House rules that the compiler does not check, and installed files.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -7,6 +7,7 @@ mod common;
 
 mod architecture;
 mod circles;
+mod defects;
 mod documents;
 mod install;
 mod settings;

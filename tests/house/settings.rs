@@ -5,7 +5,7 @@ use std::path::Path;
 use nightsplat::train::reference;
 
 #[test]
-fn the_page_of_settings_is_made_from_their_table() {
+fn the_page_of_settings_is_generated_from_their_table() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/settings.md");
     let (page, made) = (std::fs::read_to_string(&path).unwrap_or_default(), reference().unwrap());
     if page != made {

@@ -15,7 +15,7 @@ use super::{
 
 const WEIGHTS: DenoisingWeights = DenoisingWeights { mse: 0.7, total_variation: 1.3 };
 
-/// Views and the interiors that count in them.
+/// Views and their loss regions.
 fn cases() -> Vec<(UVec2, LossRegion)> {
     let whole = |size: [u32; 2]| (size.into(), LossRegion::whole(size.into()));
     let inside = |size: [u32; 2], origin: [u32; 2], own: [u32; 2]| {
@@ -35,7 +35,7 @@ fn cases() -> Vec<(UVec2, LossRegion)> {
     ]
 }
 
-/// Both terms by their definition, in double precision, means over the interior.
+/// Both terms by their definition, in double precision, with means over the loss region.
 fn loss_of(size: UVec2, LossRegion { origin, size: own }: LossRegion, a: &[f64], b: &[f64]) -> f64 {
     let (mut squares, mut vertical, mut horizontal) = (0.0, 0.0, 0.0);
     let at = |channel: u32, x: u32, y: u32| {
@@ -138,7 +138,7 @@ fn the_terms_match_their_reference_and_finite_differences() {
 }
 
 #[test]
-fn the_terms_are_those_of_pytorch() {
+fn the_terms_agree_with_pytorch() {
     let (gpu, torch) = (gpu(), Torch::read());
     let size = UVec2::new(17, 13);
     let images = [torch.get("denoising.denoised"), torch.get("denoising.rendered")];
@@ -156,7 +156,7 @@ fn the_terms_are_those_of_pytorch() {
 }
 
 #[test]
-fn a_constant_image_that_is_the_render_costs_nothing() {
+fn a_constant_image_equal_to_the_render_has_no_loss() {
     let size = UVec2::new(20, 21);
     let image = vec![0.3; 3 * 420];
     let outcome = evaluate(&gpu(), WEIGHTS, (size, LossRegion::whole(size)), [&image, &image]);
@@ -205,7 +205,7 @@ fn the_same_step_leaves_the_same_bits() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused() {
+fn buffers_and_views_that_do_not_fit_are_refused() {
     let gpu = gpu();
     for (mse, total_variation) in [(-1.0, 0.0), (0.0, f64::INFINITY)] {
         assert!(DenoisingLoss::new(&gpu, DenoisingWeights { mse, total_variation }).is_err());
@@ -214,13 +214,13 @@ fn what_does_not_fit_is_refused() {
     loss.reserve(UVec2::splat(8)).unwrap();
     let whole = |size: [u32; 2]| (size.into(), LossRegion::whole(size.into()));
     let outside = LossRegion { origin: UVec2::splat(1), size: UVec2::splat(8) };
-    // Buffers of 8 x 8 pixels, and some that are longer than the scratch memory is for.
+    // Buffers of 8 x 8 pixels, and some that are longer than the scratch memory.
     for (len, (size, loss_region), why) in [
         (192, whole([0, 8]), "0 x 8"),
         (192, whole([9, 8]), "9 x 8"),
         (190, whole([8, 8]), "holds 190 values, the view has 192"),
         (30_000, whole([100, 100]), "100 x 100"),
-        (192, (UVec2::splat(8), outside), "interior"),
+        (192, (UVec2::splat(8), outside), "loss region"),
     ] {
         let image = gpu.zeros("image", len).unwrap();
         let [mut d_denoised, mut d_render] = [0; 2].map(|_| gpu.zeros("d", len).unwrap());

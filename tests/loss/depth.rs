@@ -14,7 +14,7 @@ use super::{
     log_step, noise, widen,
 };
 
-/// Views and the side of the boxes in them.
+/// Views and the side of their boxes.
 const CASES: [([u32; 2], u32); 7] = [
     ([1, 1], 8),
     ([3, 1], 8),
@@ -25,7 +25,7 @@ const CASES: [([u32; 2], u32); 7] = [
     ([131, 97], 32),
 ];
 
-/// A rendered and an estimated depth that have something in common.
+/// A rendered and an estimated depth that are correlated.
 fn depths([width, height]: [u32; 2]) -> [Vec<f32>; 2] {
     let pixels = (width * height) as usize;
     let depth = noise(1, pixels, 0.2, 0.8);
@@ -34,7 +34,7 @@ fn depths([width, height]: [u32; 2]) -> [Vec<f32>; 2] {
     [render, depth]
 }
 
-/// The regions of a step, the view first, as the reference draws them.
+/// The regions of a step, the view first, as drawn by the reference.
 fn regions_of(size: UVec2, side: u32, key: u32) -> Vec<[u32; 4]> {
     let boxes = DepthBoxes::new(size, side);
     let params = depth_boxes::Params { size, side: boxes.side, box_count: boxes.count, key };
@@ -62,7 +62,7 @@ fn pearson_of(width: u32, [left, top, w, h]: [u32; 4], a: &[f64], b: &[f64]) -> 
     pearson(&crop(a), &crop(b))
 }
 
-/// What the last kernels leave.
+/// The results of the last kernels.
 struct Chain {
     view_values: Vec<f32>,
     box_values: Vec<f32>,
@@ -127,7 +127,7 @@ fn the_kernels_match_their_references() {
 }
 
 #[test]
-fn the_reference_gradient_is_that_of_finite_differences() {
+fn the_reference_gradient_agrees_with_finite_differences() {
     for (size, side) in CASES.into_iter().filter(|(size, _)| size[0] * size[1] < 3000) {
         let images = depths(size);
         let regions = regions_of(size.into(), side, 12);
@@ -144,7 +144,7 @@ fn the_reference_gradient_is_that_of_finite_differences() {
 }
 
 #[test]
-fn the_term_is_that_of_pytorch() {
+fn the_term_agrees_with_pytorch() {
     let torch = Torch::read();
     let images = || [torch.get("depth.rendered").to_vec(), torch.get("depth.monocular").to_vec()];
     let mut regions = vec![[0, 0, 31, 24]];
@@ -162,7 +162,7 @@ fn the_term_is_that_of_pytorch() {
 }
 
 #[test]
-fn boxes_lie_inside_the_view_and_anywhere_in_it() {
+fn boxes_are_inside_the_view_and_anywhere_in_it() {
     let size = UVec2::new(61, 47);
     let boxes = DepthBoxes::new(size, 5);
     let mut corners = vec![];
@@ -188,12 +188,12 @@ fn boxes_lie_inside_the_view_and_anywhere_in_it() {
 }
 
 #[test]
-fn a_view_smaller_than_a_box_has_smaller_boxes_and_a_tiny_one_none() {
+fn a_view_smaller_than_a_box_has_smaller_boxes_and_a_tiny_view_none() {
     let boxes = |width, height, side| {
         let DepthBoxes { side, count } = DepthBoxes::new(UVec2::new(width, height), side);
         (side, count)
     };
-    // The sizes of LOM and RealX3D in the paper's rule: half of what fits, rounded down.
+    // The sizes of LOM and RealX3D with the paper's rule: half of those that fit, rounded down.
     assert_eq!(boxes(500, 375, 128), (128, 3));
     assert_eq!(boxes(1600, 1061, 128), (128, 48));
     assert_eq!(boxes(128, 128, 128), (128, 1));
@@ -203,7 +203,7 @@ fn a_view_smaller_than_a_box_has_smaller_boxes_and_a_tiny_one_none() {
     assert_eq!(boxes(1, 1, 128), (0, 0));
 }
 
-/// The whole term on the only plane of a render.
+/// The whole term on a render of one plane.
 fn evaluate(
     gpu: &Gpu,
     settings: DepthSettings,
@@ -256,7 +256,7 @@ fn the_term_is_the_mean_over_the_view_and_over_its_boxes() {
     }
 }
 
-/// A rounding of the mean would make a deviation of 1e-8, and a gradient of 1e8 out of it.
+/// A rounding error of the mean would cause a deviation of 1e-8, and a gradient of 1e8.
 #[test]
 fn a_constant_depth_has_no_correlation_and_no_gradient() {
     let gpu = gpu();
@@ -324,7 +324,7 @@ fn the_same_step_leaves_the_same_bits_and_another_step_other_boxes() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused() {
+fn buffers_and_views_that_do_not_fit_are_refused() {
     let gpu = gpu();
     for (weight, box_side) in [(-0.1, 128), (f64::NAN, 128), (0.1, 1), (0.1, 0)] {
         assert!(DepthLoss::new(&gpu, DepthSettings { weight, box_side }).is_err());
@@ -356,7 +356,7 @@ fn what_does_not_fit_is_refused() {
     refuses(long, strip, 0, "no scratch memory for a view of 3 x");
 }
 
-/// Chunks there are enough of, but not regions.
+/// There are enough chunks, but not enough regions.
 #[test]
 fn more_boxes_than_were_reserved_for_are_refused() {
     let gpu = gpu();

@@ -12,7 +12,7 @@ use super::{NOT_FINITE, Torch, assert_close, bits, central_differences, largest,
 const SIZES: [[u32; 2]; 8] =
     [[1, 1], [3, 1], [1, 40], [5, 7], [17, 33], [16, 64], [33, 65], [131, 97]];
 
-/// A target and a render that is off by a texture and by noise.
+/// A target, and a render that differs by a texture and noise.
 fn images([width, height]: [u32; 2]) -> [Vec<f32>; 2] {
     let mut state = 1u32;
     let mut noise = move || {
@@ -26,7 +26,7 @@ fn images([width, height]: [u32; 2]) -> [Vec<f32>; 2] {
     [render, target]
 }
 
-/// What one step of the loss leaves.
+/// The results of one step of the loss.
 struct Outcome {
     l1: f32,
     ssim: f32,
@@ -65,14 +65,14 @@ fn evaluate_loss_region(
 }
 
 /// Compares the SSIM kernel with its reference: `shape` is the columns of a lane, the rows of a subgroup, and the
-/// floats that loads and stores are aligned to.
+/// alignment of loads and stores in floats.
 fn check_ssim(shape: [u32; 3], size: [u32; 2], loss_region: LossRegion) -> Vec<f32> {
     let ([columns, rows, alignment], [width, height]) = (shape, size);
     let [render, target] = images(size);
     let scale = 1.0 / render.len() as f32;
     let lanes = gpu().properties().subgroup_size;
     let halo = 10u32.next_multiple_of(alignment);
-    // A subgroup of four has no outputs beside the windows' ends in a strip of the narrowest shape.
+    // In a strip of the narrowest shape, a subgroup of four has no outputs besides the windows' ends.
     let columns = columns.max((2 * halo / lanes + 1).next_multiple_of(alignment));
     let outputs = lanes * columns - 2 * halo;
     let count = 3 * width.div_ceil(outputs) * height.div_ceil(rows);
@@ -110,9 +110,9 @@ fn the_shape_of_the_strips_does_not_matter() {
     }
 }
 
-/// A vector that is stored for a column too many overwrites what another subgroup leaves there.
+/// A vector stored for a column too many overwrites the output of another subgroup.
 #[test]
-fn whole_vectors_leave_what_single_values_do() {
+fn whole_vectors_store_the_same_as_single_values() {
     for (size, loss_region) in [
         ([4, 3], LossRegion::whole([4, 3].into())),
         ([40, 41], LossRegion { origin: UVec2::new(2, 1), size: UVec2::new(31, 7) }),
@@ -121,7 +121,7 @@ fn whole_vectors_leave_what_single_values_do() {
         for rows in [7, 64] {
             let whole = check_ssim([4, rows, 4], size, loss_region);
             let single = check_ssim([5, rows, 1], size, loss_region);
-            // Compilers contract the arithmetic of each shape in a way of its own.
+            // Compilers contract the arithmetic of each shape differently.
             assert_close(&format!("{size:?} {rows}"), &whole, &single, 1e-8);
         }
     }
@@ -157,7 +157,7 @@ fn l1_matches_its_reference() {
     }
 }
 
-/// (1 - w) mean|a - b| + w (1 - mean SSIM) of one channel, means over the interior.
+/// (1 - w) mean|a - b| + w (1 - mean SSIM) of one channel, with means over the loss region.
 fn loss_of(
     [width, height]: [usize; 2],
     loss_region: LossRegion,
@@ -182,7 +182,7 @@ fn contains(LossRegion { origin, size }: LossRegion, x: usize, y: usize) -> bool
     pixel.cmpge(origin).all() && pixel.cmplt(origin + size).all()
 }
 
-/// Views with interiors: all of it, the middle, a corner, one pixel.
+/// Views with loss regions: all of it, the middle, a corner, one pixel.
 fn loss_regions() -> Vec<([u32; 2], LossRegion)> {
     let inside = |size, origin: [u32; 2], own: [u32; 2]| {
         (size, LossRegion { origin: origin.into(), size: own.into() })
@@ -199,7 +199,7 @@ fn loss_regions() -> Vec<([u32; 2], LossRegion)> {
 }
 
 #[test]
-fn the_reference_gradient_is_that_of_finite_differences() {
+fn the_reference_gradient_agrees_with_finite_differences() {
     let whole = |size: [u32; 2]| (size, LossRegion::whole(size.into()));
     let mut cases = vec![whole([1, 1]), whole([3, 1]), whole([5, 7]), whole([13, 17])];
     cases.extend(loss_regions().into_iter().filter(|(size, _)| size[0] < 40));
@@ -227,7 +227,7 @@ fn the_reference_gradient_is_that_of_finite_differences() {
 }
 
 #[test]
-fn the_kernels_match_their_references_with_an_interior() {
+fn the_kernels_match_their_references_with_a_loss_region() {
     let gpu = gpu();
     for (size, loss_region) in loss_regions() {
         check_ssim([16, 64, 1], size, loss_region);
@@ -251,9 +251,9 @@ fn the_kernels_match_their_references_with_an_interior() {
     }
 }
 
-/// The interior's pixels see those around them, so their gradient is not that of the interior alone.
+/// The windows of the loss region extend beyond it, so the gradient is not that of the region by itself.
 #[test]
-fn outside_the_interior_the_value_ignores_the_render_but_ssim_does_not() {
+fn l1_ignores_the_render_outside_the_loss_region_but_ssim_does_not() {
     let gpu = gpu();
     let (size, loss_region) =
         ([40, 40], LossRegion { origin: UVec2::splat(15), size: UVec2::splat(10) });
@@ -281,9 +281,9 @@ fn outside_the_interior_the_value_ignores_the_render_but_ssim_does_not() {
     }
 }
 
-/// A value that counts for nothing must not spoil the mean, unless a window sees it.
+/// A value that does not count must not affect the mean, unless a window includes it.
 #[test]
-fn a_nan_beyond_every_window_of_the_interior_changes_nothing() {
+fn a_nan_beyond_every_window_of_the_loss_region_changes_nothing() {
     let gpu = gpu();
     let (size, loss_region) =
         ([40, 40], LossRegion { origin: UVec2::splat(8), size: UVec2::splat(10) });
@@ -300,7 +300,7 @@ fn a_nan_beyond_every_window_of_the_interior_changes_nothing() {
 }
 
 #[test]
-fn an_interior_that_is_not_inside_is_refused() {
+fn a_loss_region_outside_the_view_is_refused() {
     let gpu = gpu();
     let size = UVec2::splat(8);
     let mut loss = Loss::new(&gpu, settings(0.2)).unwrap();
@@ -316,7 +316,7 @@ fn an_interior_that_is_not_inside_is_refused() {
 }
 
 #[test]
-fn l1_and_ssim_are_those_of_pytorch() {
+fn l1_and_ssim_agree_with_pytorch() {
     let (gpu, torch) = (gpu(), Torch::read());
     let images = [torch.get("image.render").to_vec(), torch.get("image.target").to_vec()];
     let whole = LossRegion::whole([23, 19].into());
@@ -329,7 +329,7 @@ fn l1_and_ssim_are_those_of_pytorch() {
 }
 
 #[test]
-fn the_gradient_of_both_is_that_of_each_by_its_weight() {
+fn the_gradient_is_the_weighted_sum_of_both_gradients() {
     let gpu = gpu();
     for (size, loss_region) in loss_regions() {
         let images = images(size);
@@ -342,7 +342,7 @@ fn the_gradient_of_both_is_that_of_each_by_its_weight() {
 }
 
 #[test]
-fn an_image_compared_with_itself_costs_nothing() {
+fn an_image_compared_with_itself_has_no_loss() {
     let gpu = gpu();
     let [_, target] = images([40, 30]);
     let outcome = evaluate(&gpu, 0.2, [40, 30], &[target.clone(), target]);
@@ -353,7 +353,7 @@ fn an_image_compared_with_itself_costs_nothing() {
 }
 
 #[test]
-fn constant_images_have_the_ssim_of_their_means_inside() {
+fn constant_images_have_the_ssim_of_their_means_away_from_the_border() {
     let gpu = gpu();
     let size = [64, 48];
     let (a, b) = (0.5f32, 0.25f32);
@@ -378,9 +378,10 @@ fn black_images_have_a_finite_gradient() {
     assert!(outcome.d_render.iter().all(|d| d.abs() < 1e-6));
 }
 
-/// Squares near 4e4 round by more than C2: without the floor under the variances the denominator turns negative.
+/// Squares near 4e4 have a rounding error above C2: without the floor of the variances, the denominator becomes
+/// negative.
 #[test]
-fn a_render_that_is_far_too_bright_keeps_its_ssim_positive() {
+fn a_far_too_bright_render_has_a_positive_ssim() {
     let gpu = gpu();
     let count = 3 * 48 * 48;
     for brightness in [150.1f32, 170.3, 190.7, 210.9, 230.3, 250.7] {
@@ -426,7 +427,7 @@ fn a_weight_outside_its_range_is_refused() {
     }
 }
 
-/// A kernel that ran on would write beyond its buffers.
+/// A kernel without bounds would write beyond its buffers.
 #[test]
 fn a_view_that_does_not_fit_is_refused() {
     let gpu = gpu();

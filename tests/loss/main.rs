@@ -24,13 +24,13 @@ use nightsplat::gpu::{Gpu, Recorder};
 use nightsplat::kernels::status::STATUS_NOT_FINITE as NOT_FINITE;
 use nightsplat::loss::{LogSlot, LossLog, StepLosses, Term};
 
-/// What the terms of one step leave in the log.
+/// The terms of one step in the log.
 struct Logged {
     losses: StepLosses,
     status: u32,
 }
 
-/// Records terms into the middle one of three slots; the others stay as they are.
+/// Records terms into the middle of three slots; the others must not change.
 fn log_step(
     gpu: &Gpu,
     record: impl FnOnce(&mut Recorder<'_>, &mut LogSlot<'_>) -> Result<()>,
@@ -54,7 +54,7 @@ fn log_step(
     Ok(Logged { losses: steps[1].clone(), status })
 }
 
-/// The first mismatches, so that a failure shows its pattern.
+/// Prints the first mismatches, so that a failure shows its pattern.
 fn assert_close(what: &str, actual: &[f32], expected: &[f32], tolerance: f32) {
     common::assert_close(what, actual, expected, |_, _| tolerance);
 }
@@ -86,13 +86,13 @@ fn central_differences(at: &[f64], loss: impl Fn(&[f64]) -> f64) -> Vec<f64> {
         .collect()
 }
 
-/// The gradient that a reference finds against that of finite differences.
+/// Compares the gradient of a reference with finite differences.
 fn assert_gradient(what: &str, analytic: &[f32], numeric: &[f64]) {
     let numeric = common::narrow(numeric);
     assert_close(what, analytic, &numeric, 1e-5 * largest(&numeric) + 1e-9);
 }
 
-/// What `PyTorch` makes of the losses.
+/// `PyTorch`'s values of the losses.
 struct Torch(BTreeMap<String, Vec<f32>>);
 
 impl Torch {
@@ -104,7 +104,7 @@ impl Torch {
         &self.0[name]
     }
 
-    /// A value to 1e-4 of itself, a gradient to 1e-4 of its largest element.
+    /// A value to a relative 1e-4, a gradient to 1e-4 of its largest element.
     fn assert_agrees(&self, name: &str, actual: &[f32]) {
         let expected = self.get(name);
         assert_close(name, actual, expected, 1e-4 * largest(expected));

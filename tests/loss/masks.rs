@@ -1,4 +1,4 @@
-//! Hidden pixels: nothing of them is in statistics, losses, gradients, density control or scores.
+//! Masked pixels do not affect statistics, losses, gradients, density control or scores.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -12,7 +12,7 @@ use nightsplat::train::{OnOff, Part, TrainConfig, Trainer};
 
 use crate::common::train::{advance, train};
 
-/// Of every view the right third is hidden, and along its border a column by half.
+/// The right third of every view is masked, and a column at its border by half.
 fn masked(mut dataset: Dataset, hidden: Option<[f32; 3]>) -> Dataset {
     for view in &mut dataset.views {
         let (width, height) = (view.camera.width, view.camera.height);
@@ -47,7 +47,7 @@ fn config(tone: ToneSettings) -> TrainConfig {
 }
 
 #[test]
-fn what_is_hidden_leaves_no_trace_in_the_model() {
+fn masked_pixels_do_not_affect_the_model() {
     for (tone, ssim_weight) in
         [(ToneSettings::default(), 0.2), (ToneSettings::new(ToneCurve::Ap3), 0.0)]
     {
@@ -61,7 +61,7 @@ fn what_is_hidden_leaves_no_trace_in_the_model() {
 }
 
 #[test]
-fn what_is_hidden_leaves_no_trace_in_the_networks() {
+fn masked_pixels_do_not_affect_the_networks() {
     for variant in [NetworkVariant::Identity, NetworkVariant::Paper] {
         let mut config = TrainConfig { steps: 6, ..config(ToneSettings::new(ToneCurve::Ap3)) };
         config.model.set_parts(&[Part::Denoiser, Part::Tonemapper]);
@@ -102,7 +102,7 @@ fn every_pass_of_a_masked_step_agrees_with_its_reference() {
 }
 
 #[test]
-fn scores_are_those_of_what_counts() {
+fn scores_are_those_of_the_unmasked_pixels() {
     let size = (40, 32);
     let wave = |phase: f32| {
         Image::from_fn(size.0, size.1, move |x, y| {
@@ -117,10 +117,10 @@ fn scores_are_those_of_what_counts() {
     let cut = Scores::of(&left(&render), &left(&reference)).unwrap();
     assert!((scores.psnr - cut.psnr).abs() < 1e-9);
     assert!((scores.psnr_channel_mean - cut.psnr_channel_mean).abs() < 1e-9);
-    // But for the windows at the border, which see the reference beyond it.
+    // Except for the windows at the border, which include the reference beyond it.
     assert!((scores.ssim - cut.ssim).abs() < 0.05, "{} {}", scores.ssim, cut.ssim);
     assert_eq!(psnr_of_counted(&render, &reference, Some(&mask)).unwrap(), scores.psnr);
-    // Whatever is hidden.
+    // For any content of the masked pixels.
     let painted =
         Image::from_fn(size.0, size.1, |x, y| if x < 24 { render.pixel(x, y) } else { [7.0; 3] });
     let again = Scores::of_counted(&painted, &reference, Some(&mask)).unwrap();

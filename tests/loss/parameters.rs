@@ -19,7 +19,7 @@ fn planes(count: usize) -> Vec<f32> {
 }
 
 #[test]
-fn the_kernel_matches_its_reference_and_leaves_other_gradients() {
+fn the_kernel_matches_its_reference_and_keeps_other_gradients() {
     for count in [1, 7, 64, 65, 1000] {
         for [opacity_scale, log_scale_scale, ratio_scale] in
             [[0.3, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.4], [0.1, 0.05, 0.02]]
@@ -61,7 +61,7 @@ fn the_kernel_matches_its_reference_and_leaves_other_gradients() {
 }
 
 #[test]
-fn the_gradient_is_that_of_finite_differences() {
+fn the_gradient_agrees_with_finite_differences() {
     let count = 5;
     let planes: Vec<f64> = planes(count).into_iter().map(f64::from).collect();
     for weights in [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.3, 0.7, 0.2]] {
@@ -109,12 +109,12 @@ fn the_means_over_the_gaussians_reach_the_log_and_their_gradients_the_planes() {
 }
 
 #[test]
-fn a_weight_of_0_has_no_term() {
+fn a_term_of_weight_0_is_off() {
     assert!(ParameterTerms::new(&gpu(), ParameterWeights::default()).unwrap().is_none());
 }
 
 #[test]
-fn only_a_ratio_above_the_limit_costs_something_and_its_gradient_does_not_grow_with_it() {
+fn only_a_ratio_above_the_limit_has_a_loss_and_its_gradient_does_not_grow_with_it() {
     let (count, columns) = (2, column_count(0, 0));
     let first = Attribute::LogScales.column(0) * count;
     for (stretch, value) in [(0.0, 0.0), (0.9, 0.0), (1.5, 0.25), (61.0, 30.0)] {

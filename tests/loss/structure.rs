@@ -14,7 +14,7 @@ use super::{
 
 const SIZES: [[u32; 2]; 7] = [[1, 1], [3, 1], [1, 40], [5, 7], [33, 17], [16, 64], [131, 97]];
 
-/// (3, H, W), soft shapes with some noise.
+/// (3, H, W), smooth shapes with some noise.
 fn photograph([width, height]: [u32; 2]) -> Vec<f32> {
     let pixels = (width * height) as usize;
     let soft = |i: usize| {
@@ -47,7 +47,7 @@ fn the_kernels_match_their_references() {
 }
 
 #[test]
-fn the_structure_is_that_of_pytorch() {
+fn the_structure_agrees_with_pytorch() {
     let torch = Torch::read();
     let structure = structure_of(&gpu(), torch.get("structure.image"), [31, 24]);
     torch.assert_agrees("structure.target", &structure);
@@ -99,7 +99,7 @@ fn a_view_without_pixels_or_with_a_short_buffer_is_refused() {
     }
 }
 
-/// The term on plane 1 of a render of two planes; gives that plane of the gradient.
+/// The term on plane 1 of a render of two planes; returns that plane of the gradient.
 fn evaluate(
     gpu: &Gpu,
     weight: f64,
@@ -159,7 +159,7 @@ fn the_term_matches_its_reference_and_finite_differences() {
 }
 
 #[test]
-fn the_term_is_that_of_pytorch() {
+fn the_term_agrees_with_pytorch() {
     let torch = Torch::read();
     let (prior, target) = (torch.get("structure.prior"), torch.get("structure.target"));
     let (logged, d_prior) = evaluate(&gpu(), 1.0, [31, 24].into(), prior, target);
@@ -168,7 +168,7 @@ fn the_term_is_that_of_pytorch() {
 }
 
 #[test]
-fn the_clamp_passes_its_bounds_and_nothing_beyond() {
+fn the_gradient_passes_the_clamp_within_its_bounds_only() {
     let (render, structure) = ([-0.1, 0.0, 0.5, 1.0, 1.1], [0.5, 0.5, 0.5, 0.5, 0.5]);
     let (_, d) = evaluate(&gpu(), 1.0, [5, 1].into(), &render, &structure);
     assert_eq!(d, [0.0, -0.2, 0.0, 0.2, 0.0]);
@@ -184,7 +184,7 @@ fn a_value_that_is_not_finite_reaches_the_log() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused() {
+fn buffers_and_views_that_do_not_fit_are_refused() {
     let gpu = gpu();
     assert!(StructureLoss::new(&gpu, -1.0).is_err() && StructureLoss::new(&gpu, f64::NAN).is_err());
     let mut loss = StructureLoss::new(&gpu, 1.0).unwrap();

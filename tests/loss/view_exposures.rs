@@ -1,5 +1,5 @@
 //! Exposures: kernels against their references, gradients against central differences, the mean that stays the
-//! identity, and trainings on photographs that are not equally bright.
+//! identity, and trainings on photographs of different exposure.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -36,7 +36,7 @@ fn every_kernel_agrees_with_its_reference_at_every_size() {
     for pixels in [1, 7, 1023, 1024, 1025, 131 * 97] {
         for (view, view_count) in [(0, 1), (2, 3), (17, 40)] {
             let (pixel_count, chunk_count) = (pixels as u32, (pixels as u32).div_ceil(1024));
-            // A plane more than colours has, which stays as it is.
+            // With one more plane than colours, which must not change.
             let render = noise(1, 4 * pixels, -0.2, 1.3);
             let d_render = noise(2, 4 * pixels, -1e-3, 1e-3);
             let exposures = noise(3, view_count * WIDTH, -0.5, 0.5);
@@ -105,12 +105,12 @@ fn the_mean_of_centred_exposures_is_the_identity_in_every_order_of_summation() {
             for (column, before) in columns(&after).zip(columns(&before)) {
                 let exact: f64 = column.iter().copied().map(f64::from).sum();
                 assert_eq!(exact, 0.0, "{views} views from {low} to {high}");
-                // Single precision has room for the sum of fewer than eight whole bounds.
+                // In single precision, the sum of fewer than eight times the bound is exact.
                 if high <= 0.5 && views < 30 {
                     let [forth, back] = [column.iter().sum::<f32>(), column.iter().rev().sum()];
                     assert_eq!([forth, back], [0.0; 2]);
                 }
-                // Differences between views stay, but for a rounding.
+                // Differences between views are kept up to a rounding.
                 let difference =
                     |values: &[f32]| f64::from(values[0]) - f64::from(values[views - 1]);
                 let is_cut = high > 4.0;
@@ -123,7 +123,7 @@ fn the_mean_of_centred_exposures_is_the_identity_in_every_order_of_summation() {
 }
 
 #[test]
-fn numbers_that_are_not_finite_leave_finite_ones() {
+fn values_that_are_not_finite_become_finite() {
     let mut exposures = noise(1, 5 * WIDTH, -0.1, 0.1);
     (exposures[0], exposures[7]) = (f32::INFINITY, f32::NEG_INFINITY);
     for column in columns(&centred(&exposures, 0)) {
@@ -131,13 +131,13 @@ fn numbers_that_are_not_finite_leave_finite_ones() {
     }
 }
 
-/// Three exposures, of which the middle one is looked at.
+/// Three exposures, the middle one under test.
 fn three() -> [Affine; 3] {
     let second = Affine { gain: [0.7, 1.2, 0.9], bias: [0.05, -0.02, 0.01] };
     [Affine { gain: [1.3, 0.9, 1.0], bias: [-0.1, 0.0, 0.03] }, second, Affine::IDENTITY]
 }
 
-/// L = sum of w e over all values, e what the exposure makes of the render of Gaussians.
+/// L = sum of w e over all values, where e is the exposed render of Gaussians.
 #[test]
 fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     let gpu = gpu();
@@ -161,7 +161,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     let d_render = crate::common::widen(&gpu.read(&d_render).unwrap());
     let gradients = gpu.read(exposures.buffers().gradients).unwrap();
 
-    // Of the exposure: L is linear in each of its numbers.
+    // With respect to the exposure, in whose values L is linear.
     let loss = |affine: &Affine| -> f64 {
         let exposed = |(i, &c): (usize, &f32)| {
             weights[i] * (affine.gain[i / pixels] * f64::from(c) + affine.bias[i / pixels])
@@ -183,7 +183,8 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     }
     assert!(gradients[..WIDTH].iter().chain(&gradients[2 * WIDTH..]).all(|&d| d == 0.0));
 
-    // Of the Gaussians: the chain after the gradient that the exposure passes on, against differences of all of it.
+    // With respect to the Gaussians: the chain applied to the gradient after the exposure, against differences of the
+    // whole.
     let mut downstream = Chain::new(&setup);
     downstream.d_render = d_render;
     let gradient = downstream.run(&parameters).gradient;
@@ -205,7 +206,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
 }
 
 #[test]
-fn adam_finds_the_exposures_of_views_that_differ_by_nothing_else() {
+fn adam_finds_the_exposures_of_views_that_only_differ_in_exposure() {
     let (gpu, size) = (gpu(), UVec2::new(20, 15));
     let truth = Affine::about_their_mean(&three());
     let render = noise(8, 3 * 300, 0.0, 1.0);
@@ -240,7 +241,7 @@ fn adam_finds_the_exposures_of_views_that_differ_by_nothing_else() {
 }
 
 #[test]
-fn what_does_not_fit_is_refused() {
+fn buffers_and_views_that_do_not_fit_are_refused() {
     let gpu = gpu();
     let new = |start: &[Affine]| Exposures::new(&gpu, ExposureRates::default(), start);
     assert!(new(&[]).is_err());
@@ -259,10 +260,10 @@ fn what_does_not_fit_is_refused() {
     assert!(gpu.run("e", |pass| exposures.expose(pass, 0, UVec2::splat(8), &short)).is_err());
 }
 
-/// The exposures of the four views in turn, in linear light.
+/// The factors of the views' light, in groups of four.
 const FACTORS: [f32; 4] = [1.0, 0.5, 0.25, 2.0];
 
-/// Synthetic views of which each is darkened or brightened, under one curve.
+/// Synthetic views, each darkened or brightened, under one curve.
 fn varied(folder: &Path) -> (TrainConfig, Dataset) {
     let options = SyntheticOptions {
         views: 14,
@@ -359,7 +360,7 @@ fn exposures_that_are_off_leave_no_kernel_and_no_file() {
 }
 
 #[test]
-fn a_run_with_exposures_goes_on_bit_for_bit() {
+fn a_run_with_exposures_is_resumed_bit_for_bit() {
     let folder = tempfile::tempdir().unwrap();
     let (mut config, dataset) = varied(folder.path());
     config.steps = 30;
@@ -407,7 +408,7 @@ fn a_denoiser_on_crops_sees_the_neutral_exposure_and_a_tonemapper_is_refused() {
 }
 
 #[test]
-fn a_table_says_where_exposures_begin() {
+fn a_table_sets_the_initial_exposures() {
     let folder = tempfile::tempdir().unwrap();
     let (mut config, dataset) = varied(folder.path());
     let names: Vec<&str> = dataset.train_views().map(|view| view.name.as_str()).collect();
@@ -419,19 +420,19 @@ fn a_table_says_where_exposures_begin() {
     };
     assert!(begin(&config).iter().all(|exposure| *exposure == Affine::IDENTITY));
 
-    // Stops of the photographs: under one curve the targets differ as they do.
+    // Stops of the photographs: with one curve, the targets differ accordingly.
     let lines = names.iter().zip(FACTORS.iter().cycle());
     let lines: String = lines.map(|(name, factor)| format!("{name},{}\n", factor.log2())).collect();
     std::fs::write(&path, format!("name,ev\n{lines}")).unwrap();
     config.exposure.start = Some(path.clone());
     let of_stops = begin(&config);
     assert!(of_stops[2].stops() < of_stops[1].stops() && of_stops[1].stops() < of_stops[0].stops());
-    // Beside the photographs it is found.
+    // Next to the photographs, it is found.
     std::fs::copy(&path, folder.path().join("exposures.csv")).unwrap();
     config.exposure.start = None;
     assert_eq!(begin(&config), of_stops);
 
-    // What a run learned begins where it ended.
+    // The exposures of a finished run are initial values.
     let exposures: Vec<(String, Affine)> =
         names.iter().map(|&name| name.to_owned()).zip(of_stops.iter().copied()).collect();
     table::save(&path, &exposures).unwrap();

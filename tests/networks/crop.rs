@@ -1,4 +1,4 @@
-//! Windows of a view: where they lie, and what is copied.
+//! Crops of a view: their positions, and copying them.
 
 use glam::UVec2;
 use nightsplat::base::random::Stream;
@@ -8,7 +8,7 @@ use nightsplat::kernels::{crop_gather, crop_scatter};
 use nightsplat::networks::crop::{CropKernels, PaddedCrop};
 
 #[test]
-fn a_crop_is_a_cell_of_the_view_and_its_margin_is_cut_off_there() {
+fn a_crop_is_a_cell_of_the_view_and_its_margin_is_clipped_to_the_view() {
     let stream = Stream::new(1, 2);
     let view = UVec2::new(43, 25);
     let mut cells = std::collections::BTreeSet::new();
@@ -30,7 +30,7 @@ fn a_crop_is_a_cell_of_the_view_and_its_margin_is_cut_off_there() {
 fn means_over_crops_estimate_the_mean_over_the_view() {
     const DRAWS: u64 = 40_000;
     let stream = Stream::new(7, 1);
-    // Far from a multiple of the side; and one pixel more than one cell.
+    // Far from a multiple of the side, and one pixel more than one cell.
     for (view, side) in [(UVec2::new(17, 11), 5), (UVec2::new(8, 7), 7)] {
         let mut weights = vec![0.0; view.element_product() as usize];
         for draw in 0..DRAWS {
@@ -43,7 +43,7 @@ fn means_over_crops_estimate_the_mean_over_the_view() {
                 }
             }
         }
-        // Every pixel weighs the same: four standard deviations of the rarest cell's count.
+        // Every pixel has the same weight, within four standard deviations of the rarest cell's count.
         let even = 1.0 / weights.len() as f64;
         for weight in weights {
             assert!((weight / even - 1.0).abs() < 4.0 * (20.0 / DRAWS as f64).sqrt(), "{weight}");
@@ -111,7 +111,7 @@ fn gathering_and_scattering_match_their_references() {
 }
 
 #[test]
-fn a_window_beyond_the_view_or_its_buffers_is_refused() {
+fn a_crop_beyond_the_view_or_its_buffers_is_refused() {
     let gpu = gpu();
     let crops = CropKernels::new(&gpu).unwrap();
     let view = UVec2::new(8, 8);
@@ -123,6 +123,6 @@ fn a_window_beyond_the_view_or_its_buffers_is_refused() {
         gathered.unwrap_err().to_string()
     };
     let beyond = PaddedCrop { origin: UVec2::ONE, ..PaddedCrop::whole(view) };
-    assert!(problem(beyond, 0..3).contains("does not lie"));
+    assert!(problem(beyond, 0..3).contains("is not inside"));
     assert!(problem(PaddedCrop::whole(view), 1..4).contains("`image` holds 192"));
 }

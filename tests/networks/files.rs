@@ -1,4 +1,4 @@
-//! Networks on disk: what is written is read back, and what does not fit is told with its remedy.
+//! Network files: saved ones are read back, and unsuitable ones refused with a remedy.
 
 use std::path::Path;
 
@@ -42,7 +42,7 @@ fn values((denoiser, tonemapper): &(Denoiser, Tonemapper)) -> [Vec<f32>; 2] {
 }
 
 #[test]
-fn networks_come_back_as_they_were_saved() {
+fn saved_networks_are_read_back() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("networks.safetensors");
     let saved = networks(SMALL, 1);
@@ -94,7 +94,7 @@ fn networks_of_another_configuration_are_refused_and_nothing_changes() {
 }
 
 #[test]
-fn damaged_files_are_told_from_whole_ones() {
+fn damaged_files_are_detected() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("networks.safetensors");
     let mut all = networks(SMALL, 1);
@@ -107,7 +107,7 @@ fn damaged_files_are_told_from_whole_ones() {
     let whole = std::fs::read(&path).unwrap();
     for cut in [0, 7, 100, whole.len() - 4] {
         std::fs::write(&path, &whole[..cut]).unwrap();
-        refused(&mut all, "no whole safetensors file");
+        refused(&mut all, "not an intact safetensors file");
     }
     let mut poisoned = whole;
     let last = poisoned.len() - 4;

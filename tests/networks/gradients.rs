@@ -5,7 +5,7 @@ use nightsplat::networks::{DenoiserSettings, NetworkVariant};
 use super::model::{Denoiser, Gradients, Tonemapper};
 use crate::common::Random;
 
-/// The central difference of `loss` in every element of `at`, against `gradient`, relative to its largest.
+/// Compares the central difference of `loss` in every element of `at` with `gradient`, relative to its largest.
 fn check(what: &str, at: &[f64], gradient: &[f64], loss: &dyn Fn(&[f64]) -> f64) {
     assert_eq!(at.len(), gradient.len());
     let largest = gradient.iter().fold(0.0, |largest: f64, g| largest.max(g.abs()));
@@ -39,7 +39,7 @@ fn check_all(forward: Forward<'_>, gradients: &Gradients, [values, first, second
 }
 
 #[test]
-fn the_gradient_of_the_denoiser_is_that_of_finite_differences() {
+fn the_gradient_of_the_denoiser_agrees_with_finite_differences() {
     let sizes = [([4, 3], 1), ([3, 5], 2), ([4, 4], 3)];
     let variants = [NetworkVariant::Identity, NetworkVariant::Paper];
     for ((size, stages), variant) in
@@ -55,7 +55,7 @@ fn the_gradient_of_the_denoiser_is_that_of_finite_differences() {
         let per_stage = 4 * 28 + 4 * 37 + 8 + 3 * 37;
         let values = draw(stages as usize * per_stage, -0.3, 0.3);
         let pixels = size[0] * size[1];
-        // So bright that every stage clamps some values and not all.
+        // So bright that every stage clamps some of its values.
         let noise = draw(3 * pixels, 0.0, 0.5);
         let render = draw(3 * pixels, 0.4, 1.9);
         let d = draw(3 * pixels, -1.0, 1.0);
@@ -71,7 +71,7 @@ fn the_gradient_of_the_denoiser_is_that_of_finite_differences() {
 }
 
 #[test]
-fn the_gradient_of_the_tonemapper_is_that_of_finite_differences() {
+fn the_gradient_of_the_tonemapper_agrees_with_finite_differences() {
     for variant in [NetworkVariant::Identity, NetworkVariant::Paper] {
         check_tonemapper(Tonemapper { variant, size: [4, 3] });
     }

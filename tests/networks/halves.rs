@@ -1,4 +1,4 @@
-//! The kernels of 16-bit matrices: what they pack, and the products, against their references and single precision.
+//! The kernels of 16-bit matrices: packing and products, against their references and single precision.
 
 use glam::UVec2;
 use nightsplat::gpu::testing::gpu;
@@ -33,10 +33,10 @@ fn largest(values: &[f32], [offset, value_count]: [u32; 2]) -> Vec<u32> {
     )
 }
 
-/// What no kernel leaves where it should write.
+/// A value that no kernel writes.
 const UNWRITTEN: [u32; 4] = [u32::MAX; 4];
 
-/// A map as factor, with the bits of its largest magnitude.
+/// A feature map as a factor, with the bits of its largest magnitude.
 fn packed(size: UVec2, channels: u32, source: &[f32]) -> (Vec<u32>, Vec<[u32; 4]>) {
     let bits = largest(source, [0, channels * size.element_product()]);
     let columns = size.x.next_multiple_of(PACKED_COLUMNS) + 2;
@@ -57,7 +57,7 @@ fn packed(size: UVec2, channels: u32, source: &[f32]) -> (Vec<u32>, Vec<[u32; 4]
     (bits, packed)
 }
 
-/// The weights of a layer at `offset` as factor, with the bits of their largest magnitude.
+/// The weights of a layer at `offset` as a factor, with the bits of their largest magnitude.
 fn packed_weights(
     transposed: bool,
     [in_channels, out_channels]: [u32; 2],
@@ -83,12 +83,12 @@ fn packed_weights(
 }
 
 #[test]
-fn the_largest_magnitude_is_found_wherever_it_is_and_a_nan_is_larger() {
+fn the_largest_magnitude_is_found_anywhere_and_a_nan_is_larger() {
     for value_count in [0_u32, 1, 63, 64, 65, 1000] {
         let mut values = values(&mut Random::new(1), value_count + 9, -1.0, 1.0);
         largest(&values, [5, value_count]);
         for (at, value) in [(0, -3.0), (value_count / 2, f32::INFINITY), (value_count, f32::NAN)] {
-            // The first and the last are beside those that count.
+            // The first and the last are outside the range.
             values[4] = f32::MAX;
             values[5 + value_count as usize] = f32::MAX;
             values[5 + at as usize] = value;
@@ -111,13 +111,13 @@ fn a_map_is_packed_with_zeros_around_it_at_every_magnitude() {
             }
         }
     }
-    // Every power of two down to what vanishes: the largest is 1, the last 2^-45.
+    // Every power of two until they become 0: the largest is 1, the last 2^-45.
     let source: Vec<f32> = (0..46).map(|k| (-1.0f32).powi(k) * (-k as f32).exp2()).collect();
     packed(UVec2::new(46, 1), 1, &source);
 }
 
 #[test]
-fn what_is_not_a_number_is_none_when_it_is_packed_and_infinity_stays() {
+fn nan_and_infinity_are_kept_when_packed() {
     let source = [1.0, f32::NAN, f32::INFINITY, -f32::INFINITY];
     let (largest, packed) = packed(UVec2::new(4, 1), 1, &source[..]);
     assert!(f32::from_bits(largest[0]).is_nan());
@@ -130,7 +130,7 @@ fn what_is_not_a_number_is_none_when_it_is_packed_and_infinity_stays() {
 }
 
 #[test]
-fn weights_are_packed_for_both_ways() {
+fn weights_are_packed_for_both_directions() {
     let mut random = Random::new(1);
     for channels in [[1, 1], [8, 17], [17, 8], [16, 32]] {
         for (most, transposed) in [(0.2, false), (0.2, true), (1e4, false), (1e-20, true)] {
@@ -141,8 +141,8 @@ fn weights_are_packed_for_both_ways() {
     }
 }
 
-/// The products of packed factors, and how far they are from those of the factors themselves: rounding the factors
-/// costs 2^-9 of the terms' magnitudes, and 2^-28 of the largest of each may vanish.
+/// Compares the products of packed factors with those of the factors themselves: rounding the factors adds an error of
+/// 2^-9 of the terms' magnitudes, and values below 2^-28 of the largest may become 0.
 fn check_product(
     matrix: CooperativeMatrix,
     transposed: bool,
@@ -197,7 +197,7 @@ fn check_product(
     }
 }
 
-/// Runs where the device has cooperative matrices.
+/// Requires a device with cooperative matrices.
 #[test]
 fn conv3x3_half_matches_its_reference_and_single_precision_at_every_magnitude() {
     let Some(matrix) = matrix() else { return };
@@ -209,7 +209,7 @@ fn conv3x3_half_matches_its_reference_and_single_precision_at_every_magnitude() 
     check_product(matrix, true, [3, 1], [0.2, 1.0]);
 }
 
-/// Runs where the device has cooperative matrices.
+/// Requires a device with cooperative matrices.
 #[test]
 fn conv3x3_weight_gradient_half_matches_its_reference_at_every_magnitude() {
     let Some(CooperativeMatrix { m, n, k }) = matrix() else { return };

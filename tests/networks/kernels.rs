@@ -1,4 +1,4 @@
-//! Every kernel against its reference, at sizes and channel counts that divide nothing.
+//! Every kernel against its reference, at sizes and channel counts that divide no block size.
 
 use glam::{UVec2, Vec2};
 use nightsplat::gpu::Threads;
@@ -80,7 +80,7 @@ fn conv3x3_weight_gradient_and_reduce_strips_match_their_references() {
     }
 }
 
-/// Runs the six norm kernels one after another, each on what the device made of the one before.
+/// Runs the six norm kernels in order, each on the device's results of the previous one.
 fn check_norm(size: [u32; 2], channel_count: u32, chunk: u32, mean: f64, deviation: f64) {
     let pixel_count = size[0] * size[1];
     let (offset, slot) = (3, 2 * channel_count);
@@ -126,9 +126,9 @@ fn the_norm_kernels_match_their_references() {
     check_norm([83, 61], 8, 1024, 0.0, 1.0);
 }
 
-/// The mean of the squares minus the square of the mean would lose every digit here.
+/// The mean of the squares minus the square of the mean would lose all digits here.
 #[test]
-fn a_large_mean_does_not_drown_a_small_deviation() {
+fn a_small_deviation_is_exact_despite_a_large_mean() {
     check_norm([83, 61], 3, 1024, 1000.0, 0.1);
 }
 

@@ -1,5 +1,5 @@
-//! LPIPS against `PyTorch`'s, on weights that both make by a formula: `scripts/lpips-reference.py` prints what is
-//! expected.
+//! LPIPS against `PyTorch`, with weights from the same formula: `scripts/lpips-reference.py` prints the expected
+//! values.
 
 use std::process::Command;
 
@@ -21,7 +21,7 @@ fn picture(width: u32, height: u32, salt: u64) -> Image {
     Image { width, height, data: (0..3 * (width * height) as usize).map(value).collect() }
 }
 
-/// Width, height, the distance of two pictures and of one from a tenth of the way to the other.
+/// Width, height, the distance of two images, and that of one from a tenth of the way to the other.
 type Expected = (u32, u32, f64, f64);
 
 fn assert_distances(network: Network, range: Range, expected: &[Expected]) {
@@ -36,7 +36,7 @@ fn assert_distances(network: Network, range: Range, expected: &[Expected]) {
         let mixed = Image { data: mix, ..a.clone() };
         for (other, expected) in [(&b, far), (&mixed, near), (&a, 0.0)] {
             let distance = lpips.distance(&gpu(), &a, other).unwrap();
-            // Pictures that are nearly alike differ by little more than both sides round their activations.
+            // For almost equal images, the difference is close to the rounding of activations on both sides.
             let bound = 1e-4 * expected + 1e-5 * far;
             assert!(
                 (distance - expected).abs() <= bound,
@@ -49,7 +49,7 @@ fn assert_distances(network: Network, range: Range, expected: &[Expected]) {
 }
 
 #[test]
-fn the_distance_of_alexnet_is_pytorch_s() {
+fn the_distance_of_alexnet_agrees_with_pytorch() {
     let expected = [
         (31, 31, 3.992540e-03, 6.721541e-05),
         (64, 48, 1.379769e-02, 1.342557e-04),
@@ -61,7 +61,7 @@ fn the_distance_of_alexnet_is_pytorch_s() {
 }
 
 #[test]
-fn the_distance_of_vgg_is_pytorch_s() {
+fn the_distance_of_vgg_agrees_with_pytorch() {
     let expected = [(16, 16, 3.423346e-03, 6.976494e-05), (37, 22, 6.713986e-03, 1.908189e-04)];
     assert_distances(Network::Vgg, Range::Signed, &expected);
     let expected = [(16, 16, 1.460342e-03, 3.301097e-05), (37, 22, 3.067561e-03, 4.611988e-05)];
@@ -69,7 +69,7 @@ fn the_distance_of_vgg_is_pytorch_s() {
 }
 
 #[test]
-fn pictures_that_a_network_cannot_take_are_named() {
+fn images_that_a_network_cannot_process_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("lpips.safetensors");
     for (network, least, parts) in [
@@ -86,7 +86,7 @@ fn pictures_that_a_network_cannot_take_are_named() {
         refused(&small, &small, &parts);
         refused(&small, &picture(40, least - 1, 1), &["different sizes"]);
         if network == Network::Vgg {
-            // Its first layers keep 64 planes of the whole picture.
+            // Its first layers have 64 planes of the whole image.
             let limit = gpu().properties().max_storage_buffer_range;
             let width = (limit / (64 * 4 * 1000) + 1) as u32;
             let data = vec![0.0; 3 * 1000 * width as usize];
@@ -107,7 +107,7 @@ fn weights_of_another_network_are_named() {
     };
     refused(&["cannot be read"]);
     std::fs::write(&path, "no weights").unwrap();
-    refused(&["no whole safetensors file"]);
+    refused(&["not an intact safetensors file"]);
     write(Network::Alex, &path, |name, shape, values| {
         if name == "net.slice1.0.weight" {
             *shape = vec![64, 3, 3, 3];
@@ -125,7 +125,7 @@ fn weights_of_another_network_are_named() {
     let last = [0.0; 9];
     safetensors::write(&path, &[("net.slice5.28.weight", &[1, 1, 3, 3], &last)]);
     refused(&["has no tensor `net.slice1.0.weight`", "[64, 3, 3, 3]"]);
-    // SqueezeNet begins as VGG-16 does.
+    // SqueezeNet starts like VGG-16.
     let first = vec![0.0; 64 * 27];
     safetensors::write(&path, &[("net.slice1.0.weight", &[64, 3, 3, 3], &first)]);
     refused(&[
@@ -136,16 +136,16 @@ fn weights_of_another_network_are_named() {
 }
 
 #[test]
-fn every_measure_has_a_key_of_its_own() {
+fn every_measure_has_its_own_key() {
     let keys: Vec<String> = Measure::all().map(Measure::key).collect();
     assert_eq!(keys, ["lpips", "lpips_alex_unit", "lpips_vgg_signed", "lpips_vgg_unit"]);
     let titles: Vec<String> = Measure::all().map(Measure::title).collect();
     assert_eq!(titles, ["LPIPS", "LPIPS alex unit", "LPIPS vgg signed", "LPIPS vgg unit"]);
 }
 
-/// The script tests itself on planted weights, in Python alone; what it makes of them is what we read.
+/// The script tests itself on planted weights, in Python only; its output is read here.
 #[test]
-fn what_the_converter_writes_is_read() {
+fn the_output_of_the_converter_is_read() {
     let python = Command::new("python3").arg("--version").output();
     if !python.is_ok_and(|output| output.status.success()) {
         return not_run("there is no python3");

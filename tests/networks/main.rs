@@ -1,4 +1,4 @@
-//! The networks: their kernels, their gradients, `PyTorch`'s view of them, their files.
+//! The networks: their kernels, their gradients, agreement with `PyTorch`, their files.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 

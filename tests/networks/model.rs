@@ -1,4 +1,4 @@
-//! Both networks in double precision, put together from the references of their kernels.
+//! Both networks in double precision, composed of the references of their kernels.
 
 use nightsplat::networks::{DenoiserSettings, NetworkVariant};
 use nightsplat::reference::conv3x3::{activate, conv3x3, data_gradient};
@@ -29,7 +29,7 @@ impl Conv {
         conv3x3(size, self.channels, weights, biases, input)
     }
 
-    /// Adds to the gradients of the layer; gives the gradient of the input.
+    /// Adds to the gradients of the layer; returns the gradient of the input.
     fn backward(
         self,
         size: [usize; 2],
@@ -56,7 +56,7 @@ fn relu_backward(d: &mut [f64], activations: &[f64]) {
     d.iter_mut().zip(activations).filter(|(_, a)| **a <= 0.0).for_each(|(d, _)| *d = 0.0);
 }
 
-/// What a backward pass gives: dL/d parameters and dL/d both inputs.
+/// The results of a backward pass: dL/d parameters and dL/d both inputs.
 pub(crate) struct Gradients {
     pub(crate) parameters: Vec<f64>,
     pub(crate) inputs: [Vec<f64>; 2],
@@ -69,7 +69,7 @@ pub(crate) struct Denoiser {
     pub(crate) size: [usize; 2],
 }
 
-/// What a stage leaves for its backward pass.
+/// The state of a stage for its backward pass.
 struct Stage {
     input: Vec<f64>,
     features: Vec<Vec<f64>>,

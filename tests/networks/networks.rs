@@ -1,4 +1,4 @@
-//! The networks on the device: against the references put together in double precision, and their rules of use.
+//! The networks on the device: against references in double precision, and their rules of use.
 
 use glam::UVec2;
 use nightsplat::gpu::testing::gpu;
@@ -11,7 +11,7 @@ use super::model;
 use super::{largest, narrow, widen};
 use crate::common::{Random, assert_close};
 
-/// What a network makes of two images and a gradient: output, gradients of parameters and of both inputs.
+/// The results of a network for two images and a gradient: output, gradients of parameters and of both inputs.
 #[derive(PartialEq)]
 pub(crate) struct Outcome {
     pub(crate) output: Vec<f32>,
@@ -19,10 +19,10 @@ pub(crate) struct Outcome {
     pub(crate) inputs: [Vec<f32>; 2],
 }
 
-/// What the buffer that is added to holds before.
+/// The initial content of the buffer that is accumulated into.
 const BEFORE: f32 = 0.25;
 
-/// Runs a network forward and backward, and takes what the second input's gradient held before off again.
+/// Runs a network forward and backward, and subtracts the initial content of the second input's gradient.
 macro_rules! run_network {
     ($network:ident, $output:ident, $size:expr, $images:expr) => {{
         let (gpu, size): (_, UVec2) = (gpu(), $size);
@@ -60,7 +60,7 @@ pub(crate) fn run_tonemapper(
     run_network!(tonemapper, output, size, images)
 }
 
-/// Two inputs and a gradient; the second input is so bright that some values clamp and not all.
+/// Two inputs and a gradient; the second input is so bright that some values clamp.
 fn images(size: UVec2, seed: u64) -> [Vec<f32>; 3] {
     let mut random = Random::new(seed);
     [[0.0, 0.5], [0.4, 1.9], [-1.0, 1.0]].map(|[low, high]| {
@@ -68,8 +68,8 @@ fn images(size: UVec2, seed: u64) -> [Vec<f32>; 3] {
     })
 }
 
-/// Each tensor of a gradient relative to the largest of its layer: a bias in front of a norm has no gradient at all,
-/// but for the rounding of the sums that cancel.
+/// Compares each tensor of a gradient relative to the largest of its layer: a bias in front of a norm has no gradient,
+/// except for the rounding of cancelling sums.
 pub(crate) fn assert_gradients(
     what: &str,
     parameters: &Parameters,
@@ -98,7 +98,7 @@ fn assert_outcome(
         let bound = tolerance * largest(&expected) + 1e-7;
         assert_close(what, actual, &expected, |_, _| bound);
     };
-    // Some thirty layers, each of which rounds by a few units of its values.
+    // About thirty layers, each with an error of a few units in the last place.
     relative(&actual.output, output, 2e-5);
     for (actual, expected) in actual.inputs.iter().zip(&gradients.inputs) {
         relative(actual, expected, 1e-4);
@@ -106,7 +106,7 @@ fn assert_outcome(
     assert_gradients(what, parameters, &actual.parameters, &narrow(&gradients.parameters));
 }
 
-/// Weights about which nothing is special: a last layer of zeros would hide all that lies before it.
+/// Generic weights: a last layer of zeros would hide everything before it.
 fn draw_weights(parameters: &mut Parameters, seed: u64) {
     let mut random = Random::new(seed);
     let drawn: Vec<f32> =
@@ -115,7 +115,7 @@ fn draw_weights(parameters: &mut Parameters, seed: u64) {
 }
 
 #[test]
-fn in_the_identity_form_a_render_comes_out_bit_for_bit_until_something_is_learned() {
+fn in_the_identity_variant_the_output_is_the_render_bit_for_bit_before_training() {
     let (gpu, size) = (gpu(), UVec2::new(21, 9));
     let [first, second, d] = images(size, 9);
     for stages in [1, 2, 3] {
@@ -154,7 +154,7 @@ fn the_denoiser_matches_its_reference_forward_and_backward() {
         variants.map(|variant| (DenoiserSettings { variant, ..settings }, sizes.clone()))
     });
     for (settings, sizes) in all {
-        // One network for all sizes: its memory serves smaller views too.
+        // One network for all sizes: its memory also serves smaller views.
         let mut denoiser = Denoiser::new(&gpu, settings, 7).unwrap();
         assert_eq!(denoiser.margin(), settings.stages * (settings.repeats + 2));
         if settings.variant == NetworkVariant::Identity {
@@ -200,9 +200,9 @@ fn the_tonemapper_matches_its_reference_forward_and_backward() {
     }
 }
 
-/// The loss looks at what comes out: a `ReLU` or a clamp that made a number of a NaN would hide it.
+/// The loss inspects the output: a `ReLU` or a clamp that removed a NaN would hide it.
 #[test]
-fn a_value_that_is_not_a_number_reaches_the_output() {
+fn a_nan_reaches_the_output() {
     let gpu = gpu();
     let settings = DenoiserSettings { stages: 2, repeats: 1, channels: 8, ..Default::default() };
     let size = UVec2::new(21, 9);
@@ -234,14 +234,14 @@ fn two_runs_give_the_same_bits() {
     assert!(a == b && c == d);
 }
 
-/// How often a pass convolves.
+/// The number of convolutions of a pass.
 fn convolutions(report: &CheckReport) -> usize {
     let all = report.kernels().into_iter();
     all.filter(|(kernel, ..)| *kernel == "conv3x3").map(|(_, count, _)| count).sum()
 }
 
 #[test]
-fn where_activations_are_kept_no_stage_is_computed_again_and_no_bit_changes() {
+fn with_kept_activations_no_stage_is_recomputed_and_no_bit_changes() {
     let (gpu, size) = (gpu(), UVec2::new(21, 9));
     let [first, second, d] = images(size, 9);
     let [stages, repeats] = [3, 2];
@@ -268,7 +268,7 @@ fn where_activations_are_kept_no_stage_is_computed_again_and_no_bit_changes() {
 }
 
 #[test]
-fn activations_are_not_kept_where_the_device_has_no_room_for_them() {
+fn activations_are_not_kept_without_device_memory_for_them() {
     let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
     let (settings, size) = (DenoiserSettings { stages: 3, ..Default::default() }, UVec2::splat(64));
     let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
@@ -276,16 +276,16 @@ fn activations_are_not_kept_where_the_device_has_no_room_for_them() {
     let (before, kept) = (gpu.memory_in_use(), Denoiser::kept_bytes(settings, size));
     gpu.limit_memory(before + kept / 2);
     assert!(!denoiser.keep_activations(size, u64::MAX).unwrap());
-    // What did not fit is no longer there, and what is foreseen is enough.
+    // Memory of the failed attempt is freed, and the estimate suffices.
     gpu.limit_memory(before + kept + kept / 20);
     assert!(denoiser.keep_activations(size, u64::MAX).unwrap());
     assert!(gpu.memory_in_use() >= before + kept / 2);
 }
 
-/// Half precision is single precision on a device without 16-bit matrices. Gradients as small as a mean over a large
-/// view makes them lose no more than large ones.
+/// Half precision is single precision on a device without 16-bit matrices. Small gradients, as of a mean over a large
+/// view, lose no more than large ones.
 #[test]
-fn half_precision_stays_near_single_at_every_magnitude() {
+fn half_precision_is_close_to_single_at_every_magnitude() {
     let gpu = gpu();
     let variant = NetworkVariant::Paper;
     let single =
@@ -311,7 +311,8 @@ fn half_precision_stays_near_single_at_every_magnitude() {
             distance(&actual.parameters, &expected.parameters),
             distance(&actual.inputs[0], &expected.inputs[0]),
         ];
-        // Factors round by 2^-10 at most; a ReLU or a clamp near its kink may then let another gradient pass.
+        // The rounding error of factors is at most 2^-10; a ReLU or a clamp close to its kink may then pass another
+        // gradient.
         let bounds = [1e-3, 0.05, 0.05];
         assert!(far.iter().zip(bounds).all(|(far, bound)| *far < bound), "{magnitude}: {far:?}");
         println!("relative distances of output and gradients at {magnitude}: {far:?}");
@@ -325,7 +326,7 @@ fn half_precision_stays_near_single_at_every_magnitude() {
     assert!(run_denoiser(&mut denoiser, size, [&spoiled, &second, &d]).output[100].is_nan());
 }
 
-/// Weights are packed once a step for each way, the map before each convolution once and its gradient once.
+/// Weights are packed once per step for each direction, the map before each convolution once, and its gradient once.
 fn assert_each_factor_is_packed_once(settings: DenoiserSettings, size: UVec2, images: [&[f32]; 3]) {
     let gpu = gpu();
     let mut denoiser = Denoiser::new(&gpu, settings, 1).unwrap();
@@ -356,7 +357,7 @@ fn the_paper_s_denoiser_has_its_parameters_and_fits_a_gigabyte() {
 }
 
 #[test]
-fn weights_begin_as_in_pytorch_and_follow_the_seed() {
+fn initial_weights_are_those_of_pytorch_and_depend_on_the_seed() {
     let gpu = gpu();
     let variant = NetworkVariant::Paper;
     let settings =
@@ -390,7 +391,7 @@ fn weights_begin_as_in_pytorch_and_follow_the_seed() {
 }
 
 #[test]
-fn misuse_is_told_in_one_line() {
+fn misuse_is_refused_in_one_line() {
     let gpu = gpu();
     for settings in [
         DenoiserSettings { stages: 0, ..Default::default() },
@@ -423,11 +424,11 @@ fn misuse_is_told_in_one_line() {
                 $network.backward(pass, size, &image, &image, &image, d_first, d_second)
             })
             .unwrap();
-            // The backward pass has used up what the forward pass left.
+            // The backward pass has consumed the results of the forward pass.
             let again = gpu.run("n", |pass| {
                 $network.backward(pass, size, &image, &image, &image, d_first, d_second)
             });
-            told("a forward pass of its own", again);
+            told("its own preceding forward pass", again);
         };
     }
     check!(denoiser);

@@ -1,4 +1,4 @@
-//! The networks against `PyTorch`: `tests/fixtures/torch/README.md` says what each tensor is and how it was made.
+//! The networks against `PyTorch`: `tests/fixtures/torch/README.md` describes each tensor and its origin.
 
 use std::path::Path;
 
@@ -62,7 +62,7 @@ impl Fixture {
 }
 
 #[test]
-fn a_denoiser_stage_is_pytorch_s() {
+fn a_denoiser_stage_agrees_with_pytorch() {
     let fixture = Fixture::new("stage");
     let variant = NetworkVariant::Paper;
     let settings =
@@ -76,7 +76,7 @@ fn a_denoiser_stage_is_pytorch_s() {
 }
 
 #[test]
-fn the_tonemapper_is_pytorch_s() {
+fn the_tonemapper_agrees_with_pytorch() {
     let fixture = Fixture::new("tonemapper");
     let mut tonemapper = Tonemapper::new(&gpu(), NetworkVariant::Paper, 0).unwrap();
     let values = fixture.layers(tonemapper.parameters(), "");

@@ -1,4 +1,4 @@
-//! Curves from files: TOML settings, CSV and .cube tables, and what is wrong with them.
+//! Curves from files: TOML settings, CSV and .cube tables, and errors in them.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -10,7 +10,7 @@ use nightsplat::photographs::tone::{
 };
 use nightsplat::train::TrainConfig;
 
-/// A curve read from a file of that name and text.
+/// A curve read from a file with this name and text.
 fn load(name: &str, text: &str) -> Result<ToneSettings, Error> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(name);
@@ -51,7 +51,7 @@ fn tables_are_read_from_csv_and_cube() {
 }
 
 #[test]
-fn a_configuration_holds_the_whole_curve() {
+fn a_configuration_contains_the_whole_curve() {
     let csv = load("a.csv", "0,0.1\n0.30000000000000004,0.7\n1,1\n").unwrap();
     let constants = vec![0.1 + 0.2, -1.0 / 3.0, 1.0, 1e-3];
     let cubic = ToneSettings { constants, ..ToneSettings::new(ToneCurve::FittedCubic) };
@@ -59,20 +59,21 @@ fn a_configuration_holds_the_whole_curve() {
         let config = TrainConfig { tone, ..TrainConfig::bare() };
         let text = config.to_toml().unwrap();
         assert_eq!(toml::from_str::<TrainConfig>(&text).unwrap(), config, "{text}");
-        // A run's configuration is a file with a curve, too.
+        // A run's configuration is also a curve file.
         assert_eq!(load("config.toml", &text).unwrap(), config.tone);
     }
 }
 
 #[test]
 fn configurations_of_earlier_versions_load() {
-    let text = "steps = 7\n[tone]\ncurve = \"ase\"\ngain_c = 3.0\ntheta = 0.49\nalpha = 0.12\nbeta = 2.5\nbase_gain = 1.0\n";
+    let text = "steps = 7\n[tone]\ncurve = \"ase\"\ngain_c = 3.0\ntheta = 0.49\nalpha = 0.12\nbeta = 2.5\n\
+                base_gain = 1.0\n";
     let config: TrainConfig = toml::from_str(text).unwrap();
     assert_eq!(config.tone, ToneSettings::new(ToneCurve::Ase));
 }
 
 #[test]
-fn what_is_wrong_with_a_file_is_named() {
+fn the_problem_of_a_file_is_named() {
     let wrong = [
         ("a.toml", "curve = \"gama\"", "unknown curve `gama`"),
         ("a.toml", "curve = \"gamma\"\nconstants = { a = 1.0 }", "needs the constant `b`"),
@@ -90,10 +91,10 @@ fn what_is_wrong_with_a_file_is_named() {
         ("a.toml", "gain_c = 1.0", "names no curve"),
         ("a.toml", "curve = \"ap3\"\ngain = 1.0", "unknown field `gain`"),
         ("a.toml", "curve = \"table\"", "needs a file of values"),
-        ("a.toml", "curve = ", "is no tone curve"),
+        ("a.toml", "curve = ", "is not a tone curve"),
         ("a.csv", "0,0\n0.5,0.2\n0.4,0.3\n", "line 3: the first column must ascend"),
         ("a.csv", "0,0\n0,1\n", "must ascend"),
-        ("a.csv", "0,0\n1,nan\n", "line 2: `nan` is no number"),
+        ("a.csv", "0,0\n1,nan\n", "line 2: `nan` is not a number"),
         ("a.csv", "0,0\n", "at least two"),
         ("a.csv", "", "at least two"),
         ("a.csv", "luma,y\n0,0\n", "`luma`"),
@@ -116,7 +117,7 @@ fn what_is_wrong_with_a_file_is_named() {
 }
 
 #[test]
-fn another_curve_brings_its_own_constants_and_the_same_keeps_them() {
+fn another_curve_has_its_own_constants_and_the_same_curve_keeps_them() {
     let mine = ToneSettings { gain_c: 2.0, theta: 0.4, ..ToneSettings::new(ToneCurve::Ap3) };
     assert_eq!(mine.with_curve(ToneCurve::Ap3), mine);
     let ase = mine.with_curve(ToneCurve::Ase);
@@ -142,7 +143,7 @@ fn the_family_of_a_curve_has_one_key_and_its_old_name_is_read() {
 }
 
 #[test]
-fn a_rounded_curve_is_the_same_to_the_kernels_and_short() {
+fn a_rounded_curve_is_short_and_the_same_for_the_kernels() {
     let long = ToneSettings {
         gain_c: 1.234_567_890_123e-250,
         alpha: 0.1 + 0.2,
@@ -159,7 +160,7 @@ fn a_rounded_curve_is_the_same_to_the_kernels_and_short() {
 }
 
 #[test]
-fn a_cube_begins_where_its_domain_does() {
+fn a_cube_starts_at_its_domain() {
     let table = Table::from_cube(
         "LUT_1D_SIZE 3\nDOMAIN_MIN 0.2 0.2 0.2\nDOMAIN_MAX 0.6 0.6 0.6\n0 0 0\n0.5 0.5 0.5\n1 1 1\n",
     );
@@ -184,6 +185,6 @@ fn between_its_knots_a_table_is_the_monotone_cubic() {
     for x in [0.03, 0.2, 0.25, 0.9] {
         is_near(table([0.0, 0.1, 0.4, 1.0]).value(x, 0), x);
     }
-    // Level at a peak, and half way between two levels half way up.
+    // Flat at a peak, and half way between two flat knots half way up.
     is_near(table([0.0, 0.6, 0.4, 0.5]).value(0.25, 0), 0.5);
 }

@@ -1,4 +1,4 @@
-//! The table of curves: the method's values, the properties each row claims, and the device against the host.
+//! The table of curves: published values, the claimed properties of each row, and the device against the host.
 
 use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
@@ -8,7 +8,7 @@ use nightsplat::photographs::tone::{
     FAMILIES, Family, Table, TableInput, ToneCurve, ToneSettings, White,
 };
 
-/// The method's values after the clamp, as printed.
+/// The published values after the clamp, as printed.
 const T: [f64; 8] = [0.05, 0.10, 0.25, 0.50, 1.00, 1.50, 2.00, 3.00];
 const VALUES: [(&str, [f64; 8]); 23] = [
     ("fitted_cubic", [0.152, 0.198, 0.326, 0.500, 0.732, 0.854, 0.918, 1.00]),
@@ -36,7 +36,7 @@ const VALUES: [(&str, [f64; 8]); 23] = [
     ("softexp", [0.077, 0.149, 0.331, 0.553, 0.800, 0.911, 0.960, 0.992]),
 ];
 
-/// The values the task names among them, and a dense grid.
+/// A dense grid, including the published values.
 fn grid() -> Vec<f64> {
     let mut grid: Vec<f64> = (0..=20_000).map(|i| f64::from(i) / 4000.0).collect();
     grid.extend((-60..=32).map(|power| 10f64.powf(f64::from(power) / 4.0)));
@@ -50,7 +50,7 @@ fn value(family: &Family, t: f64) -> f64 {
 }
 
 #[test]
-fn every_family_has_the_method_s_values_to_their_last_digit() {
+fn every_family_has_the_published_values_to_their_last_digit() {
     for (name, expected) in VALUES {
         let family = Family::find(name).unwrap();
         for (t, expected) in T.into_iter().zip(expected) {
@@ -88,7 +88,7 @@ fn the_table_is_in_order_and_its_names_are_unique() {
 }
 
 #[test]
-fn every_value_is_a_number_in_the_range_at_every_extreme() {
+fn every_value_is_finite_and_in_range_at_every_extreme() {
     for family in &FAMILIES {
         for t in grid().into_iter().chain([f64::NAN, f64::NEG_INFINITY, -1.0]) {
             let y = value(family, t);
@@ -105,7 +105,7 @@ fn every_value_is_a_number_in_the_range_at_every_extreme() {
 }
 
 #[test]
-fn every_row_says_rightly_whether_it_rises_and_whether_it_clips() {
+fn every_row_states_correctly_whether_it_rises_and_whether_it_clips() {
     for family in &FAMILIES {
         let name = family.name;
         let values: Vec<f64> = grid().into_iter().map(|t| value(family, t)).collect();
@@ -120,7 +120,7 @@ fn every_row_says_rightly_whether_it_rises_and_whether_it_clips() {
 
 /// By central differences, away from knees.
 #[test]
-fn derivatives_are_those_of_central_differences() {
+fn derivatives_agree_with_central_differences() {
     for family in &FAMILIES {
         let constants = family.defaults();
         for i in 0..400 {
@@ -152,8 +152,8 @@ fn derivatives_are_those_of_central_differences() {
     }
 }
 
-/// The target of a planar photograph on the device, held to the kernel's reference; `numbers` are those of a table with
-/// `knot_count` knots, or of a profile.
+/// The target of a planar photograph on the device, checked against the kernel's reference; `numbers` are those of a
+/// table with `knot_count` knots, or of a profile.
 fn mapped(
     curve: ToneCurve,
     image: &[f32],
@@ -189,14 +189,14 @@ fn on_device(curve: ToneCurve, grid: &[f32], tone: ToneParameters) -> [Vec<f32>;
     [found, grid.iter().map(|&t| curve.apply(t, &tone)).collect()]
 }
 
-/// An exact value's f32 neighbours are 2^-24 of it apart at least.
+/// Distance in ulps, at least 2^-24 of the exact value each.
 fn ulps(found: f32, exact: f64) -> f64 {
     let ulp = f64::from((exact as f32).next_up()) - f64::from(exact as f32);
     (f64::from(found) - exact).abs() / ulp
 }
 
-/// What exp, pow and cancellation may cost beyond 4 ulp: 4 ulp of one, and of tiny values, which the series keep,
-/// a few parts in a million. The terms of the polynomial of degree 5 reach 30 where their sum is 1.
+/// The error of exp, pow and cancellation beyond 4 ulp: 4 ulp of one, and a few parts per million for tiny values,
+/// which the series compute. The terms of the polynomial of degree 5 reach 30 while their sum is 1.
 fn bound(family: &Family, t: f32, exact: f64) -> f64 {
     match family.curve {
         ToneCurve::Poly5Origin => 4e-6,
@@ -206,7 +206,7 @@ fn bound(family: &Family, t: f32, exact: f64) -> f64 {
 }
 
 #[test]
-fn the_device_follows_every_family_in_double_precision() {
+fn the_device_agrees_with_every_family_in_double_precision() {
     let grid: Vec<f32> = grid().into_iter().map(|t| t as f32).collect();
     let is_of_one_value = |family: &&Family| {
         family.white != White::ChannelMeans && family.curve != ToneCurve::LumPreserve
@@ -239,7 +239,7 @@ fn the_device_follows_every_family_in_double_precision() {
     }
 }
 
-/// A photograph of 8-bit noise that crowds near black.
+/// A photograph of 8-bit noise close to black.
 fn photograph(pixels: usize) -> Vec<f32> {
     let mut state = 5_u64;
     let mut noise = move || {
@@ -271,7 +271,7 @@ fn curves_that_mix_channels_match_their_reference() {
 }
 
 #[test]
-fn a_part_of_a_curve_lies_between_the_photograph_and_its_whole() {
+fn a_partial_curve_is_between_the_photograph_and_the_whole_curve() {
     let mut image = photograph(100);
     image[7] = 1.5;
     let constants = [1.0 / 3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
@@ -285,7 +285,7 @@ fn a_part_of_a_curve_lies_between_the_photograph_and_its_whole() {
 }
 
 #[test]
-fn what_is_decoded_alone_has_the_bits_that_were_stored_and_a_curve_sees_the_same() {
+fn decoding_restores_the_stored_bits_also_under_a_curve() {
     let image = photograph(333);
     let tone = ToneParameters { white: 0.2, gain: 1.0, weight: 1.0, ..Default::default() };
     let expected = mapped(ToneCurve::Ase, &image, tone, (&[], 0));
@@ -379,9 +379,9 @@ fn a_table_goes_through_its_knots_and_rises_where_they_do() {
     assert_eq!(table.value(f64::NAN, 0), 0.0);
 }
 
-/// Grey keeps to the curve of one value whatever lambda is, and colours keep their ratios where it is 1.
+/// Grey follows the curve of one value for any lambda, and colours keep their ratios for lambda 1.
 #[test]
-fn the_automatic_curve_is_one_on_grey_and_keeps_the_ratios_of_colours() {
+fn the_automatic_curve_is_one_curve_for_grey_and_keeps_the_ratios_of_colours() {
     for share in [0.0, 1.0 / 3.0, 1.0] {
         let mut constants = [0.0; 8];
         constants[0] = share;

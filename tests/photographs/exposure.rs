@@ -1,4 +1,4 @@
-//! How bright the automatic target is: the rule against a slow one over pixels, and what comes of odd sets.
+//! The brightness of automatic targets: the rule against a slow one over pixels, and unusual datasets.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -6,7 +6,7 @@ use glam::{DAffine3, DVec2, DVec3};
 use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::photographs::tone::{Exposure, LuminanceHistogram, Statistics, exposed_anew, soft};
 
-/// A reproducible photograph whose luminance crowds near black, planar; `contrast` is the power that crowds it.
+/// A reproducible photograph with luminance close to black, planar; `contrast` is the exponent of its distribution.
 fn photograph(pixels: usize, brightness: f32, contrast: i32, seed: u64) -> Vec<f32> {
     let mut state = seed;
     let mut noise = move || {
@@ -31,7 +31,7 @@ fn luminances(planes: &[f32]) -> Vec<f64> {
     (0..n).map(|i| of(i).sum()).collect()
 }
 
-/// The rule by trying gains, a thousandth apart, on every pixel.
+/// The rule by testing gains, a thousandth apart, on every pixel.
 fn slow_gain(luminances: &[f64]) -> f64 {
     let mut sorted = luminances.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -56,7 +56,7 @@ fn exposure(views: &[Vec<f32>]) -> Option<Exposure> {
 }
 
 #[test]
-fn the_gain_is_that_of_a_search_over_all_pixels() {
+fn the_gain_agrees_with_a_search_over_all_pixels() {
     let mut bounded = [0; 3];
     for (seed, brightness) in [(1, 0.05), (2, 0.1), (3, 0.3), (4, 1.0)] {
         for contrast in [1, 2, 4, 12] {
@@ -74,7 +74,7 @@ fn the_gain_is_that_of_a_search_over_all_pixels() {
 }
 
 #[test]
-fn the_mean_rises_with_the_gain_and_with_the_brightness_asked_for() {
+fn the_mean_rises_with_the_gain_and_with_the_requested_brightness() {
     let views = [1, 2, 3].map(|seed| LuminanceHistogram::of(&photograph(5000, 0.2, 3, seed)));
     let mut last = 0.0;
     for gain in (-20..=20).map(|step| f64::from(step).exp2().powf(0.35)) {
@@ -107,7 +107,7 @@ fn darker_views_have_a_higher_gain_and_equal_ones_the_scene_s() {
     let varied = exposure(&views).unwrap();
     assert!((varied.spread / 2f64.ln() - 1.118).abs() < 0.02, "{}", varied.spread);
     assert!(varied.share > 0.95 && varied.share < 1.0);
-    // Nearly all of the difference is taken back: the targets are as bright as one another.
+    // Almost all of the difference is compensated: the targets are equally bright.
     let means = views.each_ref().map(|view| {
         let histogram = LuminanceHistogram::of(view);
         histogram.mean_of(|y| soft(y, varied.gain_of(&histogram, None)))
@@ -118,7 +118,7 @@ fn darker_views_have_a_higher_gain_and_equal_ones_the_scene_s() {
     assert_eq!(shared.gain_of(&histogram, None), varied.gain);
 }
 
-/// Cameras along a path, a step apart each, that look ahead.
+/// Cameras along a path, one step apart, that look ahead.
 fn camera(step: usize) -> Camera {
     Camera {
         width: 8,
@@ -130,7 +130,7 @@ fn camera(step: usize) -> Camera {
     }
 }
 
-/// The gains of views along a path that are scaled by factors, and how much of their differences they keep.
+/// The gains of views along a path that are scaled by factors, and the share of the differences that remains.
 fn gains_along(factors: &[f32]) -> (Vec<f64>, f64) {
     let view = photograph(20_000, 0.1, 2, 7);
     let views: Vec<_> =
@@ -142,21 +142,21 @@ fn gains_along(factors: &[f32]) -> (Vec<f64>, f64) {
 }
 
 #[test]
-fn views_that_are_near_each_other_have_about_one_gain_unless_their_exposures_differ() {
+fn neighbouring_views_have_similar_gains_unless_their_exposures_differ() {
     let spread = |gains: &[f64]| {
         let [low, high] = [f64::min, f64::max].map(|of| gains.iter().copied().reduce(of).unwrap());
         (high / low).log2()
     };
-    // What differs by little from view to view is taken for what they show: the targets agree.
+    // Small differences between views are attributed to their content: the targets agree.
     let flicker: Vec<f32> = (0..40).map(|i| if i % 2 == 0 { 1.0 } else { 1.1 }).collect();
     let (gains, share) = gains_along(&flicker);
     assert!(spread(&gains[5..35]) < 0.3 * 1.1_f64.log2(), "{}", spread(&gains[5..35]));
     assert!(share < 0.3, "{share}");
-    // What changes along the path is followed.
+    // A change along the path is followed.
     let drift: Vec<f32> = (0..40).map(|i| 1.02_f32.powi(i)).collect();
     let (gains, share) = gains_along(&drift);
     assert!(share > 0.8 && spread(&gains) > 0.8 * 39.0 * 1.02_f64.log2(), "{share}");
-    // Photographs a stop apart are exposed anew, each by itself.
+    // Photographs a stop apart are compensated individually.
     let stops: Vec<f32> = (0..40).map(|i| if i % 2 == 0 { 1.0 } else { 0.5 }).collect();
     let (gains, share) = gains_along(&stops);
     assert!(share > 0.9 && spread(&gains) > 0.9, "{share}");
@@ -176,7 +176,7 @@ fn a_view_beyond_all_others_has_the_gain_of_the_nearest() {
 }
 
 #[test]
-fn a_picture_at_one_gain_is_known_at_another() {
+fn an_image_at_one_gain_is_converted_to_another() {
     for gains in [[10.0, 14.0], [14.0, 10.0], [3.0, 60.0], [8.0, 8.0]] {
         for weight in [1.0, 0.4] {
             let knots = exposed_anew(gains, weight);
@@ -194,7 +194,7 @@ fn a_picture_at_one_gain_is_known_at_another() {
 }
 
 #[test]
-fn a_thousandth_of_hot_pixels_moves_the_gain_by_little() {
+fn a_thousandth_of_hot_pixels_hardly_changes_the_gain() {
     let clean = photograph(40_000, 0.08, 2, 5);
     let mut hot = clean.clone();
     for plane in hot.chunks_mut(40_000) {
@@ -212,7 +212,7 @@ fn black_views_are_left_out_and_a_black_set_has_no_exposure() {
     let without = exposure(&[good]).unwrap();
     assert_eq!((with.gain, with.black), (without.gain, 2));
     assert_eq!(with.gain_of(&LuminanceHistogram::of(&black), None), with.gain);
-    assert!(with.reason().contains("2 as good as black"), "{}", with.reason());
+    assert!(with.reason().contains("2 almost black"), "{}", with.reason());
     assert_eq!(exposure(&[black, vec![0.0; 3000]]), None);
     assert_eq!(exposure(&[]), None);
 }
@@ -228,13 +228,13 @@ fn a_well_lit_set_has_no_curve_and_one_between_a_blend() {
     for (exposure, part) in [(well_lit, "no curve"), (between, "% of a curve"), (dark, "gain")] {
         assert!(exposure.reason().contains(part), "{}", exposure.reason());
     }
-    // One view has no spread; of two, one a half as bright as the other, each is half a stop from their mean.
+    // One view has no spread; if one of two is half as bright as the other, each is half a stop from their mean.
     let stops = |views: &[Vec<f32>]| exposure(views).unwrap().reason();
     let view = scaled(&bright, 0.2);
     assert!(!stops(std::slice::from_ref(&view)).contains("give or take"));
     let two = stops(&[view.clone(), scaled(&view, 0.5)]);
     assert!(two.contains("give or take 0.5 stops between the views"), "{two}");
-    // Half the views well lit: the set is dark on the mean, and every view is brought to the same brightness.
+    // Half of the views are well lit: the set is dark on average, and every view gets the same brightness.
     let half = exposure(&[bright.clone(), scaled(&bright, 0.05)]).unwrap();
     assert!(half.weight() > 0.0 && half.share > 0.95, "{half:?}");
 }

@@ -1,5 +1,5 @@
-//! Fits of tone curves: constants come back from synthetic pairs, real pairs beat the published constants, bad input is
-//! named.
+//! Fits of tone curves: constants are recovered from synthetic pairs, fits to real pairs are better than the published
+//! constants, and bad input is named.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -15,8 +15,8 @@ use nightsplat::photographs::fit::{
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::tone::{FAMILIES, Family, Statistics, ToneCurve, ToneSettings, White};
 
-/// A dark photograph of independent colours; brightness falls off exponentially, so that t reaches about 4, from a black
-/// level of `floor`.
+/// A dark photograph of independent colours; brightness decreases exponentially, so that t reaches about 4, from a
+/// black level of `floor`.
 fn dark(size: u32, scale: f64, floor: f64, seed: u64) -> Image {
     let stream = Stream::new(seed, 1);
     Image::from_fn(size, size, |x, y| {
@@ -27,7 +27,7 @@ fn dark(size: u32, scale: f64, floor: f64, seed: u64) -> Image {
     })
 }
 
-/// What the curve makes of a photograph, with normal noise.
+/// A photograph under the curve, with normal noise.
 fn reference(settings: &ToneSettings, dark: &Image, noise: f64, seed: u64) -> Image {
     let stream = Stream::new(seed, 2);
     let parameters = settings.parameters(&Statistics::of(&dark.data));
@@ -50,7 +50,7 @@ fn fit_to(family: &'static Family, pairs: &[Pair], options: &FitOptions) -> Fit 
     fit(family, &pairs.iter().collect::<Vec<_>>(), options).unwrap()
 }
 
-/// The table's start, every constant 6 % smaller: within the bounds, and as monotone as the start.
+/// The table's start, with every constant 6 % smaller: within the bounds, and as monotone as the start.
 fn truth(family: &Family) -> ToneSettings {
     let mut settings = ToneSettings::new(family.curve);
     settings.constants = family.constants.iter().map(|constant| 0.94 * constant.start).collect();
@@ -73,10 +73,11 @@ const PLAIN: FitOptions = FitOptions {
     adapt: false,
 };
 
-/// Noise of 0.02 on 393 216 values. A constant may be off by 5 of its standard errors and 1 % (noise that is clipped at
-/// white, and columns of a finite width, shift it a little); the curve itself by 0.005, be the constants identifiable or not.
+/// Noise of 0.02 on 393 216 values. A constant may be off by 5 of its standard errors and 1 % (clipped noise at white
+/// and the finite width of columns shift it a little); the curve itself by 0.005, whether the constants are
+/// identifiable or not.
 #[test]
-fn the_constants_of_every_identifiable_family_come_back_from_noisy_pairs() {
+fn the_constants_of_every_identifiable_family_are_recovered_from_noisy_pairs() {
     let darks = [dark(256, 0.04, 0.0, 1), dark(256, 0.07, 0.0, 2)];
     for family in fitted_on_t() {
         let truth = truth(family);
@@ -108,9 +109,9 @@ fn the_constants_of_every_identifiable_family_come_back_from_noisy_pairs() {
     }
 }
 
-/// Twelve photographs of differing brightness and black level; each number within 5 standard errors and 3 %.
+/// Twelve photographs of different brightness and black level; each value within 5 standard errors and 3 %.
 #[test]
-fn black_level_gain_and_aim_come_back_where_curves_adapt() {
+fn black_level_gain_and_target_mean_are_recovered_for_adaptive_curves() {
     let darks: Vec<Image> = (0..12)
         .map(|i| {
             dark(
@@ -157,7 +158,7 @@ fn black_level_gain_and_aim_come_back_where_curves_adapt() {
             );
         }
     }
-    // AP3 with its cubic free: black level and gain of the photograph, constants of the family.
+    // AP3 with a free cubic: black level and gain of the photograph, constants of the family.
     let family = ToneCurve::Poly3Origin.family();
     let mut truth = truth(family);
     (truth.alpha, truth.gain_c) = (0.12, 1.0);
@@ -197,7 +198,7 @@ fn robust_weights_withstand_pixels_that_do_not_match() {
     assert!(robust < 0.012 && plain > 3.0 * robust, "{robust} {plain}");
 }
 
-/// Of 24 fits to other noise, the errors in units of the standard errors must have a root mean square near 1.
+/// In 24 fits to different noise, the errors in units of the standard errors must have a root mean square near 1.
 #[test]
 fn standard_errors_are_as_large_as_the_errors() {
     let family = ToneCurve::PowerSoftexp.family();
@@ -217,9 +218,9 @@ fn standard_errors_are_as_large_as_the_errors() {
     }
 }
 
-/// One of five photographs has another exposure: under its own weight it no longer decides.
+/// One of five photographs has another exposure: with its own weight, it hardly matters.
 #[test]
-fn a_photograph_far_from_the_curve_weighs_little() {
+fn a_photograph_far_from_the_curve_has_little_weight() {
     let family = ToneCurve::Reinhard.family();
     let settings = truth(family);
     let mut pairs: Vec<Pair> =
@@ -236,7 +237,7 @@ fn a_photograph_far_from_the_curve_weighs_little() {
     assert!(photographs < 0.1 * pixels && pixels > 0.02, "{photographs} {pixels}");
 }
 
-/// With as much weight as the pairs have, the family's own curve draws a linear fit half the way.
+/// With as much weight as the pairs, the family's own curve moves a linear fit half the way.
 #[test]
 fn a_prior_counts_as_photographs() {
     let family = ToneCurve::SqrtBlend.family();
@@ -253,7 +254,7 @@ fn a_prior_counts_as_photographs() {
 }
 
 #[test]
-fn photographs_that_disagree_are_worth_fewer_values() {
+fn photographs_that_disagree_count_as_fewer_values() {
     let family = ToneCurve::Gamma.family();
     let shifted = |shift: f64, seed: u64| {
         let dark = dark(64, 0.05, 0.0, seed);
@@ -271,9 +272,9 @@ fn photographs_that_disagree_are_worth_fewer_values() {
     assert!(error(&disagreeing) > 10.0 * error(&agreeing));
 }
 
-/// The reference falls above t = 1.2, as a polynomial likes to; a curve may not.
+/// The reference falls above t = 1.2, as a polynomial could; a curve must not.
 #[test]
-fn a_fit_rises_and_stays_below_white_where_it_must() {
+fn a_fit_rises_and_stays_below_white_if_required() {
     let dark = dark(128, 0.05, 0.0, 3);
     let p90 = Statistics::of(&dark.data).p90;
     let hump = dark.data.iter().map(|x| {
@@ -299,7 +300,7 @@ fn a_fit_rises_and_stays_below_white_where_it_must() {
 }
 
 #[test]
-fn the_histogram_s_columns_do_not_decide_the_fit_and_neither_does_the_order_of_the_pairs() {
+fn neither_the_columns_of_the_histogram_nor_the_order_of_the_pairs_matter() {
     let family = ToneCurve::SoftexpGamma.family();
     let truth = truth(family);
     let mut pairs: Vec<Pair> =
@@ -314,7 +315,7 @@ fn the_histogram_s_columns_do_not_decide_the_fit_and_neither_does_the_order_of_t
     pairs.reverse();
     let reversed = fit_to(family, &pairs, &FitOptions { bins: 8192, ..PLAIN });
     assert!((fine.constants[0].value - reversed.constants[0].value).abs() < 1e-6);
-    // Grey photographs: the luminance says the same.
+    // For grey photographs, the luminance gives the same fit.
     let grey = |image: &Image| Image { data: image.data[..96 * 96].repeat(3), ..*image };
     let greys = [0, 1].map(|seed| {
         let dark = grey(&dark(96, 0.05, 0.0, seed));
@@ -351,10 +352,10 @@ fn scores_are_the_psnr_of_the_mapped_photograph() {
 }
 
 #[test]
-fn pairs_that_say_nothing_have_a_defined_end() {
+fn degenerate_pairs_have_a_defined_result() {
     let flat = |value: f32| Image::filled(16, 16, [value; 3]);
     let one = Pair::new("flat.png", &flat(0.05), &flat(0.5)).unwrap();
-    // One value of t: enough for one constant, not for two.
+    // A single value of t: enough for one constant, not for two.
     let softexp = fit_to(ToneCurve::Softexp.family(), std::slice::from_ref(&one), &PLAIN);
     assert!(
         (ToneCurve::Softexp.value(1.0, 0.0, 1.0, &softexp.settings.constants) - 0.5).abs() < 0.003
@@ -365,7 +366,7 @@ fn pairs_that_say_nothing_have_a_defined_end() {
         matches!(error, Error::Input { .. }) && error.to_string().contains("1 different values"),
         "{error}"
     );
-    // A flat reference: the flattest curve, at a bound where there is one.
+    // A flat reference: the flattest curve, at a bound if there is one.
     let flat_reference = Pair::new("a.png", &dark(16, 0.05, 0.0, 1), &flat(0.5)).unwrap();
     for family in fitted_on_t() {
         let found = fit_to(family, std::slice::from_ref(&flat_reference), &FitOptions::default());
@@ -397,8 +398,8 @@ fn pairs_that_say_nothing_have_a_defined_end() {
     assert!(cross_validate(ToneCurve::Softexp.family(), &[scene], 5, &PLAIN).is_err());
 }
 
-/// AP3's form, black level, gain and cubic all free, drawn to the published cubic as if it were as many photographs as
-/// there are: on every pair left out in turn its squared error is less than AP3's and than the cubic's.
+/// AP3's formula with black level, gain and cubic free, and a prior on the published cubic with the weight of the
+/// photographs: on every held-out pair, its squared error is lower than AP3's and the cubic's.
 fn assert_beats_the_published_constants(scene: FitScene) {
     let (count, scene) = (scene.pairs.len(), [scene]);
     let options = FitOptions { adapt: true, prior: count as f64, ..FitOptions::default() };
@@ -413,7 +414,7 @@ fn assert_beats_the_published_constants(scene: FitScene) {
 }
 
 #[test]
-fn constants_fitted_to_some_pairs_beat_the_published_ones_on_others() {
+fn constants_fitted_to_some_pairs_are_better_than_the_published_ones_on_others() {
     let settings =
         ToneSettings { alpha: 0.1, gain_c: 2.0, ..truth(ToneCurve::FittedCubic.family()) };
     let pairs = (0..6).map(|seed| {
@@ -424,10 +425,10 @@ fn constants_fitted_to_some_pairs_beat_the_published_ones_on_others() {
     assert_beats_the_published_constants(scene);
 }
 
-/// A fit without the prior explains the pairs it has seen better than AP3, but not the others: exposures of 15 references
+/// A fit without the prior is better than AP3 on its own pairs, but not on others: the exposures of 15 references
 /// differ by more than the curves do.
 #[test]
-fn constants_fitted_to_real_pairs_beat_the_published_ones_on_others() {
+fn constants_fitted_to_real_pairs_are_better_than_the_published_ones_on_others() {
     let Some(folder) = crate::common::shared("data/pairs_lol") else { return };
     let scene = FitScene::load(&folder, None).unwrap();
     assert_eq!(scene.pairs.len(), 15);

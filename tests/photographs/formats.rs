@@ -1,4 +1,4 @@
-//! Datasets: every layout is recognised and read the same, and bad input is told in one line.
+//! Datasets: every layout is recognised and read equally, and bad input is refused in one line.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -82,7 +82,7 @@ fn the_lom_layout_trains_on_low_and_scores_against_high() {
 }
 
 #[test]
-fn a_validation_listing_stands_in_for_a_test_listing_that_is_absent() {
+fn a_validation_listing_replaces_a_missing_test_listing() {
     let folder = tempfile::tempdir().unwrap();
     lom(folder.path(), 10, &[2, 5]);
     std::fs::remove_file(folder.path().join("transforms_test.json")).unwrap();
@@ -107,7 +107,7 @@ fn the_realx3d_layout_keeps_test_poses_without_photographs_and_finds_files_witho
     assert_camera_is_view(view(&dataset, "v05"), 5);
     assert_eq!(dataset.skipped.len(), 2);
 
-    // Once they are there, they are what is scored, not what is trained on.
+    // If they exist, they are scored against, not trained on.
     photographs(root, "test", 4..6, 4.0);
     let dataset = load(root);
     assert_eq!(level(view(&dataset, "v04").reference.as_ref()), Some(56.0));
@@ -115,7 +115,7 @@ fn the_realx3d_layout_keeps_test_poses_without_photographs_and_finds_files_witho
 }
 
 #[test]
-fn of_a_single_listing_every_eighth_view_by_name_is_test() {
+fn in_a_single_listing_every_eighth_view_by_name_is_a_test_view() {
     let folder = tempfile::tempdir().unwrap();
     photographs(folder.path(), "images", 0..18, 1.0);
     let frames =
@@ -127,7 +127,7 @@ fn of_a_single_listing_every_eighth_view_by_name_is_test() {
 }
 
 #[test]
-fn a_frames_own_intrinsics_win_and_views_may_differ_in_size() {
+fn a_frames_own_intrinsics_override_and_views_may_differ_in_size() {
     let folder = tempfile::tempdir().unwrap();
     photographs(folder.path(), "images", 0..4, 1.0);
     photograph(&folder.path().join("images/v01.png"), (64, 50), 0.1);
@@ -145,7 +145,7 @@ fn a_frames_own_intrinsics_win_and_views_may_differ_in_size() {
 }
 
 #[test]
-fn an_angle_alone_makes_a_centred_camera_of_the_photographs_size() {
+fn an_angle_of_view_gives_a_centred_camera_of_the_photographs_size() {
     let folder = tempfile::tempdir().unwrap();
     photographs(folder.path(), "images", 0..3, 1.0);
     let frames: Vec<_> =
@@ -244,14 +244,14 @@ fn every_supported_camera_model_is_read_and_undistorted() {
         let camera = load(folder.path()).views[0].camera;
         assert_eq!(camera.principal_point, DVec2::new(cx, cy), "{name}");
         let distorted = number >= 2;
-        // The zoom that leaves no blank pixel is one factor for both axes.
+        // The zoom that leaves no blank pixel is the same factor for both axes.
         assert_eq!((camera.focal.x - f).abs() > 0.1, distorted, "{name}: {}", camera.focal);
         assert!((camera.focal.x - camera.focal.y).abs() < 1e-9, "{name}");
     }
 }
 
 #[test]
-fn a_distorted_set_is_undistorted_alike_in_low_and_reference() {
+fn photographs_and_references_are_undistorted_equally() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let pattern = |gain: f32| {
@@ -286,7 +286,7 @@ fn a_distorted_set_is_undistorted_alike_in_low_and_reference() {
 }
 
 #[test]
-fn low_folders_are_the_input_and_their_twins_the_reference() {
+fn low_folders_are_the_input_and_normal_light_folders_the_reference() {
     for (dark_folder, normal) in
         [("low", "images"), ("images_low", "images"), ("low", "high"), ("low", "val")]
     {
@@ -321,7 +321,7 @@ fn a_list_of_test_names_decides_the_split() {
 }
 
 #[test]
-fn a_reference_folder_of_the_users_wins_and_may_be_of_another_resolution() {
+fn a_given_reference_folder_overrides_and_may_have_another_resolution() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path().join("set");
     lom(&root, 10, &[2, 5]);
@@ -335,7 +335,7 @@ fn a_reference_folder_of_the_users_wins_and_may_be_of_another_resolution() {
 }
 
 #[test]
-fn points_of_another_world_are_brought_into_the_views() {
+fn points_of_another_world_are_transformed_into_the_views() {
     let folder = tempfile::tempdir().unwrap();
     lom(folder.path(), 10, &[2, 5]);
     let rotation = DQuat::from_axis_angle(DVec3::new(1.0, 2.0, -1.0).normalize(), 2.0);
@@ -355,7 +355,7 @@ fn points_of_another_world_are_brought_into_the_views() {
     }
     assert_eq!(dataset.points[1].views, [2, 5, 8]);
 
-    // One camera off by a third of the ring: the worlds do not belong together.
+    // One camera is displaced by a third of the ring: the worlds do not match.
     moved.images[4].1.translation += DVec3::splat(0.3);
     moved.write_binary(&folder.path().join("colmap_sparse/0"));
     assert!(load(folder.path()).points.is_empty());
@@ -400,7 +400,7 @@ fn a_smaller_copy_of_the_photographs_rescales_their_cameras() {
 }
 
 #[test]
-fn the_extent_spans_the_training_cameras_alone() {
+fn the_extent_is_that_of_the_training_cameras() {
     let folder = tempfile::tempdir().unwrap();
     lom(folder.path(), 10, &[2, 5]);
     let mut dataset = load(folder.path());

@@ -1,7 +1,7 @@
-//! Bytes from elsewhere: whatever stands in a file, no parser panics, hangs or says more than a line.
+//! Hostile files: no parser panics, hangs or prints more than a line for any content.
 //!
-//! The parsers and seeds are those of the fuzz targets; here seeds are changed by a fixed stream of random numbers, the same
-//! in every run. `NIGHTSPLAT_ROUNDS` makes it longer; what fuzzing found is among the seeds.
+//! The parsers and seeds are those of the fuzz targets; here, seeds are mutated by a fixed stream of random numbers,
+//! the same in every run. `NIGHTSPLAT_ROUNDS` sets the number of rounds; findings of fuzzing are among the seeds.
 #![cfg(feature = "io")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -15,7 +15,7 @@ use nightsplat::base::random::Stream;
 mod parsers;
 use parsers::{PARSERS, Parser};
 
-/// What numbers and words of text formats become.
+/// Replacements for numbers and words of text formats.
 const WORDS: [&str; 12] = [
     "NaN",
     "-inf",
@@ -30,10 +30,10 @@ const WORDS: [&str; 12] = [
     "{}",
     "\u{0}",
 ];
-/// What numbers of binary formats become.
+/// Replacements for numbers of binary formats.
 const NUMBERS: [u64; 6] = [0, 1, 0x7f7f_ffff, 0x7ff8_0000_0000_0000, u64::MAX, i64::MAX as u64];
 
-/// A seed, changed in a few places.
+/// A seed with a few mutations.
 fn changed(seed: &[u8], stream: Stream, round: u64) -> Vec<u8> {
     let mut bytes = seed.to_vec();
     let mut draws = (0..).map(|draw| stream.bits(64 * round + draw));
@@ -68,7 +68,7 @@ fn survives((name, parse): Parser, bytes: &[u8], what: &str) {
     }
 }
 
-/// Every parser on its seeds as they are, and changed.
+/// Runs every parser on its seeds, unchanged and mutated.
 fn assert_survive(wanted: fn(&str) -> bool, rounds: u64) {
     let rounds =
         std::env::var("NIGHTSPLAT_ROUNDS").map_or(rounds, |rounds| rounds.parse().unwrap());
@@ -96,7 +96,7 @@ fn no_bytes_of_a_dataset_listing_make_its_loader_panic() {
 }
 
 #[test]
-fn no_bytes_of_a_picture_make_its_decoder_panic() {
+fn no_bytes_of_an_image_make_its_decoder_panic() {
     assert_survive(|name| ["exr", "jpeg"].contains(&name), 150);
 }
 

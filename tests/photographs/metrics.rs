@@ -1,4 +1,4 @@
-//! The scores agree with values computed elsewhere.
+//! The scores agree with independently computed values.
 
 use std::path::Path;
 use std::process::Command;
@@ -29,7 +29,7 @@ fn scores_equal_those_of_a_plain_two_dimensional_convolution() {
 }
 
 #[test]
-fn an_image_is_like_itself() {
+fn an_image_equals_itself() {
     let (image, _) = pattern(16, 12);
     let scores = Scores::of(&image, &image).unwrap();
     assert_eq!((scores.psnr, scores.psnr_channel_mean), (f64::INFINITY, f64::INFINITY));
@@ -53,7 +53,7 @@ fn images_of_different_sizes_are_refused_with_both_sizes() {
 }
 
 #[test]
-fn images_without_pixels_or_cut_short_are_refused() {
+fn empty_and_truncated_images_are_refused() {
     let empty = Image { width: 0, height: 0, data: Vec::new() };
     assert!(Scores::of(&empty, &empty).is_err());
     let short = Image { width: 2, height: 2, data: vec![0.0; 11] };

@@ -1,5 +1,4 @@
-//! Properties that hold for whatever numbers come: curves, cameras, lenses, sort and scan, and files that are written and
-//! read again.
+//! Properties for arbitrary input: curves, cameras, lenses, sort and scan, and files that are written and read back.
 #![cfg(feature = "io")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -18,7 +17,7 @@ use proptest::test_runner::RngSeed;
 
 use crate::formats::synthetic::{self, Model, SIZE};
 
-/// The same cases in every run; what fails prints its numbers.
+/// The same cases in every run; a failure prints its input.
 fn cases(cases: u32) -> ProptestConfig {
     let (failure_persistence, rng_seed) = (None, RngSeed::Fixed(7));
     ProptestConfig { cases, failure_persistence, rng_seed, ..ProptestConfig::default() }
@@ -94,7 +93,7 @@ proptest! {
         let ray = (pixel - camera.principal_point) / camera.focal;
         let point = camera.view_from_world.inverse().transform_point3((ray * depth).extend(depth));
         let back = camera.project(point);
-        // Rounding of the point, as far away as it is, seen from so near.
+        // Rounding of a distant point that is seen from close by.
         let bound = 1e-12 * (1.0 + point.length() / depth) * (camera.focal.max_element() + pixel.length()) * 16.0;
         prop_assert!(back.is_some_and(|back| back.distance(pixel) <= bound), "{back:?}, not {pixel}");
         let half = camera.resized(2 * camera.width, 2 * camera.height);
@@ -183,7 +182,7 @@ proptest! {
     }
 
     #[test]
-    fn a_configuration_survives_its_toml(
+    fn a_configuration_is_read_back_from_its_toml(
         steps in 1..u64::from(u32::MAX), seed in 0..i64::MAX as u64, near in 1e-6..1.0_f64, rate in 0.0..1.0_f64,
         max_gaussians in 1..1_000_000_000_usize, vram in 1..1_u64 << 50,
     ) {
@@ -196,7 +195,10 @@ proptest! {
     }
 
     #[test]
-    fn poses_and_points_survive_every_layout(poses in prop::collection::vec(pose(), 1..5), points in prop::collection::vec(position(1e4), 1..8)) {
+    fn poses_and_points_survive_every_layout(
+        poses in prop::collection::vec(pose(), 1..5),
+        points in prop::collection::vec(position(1e4), 1..8),
+    ) {
         let folder = tempfile::tempdir().unwrap();
         let parameters = vec![35.5, 36.25, 18.0, 16.0];
         let image = |(index, pose): (usize, &DAffine3)| (index as u32 + 7, *pose, 3, format!("v{index}.png"));
@@ -206,7 +208,9 @@ proptest! {
             points: (0..).zip(&points).map(|(id, &at)| (id, at, vec![7])).collect(),
         };
         let json = folder.path().join("json");
-        let frames = poses.iter().enumerate().map(|(index, pose)| synthetic::frame_of(pose, &format!("images/v{index}.png")));
+        let file = |index| format!("images/v{index}.png");
+        let frames =
+            poses.iter().enumerate().map(|(index, pose)| synthetic::frame_of(pose, &file(index)));
         let roots = [folder.path().join("binary"), folder.path().join("text"), json];
         for root in &roots {
             for index in 0..poses.len() {

@@ -1,4 +1,4 @@
-//! The curve on the device against that on the host, for whole photographs and in tiles.
+//! The curve on the device against the host, for whole photographs and in tiles.
 
 use nightsplat::Error;
 use nightsplat::gpu::Gpu;
@@ -13,7 +13,7 @@ use nightsplat::photographs::tone::{
 use crate::common::{assert_close, fixture, shared};
 
 #[test]
-fn a_curve_follows_the_host_from_tiny_to_huge_values() {
+fn a_curve_agrees_with_the_host_from_tiny_to_huge_values() {
     let gpu = gpu();
     let mut grid: Vec<f32> = (0..=20_000).map(|i| i as f32 / 5000.0).collect();
     grid.extend([0.0, 1e-12, 1e-9, 1e-6, 0.009_999, 0.01, 0.010_001, 65.0, 1e6, f32::MAX]);
@@ -42,7 +42,7 @@ fn a_curve_follows_the_host_from_tiny_to_huge_values() {
     }
 }
 
-/// The lift of one photograph of its own, and the target on the device.
+/// The tone mapping of a single photograph, and its target on the device.
 fn tone_mapped(gpu: &Gpu, settings: &ToneSettings, photograph: &Image) -> (ToneMapping, Image) {
     let tone_mapping =
         settings.tone_mapping(&SceneTone::default(), &MeasuredPhotograph::of(&photograph.data));
@@ -51,7 +51,7 @@ fn tone_mapped(gpu: &Gpu, settings: &ToneSettings, photograph: &Image) -> (ToneM
 }
 
 #[test]
-fn what_cannot_be_mapped_is_refused() {
+fn unsuitable_buffers_are_refused() {
     let gpu = gpu();
     let pseudo_gt = PseudoGt::new(&gpu, &ToneSettings::new(ToneCurve::Ap3)).unwrap();
     let image = gpu.zeros("image", 36).unwrap();
@@ -85,7 +85,7 @@ fn a_photograph_maps_on_the_device_as_on_the_host() {
 }
 
 #[test]
-fn a_photograph_that_no_binding_spans_is_mapped_in_tiles_to_the_same_bits() {
+fn a_photograph_beyond_a_binding_is_mapped_in_tiles_to_the_same_bits() {
     let photograph = Image::load(fixture("lom/low/000.png")).unwrap();
     let settings = ToneSettings::new(ToneCurve::Ap3);
     let (_, whole) = tone_mapped(&gpu(), &settings, &photograph);

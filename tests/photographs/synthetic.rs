@@ -1,4 +1,4 @@
-//! The synthetic set has the layout it claims, loads as a dataset, and is what its options say, byte for byte.
+//! The synthetic dataset has its documented layout, loads, and depends only on its options, byte for byte.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -16,7 +16,7 @@ use crate::common::command::run;
 const SMALL: SyntheticOptions =
     SyntheticOptions { views: 10, width: 48, height: 36, seed: 5, fisheye: false };
 
-/// Every file below a folder by its path there.
+/// Every file below a folder, by relative path.
 fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
     let mut files = BTreeMap::new();
     let mut folders = vec![root.to_owned()];
@@ -41,7 +41,7 @@ fn written(options: &SyntheticOptions) -> tempfile::TempDir {
 }
 
 #[test]
-fn equal_options_give_equal_bytes_and_another_seed_gives_others() {
+fn equal_options_give_equal_bytes_and_another_seed_gives_different_ones() {
     let first = files(written(&SMALL).path());
     assert_eq!(first, files(written(&SMALL).path()));
     let other = files(written(&SyntheticOptions { seed: 6, ..SMALL }).path());
@@ -99,7 +99,7 @@ fn the_set_loads_as_a_dataset_whose_points_project_into_their_views() {
         for &view in &point.views {
             let camera = &dataset.views[view as usize].camera;
             let pixel = camera.project(point.position).unwrap();
-            // The positions carry the error of a reconstruction.
+            // The positions have the error of a reconstruction.
             let (width, height) = (f64::from(camera.width) + 1.0, f64::from(camera.height) + 1.0);
             assert!(
                 (-1.0..width).contains(&pixel.x) && (-1.0..height).contains(&pixel.y),
@@ -110,7 +110,7 @@ fn the_set_loads_as_a_dataset_whose_points_project_into_their_views() {
 }
 
 #[test]
-fn a_points_views_agree_on_its_color() {
+fn the_views_of_a_point_agree_on_its_colour() {
     let dir = written(&SyntheticOptions { width: 96, height: 72, ..SMALL });
     let dataset = Dataset::load(dir.path(), &LoadOptions::default()).unwrap();
     let references: Vec<Image> = dataset
@@ -130,7 +130,7 @@ fn a_points_views_agree_on_its_color() {
     };
     let mut spreads: Vec<f32> = dataset.points.iter().map(spread).collect();
     spreads.sort_by(f32::total_cmp);
-    // Half of the points lie away from the edges of textures and objects.
+    // Half of the points are away from the edges of textures and objects.
     assert!(spreads[spreads.len() / 2] < 0.15, "{}", spreads[spreads.len() / 2]);
 }
 
@@ -147,7 +147,7 @@ fn the_dark_photograph_is_the_reference_darkened_in_linear_light() {
     assert!((factor / DARKENING - 1.0).abs() < 0.05, "{factor}");
     let encoded_mean = |image: &Image| image.data.iter().sum::<f32>() / image.data.len() as f32;
     assert!((0.4..0.6).contains(&encoded_mean(&high)), "{}", encoded_mean(&high));
-    // The noise is there: neighbours on plain surfaces differ in the dark by more than the light allows.
+    // The noise is present: neighbours on plain surfaces differ in the dark by more than the light does.
     let roughness = |image: &Image| {
         let pairs = image.data.windows(2).map(|pair| (pair[1] - pair[0]).abs());
         let mut steps: Vec<f32> = pairs.collect();
@@ -158,7 +158,7 @@ fn the_dark_photograph_is_the_reference_darkened_in_linear_light() {
 }
 
 #[test]
-fn options_that_make_no_sense_are_refused() {
+fn invalid_options_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     for options in [
         SyntheticOptions { views: 1, ..SMALL },
@@ -172,7 +172,7 @@ fn options_that_make_no_sense_are_refused() {
 }
 
 #[test]
-fn a_folder_that_cannot_be_made_is_named() {
+fn a_folder_that_cannot_be_created_is_named() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("taken"), "").unwrap();
     let problem = synthetic::write(dir.path().join("taken"), &SMALL).unwrap_err().to_string();
@@ -180,7 +180,7 @@ fn a_folder_that_cannot_be_made_is_named() {
 }
 
 #[test]
-fn every_eighth_view_is_for_testing() {
+fn every_eighth_view_is_a_test_view() {
     let dir = written(&SyntheticOptions {
         views: 17,
         width: 16,
@@ -207,7 +207,7 @@ mod command {
     }
 
     #[test]
-    fn a_folder_that_is_not_empty_is_kept_unless_told_otherwise() {
+    fn a_folder_that_is_not_empty_is_kept_unless_overwritten() {
         let dir = tempfile::tempdir().unwrap();
         std::fs::write(dir.path().join("letter.txt"), "mine").unwrap();
         let problem = run(args(dir.path(), false)).unwrap_err().to_string();
@@ -218,7 +218,7 @@ mod command {
     }
 
     #[test]
-    fn a_folder_that_does_not_exist_is_made() {
+    fn a_missing_folder_is_created() {
         let dir = tempfile::tempdir().unwrap();
         run(args(&dir.path().join("new"), false)).unwrap();
         assert!(dir.path().join("new/transforms_train.json").is_file());
@@ -226,13 +226,13 @@ mod command {
 }
 
 #[test]
-fn a_fisheye_set_has_one_lens_in_both_listings_and_its_points_where_its_photographs_show_them() {
+fn a_fisheye_dataset_has_one_lens_in_both_listings_and_matching_points() {
     let dir = written(&SyntheticOptions { fisheye: true, ..SMALL });
     let root = dir.path();
     let listed = Dataset::load(root, &LoadOptions::default()).unwrap();
     let camera = listed.views[0].camera;
     assert!(matches!(camera.model, CameraModel::Fisheye(_)), "{camera:?}");
-    // The middle of the longer side is 65 degrees off the picture's middle; nothing lies outside the circle.
+    // The middle of the longer side is 65 degrees off the image's centre; nothing is outside the circle.
     let reach = camera.focal.x / 48.0;
     let CameraModel::Fisheye(lens) = camera.model else { panic!() };
     assert!((lens.angle(0.5 / reach).unwrap().to_degrees() - 65.0).abs() < 1e-9);
@@ -252,7 +252,7 @@ fn a_fisheye_set_has_one_lens_in_both_listings_and_its_points_where_its_photogra
         let xyz: Vec<f64> = point.split(' ').skip(1).take(3).map(|n| n.parse().unwrap()).collect();
         let pixel = view.camera.project(DVec3::from_slice(&xyz)).unwrap();
         let off = pixel.distance(DVec2::new(observation[0], observation[1]));
-        // Positions are off by a reconstruction's noise.
+        // Positions have the noise of a reconstruction.
         assert!(off < 0.3, "point {id}: off by {off}");
     }
 }

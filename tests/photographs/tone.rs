@@ -1,4 +1,4 @@
-//! Tone curves and the statistics behind them, against the paper and by their properties.
+//! Tone curves and their statistics, against the paper and by their properties.
 
 #![allow(clippy::unwrap_used, reason = "what fails in a helper fails the test")]
 
@@ -12,7 +12,7 @@ use nightsplat::photographs::tone::{
 
 use crate::common::{fixture, shared};
 
-/// The paper's curves and none: what the loss evaluates without a detour.
+/// The paper's curves and none, which the loss evaluates directly.
 const PAPER: [ToneCurve; 4] = [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::None];
 
 /// The views of a split, by file name.
@@ -50,7 +50,7 @@ fn sorted_quantile(values: &[f32], q: f64) -> f64 {
 }
 
 #[test]
-fn the_offset_has_the_paper_s_values() {
+fn the_offset_has_the_values_of_the_paper() {
     let settings = ToneSettings::new(ToneCurve::Ap3);
     for (ratio, offset) in
         [(0.37, 0.0378), (0.26, 0.0565), (0.22, 0.0645), (0.17, 0.0753), (0.12, 0.0872)]
@@ -62,10 +62,10 @@ fn the_offset_has_the_paper_s_values() {
 }
 
 #[test]
-fn the_cubic_has_the_paper_s_values() {
+fn the_cubic_has_the_values_of_the_paper() {
     let p = |t| ToneCurve::Ap3.value(t, 0.0, 1.0, &[]);
     assert!((p(1.0) - 0.6292).abs() < 1e-12);
-    // With delta0 = 0.075 white begins at t = 2.76, 2.42 and 1.97 for b = 1, 1.07 and 1.14.
+    // With delta0 = 0.075, white starts at t = 2.76, 2.42 and 1.97 for b = 1, 1.07 and 1.14.
     for (gain, white) in [(1.0, 2.76), (1.07, 2.42), (1.14, 1.97)] {
         assert!(ToneCurve::Ap3.value(white - 0.01, 0.075, gain, &[]) < 1.0, "b = {gain}");
         assert_eq!(ToneCurve::Ap3.value(white + 0.01, 0.075, gain, &[]), 1.0, "b = {gain}");
@@ -96,7 +96,7 @@ fn every_curve_rises_within_zero_and_one() {
 }
 
 #[test]
-fn the_f32_curves_follow_the_f64_curves() {
+fn the_f32_curves_agree_with_the_f64_curves() {
     let mut grid: Vec<f32> = (0..=20_000).map(|i| i as f32 / 5000.0).collect();
     grid.extend([0.0, 1e-12, 1e-9, 1e-6, 0.009_999, 0.01, 0.010_001, 65.0, 1e6, f32::MAX]);
     for curve in PAPER {
@@ -107,7 +107,7 @@ fn the_f32_curves_follow_the_f64_curves() {
                 let t = f64::from(x) / f64::from(white);
                 let exact = curve.value(t, offset.into(), gain.into(), &[]);
                 let error = (f64::from(curve.apply(x, &parameters)) - exact).abs();
-                // Relative where the value is tiny; a few ulps of one elsewhere.
+                // Relative for tiny values; a few ulps of one otherwise.
                 let bound = 4e-7 * if offset == 0.0 && t < 1e-3 { exact } else { 1.0 };
                 assert!(error <= bound, "{curve} at {x} / {white}: off by {error:e}");
             }
@@ -116,7 +116,7 @@ fn the_f32_curves_follow_the_f64_curves() {
 }
 
 #[test]
-fn a_value_that_is_no_number_or_negative_maps_into_the_range() {
+fn nan_and_negative_values_map_into_the_range() {
     for curve in ToneCurve::ALL {
         let parameters = ToneSettings::new(curve).parameters(&Statistics::of(&[0.1; 12]));
         for x in [f32::NAN, f32::NEG_INFINITY, -1.0, -1e-9, f32::INFINITY, f32::MAX] {
@@ -149,7 +149,7 @@ fn curves_are_found_by_name_and_an_unknown_name_lists_them() {
 }
 
 #[test]
-fn settings_survive_toml() {
+fn settings_are_read_back_from_toml() {
     for curve in ToneCurve::ALL {
         let settings = ToneSettings { gain_c: 1.7, ..ToneSettings::new(curve) };
         let text = toml::to_string(&settings).unwrap();
@@ -253,7 +253,7 @@ fn a_constant_photograph_has_no_offset_and_black_stays_black() {
 }
 
 #[test]
-fn the_linear_curve_brings_the_mean_to_theta() {
+fn the_linear_curve_scales_the_mean_to_theta() {
     let planes: Vec<f32> = (0..300).map(|i| i as f32 / 6000.0).collect();
     let settings = ToneSettings { theta: 0.3, ..ToneSettings::new(ToneCurve::Linear) };
     let parameters = settings.parameters(&Statistics::of(&planes));
@@ -261,7 +261,7 @@ fn the_linear_curve_brings_the_mean_to_theta() {
     assert!((sum / 300.0 - 0.3).abs() < 1e-5);
 }
 
-/// p10, p90, delta0, the mean luminance and the mean of the committed photographs, computed elsewhere.
+/// p10, p90, delta0, the mean luminance and the mean of the committed photographs, computed independently.
 const KNOWN_STATISTICS: [(&str, [f64; 5]); 3] = [
     ("000.png", [0.044202, 0.147762, 0.049347, 0.098731, 0.094153]),
     ("001.png", [0.050953, 0.146753, 0.041317, 0.102327, 0.097670]),
@@ -269,7 +269,7 @@ const KNOWN_STATISTICS: [(&str, [f64; 5]); 3] = [
 ];
 
 #[test]
-fn a_photograph_has_the_statistics_that_others_find() {
+fn the_statistics_agree_with_independent_values() {
     for (name, expected) in KNOWN_STATISTICS {
         let statistics = Statistics::of(&load(&fixture("lom/low").join(name)));
         let [p10, p90] = statistics.percentiles();
@@ -282,7 +282,7 @@ fn a_photograph_has_the_statistics_that_others_find() {
 }
 
 #[test]
-fn the_training_photographs_have_the_paper_s_statistics() {
+fn the_training_photographs_have_the_statistics_of_the_paper() {
     let Some(lom) = shared("data/lom") else { return };
     for (scene, expected) in [
         ("chair", [0.0816, 0.170, 0.0754, 0.0521]),
@@ -311,7 +311,7 @@ fn the_training_photographs_have_the_paper_s_statistics() {
     }
 }
 
-/// PSNR in dB of a curve alone on the test views of chair, sofa and shrub, from libjpeg's pixels.
+/// PSNR in dB of a curve, without training, on the test views of chair, sofa and shrub, from libjpeg's pixels.
 const CURVE_ALONE: [(ToneCurve, f64, [f64; 3]); 11] = [
     (ToneCurve::Linear, 0.0, [20.68, 19.14, 14.59]),
     (ToneCurve::Ase, 0.0, [22.97, 19.85, 19.56]),
@@ -326,7 +326,7 @@ const CURVE_ALONE: [(ToneCurve, f64, [f64; 3]); 11] = [
     (ToneCurve::Ap3, 4.0, [19.33, 23.52, 17.15]),
 ];
 
-/// PSNR in dB of a curve alone on the committed test view, computed elsewhere.
+/// PSNR in dB of a curve, without training, on the committed test view, computed independently.
 const KNOWN_PSNR: [(ToneCurve, f64, f64); 5] = [
     (ToneCurve::Linear, 0.0, 23.0533),
     (ToneCurve::Ase, 0.0, 25.7922),
@@ -335,7 +335,7 @@ const KNOWN_PSNR: [(ToneCurve, f64, f64); 5] = [
     (ToneCurve::Ap3, 4.0, 15.0251),
 ];
 
-/// The PSNR of a curve alone, as a mean over the test views.
+/// The PSNR of a curve, without training: the mean over the test views.
 fn score_of_curve(scene: &Path, curve: ToneCurve, gain_c: f64) -> f64 {
     let settings = ToneSettings { gain_c, ..ToneSettings::new(curve) };
     let names = names(scene, "test");
@@ -349,7 +349,7 @@ fn score_of_curve(scene: &Path, curve: ToneCurve, gain_c: f64) -> f64 {
 }
 
 #[test]
-fn a_curve_alone_reaches_its_known_psnr_on_the_test_views() {
+fn a_curve_without_training_has_its_known_psnr_on_the_test_views() {
     for (curve, gain_c, expected) in KNOWN_PSNR {
         let score = score_of_curve(&fixture("lom"), curve, gain_c);
         assert!((score - expected).abs() < 1e-3, "{curve} c = {gain_c}: {score}");
@@ -364,9 +364,9 @@ fn a_curve_alone_reaches_its_known_psnr_on_the_test_views() {
     }
 }
 
-/// A gain of one's own ends what asking the photographs for one began, and nothing else.
+/// A fixed gain replaces an automatic one, and changes nothing else.
 #[test]
-fn a_gain_replaces_the_choice_of_one_and_leaves_what_was_lifted_first() {
+fn a_fixed_gain_replaces_an_automatic_one_and_keeps_full_resolution() {
     let ap3 = ToneSettings::new(ToneCurve::Ap3);
     let auto = ap3.clone().with_gain(GainChoice::Auto);
     assert!(auto.auto_gain && auto.full_resolution);

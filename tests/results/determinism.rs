@@ -1,5 +1,5 @@
-//! The same command gives the same bits: whatever else the machine does, however the steps are submitted, looked at and
-//! interrupted, and as the ledger of this driver says.
+//! The same command gives the same bits: under any load, for any submission, inspection and interruption of the steps,
+//! and according to the ledger of this driver.
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -64,7 +64,7 @@ impl Drop for Load {
     }
 }
 
-/// One of the ways to the end, from the beginning that a checkpoint holds.
+/// One of several ways to the end, from a checkpoint.
 fn trained(repetition: usize, [one, other]: &mut [Trainer; 2], folder: &Path) -> Gaussians {
     let _load = (repetition % 3 == 1).then(Load::new);
     let checkpoint = folder.join("checkpoint.safetensors");
@@ -73,7 +73,7 @@ fn trained(repetition: usize, [one, other]: &mut [Trainer; 2], folder: &Path) ->
     trainer.set_batching(1 + repetition % 3, [None, Some(1), Some(3), Some(64)][repetition % 4]);
     match repetition % 5 {
         1 => {
-            // A profiled step is one like others; it may have to be done again with more memory.
+            // A profiled step is like others; it may have to be repeated with more memory.
             advance(trainer, 3);
             trainer.profile_step().unwrap();
         }
@@ -101,7 +101,7 @@ fn trained(repetition: usize, [one, other]: &mut [Trainer; 2], folder: &Path) ->
 }
 
 #[test]
-fn twenty_five_runs_under_load_profiled_resumed_and_submitted_in_any_way_give_the_same_bits() {
+fn twenty_five_runs_loaded_profiled_resumed_and_differently_submitted_give_the_same_bits() {
     let (dataset, folder) = (dataset(5, [24, 18]), tempfile::tempdir().unwrap());
     let mut trainers = [(); 2].map(|()| Trainer::new(&gpu(), config(), &dataset).unwrap());
     trainers[0].save_checkpoint(&folder.path().join("begin.safetensors")).unwrap();
@@ -112,7 +112,7 @@ fn twenty_five_runs_under_load_profiled_resumed_and_submitted_in_any_way_give_th
     }
 }
 
-/// What a device and its driver are called in the names of files.
+/// The name of a device and its driver in file names.
 fn file_name(device: &str, driver: &str) -> String {
     let text = format!("{device} {driver}");
     let keep = |c: char| if c.is_ascii_alphanumeric() || c == '.' { c } else { '-' };
@@ -120,7 +120,7 @@ fn file_name(device: &str, driver: &str) -> String {
     name.split('-').filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-") + ".csv"
 }
 
-/// Leaves the first points of a COLMAP model: of more points than Gaussians, training takes an even sample.
+/// Keeps the first points of a COLMAP model: if there were more points than Gaussians, training would sample them.
 fn keep_first_points(path: &Path, count: usize) {
     let text = fs::read_to_string(path).unwrap();
     let (comments, points): (Vec<&str>, Vec<&str>) =
@@ -146,7 +146,8 @@ fn tiny_run() -> (tempfile::TempDir, PathBuf) {
     succeed(&format!(
         "train {} --out {} --plan none --model plain --curve ap3 --steps 60 --hash-every 20 --set tile=[16,8] \
          --set schedule.densify_after=10 --set schedule.densify_interval=10 --max-gaussians 2000 --background black \
-         --set density.depth_seeding=0 --set precision.rest=32 --set precision.moments=32 --set schedule.cooldown_steps=0",
+         --set density.depth_seeding=0 --set precision.rest=32 --set precision.moments=32 \
+         --set schedule.cooldown_steps=0",
         set.display(),
         run.display()
     ));
@@ -167,8 +168,8 @@ fn a_tiny_scene_trains_to_the_ledger_of_this_driver() {
     assert_eq!(actual, expected, "where this is meant, it belongs into {}", ledger.display());
 }
 
-/// Devices round differently; Adam, which divides by how large gradients are, lifts that. Of lavapipe of two versions and
-/// `SwiftShader` the losses of 60 steps differ by up to 8e-4, the scores by up to .007 dB.
+/// Devices round differently, and Adam, which divides by the magnitude of gradients, amplifies that. Between two
+/// versions of lavapipe and `SwiftShader`, the losses of 60 steps differ by up to 8e-4, the scores by up to 0.007 dB.
 #[test]
 fn every_device_trains_a_tiny_scene_to_the_same_losses_and_score() {
     const FIRST: f64 = 1e-5;

@@ -1,4 +1,4 @@
-//! `nightsplat export`, as a shell runs it. The formats themselves are tested beside their encoders.
+//! `nightsplat export` as a shell runs it. The formats are tested next to their encoders.
 
 use std::path::Path;
 
@@ -6,7 +6,7 @@ use nightsplat::splats::scene::ply;
 
 use crate::common::command::{refused, succeed};
 
-/// A short run on a small synthetic set.
+/// A short run on a small synthetic dataset.
 fn trained(folder: &Path) -> String {
     let root = folder.display();
     succeed(&format!("synth {root}/set --views 9 --width 40 --height 32"));
@@ -17,7 +17,7 @@ fn trained(folder: &Path) -> String {
 }
 
 #[test]
-fn every_format_is_one_file_of_the_run_and_begins_as_its_readers_expect() {
+fn every_format_is_one_file_of_the_run_with_its_expected_beginning() {
     let folder = tempfile::tempdir().unwrap();
     let run = trained(folder.path());
     for (format, magic) in [
@@ -95,7 +95,7 @@ fn what_is_up_in_a_listing_of_z_up_is_plus_y_of_a_glb() {
 }
 
 #[test]
-fn what_cannot_be_exported_is_one_line_and_leaves_nothing() {
+fn a_failed_export_is_one_line_and_leaves_no_file() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path().display();
     refused(&format!("export {root} --to glb"), 3, &["config.toml"]);
@@ -111,7 +111,7 @@ fn what_cannot_be_exported_is_one_line_and_leaves_nothing() {
         1,
         &["a.glb", "cannot be written"],
     );
-    // A disk without room, where there is a device that plays one.
+    // A full disk, if there is a device that simulates one.
     if Path::new("/dev/full").exists() {
         let full = folder.path().join("full.glb.partial");
         std::os::unix::fs::symlink("/dev/full", &full).unwrap();

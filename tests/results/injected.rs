@@ -1,4 +1,4 @@
-//! What goes wrong around a run on its way: devices that are lost, disks that are full, folders that go. Each has one outcome.
+//! Failures around a run: lost devices, full disks, deleted folders. Each has a defined outcome.
 #![cfg(all(unix, feature = "cli"))]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -12,12 +12,12 @@ use nightsplat::gpu::testing::gpu;
 use crate::common::command::{command, refused_with, run, succeed};
 use crate::common::place::Place;
 
-/// A command that is at work, in a group of its own as a shell would start it.
+/// A running command in its own process group, as a shell would start it.
 fn begun(arguments: &str) -> Child {
     command(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
 }
 
-/// Waits for the first line of JSON, which says that a training has begun.
+/// Waits for the first line of JSON, which marks the start of a training.
 fn wait_for_start(child: &mut Child) {
     let mut line = String::new();
     BufReader::new(child.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
@@ -36,7 +36,7 @@ fn ended(child: Child) -> (i32, String) {
 }
 
 #[test]
-fn a_lost_device_and_memory_that_is_out_end_with_4_and_the_run_goes_on() {
+fn a_lost_device_and_a_lack_of_memory_exit_with_4_and_the_run_can_be_resumed() {
     let place = Place::new();
     let options = "--steps 40 --checkpoint-every 10";
     succeed(&place.train("straight", options));
@@ -58,13 +58,13 @@ fn a_lost_device_and_memory_that_is_out_end_with_4_and_the_run_goes_on() {
 }
 
 #[test]
-fn a_full_disk_is_said_and_what_was_there_stays_whole() {
+fn a_full_disk_is_reported_and_existing_files_stay_intact() {
     let place = Place::new();
-    // Runs of other lengths begin alike where none settles before its end.
+    // Runs of other lengths start equally if none converges before its end.
     let options = "--steps 40 --checkpoint-every 10 --set schedule.cooldown_steps=0";
     succeed(&place.train("run", &options.replace("40", "10")));
     let before = place.model("run");
-    // No file may grow beyond so many blocks, as on a disk with no more left; the checkpoint needs more.
+    // Limits the size of files, as on a full disk; the checkpoint needs more.
     let program = command("").get_program().to_str().unwrap().to_owned();
     let train = place.train("run", &format!("{options} --resume --progress none"));
     let line = format!("trap '' XFSZ; ulimit -f 40; exec {program} {train}");
@@ -86,7 +86,7 @@ fn a_full_disk_is_said_and_what_was_there_stays_whole() {
 }
 
 #[test]
-fn a_place_that_cannot_be_written_is_said_before_anything_is_trained() {
+fn an_unwritable_directory_is_refused_before_training() {
     let place = Place::new();
     let read_only = place
         .train("run", "--steps 1")
@@ -98,7 +98,7 @@ fn a_place_that_cannot_be_written_is_said_before_anything_is_trained() {
 }
 
 #[test]
-fn a_run_whose_folder_goes_says_so_and_one_whose_photographs_go_is_saved() {
+fn a_deleted_run_folder_is_reported_and_a_run_without_its_photographs_is_saved() {
     let place = Place::new();
     let endless = "--steps 1000000 --checkpoint-every 0 --progress json";
     let mut child = begun(&place.train("gone", endless));
@@ -108,7 +108,7 @@ fn a_run_whose_folder_goes_says_so_and_one_whose_photographs_go_is_saved() {
     let (code, stderr) = ended(child);
     assert!(code == 1 && stderr.contains("gone"), "{code}: {stderr}");
 
-    // A cache that holds nothing: every photograph waits on disk, as it was when the run began.
+    // An empty cache: every photograph is on disk, as at the start of the run.
     let options = "--steps 300 --cache 1K --checkpoint-every 0";
     succeed(&place.train("straight", options));
     let mut child = begun(&place.train("run", &format!("{options} --progress json")));
@@ -126,9 +126,9 @@ fn a_run_whose_folder_goes_says_so_and_one_whose_photographs_go_is_saved() {
 }
 
 #[test]
-fn a_batch_that_is_told_to_end_saves_what_is_under_way_and_goes_on_to_the_same_leaderboard() {
+fn a_terminated_batch_saves_its_runs_and_resumes_to_the_same_leaderboard() {
     let place = Place::new();
-    // A GPU is not to be done before the log of its first steps is seen, which is written twice a second.
+    // A GPU must not be done before the log of its first steps is seen, which is written twice a second.
     let steps = if gpu().properties().is_cpu { 400 } else { 10_000 };
     let sweep = |name: &str| {
         let (set, out) = (place.path("set"), place.path(name));

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant, SystemTime};
 use crate::common::command::{command, refused, run, succeed};
 use crate::common::place::Place;
 
-/// A training of its own that has begun and has thousands of steps to go.
+/// A training that has started and has thousands of steps to go.
 fn begun(arguments: &str) -> Child {
     let mut child = command(&format!("{arguments} --progress json"))
         .stdout(Stdio::piped())
@@ -50,10 +50,10 @@ fn log(run: &Path) -> Vec<String> {
 }
 
 #[test]
-fn a_signal_saves_and_stops_and_the_run_goes_on_to_the_same_bits() {
+fn a_signal_saves_and_stops_and_the_run_resumes_to_the_same_bits() {
     let place = Place::new();
     succeed(&place.train("straight", "--steps 400"));
-    for (signal, code, message) in [("-INT", 130, "interrupted"), ("-TERM", 143, "told to end")] {
+    for (signal, code, message) in [("-INT", 130, "interrupted"), ("-TERM", 143, "terminated")] {
         let name = format!("stopped{signal}");
         let mut child = begun(&place.train(&name, "--steps 400"));
         send(signal, &child);
@@ -73,7 +73,7 @@ fn a_signal_saves_and_stops_and_the_run_goes_on_to_the_same_bits() {
 }
 
 #[test]
-fn a_run_saves_when_asked_and_when_its_checkpoint_is_old_and_goes_on() {
+fn a_run_saves_on_request_and_when_its_checkpoint_is_old_and_continues() {
     let place = Place::new();
     let child =
         begun(&place.train("asked", "--steps 1000000 --checkpoint-every 0 --checkpoint-minutes 0"));
@@ -81,7 +81,7 @@ fn a_run_saves_when_asked_and_when_its_checkpoint_is_old_and_goes_on() {
     assert!(!checkpoint.exists());
     send("-USR1", &child);
     wait_for(&checkpoint);
-    // A second run in the directory is refused with the process that has it.
+    // A second run in the directory is refused, and the process of the first named.
     let holder = format!("process {}", child.id());
     for held in ["", "--resume", "--overwrite"] {
         refused(&place.train("asked", held), 1, &["asked", &holder]);
@@ -100,10 +100,10 @@ fn a_run_saves_when_asked_and_when_its_checkpoint_is_old_and_goes_on() {
 }
 
 #[test]
-fn a_run_whose_time_is_up_is_to_be_run_again_and_a_finished_one_is_not() {
+fn a_run_whose_time_is_up_asks_to_be_repeated_and_a_finished_one_does_not() {
     let place = Place::new();
-    // The clock is looked at where the ledger is written: however fast the device, that is before the last step. A slow one
-    // looks more often.
+    // The time is checked when the ledger is written: on any fast device, that is before the last step. A slow device
+    // checks more often.
     let stops = "--resume --hash-every 40 --max-minutes 0.000001";
     let train = place.train("run", &format!("--steps 120 {stops}"));
     let mut rounds = 0;
@@ -121,7 +121,7 @@ fn a_run_whose_time_is_up_is_to_be_run_again_and_a_finished_one_is_not() {
     assert!(rounds >= 2, "{rounds}");
     succeed(&place.train("straight", "--steps 120"));
     assert!(place.read("run/model.ply") == place.read("straight/model.ply"));
-    // Again: nothing is done, and nothing is touched.
+    // Repeated: nothing is done, and no file changes.
     let modified = || fs::metadata(place.path("run/model.ply")).unwrap().modified().unwrap();
     let before = modified();
     assert!(succeed(&train).contains("is done"));
@@ -131,36 +131,40 @@ fn a_run_whose_time_is_up_is_to_be_run_again_and_a_finished_one_is_not() {
 }
 
 #[test]
-fn a_finished_run_stays_until_the_one_that_replaces_it_has_done_a_step() {
+fn a_finished_run_is_kept_until_its_replacement_has_done_a_step() {
     let place = Place::new();
     succeed(&place.train("run", "--steps 3"));
     let before = place.read("run/model.ply");
-    // A network too large for any device: the run fails behind everything that is checked first.
+    // A network too large for any device: the run fails after all earlier checks.
     let hopeless = "--overwrite --steps 3 --parts denoiser --denoiser-channels 16384";
     let output = command(&place.train("run", hopeless)).output().unwrap();
     assert_ne!(output.status.code(), Some(0));
     assert!(place.read("run/model.ply") == before && !place.path("run/.replaced").exists());
-    // Killed before the first step: the next start finds it.
+    // Killed before the first step: the next start restores it.
     fs::create_dir(place.path("run/.replaced")).unwrap();
     for name in ["model.ply", "config.toml", "metrics.json", "train.csv"] {
         fs::rename(place.path("run").join(name), place.path("run/.replaced").join(name)).unwrap();
     }
     fs::write(place.path("run/.tmpA1b2C3"), "half a checkpoint").unwrap();
     fs::write(place.path("run/config.toml"), place.read("run/.replaced/config.toml")).unwrap();
-    refused(&place.train("run", "--steps 3 --resume"), 1, &["already holds a run", "--overwrite"]);
+    refused(
+        &place.train("run", "--steps 3 --resume"),
+        1,
+        &["already contains a run", "--overwrite"],
+    );
     assert!(place.read("run/model.ply") == before && !place.path("run/.tmpA1b2C3").exists());
     succeed(&place.train("run", "--steps 4 --overwrite"));
     assert!(place.read("run/model.ply") != before && !place.path("run/.replaced").exists());
 }
 
 #[test]
-fn files_of_somebody_else_are_neither_replaced_nor_resumed() {
+fn foreign_files_are_neither_replaced_nor_resumed() {
     let place = Place::new();
     fs::create_dir(place.path("theirs")).unwrap();
     for (file, content) in [("config.toml", "title = \"my app\"\n"), ("train.csv", "a,b\n")] {
         fs::write(place.path("theirs").join(file), content).unwrap();
         for held in ["--resume", "--overwrite"] {
-            refused(&place.train("theirs", held), 1, &["theirs", "somebody else's"]);
+            refused(&place.train("theirs", held), 1, &["theirs", "no config.toml"]);
         }
     }
     assert_eq!(place.read("theirs/config.toml"), b"title = \"my app\"\n");
@@ -168,7 +172,7 @@ fn files_of_somebody_else_are_neither_replaced_nor_resumed() {
 }
 
 #[test]
-fn a_damaged_checkpoint_is_said_and_the_one_before_goes_on_to_the_same_bits() {
+fn a_damaged_checkpoint_is_reported_and_the_previous_one_resumes_to_the_same_bits() {
     let place = Place::new();
     let options = "--steps 50 --checkpoint-every 20";
     succeed(&place.train("run", options));
@@ -176,7 +180,7 @@ fn a_damaged_checkpoint_is_said_and_the_one_before_goes_on_to_the_same_bits() {
     let checkpoint = place.path("run/checkpoint.safetensors");
     let whole = fs::read(&checkpoint).unwrap();
     fs::remove_file(place.path("run/done.json")).unwrap();
-    // A bit of a number, which no format notices.
+    // A bit of a value, which no format detects.
     let mut flipped = whole.clone();
     let at = flipped.len() - 9;
     flipped[at] ^= 1;
@@ -193,7 +197,7 @@ fn a_damaged_checkpoint_is_said_and_the_one_before_goes_on_to_the_same_bits() {
 }
 
 #[test]
-fn a_run_goes_on_with_its_own_dataset_alone() {
+fn a_run_resumes_only_with_its_own_dataset() {
     let place = Place::new();
     succeed(&place.train("run", "--steps 12 --checkpoint-every 10"));
     let resumed = place.train("run", "--steps 14 --resume");
@@ -209,7 +213,7 @@ fn a_run_goes_on_with_its_own_dataset_alone() {
     let text = fs::read_to_string(&listing).unwrap();
     fs::write(&listing, text.replace("\"fl_x\": ", "\"fl_x\": 1")).unwrap();
     refused(&resumed, 3, &["another dataset", "another camera or pose"]);
-    // Elsewhere, it is the same one.
+    // In another folder, it is the same dataset.
     fs::write(&listing, text).unwrap();
     fs::rename(place.path("set"), place.path("moved")).unwrap();
     succeed(&resumed.replace("/set ", "/moved "));
@@ -233,7 +237,7 @@ fn a_relative_dataset_means_the_same_from_everywhere() {
 }
 
 #[test]
-fn two_runs_have_one_ledger_and_a_resumed_one_has_it_too() {
+fn two_runs_and_a_resumed_one_have_equal_ledgers() {
     let place = Place::new();
     let options = "--steps 40 --hash-every 10 --checkpoint-every 25";
     for name in ["a", "b"] {
@@ -250,7 +254,7 @@ fn two_runs_have_one_ledger_and_a_resumed_one_has_it_too() {
 }
 
 #[test]
-fn names_from_elsewhere_break_no_table_and_reach_no_terminal() {
+fn hostile_names_break_no_table_and_reach_no_terminal() {
     let place = Place::new();
     let wild = "a,\u{1b}[31mb";
     for (folder, stem) in [("low", "003"), ("high", "003")] {
@@ -276,7 +280,7 @@ fn names_from_elsewhere_break_no_table_and_reach_no_terminal() {
 }
 
 #[test]
-fn who_has_read_enough_ends_a_command_quietly() {
+fn a_closed_output_ends_a_command_quietly() {
     for arguments in ["tone list --table", "tone list"] {
         let mut child =
             command(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
@@ -287,10 +291,10 @@ fn who_has_read_enough_ends_a_command_quietly() {
 }
 
 #[test]
-fn the_exit_code_says_who_can_do_something_about_it() {
+fn the_exit_code_depends_on_the_remedy() {
     let place = Place::new();
     succeed(&place.train("done", "--steps 1"));
-    refused(&place.train("done", "--steps 1"), 1, &["already holds a run"]);
+    refused(&place.train("done", "--steps 1"), 1, &["already contains a run"]);
     refused(&place.train("new", "--steps 0"), 2, &["--steps"]);
     refused(&format!("eval {}", place.0.path().display()), 3, &["no config.toml"]);
     refused(&place.train("new", "--steps 1 --device voodoo"), 4, &["voodoo"]);
@@ -298,7 +302,7 @@ fn the_exit_code_says_who_can_do_something_about_it() {
 }
 
 #[test]
-fn too_little_address_space_is_said_before_a_driver_faults() {
+fn too_little_address_space_is_reported_before_a_driver_crashes() {
     let place = Place::new();
     let program = command("").get_program().to_str().unwrap().to_owned();
     for kilobytes in [300_000, 600_000] {
@@ -318,11 +322,11 @@ fn a_finished_run_is_recognised_without_decoding_a_photograph() {
     succeed(&train);
     let photograph = place.path("set/low/001.png");
     let (bytes, time) = (fs::read(&photograph).unwrap(), modified(&photograph));
-    // Of the same length and time, and no picture any more: whoever decoded it would leave the view out.
+    // Of the same length and time, but not an image: decoding it would leave the view out.
     fs::write(&photograph, vec![0; bytes.len()]).unwrap();
     set_modified(&photograph, time);
     assert!(succeed(&train).contains("is done"));
-    // Of another time the pixels decide.
+    // With another time, the pixels decide.
     fs::write(&photograph, &bytes).unwrap();
     set_modified(&photograph, time + Duration::from_secs(5));
     assert!(succeed(&train).contains("is done"));

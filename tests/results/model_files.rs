@@ -1,4 +1,4 @@
-//! Model files: what a run begins with, and what is shown, scored and exported without a run.
+//! Model files: as initial models, and rendered, scored and exported without a run.
 
 use std::fs;
 use std::path::Path;
@@ -13,14 +13,14 @@ use crate::common::command::{refused, run, succeed};
 use crate::common::place::Place;
 
 #[test]
-fn a_run_begins_with_a_model_and_its_highest_sh_degree() {
+fn a_run_starts_from_a_model_and_its_highest_sh_degree() {
     let place = Place::new();
     succeed(&place.train("first", "--steps 30"));
     let model = place.path("first/model.ply");
     succeed(&place.train("second", &format!("--steps 1 --init {}", model.display())));
     let [first, second] =
         ["first", "second"].map(|run| ply::load(place.path(run).join("model.ply")).unwrap());
-    // The first had not come to use more, the second does from its first step.
+    // The first run has not reached a higher degree; the second uses it from its first step.
     assert_eq!([&first, &second].map(|model| model.shape.sh_degree), [0, 1]);
     assert_eq!(first.count, second.count);
     let moved = first.means().iter().zip(second.means()).map(|(a, b)| a.distance(*b));
@@ -28,14 +28,14 @@ fn a_run_begins_with_a_model_and_its_highest_sh_degree() {
     let config = fs::read_to_string(place.path("second/config.toml")).unwrap();
     assert!(config.contains("first/model.ply"), "{config}");
 
-    // Of another program: without our features, with properties of its own, of a lower degree.
+    // From another program: without our features, with additional properties, of a lower degree.
     let bytes = with_property(&fs::read(&model).unwrap());
     fs::write(place.path("foreign.ply"), bytes).unwrap();
     let foreign = place.path("foreign.ply");
     succeed(&place.train("third", &format!("--steps 1 --init {}", foreign.display())));
 }
 
-/// A binary PLY with one more float of every vertex.
+/// A binary PLY with an additional float in every vertex.
 fn with_property(bytes: &[u8]) -> Vec<u8> {
     let end = b"end_header\n";
     let at = bytes.windows(end.len()).position(|window| window == end).unwrap();
@@ -50,12 +50,12 @@ fn with_property(bytes: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn a_model_that_a_run_cannot_begin_with_is_one_line_that_names_file_and_rule() {
+fn an_unsuitable_initial_model_is_refused_in_one_line_with_file_and_rule() {
     let place = Place::new();
     let file = |name: &str, bytes: &[u8]| {
         fs::write(place.path(name), bytes).unwrap();
     };
-    // All zeros: the file is text.
+    // All zeros; the file is text.
     ply::save(&Gaussians::zeros(2, 2), place.path("degree.ply")).unwrap();
     let whole = String::from_utf8(place.read("degree.ply")).unwrap();
     let header = |from: &str, to: &str| whole.replacen(from, to, 1).into_bytes();
@@ -77,7 +77,7 @@ fn a_model_that_a_run_cannot_begin_with_is_one_line_that_names_file_and_rule() {
 }
 
 #[test]
-fn a_model_file_is_scored_shown_and_exported_without_its_run() {
+fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
     let place = Place::new();
     succeed(&place.train("run", "--steps 40"));
     let (model, set) = (place.path("copy.ply"), place.path("set"));
@@ -111,7 +111,7 @@ fn a_model_file_is_scored_shown_and_exported_without_its_run() {
     refused(&format!("export {model} --to html"), 3, &["copy.ply", "--dataset"]);
 }
 
-/// Removes what the file states of its model.
+/// Removes the facts that the file states.
 fn without_facts(path: &Path) {
     let bytes = fs::read(path).unwrap();
     let mut rest = &bytes[..];
@@ -131,7 +131,7 @@ fn without_facts(path: &Path) {
 }
 
 #[test]
-fn a_model_is_loaded_with_what_its_run_or_its_file_states_and_a_silent_file_with_the_defaults() {
+fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_defaults() {
     let place = Place::new();
     succeed(&place.train("run", "--steps 5 --near 0.05 --raw-colors on"));
     let own = place.path("run");
@@ -142,7 +142,7 @@ fn a_model_is_loaded_with_what_its_run_or_its_file_states_and_a_silent_file_with
     let settings = model.render_settings();
     assert_eq!((settings.near, settings.shape), (model.near, model.gaussians.shape));
 
-    // The file by itself, and the exports, state the same.
+    // The file alone and the exports state the same facts.
     let file = own.join("model.ply");
     let header = String::from_utf8_lossy(&fs::read(&file).unwrap()[..300]).into_owned();
     for line in ["max_alpha 0.99", "raw_colors true"] {
@@ -172,7 +172,7 @@ fn a_model_is_loaded_with_what_its_run_or_its_file_states_and_a_silent_file_with
     assert_eq!(stated["near"].to_string(), model.near.to_string());
     assert_eq!(stated["raw_colors"], true);
 
-    // A run from before files stated anything has its configuration.
+    // A run of a version whose files stated no facts uses its configuration.
     let shown = Gaussians::open(&file).unwrap();
     without_facts(&file);
     assert_eq!(Model::load(&own).unwrap(), model);
@@ -184,7 +184,7 @@ fn a_model_is_loaded_with_what_its_run_or_its_file_states_and_a_silent_file_with
 }
 
 #[test]
-fn what_a_file_states_is_one_line_of_an_error_where_it_is_nonsense() {
+fn an_invalid_fact_in_a_file_is_an_error_of_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.ply");
     let problem = |comment: &str| {
@@ -216,7 +216,7 @@ fn what_a_file_states_is_one_line_of_an_error_where_it_is_nonsense() {
         problem("world = position + 1 2"),
         "line 7 names the origin `1 2`, which is not three finite numbers"
     );
-    // What a later version states is skipped.
+    // Facts of later versions are skipped.
     Model::from(Gaussians::zeros(2, 0)).save(&path).unwrap();
     let text = fs::read_to_string(&path).unwrap();
     fs::write(&path, text.replacen("element", "comment nightsplat later 1 2\nelement", 1)).unwrap();
@@ -224,7 +224,7 @@ fn what_a_file_states_is_one_line_of_an_error_where_it_is_nonsense() {
 
     fs::write(&path, "solid cube").unwrap();
     let error = Model::load(&path).unwrap_err().to_string();
-    assert!(error.ends_with("model.ply: is no model: it is not PLY, SPZ or SOG"), "{error}");
+    assert!(error.ends_with("model.ply: is not a model: neither PLY, SPZ nor SOG"), "{error}");
     let error = Model::load(folder.path()).unwrap_err().to_string();
     assert!(error.contains("no config.toml"), "{error}");
 }

@@ -1,4 +1,4 @@
-//! A camera profile from end to end: fitted, used, and named wherever its results are.
+//! A camera profile end to end: fitted, used, and named with all its results.
 #![cfg(all(feature = "cli", feature = "fit"))]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -9,7 +9,7 @@ use serde_json::Value;
 
 use crate::common::command::{refused, run, succeed};
 
-/// What a result that knows references says.
+/// The label of results that depend on references.
 const LABEL: &str = "a camera profile of 9 pairs of set";
 
 fn psnr(command: &str) -> (f64, Value) {
@@ -18,7 +18,7 @@ fn psnr(command: &str) -> (f64, Value) {
 }
 
 #[test]
-fn a_profile_is_fitted_frozen_used_and_named_with_every_result() {
+fn a_profile_is_fitted_used_and_named_with_every_result() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).display().to_string();
     let (set, file, out) = (path("set"), path("profile.toml"), path("run"));
@@ -49,7 +49,7 @@ fn a_profile_is_fitted_frozen_used_and_named_with_every_result() {
         serde_json::from_slice(&fs::read(Path::new(run).join("metrics.json")).unwrap()).unwrap()
     };
     assert_eq!(metrics(&out)["with_reference"], LABEL);
-    // The run has all that it needs.
+    // The run does not need the file.
     fs::remove_file(&file).unwrap();
     assert!(succeed(&format!("eval {out}")).contains(LABEL));
     let again: Value = serde_json::from_str(&succeed(&format!("eval {out} --json"))).unwrap();
@@ -74,7 +74,7 @@ fn a_profile_is_fitted_frozen_used_and_named_with_every_result() {
 }
 
 #[test]
-fn a_profile_that_is_none_is_refused_in_one_line() {
+fn an_invalid_profile_is_refused_in_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).display().to_string();
     let (set, file) = (path("set"), path("profile.toml"));
@@ -111,7 +111,7 @@ fn a_profile_that_is_none_is_refused_in_one_line() {
 
     refused(&format!("tone fit {set} --profile --family ase"), 2, &["--profile", "--family"]);
     fs::remove_dir_all(folder.path().join("set/high")).unwrap();
-    refused(&format!("tone fit {set} --profile --out {file}"), 3, &["holds no pairs"]);
+    refused(&format!("tone fit {set} --profile --out {file}"), 3, &["contains no pairs"]);
     fs::create_dir(folder.path().join("set/high")).unwrap();
     refused(&format!("tone fit {set} --profile --out {file}"), 3, &["set/"]);
 }

@@ -1,4 +1,4 @@
-//! The page stands alone, escapes what it is given and marks what is best.
+//! The page is self-contained, escapes all text and highlights the best values.
 
 use nightsplat::photographs::image::Image;
 use nightsplat::results::report::{
@@ -53,7 +53,7 @@ fn a_table_in_html_marks_the_same_values() {
 }
 
 #[test]
-fn a_lone_value_and_a_short_row_are_not_marked() {
+fn a_single_value_and_a_short_row_are_not_marked() {
     let mut table = table();
     table.rows.truncate(1);
     table.rows.push(("short".into(), vec![]));
@@ -92,7 +92,7 @@ fn page(text: &str) -> String {
 }
 
 #[test]
-fn the_page_refers_to_nothing_outside_itself() {
+fn the_page_has_no_external_references() {
     let html = page("chair");
     for outside in ["http:", "https:", "<script", "<link", "@import", "url("] {
         assert!(!html.contains(outside), "{outside}");
@@ -143,7 +143,7 @@ fn a_plot_draws_each_series_within_its_frame() {
             .flatten()
             .all(|(x, y)| (56.0..=704.0).contains(x) && (34.0..=266.0).contains(y))
     );
-    // A greater value is higher up.
+    // A larger value is higher up.
     assert!(points[0][0].1 < points[0][1].1);
     for label in [">0.3<", ">100<", ">step<", ">loss<", ">linear<"] {
         assert!(svg.contains(label), "{label} is missing in {svg}");
@@ -151,7 +151,7 @@ fn a_plot_draws_each_series_within_its_frame() {
 }
 
 #[test]
-fn plots_of_nothing_of_one_value_and_of_extremes_stay_well_formed() {
+fn empty_constant_and_extreme_plots_are_well_formed() {
     let extremes = [f64::MAX, f64::MIN, 1e30, -1e30, 0.0, 1e-300];
     let plots = [vec![], vec![(1.0, 2.0)], extremes.iter().map(|&value| (value, value)).collect()];
     for points in plots {
@@ -161,7 +161,7 @@ fn plots_of_nothing_of_one_value_and_of_extremes_stay_well_formed() {
 }
 
 #[test]
-fn a_distribution_has_the_skewness_of_its_luminances_and_draws_its_density() {
+fn a_distribution_has_the_skewness_of_its_luminance_and_draws_its_density() {
     let of = |values: &[f32]| {
         let mut distribution = Distribution::new("grey");
         distribution.add(&[values, values, values].concat());
@@ -180,7 +180,7 @@ fn a_distribution_has_the_skewness_of_its_luminances_and_draws_its_density() {
 }
 
 #[test]
-fn a_legend_of_many_names_takes_rows_and_a_plot_can_be_a_file() {
+fn a_legend_of_many_names_has_rows_and_a_plot_can_be_a_file() {
     let series = |index: usize| Series {
         name: format!("a curve with number {index}"),
         points: vec![(0.0, 0.0), (1.0, 1.0)],
@@ -195,7 +195,7 @@ fn a_legend_of_many_names_takes_rows_and_a_plot_can_be_a_file() {
 }
 
 #[test]
-fn a_line_looks_alike_in_every_plot_of_a_page_and_its_legend_shows_how() {
+fn a_line_looks_the_same_in_every_plot_of_a_page_and_in_its_legend() {
     let series = |line: Option<usize>| Series {
         name: "ap3".into(),
         points: vec![(0.0, 0.0), (1.0, 1.0)],
@@ -208,7 +208,7 @@ fn a_line_looks_alike_in_every_plot_of_a_page_and_its_legend_shows_how() {
         let dashes = rest.split("/>").next().unwrap().contains("stroke-dasharray=\"7 3\"");
         (stroke, dashes)
     };
-    // The seventh line of the page, alone in one plot and behind another in the next.
+    // The seventh line of the page, alone in one plot and after another in the next.
     for svg in
         [plot("t", "y", &[series(Some(6))]), plot("t", "y", &[series(Some(6)), series(None)])]
     {
@@ -225,7 +225,7 @@ fn a_line_looks_alike_in_every_plot_of_a_page_and_its_legend_shows_how() {
 }
 
 #[test]
-fn many_series_are_drawn_a_few_at_a_time_with_the_same_axes() {
+fn many_series_are_divided_into_plots_with_the_same_axes() {
     let series = |index: usize| Series {
         name: format!("curve {index}"),
         points: vec![(0.0, 0.0), (3.0, index as f64)],
@@ -242,7 +242,7 @@ fn many_series_are_drawn_a_few_at_a_time_with_the_same_axes() {
 }
 
 #[test]
-fn what_a_mean_is_of_is_drawn_as_a_line_from_least_to_greatest() {
+fn the_range_of_a_mean_is_drawn_as_a_line() {
     let series = Series {
         name: "ap3".into(),
         points: vec![(0.0, 20.0), (1.0, 21.0)],
@@ -257,7 +257,7 @@ fn what_a_mean_is_of_is_drawn_as_a_line_from_least_to_greatest() {
 }
 
 #[test]
-fn facts_come_before_images_and_these_before_numbers_and_plots() {
+fn text_comes_before_images_and_images_before_tables_and_plots() {
     let html = page("chair");
     let at = |part: &str| html.find(part).unwrap();
     assert!(at("<table class=\"facts\"") < at("<img") && at("<img") < at("<div class=\"table\""));
@@ -265,7 +265,7 @@ fn facts_come_before_images_and_these_before_numbers_and_plots() {
 }
 
 #[test]
-fn few_points_have_dots_and_the_special_one_a_star() {
+fn few_points_have_dots_and_a_special_one_a_star() {
     let series = [Series {
         name: "ap3".into(),
         points: vec![(0.0, 20.0), (0.1, 24.0)],
@@ -282,7 +282,7 @@ fn few_points_have_dots_and_the_special_one_a_star() {
 }
 
 #[test]
-fn bars_begin_at_zero_and_are_as_long_as_their_values() {
+fn bars_start_at_zero_and_are_proportional_to_their_values() {
     let bar = |name: &str, value| Bar { name: name.into(), value, spread: None };
     let rows = [bar("a", 20.0), bar("b & c", 5.0), bar("d", -5.0), bar("failed", f64::NAN)];
     let svg = bars("PSNR, dB", 2, &rows);
@@ -297,7 +297,7 @@ fn bars_begin_at_zero_and_are_as_long_as_their_values() {
 }
 
 #[test]
-fn a_run_has_one_colour_in_every_drawing_and_its_name_beside_its_last_point() {
+fn a_run_has_one_colour_in_every_drawing_and_its_name_next_to_its_last_point() {
     let trace = |name: &str, color, points: &[(f64, f64)]| Trace {
         name: name.into(),
         title: format!("the run <{name}>"),
@@ -314,7 +314,7 @@ fn a_run_has_one_colour_in_every_drawing_and_its_name_beside_its_last_point() {
     assert_eq!((svg.matches("<circle").count(), svg.matches("<path").count()), (2, 1));
     assert!(svg.contains("--series-0") && svg.contains("--series-1") && !svg.contains("lost"));
     assert!(svg.contains("the run &lt;fast&gt;") && !svg.contains("NaN"), "{svg}");
-    // Two names of one place do not stand on each other.
+    // Two names at one place do not overlap.
     let place = |name: &str| {
         let before = svg.split(&format!(">{name}</text>")).next().unwrap();
         before.rsplit("<text ").next().unwrap().to_owned()

@@ -1,5 +1,5 @@
-//! Runs as their users meet them: without references, with another split, stopped on the way, opened elsewhere, seen from a
-//! path, watched by `TensorBoard`.
+//! Runs from the user's view: without references, with another split, interrupted, opened elsewhere, rendered along a
+//! path, logged to `TensorBoard`.
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -12,7 +12,7 @@ use serde_json::Value;
 
 use crate::common::command::{command, refused, refused_with, run, succeed};
 
-/// A folder with a small set below `set`.
+/// A folder with a small dataset in `set`.
 fn folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let set = folder.path().join("set").display().to_string();
@@ -34,7 +34,7 @@ fn file_count(folder: impl AsRef<Path>) -> usize {
 }
 
 #[test]
-fn without_references_test_views_are_scored_against_what_they_would_be_trained_on_and_it_is_said() {
+fn without_references_test_views_are_scored_against_their_targets_with_a_label() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
     succeed(&train(folder.path(), "with", "--steps 4 --curve ap3"));
@@ -59,10 +59,10 @@ fn without_references_test_views_are_scored_against_what_they_would_be_trained_o
         assert!(table.contains(label), "{table}");
         assert_eq!(file_count(path(out).join("eval/targets")), 2);
     }
-    // What a photograph is compared with under `none` is that photograph.
+    // With `none`, a photograph is compared with itself.
     let [low, target] = ["set/low/000.png", "plain/eval/targets/000.png"].map(path);
     assert_eq!(Image::load(low).unwrap().data, Image::load(target).unwrap().data);
-    // A page says it, too.
+    // The page has the label, too.
     let sweep = path("sweep").display().to_string();
     let set = path("set").display().to_string();
     succeed(&format!("sweep {set} --out {sweep} --curves ap3,none --steps 2 --sh-degree 0"));
@@ -73,7 +73,7 @@ fn without_references_test_views_are_scored_against_what_they_would_be_trained_o
 }
 
 #[test]
-fn scores_on_the_way_are_rows_and_a_resumed_run_has_each_once() {
+fn intermediate_scores_are_rows_and_a_resumed_run_has_each_once() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
     let options = "--eval-every 3 --checkpoint-every 4 --progress none";
@@ -97,7 +97,7 @@ fn scores_on_the_way_are_rows_and_a_resumed_run_has_each_once() {
 }
 
 #[test]
-fn a_run_says_at_its_start_what_it_trains_and_why() {
+fn a_run_prints_a_summary_at_its_start() {
     let folder = folder();
     let start = |out: &str, options: &str| succeed(&train(folder.path(), out, options));
     let message = start("a", "--steps 1 --progress plain");
@@ -105,11 +105,11 @@ fn a_run_says_at_its_start_what_it_trains_and_why() {
         "8 views of 48x32 to train on",
         "2 test views (as the transforms files say) scored against reference images",
         "points; on ",
-        "curve auto: as bright as",
+        "curve auto: brightness chosen from the photographs",
     ] {
         assert!(message.contains(part), "no `{part}` in: {message}");
     }
-    // Nothing is held out of eight views but one, and nothing of seven.
+    // Of eight views, one is held out; of seven, none.
     let message = start("d", "--progress plain --preset balanced --set steps=30");
     for part in [
         "at most 30 steps: training stops early once 1 held-out view has converged, after a cooldown of 10",
@@ -124,8 +124,8 @@ fn a_run_says_at_its_start_what_it_trains_and_why() {
         "{message}"
     );
     let message = start("b", "--steps 1 --progress plain --plan none --curve AP3 --test-every 5");
-    assert!(message.contains("curve ap3: as asked for"), "{message}");
-    assert!(message.contains("2 test views (every 5th by name, as asked for)"), "{message}");
+    assert!(message.contains("curve ap3: as requested"), "{message}");
+    assert!(message.contains("2 test views (every 5th by name, as requested)"), "{message}");
     let message = start("c", "--steps 1 --progress json --curve none");
     let first: Value = serde_json::from_str(message.lines().next().unwrap()).unwrap();
     assert_eq!(first["event"], "started");
@@ -134,7 +134,7 @@ fn a_run_says_at_its_start_what_it_trains_and_why() {
 }
 
 #[test]
-fn another_split_is_asked_for_said_and_kept() {
+fn a_requested_split_is_printed_and_recorded() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
     let (_, message) = run(&train(folder.path(), "run", "--steps 2 --test-every 3"), 0);
@@ -154,7 +154,7 @@ fn another_split_is_asked_for_said_and_kept() {
     let listed = fs::read_to_string(path("all/views.csv")).unwrap();
     assert_eq!(listed.lines().filter(|line| line.contains(",train,48,32")).count(), 10, "{listed}");
     refused(&train(folder.path(), "one", "--test-every 1"), 2, &["test_every (--test-every) is 1"]);
-    // A test view whose dark photograph is gone stays a pose: its bright twin is nothing to train on.
+    // A test view without its dark photograph stays a pose: its reference is not trained on.
     fs::remove_file(path("set/low/000.png")).unwrap();
     succeed(&train(folder.path(), "pose", "--steps 2 --test-every 0"));
     let listed = fs::read_to_string(path("pose/views.csv")).unwrap();
@@ -162,7 +162,7 @@ fn another_split_is_asked_for_said_and_kept() {
 }
 
 #[test]
-fn a_run_that_was_stopped_is_rendered_scored_and_made_longer_with_a_lower_cap() {
+fn an_interrupted_run_is_rendered_scored_and_extended_with_a_lower_limit() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
     let options = "--checkpoint-every 5 --curve ap3 --model plain --max-gaussians 4000";
@@ -170,7 +170,7 @@ fn a_run_that_was_stopped_is_rendered_scored_and_made_longer_with_a_lower_cap() 
     succeed(&train(folder.path(), "ten", &format!("--steps 10 {options}")));
     let model = |run: &str| fs::read(path(run).join("model.ply")).unwrap();
     let whole = model("run");
-    // As it would be had it been killed behind its last checkpoint.
+    // As if it had been killed after its last checkpoint.
     for file in ["metrics.json", "done.json"] {
         fs::remove_file(path("run").join(file)).unwrap();
     }
@@ -204,7 +204,7 @@ fn a_run_that_was_stopped_is_rendered_scored_and_made_longer_with_a_lower_cap() 
 }
 
 #[test]
-fn a_planned_run_is_made_longer_on_the_views_that_it_began_with() {
+fn a_planned_run_is_extended_on_its_original_views() {
     let folder = tempfile::tempdir().unwrap();
     let set = folder.path().join("set").display().to_string();
     succeed(&format!("synth {set} --views 20 --width 32 --height 24"));
@@ -245,7 +245,7 @@ fn copy(from: &Path, to: &Path) {
 }
 
 #[test]
-fn a_run_is_opened_with_another_copy_of_its_dataset_and_what_differs_is_said() {
+fn a_run_is_opened_with_another_copy_of_its_dataset_and_differences_are_reported() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
     succeed(&train(folder.path(), "run", "--steps 2"));
@@ -264,7 +264,7 @@ fn a_run_is_opened_with_another_copy_of_its_dataset_and_what_differs_is_said() {
     assert!(message.contains("differs from") && message.contains("004,train,48,32"), "{message}");
 }
 
-/// The pictures of a path, as files.
+/// The images of a path, as files.
 fn flight(run: &Path, out: &Path, options: &str) -> Vec<PathBuf> {
     succeed(&format!("render {} --out {} {options}", run.display(), out.display()));
     let mut files: Vec<PathBuf> =
@@ -274,7 +274,7 @@ fn flight(run: &Path, out: &Path, options: &str) -> Vec<PathBuf> {
 }
 
 #[test]
-fn a_camera_flies_and_the_pictures_become_a_video() {
+fn the_images_of_a_path_become_a_video() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
     succeed(&train(folder.path(), "run", "--steps 30"));
@@ -293,7 +293,7 @@ fn a_camera_flies_and_the_pictures_become_a_video() {
         let chunks = |name: &[u8]| bytes.windows(4).filter(|window| *window == name).count();
         assert_eq!((chunks(b"acTL"), chunks(b"fcTL")), (1, 4));
     }
-    // The way begins at the first training camera.
+    // The path starts at the first training camera.
     let first = flight(&path("run"), &path("test"), "--split train").swap_remove(0);
     let frame = path("interpolate/00000.png");
     assert_eq!(Image::load(first).unwrap(), Image::load(frame).unwrap());
@@ -352,7 +352,7 @@ fn tensorboard_gets_its_events_and_changes_no_bit() {
 }
 
 #[test]
-fn options_of_what_a_run_has_not_are_said_with_what_switches_it_on() {
+fn options_for_missing_parts_are_refused_with_the_setting_that_enables_them() {
     let folder = folder();
     let message = |out: &str, options: &str| run(&train(folder.path(), out, options), 0).1;
     let plain = message("a", "--steps 1 --model plain --denoiser-channels 8 --depth-is-disparity");
@@ -378,14 +378,14 @@ fn options_of_what_a_run_has_not_are_said_with_what_switches_it_on() {
 }
 
 #[test]
-fn large_photographs_shrink_to_a_limit_that_is_said_and_recorded() {
+fn large_photographs_are_resized_to_a_limit_that_is_printed_and_recorded() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
     let views = |out: &str| fs::read_to_string(path(out).join("views.csv")).unwrap();
     let (_, message) = run(&train(folder.path(), "run", "--steps 2 --max-resolution 24"), 0);
     assert!(message.contains("48x32 are trained on at 24x16"), "{message}");
     assert!(views("run").contains("001,train,24,16"), "{}", views("run"));
-    // Behind another factor, which does more by itself.
+    // In addition to another factor, which is the stronger one.
     let (_, message) =
         run(&train(folder.path(), "both", "--steps 2 --max-resolution 40 --downscale 2"), 0);
     assert!(
@@ -399,7 +399,7 @@ fn large_photographs_shrink_to_a_limit_that_is_said_and_recorded() {
 }
 
 #[test]
-fn whatever_the_cache_leaves_on_disk_the_model_has_the_same_bits() {
+fn the_model_has_the_same_bits_for_any_cache_size() {
     let folder = folder();
     let model = |out: &str, options: &str| {
         succeed(&train(folder.path(), out, &format!("--steps 30 --progress none {options}")));
@@ -415,9 +415,9 @@ fn whatever_the_cache_leaves_on_disk_the_model_has_the_same_bits() {
     refused(&train(folder.path(), "no", "--cache much"), 2, &["much", "4G"]);
 }
 
-/// Reference images, and the targets where there are none, are read and made anew for every score.
+/// Reference images and, without them, targets are read again for every score.
 #[test]
-fn whatever_the_cache_leaves_on_disk_views_score_the_same() {
+fn views_have_the_same_scores_for_any_cache_size() {
     let folder = folder();
     let path = |name: &str| folder.path().join(name);
     let scores = |out: &str, cache: &str| {

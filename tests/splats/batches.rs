@@ -1,4 +1,4 @@
-//! More Gaussians than one binding holds the planes of: in batches, to the same bits.
+//! More Gaussians than one binding can hold: passes in batches, with the same bits.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -15,12 +15,12 @@ use nightsplat::train::{TrainConfig, Trainer};
 use crate::common::setup::{Setup, features};
 use crate::common::train::{advance, dataset};
 
-/// Planes of 2176 Gaussians of SH degree 3, splats of 16384.
+/// The planes of 2176 Gaussians of SH degree 3, or 16384 splats.
 const LITTLE: u64 = 1 << 19;
 const BATCH: usize = 2176;
 
 #[test]
-fn planes_go_there_in_batches_and_come_back_whole() {
+fn planes_are_written_in_batches_and_read_back_whole() {
     let gpu = gpu_that_binds(LITTLE);
     let shape = Shape { sh_degree: 2, features: features(5) };
     let columns = width(shape);
@@ -33,7 +33,7 @@ fn planes_go_there_in_batches_and_come_back_whole() {
         for (float, value) in gpu.read(&buffer).unwrap().into_iter().enumerate() {
             assert_eq!(all.place_of(float) as f32, value);
         }
-        // The scales of a batch's last Gaussian are where its kernels look.
+        // The scales of each batch's last Gaussian are at the addresses that its kernels read.
         if let Some(batch) = all.iter().filter(|batch| batch.count > 0).last() {
             let own = gpu.read(batch.planes(&buffer).unwrap()).unwrap();
             let of = |count: usize, parameters: &[f32]| {
@@ -48,12 +48,12 @@ fn planes_go_there_in_batches_and_come_back_whole() {
     }
 }
 
-/// Views of a set without points.
+/// Views of a dataset without points.
 fn views() -> Dataset {
     Dataset { points: vec![], ..dataset(8, [40, 30]) }
 }
 
-/// Density control and a growing SH degree among its steps.
+/// The steps include density control and a growing SH degree.
 fn config() -> TrainConfig {
     let mut config =
         TrainConfig { steps: 30, max_gaussians: 5200, random_points: 4200, ..TrainConfig::bare() };
@@ -61,13 +61,13 @@ fn config() -> TrainConfig {
     config.schedule.densify_before = 25;
     config.schedule.sh_degree_interval = 7;
     config.density.gradient_threshold = 1e-6;
-    // Small ones, which meet few tiles: as many as there are, a binding holds on each of the devices.
+    // Small Gaussians, which intersect few tiles: a binding holds the intersections of all of them on each device.
     config.start.scale = 0.2;
     config
 }
 
 #[test]
-fn batches_train_to_the_bits_of_one() {
+fn training_in_batches_gives_the_bits_of_one_batch() {
     let (dataset, folder) = (views(), tempfile::tempdir().unwrap());
     let new = |gpu: &Gpu| Trainer::new(gpu, config(), &dataset).unwrap();
     let (whole, little) = (gpu(), gpu_that_binds(LITTLE));
@@ -76,7 +76,7 @@ fn batches_train_to_the_bits_of_one() {
         [&mut expected, &mut batched].map(|trainer| advance(trainer, 30));
     assert!(
         batched.gaussian_count() > 2 * BATCH,
-        "{} make no three batches",
+        "{} do not make three batches",
         batched.gaussian_count()
     );
     assert_eq!(batched.gaussian_count(), expected.gaussian_count());
@@ -91,7 +91,7 @@ fn batches_train_to_the_bits_of_one() {
     };
     assert!(end(&mut batched) == end(&mut expected), "another state");
 
-    // A run goes on where a binding holds more, and where it holds less.
+    // The run resumes with larger and with smaller bindings.
     let checkpoint = folder.path().join("checkpoint.safetensors");
     for [from, to] in [[&whole, &little], [&little, &whole]] {
         let (mut first, mut second) = (new(from), new(to));
@@ -104,7 +104,7 @@ fn batches_train_to_the_bits_of_one() {
 }
 
 #[test]
-fn the_passes_of_batches_match_their_references() {
+fn passes_in_batches_match_their_references() {
     let dataset = views();
     let mut trainer = Trainer::new(&gpu_that_binds(LITTLE), config(), &dataset).unwrap();
     advance(&mut trainer, 22);
@@ -129,13 +129,13 @@ fn growth_in_batches_matches_its_references() {
     assert!(trainer.gaussian_count() > before.max(BATCH));
     assert!(report.first_difference().is_none(), "{report:?}");
     let passes = |kernel| report.passes.iter().filter(|pass| pass.kernel == kernel).count();
-    // From one batch or two to two.
+    // From one batch or two into two.
     assert!(passes("densify_scatter") > 3 && passes("densify_moments") > 6);
 }
 
-/// Half of them lie behind the camera, in the first batch; those that are seen are in the second.
+/// Half of the Gaussians are behind the camera, in the first batch; the visible ones are in the second.
 #[test]
-fn what_lies_beyond_a_binding_is_rendered() {
+fn gaussians_beyond_a_binding_are_rendered() {
     let gpu = gpu();
     let shape = Shape::from(3);
     let binding = gpu.properties().max_storage_buffer_range as usize;
@@ -171,7 +171,7 @@ fn what_lies_beyond_a_binding_is_rendered() {
 }
 
 #[test]
-fn what_a_device_cannot_bind_is_refused_and_growth_ends_before_it() {
+fn more_than_a_device_can_bind_is_refused_and_growth_stops_before_it() {
     let gpu = gpu_that_binds(LITTLE);
     let settings = RenderSettings::default();
     assert_eq!(settings.peak_gaussians(&gpu), 16_384);
@@ -181,7 +181,7 @@ fn what_a_device_cannot_bind_is_refused_and_growth_ends_before_it() {
     assert!(refused.contains("`splats`"), "{refused}");
     renderer.reserve(3000, [&camera]).unwrap();
     let mut short = Gaussians::zeros(2999, settings.shape).upload(&gpu).unwrap();
-    // Fewer parameters than the layout says.
+    // Fewer parameters than the layout requires.
     short.layout.count = 3000;
     let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
     let refused = renderer.render_image(&short, &camera, &options).unwrap_err().to_string();
@@ -189,7 +189,7 @@ fn what_a_device_cannot_bind_is_refused_and_growth_ends_before_it() {
 }
 
 #[test]
-fn of_more_points_than_a_device_can_render_the_first_begin() {
+fn training_starts_with_the_first_points_if_there_are_more_than_a_device_renders() {
     let mut config = config();
     (config.random_points, config.max_gaussians) = (17_000, 20_000);
     config.start.scale = 1e-3;

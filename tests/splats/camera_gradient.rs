@@ -1,5 +1,5 @@
-//! The gradient of a camera, by `camera_backward` and `camera_gradient`: central differences of the f64 chain, the
-//! device against the chain, the same bits always.
+//! The gradient of a camera from `camera_backward` and `camera_gradient`: central differences of the f64 chain, the
+//! device against the chain, and the same bits every time.
 
 use glam::{DMat3, DVec3};
 use nightsplat::camera::CameraModel;
@@ -13,7 +13,7 @@ use nightsplat::splats::scene::Shape;
 
 const WIDTH: usize = CameraGradient::WIDTH;
 
-/// A camera of which one number of its gradient is moved.
+/// The camera with one of the numbers of its gradient shifted.
 fn moved(camera: &Camera, number: usize, by: f64) -> Camera {
     let mut camera = camera.clone();
     match number {
@@ -45,7 +45,7 @@ fn setups() -> [Setup; 4] {
 }
 
 #[test]
-fn the_gradient_of_a_camera_is_its_central_difference() {
+fn the_gradient_of_a_camera_agrees_with_central_differences() {
     for setup in setups() {
         let chain = Chain::new(&setup);
         let (parameters, background) = (chain.parameters(), chain.background());
@@ -73,7 +73,7 @@ fn the_gradient_of_a_camera_is_its_central_difference() {
     }
 }
 
-/// From the device, every pass checked against its reference.
+/// The gradient on the device, with every pass checked against its reference.
 fn gradient_of(setup: &Setup, d_render: &[f32]) -> Vec<f32> {
     let gpu = gpu();
     let mut rendered = setup.render();
@@ -92,7 +92,7 @@ fn gradient_of(setup: &Setup, d_render: &[f32]) -> Vec<f32> {
 }
 
 #[test]
-fn the_device_gives_the_gradient_of_the_chain_and_the_same_bits_every_time() {
+fn the_device_agrees_with_the_chain_and_gives_the_same_bits_every_time() {
     let many = Setup::seen_by(fisheye(), 300, [70, 53], 1, 8);
     for setup in setups().into_iter().chain([many]) {
         let chain = Chain::new(&setup);

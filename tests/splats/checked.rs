@@ -1,5 +1,5 @@
-//! What ships is what is checked: every pass of rendering, training, density control and pseudo-GT, as the library
-//! records it, against its CPU reference.
+//! The code that ships is the code that is checked: every pass of rendering, training, density control and pseudo-GT,
+//! as the library records it, against its CPU reference.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -22,7 +22,7 @@ use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 use crate::common::Random;
 use crate::common::setup::variants;
 
-/// Six views of 40 x 30 pixels with depth maps, as the model wants them.
+/// Six views of 40 x 30 pixels with depth maps, as the model requires.
 fn dataset(config: &TrainConfig) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
     let options = SyntheticOptions {
@@ -43,7 +43,7 @@ fn dataset(config: &TrainConfig) -> Dataset {
     Dataset::load(folder.path(), &config.load_options()).unwrap()
 }
 
-/// Density control acts after the second step.
+/// Density control runs after the second step.
 fn config(parts: &[Part]) -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::Ap3);
     let mut config =
@@ -63,7 +63,7 @@ fn kernels(report: &CheckReport) -> BTreeSet<&str> {
     report.passes.iter().map(|pass| pass.kernel).collect()
 }
 
-/// Every pass was compared, and no number differs by more than its roundings explain.
+/// Asserts that every pass was compared and that no number differs by more than its rounding error explains.
 fn assert_agrees(what: &str, report: &CheckReport) {
     let shown: Vec<String> = report
         .passes
@@ -83,7 +83,7 @@ fn assert_agrees(what: &str, report: &CheckReport) {
     );
 }
 
-/// Three checked steps, density control included; the kernels that took part.
+/// Runs three checked steps, including density control; returns the kernels that ran.
 fn assert_steps_agree(name: &str, config: &TrainConfig) -> BTreeSet<String> {
     let (gpu, dataset) = (gpu(), dataset(config));
     let (trainer, mut all) = gpu.checked(|| Trainer::new(&gpu, config.clone(), &dataset));
@@ -98,7 +98,7 @@ fn assert_steps_agree(name: &str, config: &TrainConfig) -> BTreeSet<String> {
 }
 
 #[test]
-fn every_pass_of_a_step_agrees_with_its_reference_whatever_the_model_is_made_of() {
+fn every_pass_of_a_step_agrees_with_its_reference_for_every_part_of_the_model() {
     let plain = assert_steps_agree("plain", &config(&[]));
     for kernel in ["project", "sort_downsweep", "blend_backward", "ssim", "densify_scatter"] {
         assert!(plain.contains(kernel), "{kernel} is not in {plain:?}");
@@ -129,7 +129,7 @@ fn every_pass_of_the_whole_model_agrees_with_its_reference_on_a_crop() {
 }
 
 #[test]
-fn a_checked_step_leaves_the_bits_that_an_unchecked_one_leaves() {
+fn a_checked_step_gives_the_bits_of_an_unchecked_one() {
     let (gpu, config) = (gpu(), config(&Part::ALL));
     let dataset = dataset(&config);
     let [mut checked, mut unchecked] =
@@ -152,7 +152,7 @@ fn a_checked_step_leaves_the_bits_that_an_unchecked_one_leaves() {
     assert!(bytes(&mut checked, "a") == bytes(&mut unchecked, "b"), "moments or networks differ");
 }
 
-/// Values that crowd near black, as dark photographs do, and some that are none.
+/// Values concentrated near black, as in dark photographs, and some that are not finite.
 fn dark(pixels: u64) -> Vec<f32> {
     let stream = Stream::new(3, 1);
     let mut image: Vec<f32> =
@@ -174,7 +174,7 @@ fn every_pass_of_the_pseudo_gt_agrees_with_its_reference_for_every_curve() {
         let (done, report) = gpu.checked(|| -> nightsplat::Result<()> {
             let pseudo_gt = PseudoGt::new(&gpu, &settings)?;
             let image = gpu.buffer("image", &dark(47 * 33))?;
-            // Longer than the image: what lies beyond is undefined.
+            // Longer than the image: the values beyond it are undefined.
             let curve = settings.parameters(&Statistics::of(&dark(47 * 33)));
             let parameters = gpu.buffer("tone", &[curve; 3])?;
             let mut target = gpu.zeros("target", image.len())?;
@@ -187,7 +187,7 @@ fn every_pass_of_the_pseudo_gt_agrees_with_its_reference_for_every_curve() {
 }
 
 #[test]
-fn every_pass_of_the_rasteriser_agrees_with_its_reference_whatever_its_sizes() {
+fn every_pass_of_the_rasteriser_agrees_with_its_reference_at_every_size() {
     for setup in variants() {
         let mut random = Random::new(3);
         let (_, report) = gpu().checked(|| {
@@ -225,7 +225,7 @@ fn every_pass_of_scan_and_sort_agrees_with_its_reference_at_every_size() {
     }
 }
 
-/// A step of `plain` on a device whose `kernel` gets one parameter with its lowest bits flipped.
+/// A step of `plain` on a device that flips the lowest bits of one parameter of `kernel`.
 fn with_wrong_param(gpu: &Gpu, kernel: &'static str, word: usize, bits: u32) -> CheckReport {
     let mut trainer = Trainer::new(gpu, config(&[]), &dataset(&config(&[]))).unwrap();
     let (step, report) = with_defect(Defect { kernel, word, bits }, || trainer.check_step());
@@ -234,9 +234,9 @@ fn with_wrong_param(gpu: &Gpu, kernel: &'static str, word: usize, bits: u32) -> 
 }
 
 #[test]
-fn a_wrong_wiring_is_named_where_it_arises() {
+fn a_wrong_parameter_is_reported_at_the_pass_that_uses_it() {
     let gpu = gpu();
-    // The near plane, the tile's columns, the scale of L1, Adam's rate of the means.
+    // The near plane, the tile's columns, the scale of L1, Adam's rate for the means.
     for (kernel, word, bits, buffer) in [
         ("project", 1, 0x4000_0000, "splats"),
         ("blend_forward", 2, 1, "render"),
@@ -245,20 +245,21 @@ fn a_wrong_wiring_is_named_where_it_arises() {
         ("sort_upsweep", 2, 1, "table"),
     ] {
         let report = with_wrong_param(&gpu, kernel, word, bits);
-        let first = report.first_difference().unwrap_or_else(|| panic!("{kernel} went unnoticed"));
+        let first =
+            report.first_difference().unwrap_or_else(|| panic!("{kernel} was not detected"));
         assert_eq!((first.kernel, first.buffer), (kernel, buffer), "{first}");
         assert!((first.device - first.reference).abs() > first.bound && first.count > 0, "{first}");
         assert_eq!(report.passes[first.pass].difference.as_ref(), Some(first));
         let message = first.to_string();
         assert!(message.contains(kernel) && message.contains(buffer), "{message}");
-        // What works on wrong counts or indices is not compared: a reference could not follow it.
+        // Passes that depend on wrong counts or indices are not compared: their references would be out of range.
         let is_index = matches!(kernel, "project" | "blend_forward" | "sort_upsweep");
         assert_eq!(report.passes.iter().any(|pass| pass.error.is_none()), is_index, "{kernel}");
     }
 }
 
 #[test]
-fn a_panic_ends_what_is_checked_and_takes_the_defect_along() {
+fn a_panic_ends_the_checks_and_removes_the_defect() {
     let gpu = gpu();
     let defect = Defect { kernel: "project", word: 12, bits: 0x0040_0000 };
     let work = || gpu.checked(|| with_defect(defect, || panic!("on purpose")));
@@ -269,7 +270,7 @@ fn a_panic_ends_what_is_checked_and_takes_the_defect_along() {
 }
 
 #[test]
-fn data_that_is_not_finite_is_no_difference_and_no_panic() {
+fn data_that_is_not_finite_gives_no_difference_and_no_panic() {
     let gpu = gpu();
     let mut dataset = dataset(&config(&[]));
     for view in &mut dataset.views {
@@ -297,7 +298,7 @@ fn data_that_is_not_finite_is_no_difference_and_no_panic() {
 }
 
 #[test]
-fn the_command_checks_a_dataset_and_names_what_differs() {
+fn the_command_checks_a_dataset_and_names_the_buffer_that_differs() {
     use clap::Parser as _;
     let folder = tempfile::tempdir().unwrap();
     let options = SyntheticOptions {

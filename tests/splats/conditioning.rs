@@ -1,5 +1,5 @@
 //! How errors grow: blending with its layers, Adam with its steps, percentiles and means with their pixels; each
-//! against f64, with the bound that is promised.
+//! against f64, with the promised bound.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -22,15 +22,15 @@ use nightsplat::splats::optimizer::{Adam, AdamBuffers, LearningRates, Moments};
 use crate::common::setup::Setup;
 use crate::common::{Random, widen};
 
-/// Numbers of a record of three channels: mean2d, conic, opacity, colour.
+/// Numbers in a record of three channels: mean2d, conic, opacity, colour.
 const RECORD: usize = 9;
 
-/// Of this many layers that together leave a fiftieth of the light; no fainter than 1/255 anywhere in the view.
+/// The opacity of `count` layers that together let a fiftieth of the light through; above 1/255 everywhere in the view.
 fn opacity_of(count: usize) -> f64 {
     (1.0 - (-4.0 / count as f64).exp()).max(0.0055)
 }
 
-/// This many layers over a view of one tile, front to back.
+/// `count` layers over a view of one tile, front to back.
 fn layers(count: usize) -> Setup {
     let mut setup = Setup::new(count, [16, 8], 0, 7);
     let mut random = Random::new(count as u64);
@@ -49,8 +49,8 @@ fn layers(count: usize) -> Setup {
     setup
 }
 
-/// The largest error of the render over the largest colour, and that of the records over the largest of each number, in
-/// roundings.
+/// The largest error of the render relative to the largest colour, and of the records relative to the largest of each
+/// number, in roundings.
 fn errors_of(count: usize) -> [f64; 2] {
     let setup = layers(count);
     let mut rendered = setup.render();
@@ -62,7 +62,7 @@ fn errors_of(count: usize) -> [f64; 2] {
     let splats = gpu().read(&frame.splats).unwrap();
     let splats: Vec<Splat> = splats[..count].iter().map(Splat::from).collect();
     let colors = widen(bytemuck::cast_slice(&gpu().read(&frame.colors).unwrap()[..count]));
-    // The view is one tile, so that every layer has one slot.
+    // The view is one tile, so every layer has one slot.
     let intersection_ids = gpu().read(&frame.intersection_ranges).unwrap();
     let stored = gpu().read(&frame.gradient_records).unwrap();
     let sums: Vec<f32> = intersection_ids[..count]
@@ -105,24 +105,24 @@ fn errors_of(count: usize) -> [f64; 2] {
 }
 
 #[test]
-fn the_error_of_blending_and_its_backward_grows_no_faster_than_the_layers() {
+fn the_errors_of_blending_and_its_gradients_grow_at_most_linearly_with_the_layers() {
     for count in [1, 4, 16, 64, 256, 1024, 4096] {
         let [forward, backward] = errors_of(count);
         println!("{count} layers: render {forward:.1}, gradients {backward:.1} roundings");
         let bound = 32.0 + 6.0 * count as f64;
         assert!(forward <= bound, "{count} layers: the render is off by {forward} roundings");
-        // What a pixel still sees is divided by what the layer lets through.
+        // The backward pass divides by each layer's transmittance.
         let bound = 4.0 * bound / (1.0 - opacity_of(count));
-        assert!(backward <= bound, "{count} layers: gradients by {backward} roundings");
+        assert!(backward <= bound, "{count} layers: gradients are off by {backward} roundings");
     }
 }
 
-/// As training has them after its schedules; of means, quats, log scales, raw opacities, dc, features, rest.
+/// Final rates of a training schedule: of means, quats, log scales, raw opacities, dc, features, rest.
 const RATES: LearningRates = LearningRates([1.6e-6, 1e-3, 5e-4, 2.5e-3, 2.5e-3, 1e-3, 1.25e-4]);
 const LOG_SCALES: usize = 2;
 const COLUMNS: usize = 23;
 const GAUSSIANS: usize = 4;
-/// Gradients that come in turn: noise about a mean.
+/// Number of distinct gradients, which repeat: noise about a mean.
 const TURNS: u64 = 16;
 
 fn gradient(turn: u64, at: usize) -> f32 {
@@ -130,7 +130,7 @@ fn gradient(turn: u64, at: usize) -> f32 {
     (0.02 + stream.normal(at as u64)) as f32 * 1e-4
 }
 
-/// Adam as it is written, in f64.
+/// Adam in f64, as published.
 fn adam_in_f64(steps: u64, start: &[f32]) -> Vec<f64> {
     let gradients: Vec<Vec<f64>> = (0..TURNS)
         .map(|turn| (0..start.len()).map(|at| gradient(turn, at).into()).collect())
@@ -161,7 +161,7 @@ fn adam_in_f64(steps: u64, start: &[f32]) -> Vec<f64> {
     (0..start.len()).map(in_f64).collect()
 }
 
-/// The same on the device.
+/// The same steps on the device.
 fn adam_on_device(steps: u64, start: &[f32]) -> Vec<f32> {
     let gpu = gpu();
     let gradients: Vec<_> = (0..TURNS)
@@ -194,14 +194,13 @@ fn adam_on_device(steps: u64, start: &[f32]) -> Vec<f32> {
     gpu.read(&parameters).unwrap()
 }
 
-/// Of each plane, what `assert_adam_stays_with_f64` holds it to.
+/// The errors of a plane, which `assert_adam_stays_with_f64` bounds.
 struct PlaneError {
     /// The largest error.
     error: f64,
-    /// How far it moved.
+    /// How far the parameter moved.
     moved: f64,
-    /// The largest unit in the last place of what it was on the way, which is between where it begins and where it
-    /// ends.
+    /// The largest unit in the last place of the parameter, which moves between its first and its last value.
     unit: f64,
 }
 
@@ -222,8 +221,8 @@ fn adam_errors(steps: u64) -> Vec<PlaneError> {
     planes(0, COLUMNS).map(of_plane).into()
 }
 
-/// A step rounds the parameter once, which is half a unit in its last place; beside, the step itself is off by some
-/// roundings. Of the first the signs differ.
+/// A step rounds the parameter once, by up to half a unit in its last place; the step itself is also off by some
+/// roundings. The signs of the first errors differ.
 fn assert_adam_stays_with_f64(steps: u64) {
     for (plane, PlaneError { error, moved, unit }) in adam_errors(steps).into_iter().enumerate() {
         if moved == 0.0 {
@@ -234,7 +233,7 @@ fn assert_adam_stays_with_f64(steps: u64) {
             error / unit / steps as f64
         );
         let bound = unit * steps as f64 / 2.0 + 1e-4 * moved;
-        assert!(error <= bound, "plane {plane}: off by {error:e} of {moved:e}");
+        assert!(error <= bound, "plane {plane}: off by {error:e} after moving by {moved:e}");
     }
 }
 
@@ -244,12 +243,12 @@ fn adam_stays_with_f64_over_thousands_of_steps() {
 }
 
 #[test]
-#[ignore = "a minute: of `make stress`"]
+#[ignore = "takes a minute: part of `make stress`"]
 fn adam_stays_with_f64_over_a_hundred_thousand_steps() {
     assert_adam_stays_with_f64(100_000);
 }
 
-/// Ranks beyond 2^24 are whole numbers that f32 does not have.
+/// Ranks above 2^24 include whole numbers that f32 cannot represent.
 #[test]
 fn percentiles_and_means_of_more_than_sixteen_million_pixels_are_exact() {
     let pixels = (1 << 24) + 12_346;

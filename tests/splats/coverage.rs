@@ -1,4 +1,4 @@
-//! What a split of density control does to the coverage of images, on the host.
+//! How a split in density control changes the coverage of images, on the host.
 
 use glam::{Quat, Vec3};
 use nightsplat::reference::densify_scatter::{Shape, half_of};
@@ -7,8 +7,8 @@ fn opacity(raw: f32) -> f64 {
     1.0 / (1.0 + f64::from(-raw).exp())
 }
 
-/// Alpha of Gaussians without rotation, composited, seen along a direction in the plane of x and z: over the image's x
-/// in the plane and y across it.
+/// Composited alpha of Gaussians without rotation, seen along a direction in the x-z plane; image x is in that plane,
+/// image y perpendicular to it.
 fn alpha(shapes: &[Shape], angle: f64, [x, y]: [f64; 2]) -> f64 {
     let transmitted = |shape: &Shape| {
         let scales = shape.log_scales.to_array().map(|log| f64::from(log).exp());
@@ -29,7 +29,7 @@ fn two_halves_cover_what_their_parent_covered_from_every_side() {
         let parent = Shape { mean: Vec3::ZERO, log_scales, raw_opacity };
         let halves = [0, 1].map(|copy| half_of(&parent, Quat::IDENTITY, copy));
         assert_eq!(halves[0].mean, -halves[1].mean);
-        // Sums over places, weighed as directions are on the sphere: before, after, squared difference, squared before.
+        // Sums over directions, weighted by area on the sphere: before, after, squared difference, squared before.
         let mut sums = [0.0; 4];
         for step in 0..8 {
             let angle = (f64::from(step) + 0.5) / 8.0 * std::f64::consts::FRAC_PI_2;

@@ -1,4 +1,5 @@
-//! Density control: the kernels against their references, what becomes of whom, the limit, the edges.
+//! Density control: the kernels against their references, the outcome for each kind of Gaussian, the limit, the edge
+//! cases.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -34,7 +35,7 @@ fn density_control_matches_its_references() {
         assert_eq!(actual.count, expected.count, "{report:?}");
         assert_eq!((&actual.first, &actual.second), (&expected.first, &expected.second));
         for (i, (a, b)) in actual.parameters.iter().zip(&expected.parameters).enumerate() {
-            // Only means, scales and opacities are computed; exp, log and cos are good to about 1e-5 here.
+            // Only means, scales and opacities are computed; exp, log and cos are accurate to about 1e-5 here.
             let tolerance = if i < 11 * actual.count { 2e-5 } else { 0.0 };
             assert!((a - b).abs() <= tolerance, "{count} Gaussians, float {i}: {a} {b}");
         }
@@ -45,7 +46,7 @@ fn density_control_matches_its_references() {
 }
 
 #[test]
-fn a_small_gaussian_under_a_large_gradient_stays_and_gets_a_copy() {
+fn a_small_gaussian_with_a_large_gradient_is_cloned() {
     let gpu = gpu();
     let mut before = Host::calm(3);
     before.pull_at(1);
@@ -63,14 +64,14 @@ fn a_small_gaussian_under_a_large_gradient_stays_and_gets_a_copy() {
     let (parent, copy) = (before.row(&before.parameters, 1), after.row(&after.parameters, 2));
     assert_eq!(parent[3..], copy[3..]);
     let distance = before.mean(1).distance(after.mean(2));
-    assert!(distance > 0.0 && distance < 0.06, "{distance}: not a draw at scale 0.01");
+    assert!(distance > 0.0 && distance < 0.06, "{distance}: not a sample at scale 0.01");
     assert!(
         after.row(&after.first, 2).iter().chain(&after.row(&after.second, 2)).all(|m| *m == 0.0)
     );
 }
 
 #[test]
-fn a_large_gaussian_under_a_large_gradient_is_replaced_by_two_smaller_ones() {
+fn a_large_gaussian_with_a_large_gradient_is_split_into_two_smaller_ones() {
     let gpu = gpu();
     let mut before = Host::calm(2);
     before.pull_at(0);
@@ -91,7 +92,7 @@ fn a_large_gaussian_under_a_large_gradient_is_replaced_by_two_smaller_ones() {
 }
 
 #[test]
-fn drawn_positions_have_the_covariance_of_their_parent() {
+fn sampled_positions_have_the_covariance_of_their_parent() {
     let gpu = gpu();
     let count = 4000;
     let mut before = Host::calm(count);
@@ -99,7 +100,7 @@ fn drawn_positions_have_the_covariance_of_their_parent() {
     let scales = Vec3::new(0.04, 0.02, 0.005);
     for i in 0..count {
         before.pull_at(i);
-        // Twice the length: what is stored is not normalised.
+        // Twice unit length: stored quaternions are not normalised.
         let [x, y, z, w] = (rotation * 2.0).to_array();
         before.quat_mut(i).copy_from_slice(&[w, x, y, z]);
         before.log_scales_mut(i).copy_from_slice(&scales.to_array().map(f32::ln));
@@ -121,7 +122,7 @@ fn drawn_positions_have_the_covariance_of_their_parent() {
 }
 
 #[test]
-fn a_faint_gaussian_goes_even_where_views_pull_at_it() {
+fn a_faint_gaussian_is_pruned_even_if_its_gradient_is_large() {
     let gpu = gpu();
     let mut before = Host::calm(3);
     before.parameters[10 * 3 + 1] = -5.4;
@@ -132,7 +133,7 @@ fn a_faint_gaussian_goes_even_where_views_pull_at_it() {
 }
 
 #[test]
-fn all_can_go() {
+fn all_gaussians_can_be_pruned() {
     let gpu = gpu();
     let mut before = Host::calm(70);
     before.parameters[10 * 70..11 * 70].fill(-9.0);
@@ -142,7 +143,7 @@ fn all_can_go() {
 }
 
 #[test]
-fn a_gaussian_that_is_not_finite_goes() {
+fn a_gaussian_that_is_not_finite_is_pruned() {
     let gpu = gpu();
     for (column, value) in [
         (0, f32::NAN),
@@ -166,7 +167,7 @@ fn a_gaussian_that_is_not_finite_goes() {
 }
 
 #[test]
-fn a_quaternion_of_zero_length_draws_along_the_axes() {
+fn a_quaternion_of_zero_length_samples_along_the_axes() {
     let gpu = gpu();
     let mut before = Host::calm(1);
     before.pull_at(0);
@@ -177,9 +178,9 @@ fn a_quaternion_of_zero_length_draws_along_the_axes() {
     assert!(offset.x != 0.0 && offset.y == 0.0 && offset.z == 0.0, "{offset}");
 }
 
-/// At this step the first uniform draw of this clone has all its bits zero; its logarithm must stay finite.
+/// At this step the first uniform sample of this clone has all its bits zero; its logarithm must stay finite.
 #[test]
-fn the_rarest_draw_is_finite() {
+fn a_sample_of_all_zero_bits_is_finite() {
     let gpu = gpu();
     let mut before = Host::calm(1);
     before.pull_at(0);
@@ -191,7 +192,7 @@ fn the_rarest_draw_is_finite() {
 }
 
 #[test]
-fn a_gradient_that_is_nan_or_was_never_seen_multiplies_nothing() {
+fn a_gaussian_without_a_finite_gradient_is_not_cloned_or_split() {
     let gpu = gpu();
     let mut before = Host::calm(3);
     before.grad_norm_sums = vec![f32::NAN, 1.0, 7e-4];
@@ -201,28 +202,28 @@ fn a_gradient_that_is_nan_or_was_never_seen_multiplies_nothing() {
 }
 
 #[test]
-fn growth_beyond_the_limit_goes_to_the_neediest() {
+fn growth_up_to_the_limit_goes_to_the_largest_gradients() {
     let gpu = gpu();
     let mut before = Host::calm(10);
     before.parameters[10 * 10] = -9.0;
     for i in 0..10 {
         before.grad_norm_sums[i] = 0.1 * (i * 3 % 10) as f32 + 0.1;
     }
-    // Nine stay; their gradients but one's rank as 3, 7, 1, 4, 8, 2, 5, 9, 6 times 0.1 + 0.1.
+    // Nine remain; the gradients of all but one rank as 3, 7, 1, 4, 8, 2, 5, 9, 6 times 0.1 + 0.1.
     let (after, report) =
         before.densify(&gpu, DensifySettings { max_gaussians: 11, ..SETTINGS }, LAST);
     assert_eq!(
         report,
         DensifyReport { cloned: 2, pruned: 1, count: 11, refused: 7, ..Default::default() }
     );
-    // Gaussians 3 (rank 9) and 6 (rank 8) have their copies after them.
+    // The copies of Gaussians 3 (rank 9) and 6 (rank 8) follow them.
     let rows: Vec<_> = (0..11).map(|i| after.row(&after.parameters, i)[3..].to_vec()).collect();
     let twins: Vec<usize> = (0..10).filter(|&i| rows[i] == rows[i + 1]).collect();
     assert_eq!(twins, [2, 6]);
 }
 
 #[test]
-fn the_limit_holds_where_all_gradients_are_equal_and_where_it_is_passed_already() {
+fn the_limit_applies_with_equal_gradients_and_when_it_is_already_exceeded() {
     let gpu = gpu();
     let mut before = Host::calm(100);
     before.grad_norm_sums.fill(0.3);
@@ -234,7 +235,7 @@ fn the_limit_holds_where_all_gradients_are_equal_and_where_it_is_passed_already(
 }
 
 #[test]
-fn the_same_pass_leaves_the_same_bits_and_another_step_or_seed_other_ones() {
+fn the_same_pass_gives_the_same_bits_and_another_step_or_seed_gives_others() {
     let gpu = gpu();
     let before = Host::mixed(500);
     let bits = |seed: u64, step: u64| -> Vec<u32> {
@@ -246,13 +247,13 @@ fn the_same_pass_leaves_the_same_bits_and_another_step_or_seed_other_ones() {
     assert!(first == bits(10, 600));
     assert!(first != bits(10, 800));
     assert!(first != bits(11, 600));
-    // Seeds that differ above 32 bits are other seeds, even where the bits below are set, too.
+    // Seeds that differ only above bit 32 are different seeds, even if the lower bits are set.
     assert!(first != bits(10 | 1 << 40, 600));
     assert!(first != bits(10 | 10 << 32, 600));
 }
 
 #[test]
-fn a_density_control_is_told_by_its_name() {
+fn a_density_control_is_parsed_from_its_name() {
     for (name, control) in
         [("conserving", DensityControl::Conserving), ("paper", DensityControl::Paper)]
     {
@@ -263,7 +264,7 @@ fn a_density_control_is_told_by_its_name() {
 }
 
 #[test]
-fn settings_that_make_no_sense_are_refused() {
+fn invalid_settings_are_refused() {
     let gpu = gpu();
     for settings in [
         DensifySettings { gradient_threshold: f64::NAN, ..SETTINGS },
@@ -275,7 +276,7 @@ fn settings_that_make_no_sense_are_refused() {
     }
 }
 
-/// A kernel that ran on would read beyond its buffers.
+/// A kernel that ran anyway would read out of bounds.
 #[test]
 fn a_buffer_that_is_too_short_is_refused() {
     let gpu = gpu();
@@ -307,7 +308,7 @@ fn a_buffer_that_is_too_short_is_refused() {
 }
 
 #[test]
-fn a_gaussian_under_a_large_gradient_is_halved_along_its_longest_axis_whatever_its_size() {
+fn a_gaussian_with_a_large_gradient_of_any_size_is_split_along_its_longest_axis() {
     let gpu = gpu();
     for scale in [0.2_f32, 0.001] {
         let mut before = Host::calm(3);
@@ -337,7 +338,7 @@ fn a_gaussian_under_a_large_gradient_is_halved_along_its_longest_axis_whatever_i
 }
 
 #[test]
-fn a_round_takes_its_share_of_the_room_and_the_last_one_the_rest() {
+fn a_round_uses_its_share_of_the_remaining_gaussians_and_the_last_round_uses_the_rest() {
     let gpu = gpu();
     let mut before = Host::calm(100);
     for (i, sum) in before.grad_norm_sums.iter_mut().enumerate() {
@@ -352,7 +353,7 @@ fn a_round_takes_its_share_of_the_room_and_the_last_one_the_rest() {
 }
 
 #[test]
-fn growth_ends_where_the_views_leave_no_more_room() {
+fn growth_stops_at_the_limit_that_the_views_set() {
     let mut before = Host::calm(100);
     for (i, sum) in before.grad_norm_sums.iter_mut().enumerate() {
         *sum = 0.1 + i as f32;
@@ -364,7 +365,7 @@ fn growth_ends_where_the_views_leave_no_more_room() {
 }
 
 #[test]
-fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
+fn large_enough_buffers_are_kept_and_others_grow_with_headroom() {
     let gpu = gpu();
     let mut host = Host::calm(100);
     (0..10).for_each(|i| host.pull_at(i));
@@ -396,7 +397,7 @@ fn buffers_that_suffice_are_kept_and_others_grow_with_headroom() {
 }
 
 #[test]
-fn a_round_that_is_refused_is_tried_again_with_fewer_splits_and_at_last_with_none() {
+fn a_refused_round_is_retried_with_fewer_splits_and_finally_with_none() {
     let gpu = gpu();
     let mut before = Host::calm(100);
     for (i, sum) in before.grad_norm_sums.iter_mut().enumerate() {
@@ -411,10 +412,10 @@ fn a_round_that_is_refused_is_tried_again_with_fewer_splits_and_at_last_with_non
         tried.push(count);
         if count > 120 { 0.3 } else { 1.0 }
     });
-    // 99 splits, three tenths of them, three tenths of these.
+    // 99 splits, then three tenths of them, then three tenths of those.
     assert_eq!(tried, [198, 99 + 29, 99 + 8]);
     assert_eq!((report.split, report.pruned, report.count), (8, 1, 107));
-    // What stays are the largest gradients, and what a refused trial wrote is gone.
+    // The largest gradients remain, and nothing that a refused attempt wrote is left.
     let limited = DensifySettings { max_gaussians: 107, ..CONSERVING };
     assert_eq!(after, before.densify(&gpu, limited, LAST).0);
     let mut tried = 0;
@@ -425,7 +426,7 @@ fn a_round_that_is_refused_is_tried_again_with_fewer_splits_and_at_last_with_non
     assert_eq!((tried, report.split, report.pruned, report.count), (4, 0, 1, 99));
 }
 
-/// A Gaussian before a camera at the origin.
+/// A Gaussian in front of a camera at the origin.
 fn in_depth(opacity: f32, scales: [f32; 3]) -> Host {
     let mut host = Host::calm(1);
     host.pull_at(0);
@@ -437,16 +438,16 @@ fn in_depth(opacity: f32, scales: [f32; 3]) -> Host {
 }
 
 #[test]
-fn a_gaussian_whose_halves_a_camera_would_see_otherwise_stays_whole() {
+fn a_gaussian_whose_halves_would_look_different_to_a_camera_is_not_split() {
     let gpu = gpu();
     let cameras = [DVec3::new(90.0, 0.0, 0.0), DVec3::ZERO].map(camera_at);
     for (opacity, scales, split) in [
-        // Wide in depth: by what it covers and how opaque it is.
+        // Wide in depth: decided by its coverage and opacity.
         (0.9, [0.3, 0.3, 1.0], 0),
         (0.9, [0.01, 0.01, 1.0], 1),
         (0.01, [0.3, 0.3, 1.0], 1),
         (0.9, [0.3, 0.3, 400.0], 0),
-        // As wide across the view: its halves show what it showed.
+        // As wide across the view: its halves look the same.
         (0.9, [1.0, 0.3, 0.3], 1),
     ] {
         let before = in_depth(opacity, scales);
@@ -454,15 +455,15 @@ fn a_gaussian_whose_halves_a_camera_would_see_otherwise_stays_whole() {
             before.densify_seen_from(cameras, &gpu, settings, LAST).1.split
         };
         assert_eq!(round(CONSERVING, &cameras), split, "{opacity} {scales:?}");
-        // The first camera has it far out of sight, unless it reaches everywhere.
+        // For the first camera it is far out of view, unless it is everywhere.
         assert_eq!(round(CONSERVING, &cameras[..1]), u32::from(scales[2] < 400.0) as usize);
         assert_eq!((round(CONSERVING, &[]), round(SETTINGS, &cameras)), (1, 1));
     }
 }
 
-/// What splits change at the most where the bound lets them pass, and what they would change beyond it.
+/// The largest change by splits within the bound, and the change by splits beyond it.
 #[test]
-fn a_split_within_the_bound_changes_no_view_by_much() {
+fn a_split_within_the_bound_changes_every_view_only_a_little() {
     let gpu = gpu();
     let camera = camera_at(DVec3::ZERO);
     let settings = RenderSettings { shape: shape(), ..RenderSettings::default() };
@@ -497,7 +498,7 @@ fn a_split_within_the_bound_changes_no_view_by_much() {
             }
         }
     }
-    // 30 dB have a mean square of 1e-3; a tenth of a decibel is 2e-5 of it.
+    // 30 dB correspond to a mean squared error of 1e-3; a tenth of a decibel is 2e-5 of it.
     assert!(max_passed < 2e-4, "{max_passed}");
     assert!(max_refused > 1e-2, "{max_refused}");
 }

@@ -1,4 +1,4 @@
-//! The native fisheye: golden projections, culling, gradients, and a whole render against the f64 chain.
+//! The native fisheye: golden projections, culling, gradients, and a complete render against the f64 chain.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -34,7 +34,7 @@ fn reference(camera: &Camera) -> camera::Camera {
     camera::Camera::from(&kernels::Camera::from(&Patch::from(camera)))
 }
 
-/// The formula of the documentation of `cv::fisheye::projectPoints`.
+/// The formula from the documentation of `cv::fisheye::projectPoints`.
 fn published(camera: &Camera, point: DVec3) -> DVec2 {
     let CameraModel::Fisheye(KannalaBrandt { coefficients: [k1, k2, k3, k4] }) = camera.model
     else {
@@ -50,7 +50,7 @@ fn published(camera: &Camera, point: DVec3) -> DVec2 {
 }
 
 #[test]
-fn a_point_is_seen_where_opencv_s_formula_puts_it() {
+fn points_project_as_opencv_s_formula_states() {
     let mut random = Random::new(3);
     for camera in COEFFICIENTS.map(camera) {
         let reference = reference(&camera);
@@ -65,7 +65,7 @@ fn a_point_is_seen_where_opencv_s_formula_puts_it() {
     }
 }
 
-/// One pixel's Gaussian where each of `points` is.
+/// A Gaussian of one pixel at each of `points`.
 fn dots(camera: &Camera, points: &[DVec3]) -> Setup {
     let mut setup = Setup::new(points.len(), [64, 48], 0, 7);
     setup.camera = *camera;
@@ -78,10 +78,10 @@ fn dots(camera: &Camera, points: &[DVec3]) -> Setup {
 }
 
 #[test]
-fn the_device_puts_splats_where_opencv_s_formula_puts_points() {
+fn the_device_projects_splats_as_opencv_s_formula_states() {
     let mut random = Random::new(4);
     for camera in COEFFICIENTS.map(camera) {
-        // To a tenth of a degree from the edge of the half space.
+        // Up to a tenth of a degree from the edge of the half space.
         let point = |_| {
             let (sin, cos) = random.between(0.0, FRAC_PI_2 - 2e-3).sin_cos();
             let turn = DVec2::from_angle(random.between(0.0, 6.2));
@@ -100,7 +100,7 @@ fn the_device_puts_splats_where_opencv_s_formula_puts_points() {
 
 #[test]
 fn nothing_is_seen_at_90_degrees_or_behind_or_where_the_polynomial_falls() {
-    // Rises to 70.0 degrees; what lies beyond would come back into the picture.
+    // Rises until 70.0 degrees; points beyond would be projected into the image again.
     let fold = [-0.2231, 0.0, 0.0, 0.0];
     for camera in [camera([0.0; 4]), camera(fold)] {
         let CameraModel::Fisheye(lens) = camera.model else { panic!() };
@@ -123,7 +123,7 @@ fn nothing_is_seen_at_90_degrees_or_behind_or_where_the_polynomial_falls() {
         let gradients = rendered.backward(&vec![1.0; rendered.render.len()]);
         assert!(gradients.parameters.iter().all(|&g| g == 0.0));
         assert!(gradients.visit_counts.iter().all(|&visits| visits == Rendered::VISITS_BEFORE));
-        // The nearest that there is counts by its distance.
+        // The near limit applies to the distance.
         let near = f64::from(setup.settings.near);
         for (distance, is_seen) in [(near * 0.99, false), (near * 1.01, true)] {
             setup = dots(&camera, &[at(60.0, 0.5) / 3.0 * distance]);
@@ -134,7 +134,7 @@ fn nothing_is_seen_at_90_degrees_or_behind_or_where_the_polynomial_falls() {
 }
 
 #[test]
-fn wide_splats_at_the_edge_of_what_is_seen_stay_finite() {
+fn wide_splats_at_the_edge_of_the_view_stay_finite() {
     let camera = camera([0.05, -0.02, 0.006, -0.001]);
     let mut points = vec![DVec3::Z];
     for degrees in [1e-5, 1e-3, 0.1, 45.0, 85.0, 89.9, 89.999] {
@@ -156,9 +156,9 @@ fn wide_splats_at_the_edge_of_what_is_seen_stay_finite() {
     assert!(all.iter().all(|value| value.is_finite()));
 }
 
-/// Central differences of the place and of the Jacobian in f64, from the axis to the edge.
+/// Central differences of the position and of the Jacobian in f64, from the axis to the edge.
 #[test]
-fn jacobian_and_gradient_of_a_point_are_central_differences() {
+fn jacobian_and_gradient_of_a_point_agree_with_central_differences() {
     let mut random = Random::new(5);
     for camera in COEFFICIENTS.map(|k| reference(&camera(k))) {
         for degrees in [0.0, 1e-3, 0.05, 1.0, 1.2, 30.0, 60.0, 89.0] {
@@ -190,10 +190,10 @@ fn jacobian_and_gradient_of_a_point_are_central_differences() {
 }
 
 #[test]
-fn the_renderer_gives_what_the_chain_gives_through_a_fisheye_of_180_degrees() {
+fn the_renderer_gives_the_chain_s_values_through_a_fisheye_of_180_degrees() {
     let shape = Shape { sh_degree: 2, features: features(4) };
     let mut setup = Setup::seen_by(fisheye(), 150, [70, 56], shape, 12);
-    // Both edges of the width lie beyond 80 degrees, its corners beyond what is seen.
+    // The left and right edges are beyond 80 degrees, the corners out of view.
     setup.camera.focal = DVec2::new(24.0, 23.0);
     for i in 0..setup.count {
         let pixel = DVec2::new((i % 15) as f64 * 5.0, (i / 15) as f64 * 6.0);
@@ -205,10 +205,10 @@ fn the_renderer_gives_what_the_chain_gives_through_a_fisheye_of_180_degrees() {
 }
 
 #[test]
-fn a_fisheye_without_distortion_is_near_its_axis_what_a_pinhole_is() {
+fn a_fisheye_without_distortion_is_like_a_pinhole_near_its_axis() {
     let size = [40, 30];
     let mut setup = Setup::new(30, size, 1, 9);
-    // A degree to the corners: tangents are angles to four digits.
+    // One degree to the corners: tangents equal angles to four digits.
     setup.camera.focal = DVec2::splat(2000.0);
     for i in 0..30 {
         let pixel = DVec2::new((7 * i % 40) as f64, (11 * i % 30) as f64);
@@ -223,7 +223,7 @@ fn a_fisheye_without_distortion_is_near_its_axis_what_a_pinhole_is() {
 }
 
 #[test]
-fn one_renderer_shows_a_pinhole_and_a_fisheye_in_turn() {
+fn one_renderer_renders_a_pinhole_and_a_fisheye_in_turn() {
     let pinhole = Setup::new(40, [50, 40], 1, 5);
     let mut of_fisheye = pinhole.clone();
     of_fisheye.camera.model = fisheye();

@@ -1,4 +1,4 @@
-//! The backward pass: central differences of the f64 chain, the renderer against the chain, the same bits always.
+//! The backward pass: central differences of the f64 chain, the renderer against the chain, the same bits every time.
 
 use glam::{DVec2, DVec3, DVec4};
 use nightsplat::gpu::testing::gpu;
@@ -11,8 +11,8 @@ use crate::common::setup::{Gradients, Rendered, Setup, features, fisheye, tile_o
 
 const SIZE: [u32; 2] = [26, 19];
 
-/// Compares central differences with the chain's gradient, relative to the largest of each attribute, and the chain
-/// with the renderer.
+/// Compares the chain's gradient with central differences, relative to the largest of each attribute, and the renderer
+/// with the chain.
 fn check(setup: &Setup, name: &str) {
     let chain = Chain::new(setup);
     let (parameters, background) = (chain.parameters(), chain.background());
@@ -39,11 +39,11 @@ fn check(setup: &Setup, name: &str) {
     ] {
         let range = first * count..end * count;
         let largest = gradient[range.clone()].iter().fold(0.0f64, |a, g| a.max(g.abs()));
-        assert!(largest > 1e-3 || range.is_empty(), "{name}: no gradient of {attribute}");
+        assert!(largest > 1e-3 || range.is_empty(), "{name}: the gradient of {attribute} is zero");
         for at in range {
             let expected = difference(&parameters, at, &|p| chain.loss(p, &background));
             let actual = gradient[at];
-            // The second term is the rounding of the loss, over the step.
+            // The second term is the rounding error of the loss, divided by the step.
             let bound = 1e-6 * largest + 1e-9;
             let error = (actual - expected).abs();
             assert!(error < bound, "{name}: {attribute} [{at}] {actual} is not {expected}");
@@ -57,14 +57,14 @@ fn check(setup: &Setup, name: &str) {
 }
 
 #[test]
-fn the_chain_s_gradients_are_its_central_differences() {
+fn the_chain_s_gradients_agree_with_central_differences() {
     for degree in 0..=3 {
         check(&Setup::new(7, SIZE, degree, 21 + u64::from(degree)), &format!("degree {degree}"));
     }
 }
 
 #[test]
-fn the_chain_s_gradients_are_its_central_differences_through_a_fisheye_too() {
+fn the_chain_s_gradients_agree_with_central_differences_through_a_fisheye() {
     for degree in [0, 2] {
         let setup = Setup::seen_by(fisheye(), 7, SIZE, degree, 21 + u64::from(degree));
         check(&setup, &format!("fisheye, degree {degree}"));
@@ -72,7 +72,7 @@ fn the_chain_s_gradients_are_its_central_differences_through_a_fisheye_too() {
 }
 
 #[test]
-fn every_feature_and_every_raw_color_has_its_central_difference() {
+fn gradients_of_features_and_raw_colors_agree_with_central_differences_of_the_chain() {
     for (channels, raw_colors) in [(5, false), (11, true)] {
         let shape = Shape { sh_degree: 1, features: features(channels) };
         let mut setup = Setup::new(7, SIZE, shape, 61);
@@ -92,7 +92,7 @@ fn coefficients_above_the_degree_in_use_have_no_gradient() {
 }
 
 #[test]
-fn the_gradient_holds_where_the_slope_is_clamped() {
+fn the_gradient_is_correct_where_the_slope_is_clamped() {
     let mut setup = Setup::new(5, SIZE, 1, 41);
     let camera = setup.camera();
     let Model::Pinhole(pinhole) = &camera.model else { panic!("{camera:?}") };
@@ -109,7 +109,7 @@ fn the_gradient_holds_where_the_slope_is_clamped() {
 }
 
 #[test]
-fn the_gradient_holds_through_capped_alphas_and_done_pixels() {
+fn the_gradient_is_correct_through_capped_alphas_and_done_pixels() {
     let mut setup = Setup::new(12, [16, 12], 1, 51);
     for i in 0..12 {
         let gaussian = setup.get(i);
@@ -123,11 +123,11 @@ fn the_gradient_holds_through_capped_alphas_and_done_pixels() {
 }
 
 #[test]
-fn the_gradient_holds_where_one_part_of_a_tile_is_done_before_another() {
+fn the_gradient_is_correct_where_one_part_of_a_tile_is_done_before_another() {
     for (channels, subgroups) in [(3, 2), (3, 4), (11, 4)] {
         let shape = Shape { sh_degree: 0, features: features(channels) };
         let mut setup = Setup::new(90, [32, 35], shape, 52);
-        // Of the uppermost part nothing shows after the first ones; what lies below goes on for several batches.
+        // The uppermost part is opaque after the first Gaussians; the lower parts continue for several batches.
         for i in 0..12 {
             let mean = setup.at_pixel(DVec2::new(16.0, 2.0), 0.8 + 0.01 * i as f64);
             let log_scale = DVec3::new(0.5, 0.03, 0.03).map(f64::ln);
@@ -144,7 +144,7 @@ fn the_gradient_holds_where_one_part_of_a_tile_is_done_before_another() {
 }
 
 #[test]
-fn the_renderer_gives_what_the_chain_gives() {
+fn the_renderer_gives_the_chain_s_values() {
     for setup in variants() {
         let name = format!("{} Gaussians, {:?}", setup.count, setup.settings);
         Chain::new(&setup).assert_agrees_with_the_device(&name);
@@ -152,7 +152,7 @@ fn the_renderer_gives_what_the_chain_gives() {
 }
 
 #[test]
-fn an_overflow_leaves_no_gradient_and_no_statistics() {
+fn an_overflow_gives_no_gradient_and_no_statistics() {
     let setup = Setup::new(65, [50, 40], 1, 5);
     let (mut rendered, status) = setup.render_within(3);
     assert!(status.overflowed);
@@ -163,7 +163,7 @@ fn an_overflow_leaves_no_gradient_and_no_statistics() {
     assert_eq!((grad_norm_sums, visit_counts), untouched);
 }
 
-/// Sums have one order, in the subgroups of `blend_backward` and over the slots in `project_backward`.
+/// Sums have a fixed order, in the subgroups of `blend_backward` and over the slots in `project_backward`.
 #[test]
 fn the_same_frame_gives_the_same_bits_every_time() {
     let shape = Shape { sh_degree: 2, features: features(4) };

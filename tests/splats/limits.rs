@@ -1,5 +1,5 @@
-//! The passes of the renderer at what they can hold: counts that wrap around, slots without a tile, Gaussians that
-//! cover everything, crowds on one pixel, and tiles that suit no device.
+//! The renderer's passes at their limits: counts that wrap around, slots without a tile, Gaussians that cover
+//! everything, many Gaussians on one pixel, and unsuitable tiles.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -22,8 +22,8 @@ use crate::common::Random;
 use crate::common::setup::{Setup, features};
 
 #[test]
-fn the_most_intersections_that_can_be_counted_are_an_overflow() {
-    // The last wraps around.
+fn more_intersections_than_can_be_counted_are_an_overflow() {
+    // The last sum wraps around.
     for (tile_counts, before, flag) in [
         (vec![], [0, 9], 0),
         (vec![2, 3], [0, 9], 0),
@@ -103,10 +103,10 @@ fn the_gaussian_across_the_end_of_the_memory_covers_no_tile() {
 }
 
 #[test]
-fn memory_for_intersections_grows_to_what_the_device_can_bind_and_no_further() {
+fn memory_for_intersections_grows_to_the_largest_binding_and_no_further() {
     let mut renderer = Setup::new(1, [32, 32], 0, 1).render().renderer;
     let most = renderer.max_intersections();
-    // Where a device binds gigabytes, allocating them is no test.
+    // If a device binds gigabytes, allocating them makes no sense in a test.
     if most > 1 << 23 {
         eprintln!("not run: this device binds {most} intersections at once");
         return;
@@ -117,7 +117,7 @@ fn memory_for_intersections_grows_to_what_the_device_can_bind_and_no_further() {
     assert!(message.contains("gradient_records"), "{message}");
 }
 
-/// What `blend_forward` finds of the runs of `sorted_tiles` in a view of 5 x 24 tiles, and the status.
+/// The runs of `sorted_tiles` that `blend_forward` finds in a view of 5 x 24 tiles, and the status.
 fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>, Vec<u32>) {
     let setup = Setup::new(1, [32, 32], 0, 1);
     let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
@@ -170,10 +170,10 @@ fn every_tile_finds_its_run_among_any_number_of_intersections() {
 }
 
 #[test]
-fn a_count_that_wrapped_around_writes_no_slot_beyond_the_counted() {
+fn a_count_that_wrapped_around_writes_no_slot_beyond_the_count() {
     let setup = Setup::new(3, [32, 32], 0, 1);
     let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
-    // As if the offsets of later ranks had run past the total.
+    // As if the offsets of later ranks had exceeded the total.
     let (counts, sorted_ids, tile_counts) = (vec![2], vec![0, 1, 2], vec![4, 4, u32::MAX - 5]);
     let (sums, intersection_offsets) = (vec![0], vec![0, 4, 8]);
     let [tiles, intersection_ids, gaussian_ids] = [0; 3].map(|_| vec![7u32; 16]);
@@ -191,7 +191,7 @@ fn a_count_that_wrapped_around_writes_no_slot_beyond_the_counted() {
     assert!(intersection_ranges.iter().all(|range| range.x == range.y));
 }
 
-/// Splats that cover an image whole, `extra` slots more reserved than they need, and what `emit` makes of them.
+/// Splats that cover an image entirely, with `extra` slots more reserved than they need, and the output of `emit`.
 fn emit_wide(count: u32, size: UVec2, extra: u32) -> (Vec<u32>, Vec<UVec2>, u32) {
     let constants = emit::Constants { partition_size: 256, ..Default::default() };
     let tile = UVec2::new(constants.tile_width, constants.tile_height);
@@ -223,7 +223,7 @@ fn emit_wide(count: u32, size: UVec2, extra: u32) -> (Vec<u32>, Vec<UVec2>, u32)
 /// A record of four channels.
 type Record = [Vec3; 4];
 
-/// Sums the records of Gaussians with one feature, all in one place, whose slots are these: the gradients of the
+/// Sums the records of Gaussians with one feature, all at one position, which have these slots: the gradients of the
 /// features are the sums of the last channel.
 fn sums(intersection_ranges: Vec<UVec2>, gradient_records: &[Record]) -> Vec<f32> {
     let (count, shape) = (intersection_ranges.len(), Shape { sh_degree: 3, features: features(4) });
@@ -259,7 +259,7 @@ fn sums(intersection_ranges: Vec<UVec2>, gradient_records: &[Record]) -> Vec<f32
 
 #[test]
 fn gaussians_that_cover_the_whole_of_a_large_image_fill_their_slots_and_are_summed() {
-    // More tiles than a loop of some devices has turns, for every lane of a subgroup.
+    // More tiles than the loop limit of some devices, for every lane of a subgroup.
     let size = UVec2::new(4096, 2176);
     let (tiles, intersection_ranges, per_splat) = emit_wide(9, size, 0);
     assert!(per_splat > 32_000 && tiles.len() == 9 * per_splat as usize);
@@ -272,13 +272,13 @@ fn gaussians_that_cover_the_whole_of_a_large_image_fill_their_slots_and_are_summ
 }
 
 #[test]
-fn slots_that_no_tile_fills_are_padding_and_leave_no_trace_in_the_sums() {
-    // Few slots, which their lane walks alone, and many, which all lanes share.
+fn slots_that_no_tile_fills_are_padding_and_do_not_change_the_sums() {
+    // Few slots, which one lane processes alone, and many, which all lanes share.
     for size in [UVec2::new(40, 20), UVec2::new(400, 200)] {
         let (tiles, intersection_ranges, per_splat) = emit_wide(11, size, 5);
         let is_padding = |slot: usize| slot as u32 % per_splat >= per_splat - 5;
         assert!((0..tiles.len()).all(|slot| (tiles[slot] == emit::NO_TILE) == is_padding(slot)));
-        // No tile has written the records of padding.
+        // No tile writes the records of padding.
         let record = |slot: usize| [if is_padding(slot) { Vec3::NAN } else { Vec3::ONE }; 4];
         let gradient_records: Vec<Record> = (0..tiles.len()).map(record).collect();
         assert_eq!(sums(intersection_ranges, &gradient_records), [(per_splat - 5) as f32; 11]);
@@ -286,24 +286,24 @@ fn slots_that_no_tile_fills_are_padding_and_leave_no_trace_in_the_sums() {
 }
 
 #[test]
-fn a_view_has_at_most_the_tiles_that_a_subgroup_of_gaussians_that_cover_them_all_gets_through() {
+fn a_view_has_at_most_the_tiles_that_a_subgroup_of_covering_gaussians_can_process() {
     let most = gpu().properties().max_loop_iterations;
     if most == u32::MAX {
-        eprintln!("not run: loops of this device do not end");
+        eprintln!("not run: this device has no loop limit");
         return;
     }
     let mut renderer = Renderer::new(&gpu(), Setup::new(1, [32, 32], 0, 1).settings).unwrap();
     let view = |size| Setup::new(1, size, 0, 1).camera;
     renderer.reserve(1, [&view([8192, 16])]).unwrap();
     renderer.reserve(1, [&view([3840, 2160])]).unwrap();
-    // The host's renders are put together from patches; one pass takes no such view.
+    // The host's renders are assembled from patches; no single pass accepts such a view.
     renderer.reserve(1, [&view([8192, 8192])]).unwrap();
     let refused = renderer.reserve_sizes(1, 1, [UVec2::splat(8192)]).unwrap_err();
     let message = refused.to_string();
     assert!(message.starts_with("a 8192x8192 view has 524288 tiles of 16x8 pixels"), "{message}");
     assert!(!message.contains('\n'), "{message}");
 
-    // A tile grows with the view, but for one that is named.
+    // The tile grows with the view unless a size is given.
     let tile_for = |tile: Option<Tile>| {
         let settings = RenderSettings { tile, ..RenderSettings::default() };
         settings.tile_for(&gpu(), [[8192, 4096]].into_iter()).unwrap()
@@ -322,7 +322,7 @@ fn a_view_has_at_most_the_tiles_that_a_subgroup_of_gaussians_that_cover_them_all
     );
 }
 
-/// What the refusal of a view names as the longest side is one that fits, and not much less than could.
+/// The longest side that a refusal names fits, and is not much less than the maximum.
 #[test]
 fn a_refused_view_names_a_longest_side_that_fits() {
     let gpu = gpu();
@@ -341,7 +341,7 @@ fn a_refused_view_names_a_longest_side_that_fits() {
     }
 }
 
-/// This many faint splats, one after the other, on one pixel.
+/// `count` faint splats on one pixel, at increasing depths.
 fn splats_per_tile(count: usize) -> Setup {
     let mut setup = Setup::new(count, [16, 8], 0, 5);
     let size = setup.camera().size;
@@ -359,9 +359,9 @@ fn splats_per_tile(count: usize) -> Setup {
 }
 
 #[test]
-fn a_hundred_thousand_splats_on_one_pixel_are_blended_as_the_references_say() {
+fn a_hundred_thousand_splats_on_one_pixel_are_blended_as_in_the_references() {
     let mut setup = splats_per_tile(100_000);
-    // Where four subgroups share a tile, each turns over its parts as well.
+    // If four subgroups share a tile, each also iterates over its parts.
     let shared = Tile { size: [16, 16], subgroups: 4 };
     for tile in [None, Some(shared).filter(|&tile| gpu().properties().suits_tile(tile))] {
         setup.settings.tile = tile;
@@ -378,7 +378,7 @@ fn a_hundred_thousand_splats_on_one_pixel_are_blended_as_the_references_say() {
 }
 
 #[test]
-fn more_splats_on_a_tile_than_the_device_follows_are_an_error_that_says_so() {
+fn more_splats_on_a_tile_than_the_device_can_process_are_a_clear_error() {
     let (ranges, status) = tile_runs(vec![0, 0, 0, 0, 2, 2, 2], 3);
     assert_eq!(ranges[..3], [UVec2::ZERO, UVec2::splat(4), UVec2::new(4, 7)]);
     assert_eq!(status, [STATUS_TILE_LIMIT, 0, 4]);
@@ -397,7 +397,7 @@ fn more_splats_on_a_tile_than_the_device_follows_are_an_error_that_says_so() {
 }
 
 #[test]
-fn a_tile_that_does_not_suit_the_device_is_refused_in_one_line_and_others_render() {
+fn a_tile_that_does_not_suit_the_device_is_refused_in_one_line_and_other_tiles_render() {
     let lanes = gpu().properties().subgroup_size;
     let mut setup = Setup::new(5, [50, 40], 1, 5);
     for tile in [[0, 8], [1, 1], [lanes + 1, 1], [lanes, 33], [64 * lanes, 1], [1 << 20, 1 << 20]] {

@@ -1,4 +1,4 @@
-//! NaN where none may be: it is caught in the step in which it arises, named, and changes nothing.
+//! NaN where none is allowed: it is caught in the step in which it arises, named, and changes nothing.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -10,10 +10,10 @@ use nightsplat::train::{NotFinite, TrainConfig, Trainer};
 use crate::common::setup::Setup;
 use crate::common::train::{advance, dataset};
 
-/// The background of a render is NaN, and so is the loss.
+/// The background of the render is NaN, and therefore the loss.
 const BAD_LOSS: Defect = Defect { kernel: "blend_forward", word: 4, bits: 0x7fc0_0000 };
 
-/// The scale of the loss's gradient is NaN, the loss is not.
+/// The scale of the loss's gradient is NaN; the loss itself is not.
 fn bad_gradient() -> Defect {
     let scale = (1.0 / (3.0 * 40.0 * 30.0)) as f32;
     Defect { kernel: "l1", word: 1, bits: scale.to_bits() ^ 0x7fc0_0000 }
@@ -29,7 +29,7 @@ fn config(not_finite: NotFinite) -> TrainConfig {
 }
 
 #[test]
-fn what_is_not_finite_ends_the_run_at_its_own_step_with_view_and_place_and_changes_nothing() {
+fn a_not_finite_value_ends_the_run_at_its_own_step_with_view_and_place_and_changes_nothing() {
     let dataset = dataset(6, [40, 30]);
     for (defect, place) in [(BAD_LOSS, "L1"), (bad_gradient(), "a gradient")] {
         let mut trainer = Trainer::new(&gpu(), config(NotFinite::Stop), &dataset).unwrap();
@@ -46,7 +46,7 @@ fn what_is_not_finite_ends_the_run_at_its_own_step_with_view_and_place_and_chang
 }
 
 #[test]
-fn a_view_whose_numbers_are_not_finite_is_left_out_and_the_run_goes_on_to_the_same_bits() {
+fn a_view_with_not_finite_values_is_left_out_and_the_run_continues_to_the_same_bits() {
     let dataset = dataset(6, [40, 30]);
     let folder = tempfile::tempdir().unwrap();
     for defect in [BAD_LOSS, bad_gradient()] {
@@ -58,7 +58,7 @@ fn a_view_whose_numbers_are_not_finite_is_left_out_and_the_run_goes_on_to_the_sa
         assert!(done.unwrap().is_empty() && trainer.steps_done() == 3);
         assert!(
             trainer.gaussians().unwrap() == before,
-            "the state before the step is the good one"
+            "the state before the step is the valid one"
         );
         let checkpoint = folder.path().join("checkpoint.safetensors");
         trainer.save_checkpoint(&checkpoint).unwrap();
@@ -92,7 +92,7 @@ fn the_last_view_is_never_left_out() {
 }
 
 #[test]
-fn a_gradient_that_is_not_finite_raises_a_flag_and_leaves_no_trace_in_the_statistics() {
+fn a_gradient_that_is_not_finite_raises_a_flag_and_does_not_change_the_statistics() {
     let setup = Setup::new(20, [33, 17], 3, 6);
     let mut rendered = setup.render();
     let mut d_render = vec![0.1; rendered.render.len()];

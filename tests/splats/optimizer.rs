@@ -1,4 +1,4 @@
-//! Adam: the kernel against its reference, its guards, and a problem it has to solve.
+//! Adam: the kernel against its reference, its guards, and a minimisation.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -16,10 +16,10 @@ const COLUMNS: u32 = 25;
 const FEATURES: u32 = 2;
 /// Two Gaussians without features or SH beyond degree 0.
 const PLANES: PlaneCounts = PlaneCounts { gaussians: 2, columns: 14, features: 0 };
-/// Of means, quats, log scales, raw opacities, dc, features, rest.
+/// Learning rates of means, quats, log scales, raw opacities, dc, features, rest.
 const RATES: LearningRates = LearningRates([0.01, 0.02, 0.03, 0.04, 0.05, 0.015, 0.06]);
 
-/// Parameters, gradients and both moments of one step, in host memory.
+/// Parameters, gradients and both moments of one step in host memory.
 #[derive(Clone)]
 struct Planes {
     parameters: Vec<f32>,
@@ -87,7 +87,7 @@ impl Planes {
         self.second = gpu.read(second).unwrap();
     }
 
-    /// The same step by the reference.
+    /// The same step in the reference.
     fn reference_step(&mut self, step: i32, [gaussian_count, column_count]: [u32; 2]) {
         let first_correction = 1.0 / (1.0 - 0.9f64.powi(step));
         let rate = |rate: f64| (rate * first_correction) as f32;
@@ -128,7 +128,7 @@ fn adam_matches_its_reference() {
             let mut actual = expected.clone();
             expected.reference_step(step, [gaussian_count, column_count]);
             actual.step(&gpu, step as u64, [gaussian_count, column_count], 0);
-            // Division and square root are within a few ulp of steps of up to a unit.
+            // Division and square root are within a few ulp, and steps are at most one unit.
             let pairs = [
                 (&actual.parameters, &expected.parameters, 4e-6),
                 (&actual.first, &expected.first, 1e-9),
@@ -147,7 +147,7 @@ fn adam_matches_its_reference() {
 }
 
 #[test]
-fn the_first_step_moves_every_attribute_by_its_own_rate() {
+fn the_first_step_moves_every_attribute_by_its_own_learning_rate() {
     let gpu = gpu();
     let count = 5;
     let mut planes = Planes::new(count);
@@ -199,7 +199,8 @@ fn nothing_changes_while_the_status_is_set() {
     assert!(planes.bits() == before);
 }
 
-/// Without the guard a NaN stays in the moments for good, and an infinite second moment freezes its parameter.
+/// Without the guard, a NaN would stay in the moments forever, and an infinite second moment would freeze its
+/// parameter.
 #[test]
 fn a_gradient_that_is_not_finite_counts_as_zero() {
     let gpu = gpu();
@@ -219,7 +220,7 @@ fn a_gradient_that_is_not_finite_counts_as_zero() {
 }
 
 #[test]
-fn a_huge_gradient_leaves_finite_moments() {
+fn a_huge_gradient_gives_finite_moments() {
     let gpu = gpu();
     let mut planes = Planes::new(4);
     planes.gradients.fill(3e30);
@@ -254,7 +255,7 @@ fn adam_finds_the_minimum_of_a_parabola() {
     assert!(planes.parameters.iter().all(|p| (p - 0.5).abs() < 0.05), "{:?}", planes.parameters);
 }
 
-/// A kernel that ran on would write beyond its buffers.
+/// A kernel that ran anyway would write out of bounds.
 #[test]
 fn a_buffer_that_is_too_short_is_refused() {
     let gpu = gpu();
@@ -284,10 +285,10 @@ fn a_buffer_that_is_too_short_is_refused() {
 }
 
 #[test]
-fn coefficients_in_halves_are_refused_where_a_buffer_is_too_short() {
+fn coefficients_in_halves_are_refused_if_a_buffer_is_too_short() {
     let gpu = gpu();
     let adam = Adam::new(&gpu).unwrap();
-    // Two Gaussians of 14 columns, and 9 coefficients after them in 5 words.
+    // Two Gaussians of 14 columns, followed by 9 coefficients in 5 words.
     let fitting = [2 * (14 + 5), 2 * (14 + 9), 2 * (14 + 9)];
     for (short, fits) in
         [([0, 0, 0], true), ([1, 0, 0], false), ([0, 1, 0], false), ([0, 0, 1], false)]
@@ -317,11 +318,11 @@ fn coefficients_in_halves_are_refused_where_a_buffer_is_too_short() {
 }
 
 #[test]
-fn the_first_value_that_is_not_finite_is_found_wherever_it_stands_and_none_where_there_is_none() {
+fn the_first_not_finite_value_is_found_at_every_position_and_none_if_all_are_finite() {
     let gpu = gpu();
     let mut check = FiniteCheck::new(&gpu).unwrap();
     for count in [1, 3, 4, 255, 1024, 1025, 4097] {
-        // Extremes are finite; what lies after the last value does not count.
+        // Extreme values are finite; values after the last one do not count.
         let mut values: Vec<f32> =
             (0..count + 4).map(|i| [f32::MAX, -f32::MAX, 1e-45, -0.0][i % 4]).collect();
         values[count] = f32::NAN;

@@ -1,5 +1,4 @@
-//! Moments and SH coefficients in 16 bits: the kernels against their references, roundings that keep the mean, and
-//! runs.
+//! Moments and SH coefficients in 16 bits: the kernels against their references, unbiased rounding, and runs.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -18,7 +17,7 @@ use crate::common::own_gpu;
 use crate::common::setup::{Setup, features};
 use crate::common::train::{advance, dataset};
 
-/// Of SH coefficients, and of moments.
+/// Formats of SH coefficients and of moments.
 const ALL: [[StorageFormat; 2]; 4] = [
     [StorageFormat::Single, StorageFormat::Single],
     [StorageFormat::Single, StorageFormat::Half],
@@ -30,7 +29,7 @@ fn wave(len: usize, scale: f32, phase: f32) -> Vec<f32> {
     (0..len).map(|i| scale * (i as f32 * 0.7 + phase).sin()).collect()
 }
 
-/// What Adam works on in one buffer after the other, all of it learned at one rate.
+/// The buffers that Adam updates, concatenated, with one learning rate.
 struct Learned {
     gaussians: DeviceGaussians,
     moments: Moments,
@@ -55,7 +54,7 @@ impl Learned {
         Self { gaussians, moments, gradients, adam, rate: 1e-3, status }
     }
 
-    /// As [`nightsplat::train::Trainer`] does: floats, and what is in halves.
+    /// A step as in [`nightsplat::train::Trainer`]: first floats, then halves.
     fn step(&mut self, gpu: &Gpu, step: u64) {
         let layout = self.gaussians.layout;
         let (planes, rest) = (layout.floats(), layout.sh_rest);
@@ -124,9 +123,9 @@ fn steps_on_halves_match_their_references() {
     }
 }
 
-/// A mean that keeps .999 of itself stays where it is if it is rounded to the nearest of 8 bits.
+/// A mean that decays by .999 a step would not change if it were rounded to the nearest value of 8 bits.
 #[test]
-fn moments_in_halves_fade_as_those_of_floats() {
+fn moments_in_halves_decay_as_floats_do() {
     let _alone = alone();
     let gpu = gpu();
     let mean = |learned: &Learned| {
@@ -143,9 +142,9 @@ fn moments_in_halves_fade_as_those_of_floats() {
     assert!((halves / floats - 1.0).abs() < 0.01, "{halves:e}, not {floats:e}");
 }
 
-/// A step of a twentieth of what two neighbours differ by.
+/// A step of a twentieth of the distance between two neighbouring halves.
 #[test]
-fn coefficients_in_halves_move_by_less_than_their_unit() {
+fn coefficients_in_halves_move_by_steps_below_their_precision() {
     let _alone = alone();
     let gpu = gpu();
     let count = 300;
@@ -161,11 +160,11 @@ fn coefficients_in_halves_move_by_less_than_their_unit() {
     let moved = 0.75 - mean;
     assert!((moved / (40.0 * learned.rate) - 1.0).abs() < 0.02, "moved by {moved}");
     let unit = 1.0 / 2048.0;
-    assert!(rest.iter().all(|value| value.rem_euclid(unit) == 0.0), "these are no halves");
+    assert!(rest.iter().all(|value| value.rem_euclid(unit) == 0.0), "these are not halves");
 }
 
 #[test]
-fn coefficients_beyond_halves_and_gradients_that_are_not_finite_leave_finite_halves() {
+fn coefficients_beyond_the_range_and_gradients_that_are_not_finite_give_finite_halves() {
     let _alone = alone();
     let gpu = gpu();
     let mut learned = Learned::new(&gpu, 4, 1.into(), [StorageFormat::Half, StorageFormat::Half]);
@@ -184,9 +183,9 @@ fn coefficients_beyond_halves_and_gradients_that_are_not_finite_leave_finite_hal
     assert!(learned.moments(&gpu).iter().flatten().all(|moment| moment.is_finite()));
 }
 
-/// Halves stand for floats: what those give is given, forward and backward.
+/// Halves represent floats: both give the same values, forward and backward.
 #[test]
-fn a_render_of_halves_is_that_of_the_floats_they_stand_for() {
+fn a_render_of_halves_equals_that_of_the_floats_they_represent() {
     let _alone = alone();
     let gpu = gpu();
     for (degree, channels) in [(1, 3), (2, 11), (3, 3)] {
@@ -230,14 +229,14 @@ fn a_render_of_halves_is_that_of_the_floats_they_stand_for() {
     }
 }
 
-/// The device is shared, and so is the peak of its memory: one test at a time. A checked render beside the start of a
-/// training also ended the process on lavapipe, in two runs of forty, for a reason that is not found yet.
+/// The device and the peak of its memory are shared: one test at a time. A checked render concurrent with the start of
+/// a training also ended the process on lavapipe, in two runs of forty, for an unknown reason.
 fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Density control and a growing SH degree among its steps.
+/// The steps include density control and a growing SH degree.
 fn config([rest, moments]: [StorageFormat; 2]) -> TrainConfig {
     let precision = PrecisionConfig { rest, moments, ..PrecisionConfig::default() };
     let mut config = TrainConfig { steps: 40, precision, ..TrainConfig::bare() };
@@ -252,7 +251,7 @@ fn config([rest, moments]: [StorageFormat; 2]) -> TrainConfig {
 }
 
 #[test]
-fn runs_in_fewer_bits_are_near_those_of_floats_in_less_memory_and_the_same_every_time() {
+fn runs_in_fewer_bits_are_close_to_those_of_floats_in_less_memory_and_repeatable() {
     let _alone = alone();
     let dataset = dataset(8, [40, 30]);
     let gpu = own_gpu();
@@ -288,9 +287,9 @@ fn every_pass_of_runs_in_fewer_bits_matches_its_reference() {
     }
 }
 
-/// On a device that binds little, too: batches round as a whole does.
+/// Also on a device with small bindings: batches round as one buffer does.
 #[test]
-fn runs_in_fewer_bits_go_on_to_the_same_bits() {
+fn runs_in_fewer_bits_resume_to_the_same_bits() {
     let _alone = alone();
     let (dataset, folder) = (dataset(8, [40, 30]), tempfile::tempdir().unwrap());
     let checkpoint = folder.path().join("checkpoint.safetensors");
@@ -312,7 +311,7 @@ fn runs_in_fewer_bits_go_on_to_the_same_bits() {
 }
 
 #[test]
-fn the_bits_are_settings_like_any_other() {
+fn the_bits_are_ordinary_settings() {
     let with = |assignment: &str| TrainConfig::bare().with(&[assignment.to_owned()]);
     let config = with("precision.rest=16").unwrap().with(&["precision.moments=16".to_owned()]);
     let config = config.unwrap();

@@ -1,4 +1,4 @@
-//! The forward pass of the renderer: at its limits, the same whatever must not matter, and against golden renders.
+//! The renderer's forward pass: its limits, its invariances, and golden renders.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -24,7 +24,7 @@ use crate::common::{Random, assert_close, fixture, safetensors, shared};
 
 const SIZE: [u32; 2] = [50, 40];
 
-/// The render is the background, and nothing hides it.
+/// Asserts that the render is the background at full transmittance.
 fn assert_shows_nothing(rendered: &Rendered<'_>, setup: &Setup) {
     assert!(rendered.transmittances.iter().all(|&transmittance| transmittance == 1.0));
     for (plane, value) in rendered.render.chunks(setup.pixels()).zip(setup.background()) {
@@ -45,7 +45,7 @@ fn an_overflow_renders_nothing_and_keeps_its_flag() {
     let (mut rendered, status) = setup.render_within(total - 1);
     assert!(status.overflowed && status.intersections == total);
     assert_shows_nothing(&rendered, &setup);
-    // A render that fits does not lower it, nor any other.
+    // Neither a render that fits nor any other clears the flags.
     let flags = STATUS_OVERFLOWED | STATUS_NOT_FINITE;
     gpu().write(rendered.renderer.render_and_status().1, &[flags, 7]).unwrap();
     rendered.renderer.set_intersection_capacity(total).unwrap();
@@ -66,7 +66,7 @@ fn plain(setup: &Setup, depth: f64) -> Gaussian {
 }
 
 #[test]
-fn gaussians_out_of_range_leave_no_trace() {
+fn gaussians_out_of_range_are_not_rendered() {
     let mut setup = Setup::new(17, SIZE, 1, 5);
     let (base, nan, infinity) = (plain(&setup, 3.0), f64::NAN, f64::INFINITY);
     let scale = |s| Gaussian { log_scale: DVec3::splat(s), ..base.clone() };
@@ -83,13 +83,13 @@ fn gaussians_out_of_range_leave_no_trace() {
         at(DVec3::new(0.0, 0.0, infinity)),
         at(DVec3::new(1e30, -1e30, 3.0)),
         at(base.mean + 100.0 * right),
-        // 1 / (1 + 254.5) is below 1/255, by less than any rounding may cover.
+        // 1 / (1 + 254.5) is below 1/255, by less than the allowed rounding error.
         opacity(-(254.5f64.ln())),
         opacity(-1000.0),
         opacity(-infinity),
         opacity(nan),
         scale(nan),
-        // A determinant of 1e35: finite, and its square is not.
+        // A determinant of 1e35: finite, but its square is not.
         scale(18.0),
         scale(40.0),
         scale(1000.0),
@@ -139,7 +139,7 @@ fn a_pixel_is_done_before_its_transmittance_falls_below_the_limit() {
     let mut setup = Setup::new(9, [16, 16], 0, 5);
     for i in 0..9 {
         let log_scale = DVec3::splat(6.0);
-        // Transmittances 0.2, 0.04, 0.008, 0.0016, 0.00032, and 0.000064 would be too little.
+        // Transmittances 0.2, 0.04, 0.008, 0.0016, 0.00032; the next, 0.000064, would be below the limit.
         let raw_opacity = 4.0f64.ln();
         setup.set(i, &Gaussian { log_scale, raw_opacity, ..plain(&setup, 2.0 + i as f64) });
     }
@@ -169,7 +169,7 @@ fn needles(count: usize) -> Setup {
     setup
 }
 
-/// Every intersection of a render: the tile and the Gaussian.
+/// Every intersection of a render: tile and Gaussian.
 fn intersections(rendered: &Rendered<'_>) -> Vec<(u32, u32)> {
     let frame = rendered.renderer.frame();
     let [tiles, intersection_ids, gaussian_ids, counts] =
@@ -180,7 +180,7 @@ fn intersections(rendered: &Rendered<'_>) -> Vec<(u32, u32)> {
     tiles.into_iter().zip(gaussian_ids).collect()
 }
 
-/// Those of the tiles that subgroups of this device can own.
+/// Those of the tiles that subgroups of this device support.
 fn suited<const N: usize>(tiles: [([u32; 2], u32); N]) -> impl Iterator<Item = Tile> {
     tiles.into_iter().map(tile_of).filter(|&tile| gpu().properties().suits_tile(tile))
 }
@@ -195,7 +195,7 @@ fn counting_and_emitting_agree() {
         assert!(all.len() > 20_000, "{}", all.len());
         let tile_count = setup.camera.width.div_ceil(width) * setup.camera.height.div_ceil(height);
         assert!(all.iter().all(|&(tile, _)| tile < tile_count), "a slot is padding");
-        assert_eq!(all.iter().collect::<HashSet<_>>().len(), all.len(), "one is there twice");
+        assert_eq!(all.iter().collect::<HashSet<_>>().len(), all.len(), "one is a duplicate");
     }
 }
 
@@ -235,7 +235,8 @@ fn no_visible_pixel_is_missed() {
 
 #[test]
 fn neither_tiles_nor_the_order_of_gaussians_change_a_bit() {
-    // Faint, so that nothing hides what another tile may have missed; no two at one depth, which their order decides.
+    // Faint, so that nothing occludes a Gaussian that another tile missed; no two at the same depth, where the order
+    // would decide.
     let mut setup = needles(1000);
     let camera = setup.camera();
     for i in 0..setup.count {
@@ -264,18 +265,18 @@ fn neither_tiles_nor_the_order_of_gaussians_change_a_bit() {
 // ---------------------------------------------------------------------------
 // Golden renders
 
-/// A render, or its golden twin: (channels + 1, H, W), the last plane being the transmittances.
+/// A render or its golden counterpart: (channels + 1, H, W), the last plane being the transmittances.
 fn planes(render: Vec<f32>, transmittances: Vec<f32>) -> Vec<f32> {
     [render, transmittances].concat()
 }
 
-/// Panics with the largest difference and where it is.
+/// Panics with the largest difference and its position.
 fn assert_golden(name: &str, setup: &Setup, golden: &[f32], tolerance: f32) {
     let Rendered { render, transmittances, .. } = setup.render();
     let actual = planes(render, transmittances);
     assert_eq!(actual.len(), golden.len(), "{name}");
     let difference = |&at: &usize| (actual[at] - golden[at]).abs();
-    // A NaN is the largest.
+    // NaN counts as the largest.
     let by = |a: &usize, b: &usize| difference(a).total_cmp(&difference(b));
     let at = (0..golden.len()).max_by(by).unwrap();
     let (pixel, width) = (at % setup.pixels(), setup.camera.width as usize);
@@ -287,7 +288,7 @@ fn assert_golden(name: &str, setup: &Setup, golden: &[f32], tolerance: f32) {
     );
 }
 
-/// The scenes of `tests/fixtures/golden`; its README says what is in a file.
+/// The scenes of `tests/fixtures/golden`; its README describes the files.
 fn golden_setups() -> [(&'static str, Setup); 2] {
     let plain = Setup::new(16, [24, 16], 2, 90);
     let shape = Shape { sh_degree: 0, features: Features::ALL };
@@ -296,11 +297,11 @@ fn golden_setups() -> [(&'static str, Setup); 2] {
     [("plain", plain), ("features", features)]
 }
 
-/// A render's rounding: of some dozens of operations on values of a few units.
+/// The rounding error of a render: dozens of operations on values of a few units.
 const GOLDEN_TOLERANCE: f32 = 1e-5;
 
 #[test]
-fn golden_renders_of_the_f64_chain_are_met() {
+fn renders_agree_with_golden_renders_of_the_f64_chain() {
     for (name, mut setup) in golden_setups() {
         let path = fixture("golden").join(name).with_extension("safetensors");
         if std::env::var_os("NIGHTSPLAT_WRITE_GOLDEN").is_some() {
@@ -318,7 +319,7 @@ fn golden_renders_of_the_f64_chain_are_met() {
     }
 }
 
-/// Renders on the CPU, in f64; refuses a scene in which a rounding decides what is seen.
+/// Renders on the CPU in f64; refuses a scene whose visibility depends on a rounding.
 fn write_golden(path: &Path, setup: &Setup) {
     let chain = Chain::new(setup);
     let results = chain.run(&chain.parameters());
@@ -326,7 +327,10 @@ fn write_golden(path: &Path, setup: &Setup) {
         let jittered = chain.run(&chain.jitter(seed));
         let moved = results.render.iter().zip(&jittered.render).map(|(a, b)| (a - b).abs());
         let most = moved.fold(0.0, f64::max);
-        assert!(most < 10.0 * f64::from(GOLDEN_TOLERANCE), "{path:?} hangs on a rounding: {most}");
+        assert!(
+            most < 10.0 * f64::from(GOLDEN_TOLERANCE),
+            "{path:?} depends on a rounding: {most}"
+        );
     }
     let narrow = |values: &[f64]| values.iter().map(|&v| v as f32).collect::<Vec<_>>();
     let Camera { width, height, focal, principal_point, view_from_world, .. } = setup.camera;
@@ -345,7 +349,7 @@ fn write_golden(path: &Path, setup: &Setup) {
 }
 
 #[test]
-fn golden_renders_of_another_renderer_are_met() {
+fn renders_agree_with_golden_renders_of_another_renderer() {
     let Some(folder) = shared("data/fixtures/golden_render") else { return };
     for case in ["tiny_case", "basic_case"] {
         let golden = safetensors::read(folder.join(case).with_extension("safetensors"));
@@ -370,7 +374,7 @@ fn golden_renders_of_another_renderer_are_met() {
             };
             setup.set(i, &gaussian);
         }
-        // (H, W, RGBA), of which the last is what the transmittance leaves.
+        // (H, W, RGBA), where A is one minus the transmittance.
         let plane = |c: usize| golden["out_img"].iter().skip(c).step_by(4).copied();
         let transmittances = plane(3).map(|alpha| 1.0 - alpha).collect();
         let golden = planes((0..3).flat_map(plane).collect(), transmittances);
@@ -401,11 +405,11 @@ fn gaussians_of_another_shape_or_storage_are_refused() {
 }
 
 #[test]
-fn what_is_drawn_are_the_gaussians_given_whatever_was_reserved() {
+fn only_the_given_gaussians_are_rendered_however_many_are_reserved() {
     let gpu = gpu();
     let setup = Setup::new(100, [32, 24], 0, 1);
     let mut subset = setup.gaussians();
-    // Of every plane the first: those of fewer Gaussians.
+    // The first of every plane: a subset of the Gaussians.
     subset = Gaussians { count: 10, parameters: vec![], ..subset };
     for (attribute, width) in [
         (Attribute::Means, 3),

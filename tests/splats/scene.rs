@@ -1,4 +1,4 @@
-//! Gaussians on the host: their table, their beginning, their file.
+//! Gaussians on the host: their table, their initialisation, their file.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -24,7 +24,7 @@ fn camera(position: DVec3) -> Camera {
     }
 }
 
-/// Gaussians whose every parameter is another number.
+/// Gaussians whose parameters are all distinct.
 fn distinct(count: usize, shape: impl Into<Shape>) -> Gaussians {
     let mut gaussians = Gaussians::zeros(count, shape);
     for (index, parameter) in gaussians.parameters.iter_mut().enumerate() {
@@ -37,15 +37,15 @@ mod table {
     use super::*;
 
     #[test]
-    fn the_rows_stand_in_the_order_of_the_planes() {
+    fn the_rows_are_in_the_order_of_the_planes() {
         for (index, spec) in ATTRIBUTES.iter().enumerate() {
             assert_eq!(spec.attribute as usize, index, "{}", spec.name);
         }
     }
 
-    /// Files and shaders have relied on these from the first version on.
+    /// Files and shaders have depended on these columns since the first version.
     #[test]
-    fn the_columns_stay_where_they_are() {
+    fn the_columns_do_not_change() {
         let columns = ATTRIBUTES.map(|spec| spec.attribute.column(2));
         assert_eq!(columns, [0, 3, 7, 10, 11, 14, 16]);
     }
@@ -86,7 +86,7 @@ mod table {
     }
 
     #[test]
-    fn no_gaussians_are_gaussians_too() {
+    fn zero_gaussians_are_valid() {
         let none = Gaussians::zeros(0, 3);
         assert!(none.means().is_empty() && none.rest().is_empty());
     }
@@ -103,7 +103,7 @@ mod from_points {
     }
 
     #[test]
-    fn every_attribute_begins_as_in_3dgs() {
+    fn every_attribute_is_initialised_as_in_3dgs() {
         let positions = [DVec3::ZERO, DVec3::X, DVec3::Y * 2.0, DVec3::Z * 3.0];
         let colors = [Vec3::new(0.1, 0.5, 0.9); 4];
         let gaussians =
@@ -121,7 +121,7 @@ mod from_points {
     }
 
     #[test]
-    fn neighbours_on_a_plane_make_discs_along_it() {
+    fn neighbours_in_a_plane_give_discs_in_it() {
         let normal = DVec3::new(1.0, 2.0, -2.0) / 3.0;
         let (right, up) =
             (normal.any_orthonormal_vector(), normal.cross(normal.any_orthonormal_vector()));
@@ -130,7 +130,7 @@ mod from_points {
         let colors = vec![Vec3::ONE; positions.len()];
         let start = Initialization { opacity: 0.3, scale: 0.5, min_axis_ratio: 0.2 };
         let gaussians = Gaussians::from_points(&positions, &colors, 0, &start, 0).unwrap();
-        // In the middle of the grid, where neighbours lie on all sides.
+        // In the middle of the grid, with neighbours on all sides.
         let middle = 40;
         let [w, x, y, z] = gaussians.quats()[middle];
         let scales = gaussians.log_scales()[middle].exp();
@@ -138,7 +138,7 @@ mod from_points {
         let axis = Quat::from_xyzw(x, y, z, w) * Vec3::AXES[thin];
         assert!(axis.as_dvec3().dot(normal).abs() > 1.0 - 1e-6, "{axis}");
         assert!((scales[thin] - 0.2 * scales.max_element()).abs() < 1e-6, "{scales}");
-        // The disc has the area of the round Gaussian at half the distance of the grid.
+        // The disc has the area of an isotropic Gaussian at half the grid spacing.
         let area = scales.element_product() / scales.min_element();
         assert!((area - 0.25).abs() < 1e-6, "{scales}");
         let opacity = 1.0 / (1.0 + (-gaussians.raw_opacities()[middle]).exp());
@@ -146,7 +146,7 @@ mod from_points {
     }
 
     #[test]
-    fn points_in_one_line_and_pairs_make_finite_gaussians() {
+    fn collinear_points_and_pairs_give_finite_gaussians() {
         for count in [2, 3, 20] {
             let positions: Vec<DVec3> = (0..count).map(|i| DVec3::X * f64::from(i)).collect();
             let colors = vec![Vec3::ONE; positions.len()];
@@ -161,7 +161,7 @@ mod from_points {
     }
 
     #[test]
-    fn a_start_that_makes_no_gaussian_is_refused_by_name() {
+    fn invalid_start_settings_are_refused_by_name() {
         for (start, name) in [
             (Initialization { opacity: 1.0, ..Initialization::PAPER }, "start.opacity"),
             (Initialization { scale: 0.0, ..Initialization::PAPER }, "start.scale"),
@@ -176,7 +176,7 @@ mod from_points {
     }
 
     #[test]
-    fn the_scales_are_those_of_a_search_through_all_pairs() {
+    fn the_scales_equal_those_of_a_search_through_all_pairs() {
         let coordinate = |i: usize| ((i as f64 * 12.9898).sin() * 43_758.545_3).fract();
         let positions: Vec<_> = (0..500)
             .map(|i| DVec3::new(coordinate(3 * i), coordinate(3 * i + 1), coordinate(3 * i + 2)))
@@ -199,7 +199,7 @@ mod from_points {
     }
 
     #[test]
-    fn thousands_of_coincident_points_and_flat_grids_are_no_trouble() {
+    fn thousands_of_coincident_points_and_flat_grids_are_handled() {
         assert_eq!(scales(&vec![DVec3::ONE; 5000]), vec![0.01; 5000]);
         let grid: Vec<_> =
             (0..4096).map(|i| DVec3::new((i % 64) as f64, (i / 64) as f64, 0.0)).collect();
@@ -209,7 +209,7 @@ mod from_points {
     }
 
     #[test]
-    fn fewer_than_four_positions_use_the_neighbours_there_are() {
+    fn fewer_than_four_positions_use_the_available_neighbours() {
         assert!(scales(&[]).is_empty());
         assert_eq!(scales(&[DVec3::ONE]), [0.01]);
         assert!(
@@ -244,12 +244,12 @@ mod random {
 
     fn sees(camera: &Camera, position: DVec3) -> bool {
         let Some(pixel) = camera.project(position) else { return false };
-        // A hundredth of a pixel for the rounding of a position on the border.
+        // A tolerance of a hundredth of a pixel for the rounding of a position on the border.
         pixel.cmpge(DVec2::splat(-0.01)).all() && pixel.cmple(DVec2::new(8.01, 6.01)).all()
     }
 
     #[test]
-    fn every_position_is_seen_and_most_are_seen_twice() {
+    fn every_position_is_visible_and_most_in_two_views() {
         let cameras = [DVec3::ZERO, DVec3::X * 0.5, DVec3::Y * 0.5].map(camera);
         let positions = init::random(&cameras, 1000, 7);
         assert_eq!(positions.len(), 1000);
@@ -260,14 +260,14 @@ mod random {
     }
 
     #[test]
-    fn the_seed_decides_everything() {
+    fn the_seed_determines_everything() {
         let cameras = [DVec3::ZERO, DVec3::X].map(camera);
         assert_eq!(init::random(&cameras, 100, 1), init::random(&cameras, 100, 1));
         assert_ne!(init::random(&cameras, 100, 1), init::random(&cameras, 100, 2));
     }
 
     #[test]
-    fn cameras_in_one_place_see_depths_around_one() {
+    fn cameras_at_one_position_see_depths_around_one() {
         let one = [camera(DVec3::splat(1e3))];
         for cameras in [&one[..], &[one[0]; 5]] {
             let depths = init::random(cameras, 200, 0).into_iter().map(|position| position.z - 1e3);
@@ -279,7 +279,7 @@ mod random {
     }
 
     #[test]
-    fn no_cameras_see_nothing() {
+    fn no_cameras_give_no_positions() {
         assert!(init::random(&[], 10, 0).is_empty());
     }
 }
@@ -325,13 +325,13 @@ mod colors {
     }
 
     #[test]
-    fn without_targets_everything_is_grey() {
+    fn without_targets_every_point_is_grey() {
         let color = colors(&[point(DVec3::Z, &[0])], &[view(Split::Train, DVec3::ZERO)], &[])[0];
         assert_eq!(color, Vec3::splat(0.5));
     }
 
     #[test]
-    fn sampling_is_bilinear_between_pixel_centers_and_goes_on_at_the_edge() {
+    fn sampling_is_bilinear_between_pixel_centers_and_clamps_to_the_edge() {
         let ramp = [Image::from_fn(8, 6, |x, y| [x as f32, y as f32, 1.0])];
         let views = [view(Split::Train, DVec3::ZERO)];
         let at = |x: f64, y: f64| {
@@ -356,7 +356,7 @@ mod colors {
 mod ply_file {
     use super::*;
 
-    /// The problem that loading these bytes meets.
+    /// The error of loading these bytes.
     fn problem(bytes: &[u8]) -> String {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("model.ply");
@@ -371,7 +371,7 @@ mod ply_file {
     }
 
     #[test]
-    fn features_come_back_and_stand_behind_the_harmonics() {
+    fn features_survive_a_round_trip_and_follow_the_harmonics() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("model.ply");
         for features in [Features::ALL, Features { noise: true, ..Features::NONE }] {
@@ -386,7 +386,7 @@ mod ply_file {
         assert!(header.contains(&lines), "{header}");
     }
 
-    /// The file with its header's text changed.
+    /// The file with the text of its header changed.
     fn with_header(bytes: &[u8], from: &str, to: &str) -> Vec<u8> {
         let body = bytes.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
         let header = std::str::from_utf8(&bytes[..body]).unwrap();
@@ -395,7 +395,7 @@ mod ply_file {
     }
 
     #[test]
-    fn saving_and_loading_changes_no_bit() {
+    fn saving_and_loading_preserves_every_bit() {
         let dir = tempfile::tempdir().unwrap();
         for sh_degree in 0..=3 {
             for count in [0, 1, 37] {
@@ -429,7 +429,7 @@ mod ply_file {
         };
         assert_eq!(Vec3::new(second("x"), second("y"), second("z")), gaussians.means()[1]);
         assert_eq!(Vec3::new(second("nx"), second("ny"), second("nz")), Vec3::ZERO);
-        // Channel-major: green begins after the three red coefficients.
+        // Channel-major: green starts after the three red coefficients.
         let coefficient = gaussians.rest()[3 + 2];
         assert_eq!(
             Vec3::new(second("f_rest_2"), second("f_rest_5"), second("f_rest_8")),
@@ -481,13 +481,13 @@ mod ply_file {
     }
 
     #[test]
-    fn a_file_cut_short_anywhere_is_refused() {
+    fn a_file_truncated_anywhere_is_refused() {
         let plain = bytes(&distinct(2, 1));
         for length in [2, 3, 40, 300, plain.len() - 100, plain.len() - 1] {
             let problem = problem(&plain[..length]);
             assert!(problem.contains("model.ply"), "{length}: {problem}");
         }
-        assert!(problem(&plain[..plain.len() - 1]).contains("cut short"));
+        assert!(problem(&plain[..plain.len() - 1]).contains("truncated"));
     }
 
     #[test]
@@ -495,7 +495,7 @@ mod ply_file {
         let plain = bytes(&distinct(2, 1));
         for (count, words) in [
             ("1", "more than"),
-            ("3", "cut short"),
+            ("3", "truncated"),
             ("-1", "vertex count"),
             ("many", "vertex count"),
         ] {
@@ -522,7 +522,7 @@ mod ply_file {
     }
 
     #[test]
-    fn a_value_that_is_not_finite_is_refused_with_its_place() {
+    fn a_value_that_is_not_finite_is_refused_with_its_position() {
         let mut gaussians = distinct(4, 0);
         gaussians.log_scales_mut()[2].y = f32::NAN;
         let problem = problem(&bytes(&gaussians));
@@ -530,7 +530,7 @@ mod ply_file {
     }
 
     #[test]
-    fn a_folder_that_is_missing_is_named_and_nothing_is_left() {
+    fn a_missing_folder_is_named_and_no_file_is_left() {
         let dir = tempfile::tempdir().unwrap();
         let problem = ply::save(&distinct(1, 0), dir.path().join("missing/model.ply"))
             .unwrap_err()
@@ -545,7 +545,7 @@ mod ply_file {
     }
 
     #[test]
-    fn a_vertex_holds_what_the_table_says() {
+    fn a_vertex_has_the_size_that_the_table_states() {
         let header_and = |count| bytes(&distinct(count, 3)).len();
         assert_eq!(header_and(3) - header_and(2), 4 * (width(3) + 3));
     }

@@ -34,7 +34,7 @@ fn assert_same(what: &str, actual: &[u32], expected: &[u32]) {
     assert!(wrong.is_empty(), "{what}: (index, (actual, expected)) {wrong:?}");
 }
 
-/// The pairs (keys[i], i) for i below `count`, as [`RadixSort`] leaves them.
+/// The pairs (keys[i], i) for i below `count`, as sorted by [`RadixSort`].
 fn sorted(
     gpu: &Gpu,
     sort: &mut RadixSort,
@@ -64,7 +64,7 @@ fn assert_sorts(gpu: &Gpu, sort: &mut RadixSort, what: &str, keys: &[u32], count
 }
 
 #[test]
-fn sorts_of_all_sizes_are_right_and_stable() {
+fn sorts_of_all_sizes_are_correct_and_stable() {
     let gpu = gpu();
     let mut sort = RadixSort::new(&gpu, 0).unwrap();
     for size in SIZES {
@@ -76,7 +76,7 @@ fn sorts_of_all_sizes_are_right_and_stable() {
 }
 
 #[test]
-fn any_number_of_bits_sorts_by_those_bits_alone() {
+fn a_sort_by_any_number_of_bits_uses_only_those_bits() {
     let gpu = gpu();
     let mut sort = RadixSort::new(&gpu, 3000).unwrap();
     let keys = noise(3000);
@@ -99,7 +99,7 @@ fn equal_and_extreme_keys_keep_their_order() {
 }
 
 #[test]
-fn a_sort_takes_its_count_from_the_device_and_stays_within_the_buffers() {
+fn a_sort_reads_its_count_on_the_device_and_stays_within_the_buffers() {
     let gpu = gpu();
     let mut sort = RadixSort::new(&gpu, 4000).unwrap();
     let keys = noise(4000);
@@ -112,7 +112,7 @@ fn a_sort_takes_its_count_from_the_device_and_stays_within_the_buffers() {
 fn twenty_five_sorts_are_identical() {
     let gpu = gpu();
     let mut sort = RadixSort::new(&gpu, 20_000).unwrap();
-    // Few distinct keys: any race between equal ones would show in the values.
+    // Few distinct keys: a race between equal ones would change the values.
     let keys: Vec<u32> = noise(20_000).iter().map(|n| n % 37).collect();
     let first = sorted(&gpu, &mut sort, &keys, 20_000, 8);
     for _ in 1..25 {
@@ -121,7 +121,7 @@ fn twenty_five_sorts_are_identical() {
 }
 
 #[test]
-fn two_sorts_in_one_recording_do_not_disturb_each_other() {
+fn two_sorts_in_one_recording_are_independent() {
     let gpu = gpu();
     let (keys, ids) = (noise(2500), (0..2500).collect::<Vec<u32>>());
     let mut sort = RadixSort::new(&gpu, 2500).unwrap();
@@ -143,7 +143,7 @@ fn two_sorts_in_one_recording_do_not_disturb_each_other() {
 }
 
 #[test]
-fn scans_of_all_sizes_are_right_and_leave_the_rest_alone() {
+fn scans_of_all_sizes_are_correct_and_do_not_change_the_rest() {
     let gpu = gpu();
     let mut scan = Scan::new(&gpu, 0).unwrap();
     for size in SIZES {
@@ -169,7 +169,7 @@ fn scans_of_all_sizes_are_right_and_leave_the_rest_alone() {
 }
 
 #[test]
-fn a_count_beyond_the_buffers_scans_what_they_hold() {
+fn a_count_beyond_the_buffers_scans_whole_buffers() {
     let gpu = gpu();
     let mut scan = Scan::new(&gpu, 3).unwrap();
     let counts = gpu.buffer("counts", &[u32::MAX]).unwrap();
@@ -207,7 +207,7 @@ fn buffers_that_do_not_fit_together_are_an_error() {
 
 #[test]
 fn more_workgroups_than_fit_along_x_are_folded() {
-    // Two values a partition make 70 001 workgroups, in two rows: the last is idle in part.
+    // Two values in a partition need 70 001 workgroups, in two rows; the last row is partly idle.
     compare_scan_kernels(140_001, 2);
 }
 
@@ -220,7 +220,7 @@ fn scan_kernels_match_their_references() {
 
 fn compare_scan_kernels(size: u32, partition_size: u32) {
     let partitions = size.div_ceil(partition_size).max(1);
-    // One workgroup more than there are partitions: it must leave no trace.
+    // One workgroup more than there are partitions: it must not change anything.
     let groups = Threads::Workgroups([partitions + 1, 1, 1]);
     // A count beyond the capacity is clamped to it.
     let (counts, values, capacity) = (vec![size + 5], noise(size), size);
@@ -262,7 +262,7 @@ fn compare_sort_kernels(rank_by_ballot: bool) {
     for (size, (shift, digit_bits)) in SIZES.into_iter().flat_map(|s| [(s, (31, 1)), (s, (5, 8))]) {
         let (capacity, count_index, digits) = (size, 0, 1_u32 << digit_bits);
         let partitions = size.div_ceil(PARTITION);
-        // One workgroup more than there are partitions: it must leave no trace.
+        // One workgroup more than there are partitions: it must not change anything.
         let groups = Threads::Workgroups([partitions + 1, 1, 1]);
         // A count beyond the capacity is clamped to it.
         let (counts, keys) = (vec![size + 5], noise(size));

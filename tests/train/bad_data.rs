@@ -1,4 +1,4 @@
-//! Data that would cost memory, poison a model or train nothing: it is said, by name, before it does.
+//! Data that would exhaust memory, corrupt a model or train nothing: it is reported, by name, beforehand.
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -11,7 +11,7 @@ use serde_json::Value;
 
 use crate::common::command::{refused, run};
 
-/// Nine small views, to spoil.
+/// Nine small views, to be corrupted.
 fn small_set() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let options = SyntheticOptions {
@@ -29,7 +29,7 @@ fn train(root: &Path) -> String {
     format!("train {} --out {}/run --steps 1 --plan none", root.display(), root.display())
 }
 
-/// Training must succeed and say all of `parts` on standard error.
+/// Asserts that training succeeds and that standard error contains all of `parts`.
 fn trains_and_says(root: &Path, parts: &[&str]) {
     let (_, stderr) = run(&train(root), 0);
     for part in parts {
@@ -43,7 +43,7 @@ fn edit(path: PathBuf, change: impl FnOnce(String) -> String) {
 }
 
 #[test]
-fn points_that_no_device_holds_and_views_that_show_nothing_are_said() {
+fn points_that_no_device_represents_and_views_that_show_nothing_are_reported() {
     let set = small_set();
     edit(set.path().join("colmap_sparse/0/points3D.txt"), |text| {
         text + "900001 1e39 0 0 1 2 3 0.5\n900002 0 -1e300 0 1 2 3 0.5\n900003 1e9 0 0 1 2 3 0.5\n"
@@ -52,7 +52,7 @@ fn points_that_no_device_holds_and_views_that_show_nothing_are_said() {
 
     let set = small_set();
     edit(set.path().join("transforms_train.json"), |text| {
-        // The second view looks the other way: x and z of its axes are negated.
+        // The second view looks the opposite way: the x and z axes are negated.
         let mut listing: Value = serde_json::from_str(&text).unwrap();
         for row in
             listing["frames"][1]["transform_matrix"].as_array_mut().unwrap().iter_mut().take(3)
@@ -67,7 +67,7 @@ fn points_that_no_device_holds_and_views_that_show_nothing_are_said() {
 }
 
 #[test]
-fn pictures_larger_than_their_views_are_refused_before_they_are_decoded() {
+fn images_larger_than_their_views_are_refused_before_they_are_decoded() {
     let set = small_set();
     let bomb = |path: &str| {
         Image::from_fn(1200, 900, |_, _| [0.5; 3]).save_png8(set.path().join(path)).unwrap();
@@ -77,7 +77,7 @@ fn pictures_larger_than_their_views_are_refused_before_they_are_decoded() {
 }
 
 #[test]
-fn a_camera_far_from_all_others_is_named_and_the_others_train() {
+fn a_camera_far_from_all_others_is_named_and_training_continues() {
     let set = small_set();
     edit(set.path().join("transforms_train.json"), |text| {
         let mut listing: Value = serde_json::from_str(&text).unwrap();
@@ -102,7 +102,7 @@ fn a_depth_map_far_larger_than_its_view_is_left_out_by_name() {
 }
 
 #[test]
-fn a_number_of_a_configuration_that_is_none_names_file_and_setting() {
+fn a_configuration_value_of_nan_is_refused_with_its_file_and_setting() {
     let set = small_set();
     let file = set.path().join("wrong.toml");
     fs::write(&file, "[schedule.initial_rates]\nquats = nan\n").unwrap();

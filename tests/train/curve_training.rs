@@ -1,4 +1,5 @@
-//! Training with every kind of curve: evaluated in the loss, baked at upload, of the scene; and from what a run records.
+//! Training with every kind of curve: evaluated in the loss, baked at upload, fitted to the scene; and from a run's
+//! recorded configuration.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -12,7 +13,7 @@ use nightsplat::photographs::tone::{
 };
 use nightsplat::train::{TargetExposure, TrainConfig, Trainer};
 
-/// The losses of the first steps, and the parameters after them.
+/// The losses of the first steps and the resulting parameters.
 fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<f64>, Vec<f32>) {
     let (reports, gaussians) = crate::common::train::train(config, dataset);
     (reports.into_iter().map(|report| report.loss).collect(), gaussians.parameters)
@@ -22,7 +23,7 @@ fn config(tone: ToneSettings) -> TrainConfig {
     TrainConfig { steps: 5, sh_degree: 0, tone, ..TrainConfig::bare() }
 }
 
-/// Points so close that the cubics between them are the curve's to 1e-4.
+/// Knots so close that the cubics between them agree with the curve to 1e-4.
 fn dense_table(curve: ToneCurve) -> Table {
     let settings = ToneSettings::new(curve);
     let plain = settings.plain_statistics();
@@ -68,14 +69,14 @@ fn a_baked_target_trains_as_the_curve_in_the_loss() {
 }
 
 #[test]
-fn the_statistics_of_the_scene_are_not_those_of_a_view() {
+fn the_statistics_of_the_scene_are_measured_over_all_views() {
     let dataset = crate::common::train::dataset(5, [32, 24]);
     let settings = ToneSettings::new(ToneCurve::Ap3);
     let scene = ToneSettings { scene_statistics: true, ..settings.clone() };
     assert_ne!(train(&config(settings), &dataset).0, train(&config(scene), &dataset).0);
 }
 
-/// What training finds of the brightness of a set whose training photographs were scaled, one by one.
+/// The exposure that training measures in a dataset whose training photographs are scaled, one by one.
 fn exposure(
     dataset: &Dataset,
     factors: impl Fn(usize) -> f32,
@@ -96,7 +97,7 @@ fn darker_views_get_more_gain_and_the_model_the_mean_of_them() {
     assert_eq!(uniform.gains.len(), 5);
     let varied = exposure(&dataset, |place| [1.0, 0.5, 0.25, 2.0, 1.0][place]).unwrap();
     for ((name, gain), factor) in varied.gains.iter().zip([1.0, 0.5, 0.25, 2.0, 1.0]) {
-        // The scene's gain moves with its brightest views, and each view has a little of it.
+        // The scene's gain follows its brightest views, to which each view contributes.
         let ratio = gain * factor / uniform.gains[name];
         assert!((0.75..1.35).contains(&ratio), "{name}: {gain}, {}", uniform.gains[name]);
     }
@@ -109,7 +110,7 @@ fn darker_views_get_more_gain_and_the_model_the_mean_of_them() {
 }
 
 #[test]
-fn odd_sets_have_a_defined_brightness_or_say_why_not() {
+fn unusual_datasets_have_a_defined_brightness_or_a_clear_error() {
     let dataset = crate::common::train::dataset(6, [32, 24]);
     let mut single = dataset.clone();
     let first = single.views.iter().position(|view| view.is_train()).unwrap();
@@ -119,22 +120,22 @@ fn odd_sets_have_a_defined_brightness_or_say_why_not() {
     });
     let one = exposure(&single, |_| 1.0).unwrap();
     assert!((one.model_gain / one.scene.gain - 1.0).abs() < 1e-9 && one.scene.spread == 0.0);
-    // Black views among good ones: left out of the measurement, and trained on at the scene's gain.
+    // Black views among usable ones are left out of the measurement and use the scene's gain.
     let with_black = exposure(&dataset, |place| if place < 2 { 0.0 } else { 1.0 }).unwrap();
     assert_eq!(with_black.scene.black, 2);
     assert_eq!(with_black.gains.values().next(), Some(&with_black.scene.gain));
     let error = exposure(&dataset, |_| 0.0).unwrap_err().to_string();
-    assert!(error.contains("as good as black") && !error.contains('\n'), "{error}");
-    // Half of them well lit, and all.
+    assert!(error.contains("almost black") && !error.contains('\n'), "{error}");
+    // Half of them well lit, then all.
     let half = exposure(&dataset, |place| if place % 2 == 0 { 8.0 } else { 1.0 }).unwrap();
     assert!(half.scene.share > 0.9, "{half:?}");
     let well_lit = exposure(&dataset, |_| 9.0).unwrap();
     assert_eq!(well_lit.scene.weight(), 0.0, "{}", well_lit.scene.reason());
 }
 
-/// The means of areas of lifted photographs, not lifted means.
+/// Targets are area means of tone-mapped photographs, not tone-mapped means.
 #[test]
-fn photographs_are_lifted_before_they_are_shrunk() {
+fn photographs_are_tone_mapped_before_they_are_downscaled() {
     let folder = tempfile::tempdir().unwrap();
     let options = SyntheticOptions {
         views: 5,
@@ -180,7 +181,7 @@ fn photographs_are_lifted_before_they_are_shrunk() {
     assert_ne!(own, late);
 }
 
-/// The same set, as it was written.
+/// The same dataset, as it was written.
 fn load_dark(options: &SyntheticOptions) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
     synthetic::write(folder.path(), options).unwrap();

@@ -1,4 +1,4 @@
-//! What is put into a capture, the diagnosis finds, and the plan follows.
+//! The diagnosis finds the defects injected into a capture, and the plan follows from them.
 
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
@@ -60,8 +60,8 @@ fn edit(folder: &Path, change: impl Fn(usize, &Image) -> Image) {
     }
 }
 
-/// A photograph at four times the size, a third of the light, and with noise: surfaces wider than the few pixels that the
-/// noise is measured in.
+/// A photograph at four times the size, a third of the light, and with noise: surfaces are wider than the few pixels in
+/// which the noise is measured.
 fn taken(image: &Image, gain: f64, read: f64, index: usize) -> Image {
     const TIMES: u32 = 4;
     let noise = Stream::new(7, index as u64);
@@ -93,7 +93,7 @@ fn taken(image: &Image, gain: f64, read: f64, index: usize) -> Image {
 }
 
 // ---------------------------------------------------------------------------
-// What is found
+// Diagnosis
 
 #[test]
 fn injected_noise_is_found_within_a_tenth() {
@@ -142,7 +142,7 @@ fn an_injected_spread_of_exposures_is_found_within_a_tenth_view_by_view() {
 #[test]
 fn a_blurred_photograph_and_one_without_a_pose_are_named() {
     let set = written(&Capture::clean());
-    // Moved by a few pixels while the shutter was open.
+    // Moved by a few pixels during the exposure.
     let moved = |image: &Image| {
         Image::from_fn(image.width, image.height, |x, y| {
             let places = (0..9).map(|step| image.pixel((x + step).min(SET.width - 1), y));
@@ -172,16 +172,16 @@ fn a_blurred_photograph_and_one_without_a_pose_are_named() {
 }
 
 // ---------------------------------------------------------------------------
-// What is planned
+// Plan
 
-/// The parts that a plan switches on.
+/// The parts that a plan enables.
 fn parts(plan: &Plan) -> Vec<&'static str> {
     let on = plan.decisions().into_iter().filter(|(_, value, _)| value == "on");
     on.map(|(name, ..)| name).collect()
 }
 
 #[test]
-fn a_clean_well_lit_set_needs_no_part() {
+fn a_clean_well_lit_dataset_needs_no_part() {
     let plan = plan_of(written(&Capture::clean()).path());
     assert_eq!(parts(&plan), Vec::<&str>::new());
     assert_eq!(plan.left_out, Vec::<String>::new());
@@ -189,12 +189,12 @@ fn a_clean_well_lit_set_needs_no_part() {
 }
 
 #[test]
-fn each_part_comes_with_its_cause() {
+fn each_part_is_enabled_with_its_cause() {
     let planned = |capture: &Capture| parts(&plan_of(written(capture).path()));
     assert_eq!(planned(&Capture { darkening: 25.0, ..Capture::clean() }), ["curve"]);
     let stops = vec![0.0, -1.0, 0.6];
     let set = written(&Capture { stops, darkening: 8.0, ..Capture::clean() });
-    // A gain for each view takes the spread away, one curve for all of them does not.
+    // A gain for each view removes the spread; one curve for all of them does not.
     assert_eq!(parts(&plan_of(set.path())), ["curve"]);
     let mut config = TrainConfig::default();
     config.tone.scene_statistics = true;
@@ -207,13 +207,13 @@ fn each_part_comes_with_its_cause() {
     let set = written(&Capture { darkening: 8.0, ..Capture::clean() });
     edit(set.path(), |_, image| {
         Image::from_fn(image.width, image.height, |x, y| {
-            // A lamp in the middle: twelve stops to either side.
+            // A lamp in the middle: twelve stops darker on both sides.
             let side = (2.0 * x as f32 / image.width as f32 - 1.0).abs();
             let lamp = (-12.0 * side).exp2();
             image.pixel(x, y).map(|value| srgb_from_linear(8.0 * lamp * linear_from_srgb(value)))
         })
     });
-    // It moves with the camera: shared points would take it for exposures.
+    // The lamp moves with the camera: shared points would attribute it to exposures.
     fs::remove_dir_all(set.path().join("colmap_sparse")).unwrap();
     let plan = plan_of(set.path());
     assert!(plan.tonemapper.on, "{} {}", plan.tonemapper.why, plan.exposure.why);
@@ -226,7 +226,7 @@ fn each_part_comes_with_its_cause() {
 }
 
 #[test]
-fn numbers_keep_to_views_steps_memory_and_preset() {
+fn planned_values_follow_views_steps_memory_and_preset() {
     let set = written(&Capture::default());
     let found = diagnosis_of(set.path());
     let config = TrainConfig::default();
@@ -248,7 +248,7 @@ fn numbers_keep_to_views_steps_memory_and_preset() {
 }
 
 #[test]
-fn a_plan_survives_its_file_and_fits_its_dataset_alone() {
+fn a_plan_survives_its_file_and_applies_only_to_its_dataset() {
     let set = written(&Capture::default());
     let (plan, path) = (plan_of(set.path()), set.path().join("plan.toml"));
     fs::write(&path, plan.to_toml().unwrap()).unwrap();
@@ -265,10 +265,10 @@ fn a_plan_survives_its_file_and_fits_its_dataset_alone() {
 }
 
 // ---------------------------------------------------------------------------
-// The commands
+// Commands
 
 #[test]
-fn the_command_prints_json_writes_a_page_and_a_plan_that_train_keeps() {
+fn the_command_prints_json_and_writes_a_page_and_a_plan_that_train_uses() {
     let set = written(&Capture::default());
     let at = |name: &str| set.path().join(name).display().to_string();
     let root = set.path().display();
@@ -284,14 +284,14 @@ fn the_command_prints_json_writes_a_page_and_a_plan_that_train_keeps() {
     let html = fs::read_to_string(&page).unwrap();
     let plan_at = html.find("The plan").unwrap();
     assert!(plan_at < html.find("<img").unwrap(), "the plan comes first");
-    assert!(html.contains("Bad: below 0.02"), "a column says its unit and what a bad value is");
+    assert!(html.contains("Bad: below 0.02"), "a column states its unit and its bad values");
     assert!(!html.contains("http://") && !html.contains("https://"));
     let text = succeed(&format!("diagnose {root}"));
     for part in ["10 photographs to train on (96x72), 2 held out", "denoiser", "views"] {
         assert!(text.contains(part), "{text}");
     }
 
-    // What the user changes is kept, and an option wins over it.
+    // The user's change is kept, and an option overrides it.
     let written = fs::read_to_string(&plan).unwrap();
     let gaussians = written.split("[max_gaussians]\nvalue = ").nth(1).unwrap();
     let gaussians = gaussians.split_whitespace().next().unwrap();
@@ -307,7 +307,7 @@ fn the_command_prints_json_writes_a_page_and_a_plan_that_train_keeps() {
     let kept = fs::read_to_string(set.path().join("run/plan.toml")).unwrap();
     assert!(kept.contains("3210"), "{kept}");
 
-    // A run that goes on keeps to the plan it has.
+    // A resumed run keeps its plan.
     let model = fs::read(set.path().join("run/model.ply")).unwrap();
     fs::remove_file(set.path().join("run/metrics.json")).unwrap();
     succeed(&format!(
@@ -336,7 +336,7 @@ fn a_preset_of_the_paper_and_a_configuration_are_not_planned() {
 fn a_run_without_a_length_ends_when_held_out_views_have_converged() {
     let set = written(&Capture::default());
     let (root, out) = (set.path().display(), set.path().join("run"));
-    // Whatever is learned is too little.
+    // Any gain is too small.
     let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 \
                    --set schedule.resolution_steps=[0,0] --set schedule.cooldown_steps=5 --set checkpoint_every=10";
     let train = format!("train {root} --out {} {options}", out.display());
@@ -345,11 +345,11 @@ fn a_run_without_a_length_ends_when_held_out_views_have_converged() {
     let steps = |text: &str| -> Vec<String> {
         text.lines().skip(1).map(|line| line.split(',').next().unwrap().to_owned()).collect()
     };
-    // It has converged at step 15, and settles.
+    // It converges at step 15 and then settles.
     assert_eq!(steps(&scores), ["5", "10", "15", "20"]);
     let log = fs::read_to_string(out.join("train.csv")).unwrap();
     assert_eq!(log.lines().count(), 21);
-    // The one that is held out is never trained on.
+    // The held-out view is never trained on.
     let views: BTreeSet<&str> =
         log.lines().skip(1).map(|line| line.split(',').nth(1).unwrap()).collect();
     assert_eq!(views.len(), 9);
@@ -367,7 +367,7 @@ fn a_run_without_a_length_ends_when_held_out_views_have_converged() {
     let spread = metrics["held_out"]["spread"].as_f64().unwrap();
     assert!((spread - (high - low)).abs() < 1e-9, "{spread}");
     assert_eq!(metrics["held_out"]["scores"], 4);
-    // What goes on from the checkpoint at 10 comes to the same end.
+    // A run resumed from the checkpoint at step 10 ends identically.
     let model = fs::read(out.join("model.ply")).unwrap();
     fs::remove_file(out.join("metrics.json")).unwrap();
     succeed(&format!("{train} --resume"));
@@ -376,7 +376,7 @@ fn a_run_without_a_length_ends_when_held_out_views_have_converged() {
 }
 
 #[test]
-fn a_run_that_has_ended_early_goes_on_from_its_end() {
+fn a_run_that_ended_early_resumes_from_its_end() {
     let set = written(&Capture::default());
     let (root, out) = (set.path().display(), set.path().join("run"));
     let options = "--preset draft --set stop.views=1 --set stop.every=5 --set stop.gain=90 \
@@ -392,7 +392,7 @@ fn a_run_that_has_ended_early_goes_on_from_its_end() {
         assert!(message.contains(event), "no {event} in {message}");
     }
     assert!(message.contains(r#""may_end_early":true"#));
-    // Done is done, whatever would have been the most steps.
+    // A finished run is done, whatever the maximum number of steps was.
     assert!(train("--resume").contains("is done: 21 steps"));
     // A resumed run may change the stopping rule, with a warning, but not which views are held out.
     let again = format!("train {root} --out {} {options} --resume --set", out.display());
@@ -415,8 +415,8 @@ fn a_run_that_has_ended_early_goes_on_from_its_end() {
 }
 
 #[test]
-fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
-    // Black views are left out and named; only black ones are refused.
+fn datasets_of_any_kind_have_a_plan_or_one_clear_error() {
+    // Black views are left out and named; a dataset of black views alone is refused.
     let set = written(&Capture::default());
     let black = |is: fn(usize) -> bool| {
         edit(set.path(), |index, image| {
@@ -439,14 +439,14 @@ fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
     let log = fs::read_to_string(out.join("train.csv")).unwrap();
     assert!(!log.contains(",003,") && !log.contains(",005,"));
     black(|_| true);
-    refused(&format!("diagnose {root}"), 3, &["as good as black", "expose longer"]);
+    refused(&format!("diagnose {root}"), 3, &["almost black", "expose longer"]);
 
-    // Half the views well lit.
+    // Half of the views well lit.
     let set = written(&Capture { stops: vec![0.0, 4.5], ..Capture::default() });
     let plan = plan_of(set.path());
     assert!(!plan.curve.on && plan.exposure.on, "{}", plan.exposure.why);
 
-    // The same photograph and camera everywhere.
+    // The same photograph and camera in every view.
     let set = written(&Capture::default());
     let first = Image::load(set.path().join("low/001.png")).unwrap();
     edit(set.path(), |_, _| first.clone());
@@ -474,7 +474,7 @@ fn sets_of_any_kind_have_a_plan_or_one_clear_error() {
 }
 
 #[test]
-fn a_plan_of_another_dataset_or_none_at_all_is_refused_in_one_line() {
+fn an_invalid_plan_or_one_of_another_dataset_is_refused_in_one_line() {
     let set = written(&Capture::default());
     let (root, out) = (set.path().display(), set.path().join("run"));
     let plan = set.path().join("plan.toml");
@@ -489,11 +489,11 @@ fn a_plan_of_another_dataset_or_none_at_all_is_refused_in_one_line() {
 }
 
 #[test]
-fn the_library_plans_and_trains_what_the_command_does() {
+fn the_library_plans_and_trains_as_the_command_does() {
     let (set, out) = (written(&Capture::default()), tempfile::tempdir().unwrap());
     let folder = out.path().join("run");
     let train = format!("train {} --out {} --preset draft", set.path().display(), folder.display());
-    // It stops at once, with its configuration written.
+    // It stops immediately, after its configuration is written.
     run(&format!("{train} --max-minutes 1e-9"), 75);
     let config = TrainConfig::load(&folder.join("config.toml")).unwrap();
     let dataset = Dataset::load(set.path(), &config.load_options()).unwrap();

@@ -1,4 +1,4 @@
-//! Datasets with few points: random ones beside them, and Gaussians at the depths that the first steps have found.
+//! Datasets with few points: random points are added, and Gaussians at the depths that the first steps found.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -14,7 +14,7 @@ use nightsplat::train::{DensityConfig, OnOff, Part, TrainConfig, Trainer};
 
 use crate::common::train::{advance, train};
 
-/// All the points, which lie on the surfaces, and the set with so many of them.
+/// All points, which are on the surfaces, and a dataset with `points` of them.
 fn dataset(points: usize) -> (Vec<DVec3>, Dataset) {
     let mut dataset = crate::common::train::dataset(9, [64, 48]);
     let all = dataset.points.iter().map(|point| point.position).collect();
@@ -23,7 +23,7 @@ fn dataset(points: usize) -> (Vec<DVec3>, Dataset) {
     (all, dataset)
 }
 
-/// The first of two rounds fills.
+/// The first of two rounds of density control seeds Gaussians by depth.
 fn config() -> TrainConfig {
     let mut config = TrainConfig { steps: 60, ..TrainConfig::bare() };
     config.schedule.densify_after = 8;
@@ -32,7 +32,7 @@ fn config() -> TrainConfig {
     config
 }
 
-/// How far a Gaussian is from the nearest of `points`, in the mean.
+/// The mean distance of Gaussians from the nearest of `points`.
 fn distance(gaussians: impl Iterator<Item = DVec3>, points: &[DVec3]) -> f64 {
     let nearest =
         |mean: DVec3| points.iter().map(|point| point.distance(mean)).fold(f64::INFINITY, f64::min);
@@ -45,10 +45,10 @@ fn means(gaussians: &Gaussians) -> impl Iterator<Item = DVec3> {
 }
 
 #[test]
-fn few_points_become_as_many_gaussians_as_asked_for_nearer_to_the_surfaces_than_random_ones() {
+fn depth_seeding_adds_the_requested_gaussians_closer_to_the_surfaces_than_random_ones() {
     let (surface, dataset) = dataset(20);
     let mut trainer = Trainer::new(&gpu(), config(), &dataset).unwrap();
-    // A tenth, with random ones beside the twenty.
+    // A tenth, with random points added to the twenty.
     assert_eq!(trainer.gaussian_count(), 30);
     let first = trainer.gaussians().unwrap();
     let estimate = trainer.memory_estimate().unwrap();
@@ -66,7 +66,7 @@ fn few_points_become_as_many_gaussians_as_asked_for_nearer_to_the_surfaces_than_
 }
 
 #[test]
-fn the_views_are_shown_better_after_as_many_steps() {
+fn scores_are_better_after_the_same_number_of_steps() {
     let (_, dataset) = dataset(20);
     let loss = |fill| {
         let mut config = config();
@@ -79,7 +79,7 @@ fn the_views_are_shown_better_after_as_many_steps() {
 }
 
 #[test]
-fn many_points_the_papers_control_and_a_setting_of_zero_change_nothing() {
+fn there_is_no_seeding_with_many_points_the_papers_control_or_a_setting_of_zero() {
     let with = |fill: usize, density: DensityConfig, points: usize| {
         let config = TrainConfig {
             steps: 40,
@@ -96,13 +96,13 @@ fn many_points_the_papers_control_and_a_setting_of_zero_change_nothing() {
 }
 
 #[test]
-fn small_views_have_a_gaussian_for_eight_of_their_pixels_at_most() {
+fn small_views_have_at_most_one_gaussian_for_eight_pixels() {
     let mut config = TrainConfig { steps: 40, ..config() };
     config.density.depth_seeding = 5_000;
     let mut trainer = Trainer::new(&gpu(), config, &dataset(20).1).unwrap();
     assert_eq!(trainer.gaussian_count(), 500);
     advance(&mut trainer, 20);
-    // There are more already: the round is one like others.
+    // There are already more: the round is an ordinary one.
     assert!(trainer.gaussian_count() < 1000);
     let config = TrainConfig {
         density: DensityConfig { depth_seeding: 1000, ..DensityConfig::default() },
@@ -115,7 +115,7 @@ fn small_views_have_a_gaussian_for_eight_of_their_pixels_at_most() {
 }
 
 #[test]
-fn growth_stops_at_the_most_gaussians_there_as_everywhere() {
+fn seeding_stops_at_the_maximum_number_of_gaussians() {
     for (most, expected) in [(150, 150), (50, 50), (1, 1)] {
         let config = TrainConfig { max_gaussians: most, steps: 40, ..config() };
         let mut trainer = Trainer::new(&gpu(), config, &dataset(20).1).unwrap();
@@ -125,7 +125,7 @@ fn growth_stops_at_the_most_gaussians_there_as_everywhere() {
 }
 
 #[test]
-fn a_training_of_every_part_fills_to_the_same_bits_however_it_is_submitted_and_interrupted() {
+fn seeding_with_every_part_gives_the_same_bits_however_steps_are_submitted_and_interrupted() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = dataset(12).1;
     for parts in [&[][..], &[Part::Structure, Part::Denoiser]] {
@@ -161,7 +161,7 @@ fn a_training_of_every_part_fills_to_the_same_bits_however_it_is_submitted_and_i
 }
 
 #[test]
-fn what_a_mask_hides_fills_nothing() {
+fn masked_pixels_seed_no_gaussians() {
     let hidden = |color: [f32; 3]| {
         let mut dataset = dataset(20).1;
         for view in &mut dataset.views {

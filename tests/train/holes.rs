@@ -1,4 +1,4 @@
-//! Holes that black hides: a dark object before a dark room needs no Gaussians before a black background.
+//! Holes that black hides: a dark object in a dark room needs no Gaussians over a black background.
 
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
@@ -25,9 +25,10 @@ use crate::common::train::{advance, train};
 const SET: SyntheticOptions =
     SyntheticOptions { views: 12, width: 64, height: 48, seed: 1, fisheye: false };
 
-/// What a lamp lights of the room stays; the rest, objects before walls, is black, and no point is found there.
+/// A room lit by one lamp: everything outside its light, including objects in front of walls, is black and has no
+/// points.
 fn dark_room() -> tempfile::TempDir {
-    /// Where the mean of the channels is less, nothing is left.
+    /// Pixels whose channel mean is below this become black.
     const DARK: f32 = 0.5;
     let folder = tempfile::tempdir().unwrap();
     synthetic::write_captured(folder.path(), &SET, &Capture::clean()).unwrap();
@@ -51,7 +52,7 @@ fn dark_room() -> tempfile::TempDir {
     folder
 }
 
-/// Makes the points of the COLMAP model black, and leaves those out that are not kept.
+/// Makes the points of the COLMAP model black and removes those for which `keeps` is false.
 fn rewrite_points(folder: &Path, keeps: impl Fn(DVec3) -> bool) {
     let file = folder.join("colmap_sparse/0/points3D.txt");
     let mut text = String::new();
@@ -71,14 +72,14 @@ fn load(folder: &Path) -> Dataset {
     Dataset::load(folder, &TrainConfig::bare().load_options()).unwrap()
 }
 
-/// What a dark room is trained with: no curve lifts its black.
+/// The configuration for a dark room: no curve brightens its black.
 fn config(background: Background) -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::None);
     TrainConfig { steps: 200, background, tone, ..TrainConfig::bare() }
 }
 
-/// The mean leftover transmittances of the test views, and what is said of them.
-fn left_over(background: Background, dataset: &Dataset) -> (Vec<f64>, Option<String>) {
+/// The mean residual transmittances of the test views, and the warning about them.
+fn residuals(background: Background, dataset: &Dataset) -> (Vec<f64>, Option<String>) {
     let config = config(background);
     let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
     advance(&mut trainer, config.steps);
@@ -90,20 +91,20 @@ fn left_over(background: Background, dataset: &Dataset) -> (Vec<f64>, Option<Str
 }
 
 #[test]
-fn a_dark_room_is_hollow_before_black_which_is_said_and_whole_before_random_colours() {
+fn a_dark_room_has_reported_holes_over_black_and_none_over_random_colours() {
     let folder = dark_room();
     let dataset = load(folder.path());
-    let (hollow, warning) = left_over(Background::Black, &dataset);
+    let (hollow, warning) = residuals(Background::Black, &dataset);
     assert!(hollow.iter().all(|&mean| mean > 1.5 * MAX_RESIDUAL_TRANSMITTANCE), "{hollow:?}");
     let warning = warning.unwrap();
     assert!(warning.contains("in 2 of 2 views") && warning.contains("--background random"));
-    let (whole, warning) = left_over(Background::Random, &dataset);
+    let (whole, warning) = residuals(Background::Random, &dataset);
     assert!(whole.iter().all(|&mean| mean < 0.2 * MAX_RESIDUAL_TRANSMITTANCE), "{whole:?}");
     assert_eq!(warning, None);
 }
 
 #[test]
-fn a_black_point_cloud_trains_to_what_a_grey_one_does() {
+fn a_black_point_cloud_trains_as_well_as_a_grey_one() {
     let folder = tempfile::tempdir().unwrap();
     synthetic::write(folder.path(), &SET).unwrap();
     let config = TrainConfig { steps: 30, ..TrainConfig::bare() };
@@ -114,7 +115,7 @@ fn a_black_point_cloud_trains_to_what_a_grey_one_does() {
 }
 
 #[test]
-fn what_a_mask_hides_is_no_hole() {
+fn masked_pixels_are_not_holes() {
     let folder = dark_room();
     let dataset = load(folder.path());
     let mut trainer = Trainer::new(&gpu(), config(Background::Black), &dataset).unwrap();
@@ -131,12 +132,12 @@ fn what_a_mask_hides_is_no_hole() {
     assert!(masked(&[]).unwrap().q99 > 0.9, "{:?}", masked(&[]));
     assert!(masked(&empty).unwrap().q99 <= 0.5 && masked(&covered).unwrap().mean > 0.5);
     assert_eq!(masked(&[empty, covered].concat()), None);
-    // A picture that no Gaussian made has none.
+    // An image that was not rendered from Gaussians has none.
     assert_eq!(ResidualTransmittance::of(&rendered.colors.clone().into(), view), None);
 }
 
 #[test]
-fn a_denoiser_and_patches_leave_the_transmittances_as_they_are() {
+fn a_denoiser_and_patches_do_not_change_the_transmittances() {
     let dataset = crate::common::train::dataset(8, [64, 48]);
     let mut config = TrainConfig { patch_pixels: Some(1000), ..TrainConfig::bare() };
     config.model.set_parts(&[Part::Denoiser]);
@@ -154,7 +155,7 @@ fn a_denoiser_and_patches_leave_the_transmittances_as_they_are() {
 }
 
 #[test]
-fn holes_are_said_by_train_eval_and_diagnose() {
+fn holes_are_reported_by_train_eval_and_diagnose() {
     let folder = dark_room();
     let set = folder.path().display();
     let run = format!("{set}/run");
@@ -179,7 +180,7 @@ fn holes_are_said_by_train_eval_and_diagnose() {
         assert!(table.contains(part), "no {part} in {table}");
     }
 
-    // Where no view is held out, training views are looked at.
+    // If no view is held out, training views are measured.
     let all = format!("train {set} --out {set}/all --test-every 0 {short}");
     let (_, warned) = command::run(&all, 0);
     assert!(warning(&warned) == 1 && warned.contains("of 6 views"), "{warned}");
@@ -191,5 +192,5 @@ fn holes_are_said_by_train_eval_and_diagnose() {
     let views = json["residual_transmittance"].as_object().unwrap();
     assert_eq!(views.len(), SET.views);
     assert_eq!(of(&views["000"]), of(&residual_transmittance["views"]["000"]));
-    assert!(!succeed(&format!("diagnose {set} --json")).contains("leftover"));
+    assert!(!succeed(&format!("diagnose {set} --json")).contains("residual_transmittance"));
 }

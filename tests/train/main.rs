@@ -1,4 +1,4 @@
-//! Training: one step after another, resumed, masked, patched, in fewer bits.
+//! Training: step by step, resumed, masked, in patches, in fewer bits.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 

@@ -1,4 +1,4 @@
-//! The parts of LITA-GS: each alone and all together, trained, saved, and shown.
+//! The parts of LITA-GS: each alone and all together, trained, saved, and rendered.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -19,7 +19,7 @@ use nightsplat::train::{Part, Rendered, StepReport, TrainConfig, Trainer};
 use crate::common::command::{refused, succeed};
 use crate::common::train::train;
 
-/// Six views of 40 x 30 pixels, with depth maps where asked.
+/// Six views of 40 x 30 pixels, with depth maps if requested.
 fn make_set(folder: &Path, with_depth: bool) {
     let options = SyntheticOptions {
         views: 6,
@@ -32,7 +32,7 @@ fn make_set(folder: &Path, with_depth: bool) {
     if with_depth {
         let depth = folder.join("depth");
         std::fs::create_dir(&depth).unwrap();
-        // Of half the size, as estimators give it; a plane that recedes upwards.
+        // Half the size, as estimators return it; a plane that recedes upwards.
         let map = Image::from_fn(20, 15, |x, y| [1.0 - (y as f32 + 0.1 * x as f32) / 20.0; 3]);
         for file in std::fs::read_dir(folder.join("low")).unwrap() {
             let name = file.unwrap().path().file_stem().unwrap().to_str().unwrap().to_owned();
@@ -90,7 +90,7 @@ fn each_part_alone_has_its_channels_and_its_terms_fall() {
     }
 }
 
-/// As the paper has it, but for the size of the networks and how fast they learn.
+/// The paper's configuration, except for the size and the learning rate of the networks.
 fn paper(parts: &[Part]) -> TrainConfig {
     let mut config = config(parts);
     let (network, rates) = (config.model.network, config.model.rates);
@@ -113,16 +113,16 @@ fn the_paper_s_denoiser_has_a_noise_map_and_its_terms_fall() {
     }
 }
 
-/// What a model shows of the first test view before it has trained.
+/// A model's render of the first test view before training.
 fn first_render(config: &TrainConfig, dataset: &Dataset) -> Rendered {
-    // Tiles of another size add up in another order.
+    // Tiles of another size sum in another order.
     let config = TrainConfig { tile: Some([8, 8].into()), ..config.clone() };
     let camera = dataset.test_views().next().unwrap().camera;
     Trainer::new(&gpu(), config, dataset).unwrap().render(&camera).unwrap()
 }
 
 #[test]
-fn with_every_part_a_model_begins_as_the_plain_one_bit_for_bit() {
+fn with_every_part_a_model_starts_as_the_plain_one_bit_for_bit() {
     let folder = tempfile::tempdir().unwrap();
     make_set(folder.path(), true);
     let dataset = load(folder.path(), &config(&Part::ALL));
@@ -136,7 +136,7 @@ fn with_every_part_a_model_begins_as_the_plain_one_bit_for_bit() {
 }
 
 #[test]
-fn what_a_denoiser_learns_leaves_every_gaussian_as_it_would_be_without_one() {
+fn a_denoiser_that_learns_does_not_change_any_gaussian() {
     let folder = tempfile::tempdir().unwrap();
     make_set(folder.path(), false);
     let plain = config(&[]);
@@ -151,9 +151,9 @@ fn what_a_denoiser_learns_leaves_every_gaussian_as_it_would_be_without_one() {
     }
 }
 
-/// The light that the dark photographs show is where the tonemapper begins: it has little to pull at.
+/// The tonemapper starts with the illumination of the dark photographs, so its loss starts small.
 #[test]
-fn the_illumination_begins_as_what_the_photographs_make_of_their_targets() {
+fn the_illumination_is_initialised_from_the_photographs_and_their_targets() {
     let folder = tempfile::tempdir().unwrap();
     make_set(folder.path(), false);
     let first = |config: &TrainConfig| {
@@ -162,7 +162,7 @@ fn the_illumination_begins_as_what_the_photographs_make_of_their_targets() {
     };
     let parts = [Part::Tonemapper];
     let (own, of_paper) = (first(&config(&parts)), first(&paper(&parts)));
-    assert!(own < of_paper, "{own} against {of_paper}");
+    assert!(own < of_paper, "{own}, and {of_paper} in the paper");
 }
 
 #[test]
@@ -182,7 +182,7 @@ fn the_whole_model_gives_the_same_bits_every_time_on_crops_too() {
 
 /// A crop that covers the view is the view: the estimate becomes the mean itself.
 #[test]
-fn a_crop_of_everything_is_no_crop() {
+fn a_crop_of_the_whole_view_changes_nothing() {
     let folder = tempfile::tempdir().unwrap();
     make_set(folder.path(), false);
     let parts = [Part::Denoiser, Part::Tonemapper];
@@ -193,8 +193,8 @@ fn a_crop_of_everything_is_no_crop() {
     assert_eq!(train(&whole, &dataset).1, train(&cropped, &dataset).1);
 }
 
-/// The terms are means over pixels, so crops come to the whole view's on average. Nothing is learned: each step is compared
-/// with the same step of the same weights.
+/// The terms are means over pixels, so crops are unbiased estimates of the whole view. Nothing is learned: each step is
+/// compared with the same step with the same weights.
 #[test]
 fn crops_estimate_the_losses_of_the_whole_view() {
     const NO_RATE: f64 = 1e-12;
@@ -222,7 +222,7 @@ fn crops_estimate_the_losses_of_the_whole_view() {
 }
 
 #[test]
-fn depth_maps_are_found_resized_negated_and_left_out_where_they_say_nothing() {
+fn depth_maps_are_found_resized_negated_and_left_out_if_they_are_constant() {
     let folder = tempfile::tempdir().unwrap();
     make_set(folder.path(), true);
     let mut config = config(&[Part::Depth]);
@@ -245,7 +245,7 @@ fn depth_maps_are_found_resized_negated_and_left_out_where_they_say_nothing() {
     let dataset = load(folder.path(), &config);
     let with_depth = dataset.train_views().filter(|view| view.depth.is_some()).count();
     assert_eq!(with_depth, views.len() - 1);
-    // Trains on: the view without depth leaves the term out.
+    // Training works: the view without depth omits the term.
     let (reports, _) = train(&TrainConfig { steps: 10, ..config.clone() }, &dataset);
     for report in &reports {
         assert_eq!((report.term(Term::DEPTH) == 0.0), report.view == *name, "{report:?}");
@@ -311,7 +311,7 @@ const SMALL: &str =
     "--steps 12 --sh-degree 0 --denoiser-channels 4 --denoiser-stages 1 --denoiser-repeats 2";
 
 #[test]
-fn a_run_with_networks_is_saved_scored_and_shown_layer_by_layer() {
+fn a_run_with_networks_is_saved_scored_and_rendered_layer_by_layer() {
     let folder = tempfile::tempdir().unwrap();
     let set = folder.path().join("set");
     make_set(&set, true);
@@ -355,7 +355,7 @@ fn a_run_with_networks_is_saved_scored_and_shown_layer_by_layer() {
 }
 
 #[test]
-fn a_layer_that_the_model_lacks_is_named_with_those_it_has() {
+fn a_missing_layer_is_named_with_the_available_ones() {
     let folder = tempfile::tempdir().unwrap();
     let set = folder.path().join("set");
     make_set(&set, false);
@@ -372,12 +372,13 @@ fn a_layer_that_the_model_lacks_is_named_with_those_it_has() {
     refused(&format!("eval {at}"), 3, &["networks.safetensors"]);
     let of_paper = with_denoiser.replace("variant = \"identity\"", "variant = \"paper\"");
     std::fs::write(&config, of_paper).unwrap();
-    refused(&format!("eval {at}"), 2, &["no noise, which the denoiser takes"]);
+    refused(&format!("eval {at}"), 2, &["no noise, which the denoiser requires"]);
 }
 
-/// Without depth maps there is no depth channel, so that the others lie elsewhere than the configuration would have them.
+/// Without depth maps there is no depth channel, so the other channels are at other positions than the configuration
+/// implies.
 #[test]
-fn a_model_without_the_depth_it_asked_for_scores_the_same_afterwards() {
+fn a_model_configured_with_unavailable_depth_scores_the_same_when_reloaded() {
     let folder = tempfile::tempdir().unwrap();
     let (set, run) = (folder.path().join("set"), folder.path().join("run"));
     make_set(&set, false);
@@ -410,7 +411,7 @@ fn a_sweep_of_parts_trains_every_model_and_leaves_pages() {
 }
 
 #[test]
-fn a_sweep_of_parts_leaves_out_the_depth_that_the_dataset_has_not() {
+fn a_sweep_of_parts_leaves_out_depth_if_the_dataset_has_none() {
     let folder = tempfile::tempdir().unwrap();
     let set = folder.path().join("set");
     make_set(&set, false);
@@ -421,7 +422,7 @@ fn a_sweep_of_parts_leaves_out_the_depth_that_the_dataset_has_not() {
 }
 
 #[test]
-fn a_preset_sets_what_the_paper_states_and_options_win() {
+fn a_preset_sets_the_paper_s_values_and_options_override_it() {
     let folder = tempfile::tempdir().unwrap();
     let set = folder.path().join("shrub");
     make_set(&set, false);

@@ -1,4 +1,4 @@
-//! Views that are too large to be taken at once are rendered and trained on patch by patch, and show the same.
+//! Views too large for one pass are rendered and trained on in patches, with the same result.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -21,7 +21,7 @@ use crate::common::place::Place;
 use crate::common::setup::{Setup, features};
 use crate::common::train::advance;
 
-/// Gaussians of every kind in a view that parts into patches; some are far beside it.
+/// Gaussians of every kind in a view of several patches; some are far outside it.
 fn setup(patch_pixels: Option<u64>) -> Setup {
     let shape = nightsplat::splats::scene::Shape { sh_degree: 2, features: features(5) };
     let mut setup = Setup::new(400, [83, 57], shape, 3);
@@ -48,14 +48,14 @@ fn patches_show_what_the_whole_view_shows() {
         let shown = renderer.render_planes(&gaussians, &setup.camera, &setup.options).unwrap();
         assert_eq!(shown.len(), (setup.channels() + 1) * setup.pixels());
         let errors = shown.iter().zip(&expected).map(|(shown, whole)| (shown - whole).abs());
-        // A splat may be just above the least alpha in one, and just below in the other.
+        // A splat may be just above the minimum alpha in one and just below it in the other.
         let far = errors.clone().filter(|&error| error > 1e-4).count();
         assert!(far * 1000 <= shown.len(), "{far} of {}", shown.len());
         assert!(errors.fold(0.0, f32::max) < 0.02);
     }
 }
 
-/// The gradients of the parameters, and what density control is told, of a loss per pixel of each patch.
+/// The gradients of the parameters and the statistics for density control, with a loss for each pixel of each patch.
 fn gradients(setup: &Setup, weights: &[f32]) -> [Vec<f32>; 3] {
     let (gpu, mut renderer) = (gpu(), renderer(setup));
     let gaussians = setup.upload();
@@ -112,7 +112,7 @@ fn the_gradients_of_the_patches_add_up_to_that_of_the_view() {
             assert!(error <= 2e-3 * largest, "{i}: {} instead of {}", sums[i], expected[i]);
         }
     }
-    // What is seen in one patch alone counts for density control as in the whole view.
+    // A Gaussian visible in one patch only counts for density control as in the whole view.
     let alone = (0..whole.count).filter(|&i| own_visits[i] == 1.0 && visits[i] == 1.0);
     let alone: Vec<usize> = alone.collect();
     assert!(alone.len() > whole.count / 4);
@@ -136,7 +136,7 @@ fn config(patch_pixels: Option<u64>) -> TrainConfig {
 }
 
 #[test]
-fn training_begins_alike_and_sees_every_patch_of_every_photograph_in_turn() {
+fn training_starts_as_with_whole_views_and_uses_every_patch_of_every_photograph_in_turn() {
     let dataset = dataset();
     let whole = Trainer::new(&gpu(), config(None), &dataset).unwrap();
     let mut trainer = Trainer::new(&gpu(), config(Some(800)), &dataset).unwrap();
@@ -150,7 +150,7 @@ fn training_begins_alike_and_sees_every_patch_of_every_photograph_in_turn() {
     for view in dataset.train_views() {
         assert_eq!(reports.iter().filter(|report| report.view == view.name).count(), 4);
     }
-    // As good as the whole views make it, behind as many pixels.
+    // As good as with whole views, after as many pixels.
     let psnr = |config: TrainConfig| {
         let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
         advance(&mut trainer, config.steps);
@@ -195,7 +195,7 @@ fn every_part_of_the_model_trains_on_patches_and_two_runs_have_the_same_bits() {
 }
 
 #[test]
-fn a_denoiser_sees_around_each_patch() {
+fn a_denoiser_reads_around_each_patch() {
     let dataset = dataset();
     let mut config = TrainConfig { steps: 20, ..config(None) };
     config.model.set_parts(&[Part::Denoiser]);
@@ -220,13 +220,13 @@ fn a_denoiser_sees_around_each_patch() {
     assert!(largest(&whole.colors, &patches.colors) < 1e-3);
     let [whole, patches] = [&whole, &patches].map(|shown| shown.denoised.as_ref().unwrap());
     assert!(largest(whole, &dataset.views[0].image.clone().unwrap()) > 0.1);
-    // The norms look at each patch.
+    // The norms are computed per patch.
     let error = largest(whole, patches);
     assert!(error < 0.1, "{error}");
 }
 
 #[test]
-fn a_run_on_patches_says_so_is_resumed_to_the_same_bits_and_scored() {
+fn a_run_on_patches_is_reported_resumed_to_the_same_bits_and_scored() {
     let place = Place::new();
     let output =
         command(&place.train("straight", "--steps 30 --patch-pixels 600")).output().unwrap();
@@ -253,7 +253,7 @@ fn a_run_on_patches_says_so_is_resumed_to_the_same_bits_and_scored() {
     assert!(!fs::exists(place.path("few")).unwrap());
 }
 
-/// So many Gaussians that each cover a view of this size.
+/// `count` Gaussians that each cover a view of this size.
 fn covering(count: usize, size: [u32; 2]) -> Setup {
     let mut setup = Setup::new(count, size, 0, 4);
     for i in 0..count {
@@ -287,7 +287,7 @@ fn more_intersections_than_the_device_binds_are_rendered_in_halves() {
 }
 
 #[test]
-fn training_takes_patches_of_which_the_device_follows_every_intersection() {
+fn training_uses_patches_whose_intersections_the_device_can_process() {
     let own = covering(300, [1440, 1280]);
     if renderer(&own).max_intersections() > 1 << 22 {
         eprintln!("not run: this device binds more intersections at once");
@@ -306,7 +306,7 @@ fn training_takes_patches_of_which_the_device_follows_every_intersection() {
     config.frame = Some(TrainingFrame::WORLD);
     config.schedule.resolution_steps = [0, 0];
     let mut trainer = Trainer::from_gaussians(&gpu(), config, &dataset, &gaussians).unwrap();
-    // Four quarters of each, with room for twice the intersections.
+    // Four quarters of each view, with room for twice the intersections.
     let reports = advance(&mut trainer, 8);
     for name in ["a", "b"] {
         assert_eq!(reports.iter().filter(|report| report.view == name).count(), 4);

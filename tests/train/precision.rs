@@ -1,4 +1,4 @@
-//! Runs that keep things in fewer bits: exact ones are the same run, the others are near it.
+//! Runs that store data in fewer bits: exact formats give the same run, the others a close one.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -10,7 +10,7 @@ use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::train::{PhotographBits, PrecisionConfig, TrainConfig, Trainer};
 
-/// The device is shared, and so is the peak of its memory: one test at a time.
+/// The device and the peak of its memory are shared: one test at a time.
 fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
@@ -21,7 +21,7 @@ fn config(tone: ToneSettings, photographs: PhotographBits) -> TrainConfig {
     TrainConfig { steps: 4, sh_degree: 0, tone, precision, ..TrainConfig::bare() }
 }
 
-/// The losses of the steps and the parameters after them, and the peak of the memory.
+/// The losses of the steps, the resulting parameters, and the peak of the memory.
 fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<f64>, Vec<f32>, u64) {
     static OWN: OnceLock<Gpu> = OnceLock::new();
     let gpu = OWN.get_or_init(crate::common::own_gpu);
@@ -32,9 +32,9 @@ fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<f64>, Vec<f32>, u64) {
     (losses, trainer.gaussians().unwrap().parameters, gpu.peak_memory())
 }
 
-/// With and without networks, with the curve in the loss and with targets that are made once, whole views and small ones.
+/// With and without networks, with the curve in the loss and with precomputed targets, whole views and small ones.
 #[test]
-fn photographs_in_as_few_bits_as_are_exact_train_to_the_same_bits_in_less_memory() {
+fn photographs_in_the_fewest_exact_bits_train_to_the_same_bits_in_less_memory() {
     let _alone = alone();
     let dataset = crate::common::train::dataset(4, [96, 72]);
     for (tone, parts, is_smaller) in [
@@ -57,7 +57,7 @@ fn photographs_in_as_few_bits_as_are_exact_train_to_the_same_bits_in_less_memory
 }
 
 #[test]
-fn photographs_in_fewer_bits_than_are_exact_train_to_nearly_the_same_losses() {
+fn photographs_in_fewer_bits_train_to_nearly_the_same_losses() {
     let _alone = alone();
     let dataset = crate::common::train::dataset(6, [160, 120]);
     let run = |bits| train(&config(ToneSettings::default(), bits), &dataset);
@@ -85,7 +85,7 @@ fn a_step_on_coded_photographs_agrees_with_the_references() {
 }
 
 #[test]
-fn the_bits_are_a_setting_like_any_other() {
+fn the_bits_are_an_ordinary_setting() {
     let with = |assignment: &str| TrainConfig::bare().with(&[assignment.to_owned()]);
     for (text, bits) in [
         ("exact", PhotographBits::Exact),

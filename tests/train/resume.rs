@@ -1,4 +1,4 @@
-//! Runs that are interrupted and go on.
+//! Interrupted runs that are resumed.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -21,7 +21,7 @@ use serde_json::Value;
 use crate::common::command::{command, refused, succeed};
 use crate::common::train::advance;
 
-/// A set of nine small views.
+/// A dataset of nine small views.
 fn make_set(folder: &Path) {
     let options = SyntheticOptions {
         views: 9,
@@ -33,7 +33,7 @@ fn make_set(folder: &Path) {
     synthetic::write(folder, &options).unwrap();
 }
 
-/// Density control acts after steps 10 and 20 of thirty.
+/// Density control runs after steps 10 and 20 of thirty.
 fn config(parts: &[Part]) -> TrainConfig {
     let mut config =
         TrainConfig { steps: 30, background: Background::Random, ..TrainConfig::bare() };
@@ -48,7 +48,7 @@ fn config(parts: &[Part]) -> TrainConfig {
     config
 }
 
-/// The whole state at the end, and what every step said.
+/// The complete state at the end, and the report of every step.
 fn finished(trainer: &mut Trainer, folder: &Path) -> (Vec<u8>, Vec<StepReport>) {
     let reports = advance(trainer, 30);
     let path = folder.join("end.safetensors");
@@ -57,7 +57,7 @@ fn finished(trainer: &mut Trainer, folder: &Path) -> (Vec<u8>, Vec<StepReport>) 
 }
 
 #[test]
-fn a_restored_run_goes_on_bit_for_bit() {
+fn a_restored_run_continues_bit_for_bit() {
     let folder = tempfile::tempdir().unwrap();
     make_set(folder.path());
     let gpu = gpu();
@@ -66,14 +66,14 @@ fn a_restored_run_goes_on_bit_for_bit() {
         let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
         let new = || Trainer::new(&gpu, config.clone(), &dataset).unwrap();
         let (expected, all) = finished(&mut new(), folder.path());
-        // Between passes of density control, right behind one, and before the first.
+        // Between passes of density control, right after one, and before the first.
         for step in [17, 20, 3] {
             let checkpoint = folder.path().join("checkpoint.safetensors");
             let mut interrupted = new();
             advance(&mut interrupted, step);
             interrupted.save_checkpoint(&checkpoint).unwrap();
             let mut restored = new();
-            // Whatever the trainer did before is gone.
+            // The trainer's previous state is discarded.
             advance(&mut restored, 12);
             restored.restore(&checkpoint).unwrap();
             assert_eq!(restored.steps_done(), step);
@@ -86,11 +86,11 @@ fn a_restored_run_goes_on_bit_for_bit() {
     }
 }
 
-/// What can never be gained ends both as soon as it is asked for.
+/// No gain is enough: both end at the first check.
 #[test]
-fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resumed_run_knows_it() {
+fn growth_and_the_sh_degree_stop_if_held_out_views_gain_too_little_and_stay_so_after_a_resume() {
     let folder = tempfile::tempdir().unwrap();
-    // So many that one can be held out.
+    // Enough views to hold one out.
     let options = SyntheticOptions {
         views: 12,
         width: 40,
@@ -110,7 +110,7 @@ fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resum
     let new = |config: &TrainConfig| Trainer::new(&gpu, config.clone(), &dataset).unwrap();
     let [mut freely, mut ended] = [new(&free), new(&ending)];
     finished(&mut freely, folder.path());
-    // Rounds after steps 6, 9, 12, 15 and 18; the first degree has been in use from step 8 to 15.
+    // Rounds after steps 6, 9, 12, 15 and 18; SH degree 1 is in use from step 8 to 15.
     advance(&mut ended, 18);
     let count = ended.gaussian_count();
     let (expected, _) = finished(&mut ended, folder.path());
@@ -130,7 +130,7 @@ fn growth_and_the_sh_degree_end_where_held_out_views_gain_too_little_and_a_resum
     }
 }
 
-/// A set of which one view is held out, and a run on it that converges as soon as it can: what is gained is never enough.
+/// A dataset with one held-out view, and a run on it that converges as early as possible: no gain is enough.
 fn early(folder: &Path) -> (Dataset, TrainConfig) {
     let options = SyntheticOptions {
         views: 12,
@@ -158,14 +158,14 @@ fn ended(trainer: &mut Trainer, folder: &Path) -> Vec<u8> {
 }
 
 #[test]
-fn a_run_that_converges_settles_and_ends_and_so_does_one_that_was_killed() {
+fn a_run_that_converges_settles_and_ends_and_so_does_one_that_is_killed_and_resumed() {
     let folder = tempfile::tempdir().unwrap();
     let (dataset, config) = early(folder.path());
     let new = || Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
     let mut whole = new();
     assert!(whole.may_end_early());
     let expected = ended(&mut whole, folder.path());
-    // Rounds follow steps 10 and 20. Scores that fall in the ten steps after one wait for the end of these.
+    // Rounds follow steps 10 and 20. A score that drops within ten steps of a round waits until they are over.
     let steps: Vec<u64> = whole.held_out_scores().map(|(step, _)| step).collect();
     assert_eq!(steps, [7, 20, 30, 39]);
     assert_eq!(
@@ -178,7 +178,7 @@ fn a_run_that_converges_settles_and_ends_and_so_does_one_that_was_killed() {
     assert!(refused.contains("has ended at step 39, before step 60"), "{refused}");
     let end = whole.end().unwrap();
     assert_eq!((end.reason, end.step), (EndReason::Converged, 39));
-    // In growth, after a score, at the step that converges, and while it settles.
+    // During growth, after a score, at convergence, and while it settles.
     for step in [5, 20, 25, 30, 34] {
         let checkpoint = folder.path().join("checkpoint.safetensors");
         let mut interrupted = new();
@@ -192,7 +192,7 @@ fn a_run_that_converges_settles_and_ends_and_so_does_one_that_was_killed() {
 }
 
 #[test]
-fn a_run_that_is_resumed_with_other_steps_takes_them_all() {
+fn a_run_that_is_resumed_with_other_steps_runs_all_of_them() {
     let folder = tempfile::tempdir().unwrap();
     let (dataset, config) = early(folder.path());
     let checkpoint = folder.path().join("end.safetensors");
@@ -263,7 +263,7 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
     refuses(&mut shorter, &whole, &["at step 6", "ends at 5", "raise steps"]);
 }
 
-/// A checkpoint with another text of its configuration, without the checksum of its own.
+/// A checkpoint with an edited configuration text and without its own checksum.
 fn with_config(checkpoint: &[u8], edit: impl Fn(&str) -> String) -> Vec<u8> {
     let (length, rest) = checkpoint.split_first_chunk().unwrap();
     let (head, tensors) = rest.split_at(u64::from_le_bytes(*length) as usize);
@@ -304,7 +304,7 @@ fn a_checkpoint_with_former_names_of_settings_is_restored() {
 }
 
 #[test]
-fn a_run_tells_its_observer_everything_in_order() {
+fn a_run_reports_every_event_to_its_observer_in_order() {
     let folder = tempfile::tempdir().unwrap();
     make_set(&folder.path().join("set"));
     let config = TrainConfig { eval_every: 12, checkpoint_every: 20, ..config(&[]) };
@@ -337,7 +337,7 @@ fn a_run_tells_its_observer_everything_in_order() {
     assert_eq!((steps.unwrap(), told), (30, expected));
 
     let (refused, told) = train(&config, IfExists::Refuse);
-    assert!(refused.unwrap_err().to_string().contains("already holds a run") && told.is_empty());
+    assert!(refused.unwrap_err().to_string().contains("already contains a run") && told.is_empty());
     let (steps, told) = train(&TrainConfig { steps: 33, ..config }, IfExists::Resume);
     assert_eq!((steps.unwrap(), told[0].as_str()), (3, "started 30 of 33"));
 }
@@ -360,7 +360,7 @@ fn a_killed_run_is_resumed_to_the_same_model() {
     let (straight, killed) = (path("straight"), path("killed"));
     succeed(&train(&straight, "--steps 200"));
 
-    // Without a checkpoint it begins; killed at some step behind one, it goes on.
+    // Without a checkpoint it starts over; killed at some step after one, it resumes.
     let mut child = command(&train(&killed, "--steps 200 --resume"));
     let mut child = child.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let checkpoint = killed.join("checkpoint.safetensors");
@@ -375,7 +375,7 @@ fn a_killed_run_is_resumed_to_the_same_model() {
     assert!(model(&killed) == model(&straight));
     assert_eq!(log(&killed), log(&straight));
 
-    // A finished run is made longer; what it had written of its end is replaced.
+    // A finished run is extended; the files of its previous end are replaced.
     succeed(&train(&killed, "--steps 203 --resume"));
     assert_eq!(log(&killed).len(), 204);
     assert!(model(&killed) != model(&straight));
@@ -387,5 +387,5 @@ fn a_killed_run_is_resumed_to_the_same_model() {
     refused(&train(&killed, "--steps 300 --resume"), 3, &["train.csv", "step 203"]);
     fs::remove_file(&checkpoint).unwrap();
     fs::remove_file(killed.join("checkpoint.before.safetensors")).unwrap();
-    refused(&train(&killed, "--steps 300 --resume"), 1, &["already holds a run", "--overwrite"]);
+    refused(&train(&killed, "--steps 300 --resume"), 1, &["already contains a run", "--overwrite"]);
 }

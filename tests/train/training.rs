@@ -25,7 +25,7 @@ fn dataset() -> Dataset {
     crate::common::train::dataset(10, [64, 48])
 }
 
-/// Density control acts twice within sixty steps.
+/// Density control runs twice within sixty steps.
 fn config() -> TrainConfig {
     let tone = ToneSettings::new(ToneCurve::Ap3);
     let mut config = TrainConfig { steps: 60, tone, ..TrainConfig::bare() };
@@ -45,7 +45,7 @@ fn mean_psnr(dataset: &Dataset, gaussians: &Gaussians) -> f64 {
 }
 
 #[test]
-fn a_model_learns_to_show_the_scene_by_normal_light() {
+fn a_model_learns_to_show_the_scene_in_normal_light() {
     let dataset = dataset();
     let config = TrainConfig { steps: 200, ..config() };
     let (reports, gaussians) = train(&config, &dataset);
@@ -67,7 +67,7 @@ fn a_model_learns_to_show_the_scene_by_normal_light() {
 }
 
 #[test]
-fn a_round_of_density_control_leaves_the_scores_nearly_as_they_were() {
+fn a_round_of_density_control_hardly_changes_the_scores() {
     let dataset = dataset();
     let drop = |control: DensityControl| {
         let mut config = TrainConfig { steps: 400, ..config() };
@@ -79,7 +79,7 @@ fn a_round_of_density_control_leaves_the_scores_nearly_as_they_were() {
         let before = (trainer.gaussian_count(), mean_psnr(&dataset, &trainer.gaussians().unwrap()));
         advance(&mut trainer, 160);
         let after = (trainer.gaussian_count(), mean_psnr(&dataset, &trainer.gaussians().unwrap()));
-        assert!(4 * after.0 > 5 * before.0, "{before:?} {after:?}: hardly anything multiplied");
+        assert!(4 * after.0 > 5 * before.0, "{before:?} {after:?}: hardly anything was split");
         before.1 - after.1
     };
     let (conserving, paper) = (drop(DensityControl::Conserving), drop(DensityControl::Paper));
@@ -103,7 +103,7 @@ fn coarse_steps_come_first_and_repeat_bit_for_bit() {
 }
 
 #[test]
-fn the_same_seed_gives_the_same_bits_and_another_seed_others() {
+fn the_same_seed_gives_the_same_bits_and_another_seed_gives_others() {
     let dataset = dataset();
     let config = TrainConfig { background: Background::Random, ..config() };
     let (_, first) = train(&config, &dataset);
@@ -128,7 +128,7 @@ fn references_change_no_trained_bit() {
 }
 
 #[test]
-fn steps_that_outgrow_their_memory_are_redone_and_nothing_is_lost() {
+fn steps_that_outgrow_their_memory_are_repeated_without_loss() {
     let dataset = dataset();
     let config = TrainConfig { steps: 20, ..config() };
     let run = |reserved: u32, in_flight: usize| {
@@ -187,9 +187,9 @@ fn a_plain_step_is_at_most_24_dispatches_and_20_barriers() {
     }
 }
 
-/// The dispatches and the barriers of one step.
+/// The dispatches and barriers of one step.
 fn recorded_for_a_step(config: TrainConfig) -> [u64; 2] {
-    // A device of its own: others would count with it.
+    // A separate device: other tests would add to its counts.
     let (gpu, dataset) = (Gpu::new(&DeviceChoice::Best).unwrap(), dataset());
     let mut trainer = Trainer::new(&gpu, config, &dataset).unwrap();
     trainer.set_intersection_capacity(100_000).unwrap();
@@ -199,7 +199,7 @@ fn recorded_for_a_step(config: TrainConfig) -> [u64; 2] {
         assert_eq!(trainer.advance(until).unwrap().last().unwrap().step, until);
         [0, 1].map(|i| recorded(&gpu)[i] - before[i])
     };
-    // Each of the first steps begins a degree; what a submission costs is the same for two steps and for eight.
+    // Each of the first steps raises the SH degree; the cost of a submission is the same for two steps and for eight.
     for step in 1..=4 {
         recorded_in(step);
     }
@@ -221,7 +221,7 @@ fn twenty_five_trainings_give_the_same_bits() {
     }
 }
 
-/// Trains a few steps on views of one size, from the points there are.
+/// Trains a few steps on views of one size, starting from `points` points.
 fn train_on(size: [u32; 2], points: usize) -> (Vec<StepReport>, Gaussians) {
     let mut dataset = crate::common::train::dataset(3, [64, 48]);
     dataset.points.truncate(points);
@@ -249,7 +249,7 @@ fn views_of_one_pixel_and_of_a_long_strip_are_trained_on() {
 }
 
 #[test]
-fn one_gaussian_and_none_are_trained_and_rendered() {
+fn one_gaussian_and_zero_gaussians_are_trained_and_rendered() {
     let (reports, gaussians) = train_on([64, 48], 1);
     assert!(reports.len() == 6 && gaussians.count <= 64);
     assert!(gaussians.parameters.iter().all(|value| value.is_finite()));
@@ -267,7 +267,7 @@ fn one_gaussian_and_none_are_trained_and_rendered() {
 fn a_loss_that_is_not_finite_names_step_view_and_term() {
     let dataset = dataset();
     let mut gaussians = Trainer::new(&gpu(), config(), &dataset).unwrap().gaussians().unwrap();
-    // The colours are finite, their squares in SSIM are not.
+    // The colours are finite; their squares in SSIM are not.
     gaussians.dc_mut().fill(Vec3::splat(1e30));
     let mut trainer = Trainer::from_gaussians(&gpu(), config(), &dataset, &gaussians).unwrap();
     let error = trainer.advance(20).unwrap_err();
@@ -281,7 +281,7 @@ fn a_loss_that_is_not_finite_names_step_view_and_term() {
 #[test]
 fn a_parameter_that_is_not_finite_ends_the_run_with_step_and_plane_and_reaches_no_file() {
     let (dataset, mut config) = (dataset(), config());
-    // A round of density control may drop the Gaussian before the look.
+    // A round of density control could prune the Gaussian before the check.
     config.schedule.densify_after = 1000;
     let mut gaussians =
         Trainer::new(&gpu(), config.clone(), &dataset).unwrap().gaussians().unwrap();
@@ -295,7 +295,7 @@ fn a_parameter_that_is_not_finite_ends_the_run_with_step_and_plane_and_reaches_n
     let error = loop {
         match trainer.advance(60) {
             Ok(reports) => {
-                assert!(reports.iter().all(|report| report.step < 60), "it went unnoticed");
+                assert!(reports.iter().all(|report| report.step < 60), "it was not detected");
             }
             Err(error) => break error,
         }
@@ -307,7 +307,7 @@ fn a_parameter_that_is_not_finite_ends_the_run_with_step_and_plane_and_reaches_n
 }
 
 #[test]
-fn a_set_without_points_begins_with_random_ones() {
+fn a_dataset_without_points_starts_with_random_ones() {
     let mut dataset = dataset();
     dataset.points.clear();
     let config = TrainConfig { steps: 10, random_points: 300, ..config() };
@@ -322,14 +322,14 @@ fn growth_stops_at_the_limit() {
     let limit = dataset.points.len() + 5;
     let mut config = TrainConfig { max_gaussians: limit, ..config() };
     config.density.gradient_threshold = 1e-9;
-    // The last round may take all the room that is left.
+    // The last round may use all of the remaining capacity.
     config.schedule.densify_before = 60;
     let (_, gaussians) = train(&config, &dataset);
     assert_eq!(gaussians.count, limit);
 }
 
 #[test]
-fn a_render_shows_what_its_model_was_trained_to() {
+fn a_render_shows_the_scene_that_its_model_was_trained_on() {
     let dataset = dataset();
     let mut trainer = Trainer::new(&gpu(), config(), &dataset).unwrap();
     advance(&mut trainer, 60);

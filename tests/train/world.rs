@@ -1,4 +1,4 @@
-//! Where the world's origin lies and how large its unit is makes no difference to a model.
+//! The world's origin and unit make no difference to a model.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
@@ -23,7 +23,7 @@ fn config() -> TrainConfig {
     config
 }
 
-/// The same scene, seen from the same cameras, in another world: scaled, then moved.
+/// The same scene and cameras in another world: scaled, then translated.
 fn moved(dataset: &Dataset, scale: f64, offset: DVec3) -> Dataset {
     let mut moved = dataset.clone();
     for view in &mut moved.views {
@@ -46,7 +46,7 @@ const WORLDS: [(f64, f64); 7] =
     [(1e-6, 0.0), (0.03, 0.0), (0.4, 1e4), (1e3, 0.0), (1e6, 0.0), (1.0, 1e7), (1e-3, -1e5)];
 
 #[test]
-fn a_scene_trains_alike_however_large_and_wherever_it_is() {
+fn a_scene_trains_equally_well_at_any_scale_and_position() {
     let dataset = crate::common::train::dataset(10, [64, 48]);
     let psnr = |dataset: &Dataset| {
         let mut trainer = Trainer::new(&gpu(), config(), dataset).unwrap();
@@ -62,7 +62,7 @@ fn a_scene_trains_alike_however_large_and_wherever_it_is() {
 }
 
 #[test]
-fn a_run_in_any_world_is_scored_as_it_was_trained_and_its_model_lies_in_that_world() {
+fn a_run_in_any_world_is_scored_as_trained_and_its_model_is_in_that_world() {
     let dataset = crate::common::train::dataset(10, [64, 48]);
     let config = TrainConfig { steps: 40, ..config() };
     for (scale, offset) in [(1e-6, 0.0), (1e6, 0.0), (3.0, 1e7)] {
@@ -84,7 +84,7 @@ fn a_run_in_any_world_is_scored_as_it_was_trained_and_its_model_lies_in_that_wor
         let (again, then) = (mean_psnr(&scored), mean_psnr(&trained.scored));
         assert!((again - then).abs() < 0.01, "{scale} at {offset}: {again}, not {then}");
 
-        // What other programs see: positions in the world, behind the origin that the header names.
+        // Other programs see positions in the world, relative to the origin in the header.
         let header = std::fs::read(out.join("model.ply")).unwrap();
         let header = String::from_utf8_lossy(&header[..400]).into_owned();
         assert!(header.contains(&stated), "{header}");
@@ -110,7 +110,7 @@ fn a_run_in_any_world_is_scored_as_it_was_trained_and_its_model_lies_in_that_wor
 }
 
 #[test]
-fn a_run_begins_with_a_model_of_its_world_as_that_model_was_left() {
+fn a_run_that_starts_from_a_model_of_its_world_starts_with_its_scores() {
     let dataset = crate::common::train::dataset(10, [64, 48]);
     let config = TrainConfig { steps: 40, ..config() };
     for (scale, offset) in [(1.0, 0.0), (3.0, 4.5e6)] {
@@ -133,7 +133,7 @@ fn a_run_begins_with_a_model_of_its_world_as_that_model_was_left() {
 }
 
 #[test]
-fn a_resumed_run_stays_in_its_frame_and_an_old_one_in_its_world() {
+fn a_resumed_run_stays_in_its_frame_and_an_old_run_in_its_world() {
     let dataset = moved(&crate::common::train::dataset(10, [64, 48]), 0.1, DVec3::ZERO);
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("run");
@@ -143,7 +143,7 @@ fn a_resumed_run_stays_in_its_frame_and_an_old_one_in_its_world() {
     let resumed = run::train(&gpu(), &longer, &dataset, &out, IfExists::Resume, |_| {}).unwrap();
     assert_eq!(*resumed.trainer.frame(), dataset.frame());
     assert_ne!(dataset.frame(), TrainingFrame::WORLD);
-    // As a version wrote it that knew no frames.
+    // As written by a version without frames.
     let path = out.join("config.toml");
     let text = std::fs::read_to_string(&path).unwrap();
     let (before, after) = text.split_once("[frame]\n").unwrap();

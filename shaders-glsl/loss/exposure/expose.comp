@@ -3,12 +3,12 @@
 #include "kernel.glsl"
 #include "exposure.glsl"
 
-//! Expose: what the exposure of a view makes of a render's colours, or the other way round, one thread per value.
+//! Expose: applies the exposure of a view to a render's colours, or its inverse, one thread per value.
 //!
 //! Reference: `src/reference/expose.rs`.
 
 layout(local_size_x = 256) in;
-layout(constant_id = 0) const bool INVERSE = false;  // from what the view shows to what the model does
+layout(constant_id = 0) const bool INVERSE = false;  // from the view's exposure to the model's
 
 layout(push_constant) uniform Params {
     uint pixel_count;  // of a channel

@@ -3,11 +3,11 @@
 #include "kernel.glsl"
 #include "exposure.glsl"
 
-//! The gradient of `expose`: of the render, in place of that of the exposed one, and per chunk what that of the
-//! exposure is made of, the sums of d c and of d.
+//! The gradient of `expose`: of the render, in place of that of the exposed image, and the sums of d c and of d per
+//! chunk, for the gradient of the exposure.
 //!
-//! A subgroup takes `CHUNK` values of one channel, in a fixed order: how a sum is parted is not the device's choice.
-//! Reference: `src/reference/expose_backward.rs`.
+//! A subgroup processes `CHUNK` values of one channel, in a fixed order: the partition of a sum does not depend on the
+//! device. Reference: `src/reference/expose_backward.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

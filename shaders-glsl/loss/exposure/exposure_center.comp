@@ -3,12 +3,12 @@
 #include "kernel.glsl"
 #include "exposure.glsl"
 
-//! Centres every one of the EXPOSURE_WIDTH numbers: afterwards its sum over the views is exactly 0.
+//! Centres each of the EXPOSURE_WIDTH values: afterwards, its sum over the views is exactly 0.
 //!
-//! Numbers become n / QUANTA with n whole. With S the sum of n and N views, each n loses floor(S / N) and the first
-//! S mod N of them one more: in integers no rounding is left to drift, and no order of summation matters.
-//! What is centred and within BOUND stays as it is, and so does everything while status[0] is set.
-//! One subgroup per number. Reference: `src/reference/exposure_center.rs`.
+//! Values become n / QUANTA with n whole. With S the sum of n and N views, each n is reduced by floor(S / N), and the
+//! first S mod N of them by one more: with integers, no rounding can drift, and the order of summation does not matter.
+//! Values that are centred and within BOUND are unchanged, as is everything while status[0] is set. One subgroup per
+//! value. Reference: `src/reference/exposure_center.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -20,7 +20,7 @@ layout(push_constant) uniform Params {
 layout(binding = 0)           buffer Exposures { float exposures[]; };  // (views, EXPOSURE_WIDTH)
 layout(binding = 1) readonly  buffer Status    { uint status[]; };
 
-// A centred number is at most 2 BOUND; a float holds this many quanta, 2^24, exactly.
+// A centred value is at most 2 BOUND; a float represents this many quanta, 2^24, exactly.
 const float QUANTA = 2097152.0;
 const float BOUND = 4.0;
 
@@ -29,7 +29,7 @@ int quanta(float x) { return int(roundEven(clamp(x, -BOUND, BOUND) * QUANTA)); }
 void main() {
     uint number = gl_WorkGroupID.x;
     if (number >= EXPOSURE_WIDTH || status[0] != 0) return;
-    // n = 256 h + l, 0 <= l < 256: neither sum passes 32 bits below 32768 views.
+    // n = 256 h + l, 0 <= l < 256: neither sum exceeds 32 bits for fewer than 32768 views.
     ivec2 sum = ivec2(0);
     for (uint view = gl_SubgroupInvocationID; view < view_count; view += SUBGROUP_SIZE) {
         int n = quanta(exposures[view * EXPOSURE_WIDTH + number]);
@@ -37,7 +37,7 @@ void main() {
     }
     sum = subgroupAdd(sum);
     int count = int(view_count);
-    // Down, not towards 0: what is left is not negative.
+    // Rounds down, not towards 0: the remainder is not negative.
     int high = sum.x >= 0 ? sum.x / count : -((count - 1 - sum.x) / count);
     int left = 256 * (sum.x - high * count) + sum.y;
     int mean = 256 * high + left / count;

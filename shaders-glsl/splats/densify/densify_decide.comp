@@ -4,20 +4,20 @@
 #include "gaussian.glsl"
 #include "densify_action.glsl"
 
-//! Densify decide: one thread per place in the order of the keys settles the fate of the Gaussian there.
+//! Densify decide: one thread per position in the order of the keys decides the action for the Gaussian there.
 //!
-//! A round may take its share of the room below the limit. Where the candidates exceed it, only those above the largest
-//! that finds no room multiply: the limit holds, and equal gradients fare alike. Reference:
-//! `src/reference/densify_decide.rs`.
+//! A round may use its share of the headroom below the limit. If the candidates exceed it, only those with a larger
+//! gradient than the first one beyond the share are densified: the limit holds, and equal gradients are treated
+//! equally. Reference: `src/reference/densify_decide.rs`.
 
 layout(local_size_x = 64) in;
 
 layout(push_constant) uniform Params {
     uint  gaussian_count;   // of all batches
-    uint  first_gaussian;   // how many lie before those of this dispatch
-    uint  batch_count;      // how many these are
+    uint  first_gaussian;   // Gaussians before those of this dispatch
+    uint  batch_count;      // Gaussians of this dispatch
     uint  max_gaussians;
-    uint  rounds_left;      // this one included; at least 1
+    uint  rounds_left;      // including this one; at least 1
     float split_log_scale;  // ln of the largest standard deviation of a clone
     uint  max_added;       // of all batches
 };
@@ -27,11 +27,11 @@ layout(constant_id = 0) const bool CONSERVING = false;  // every candidate is sp
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };      // planes of the batch
 layout(binding = 1) readonly  buffer SortedKeys { uint sorted_keys[]; };      // (gaussian_count), KEY_*
 layout(binding = 2) readonly  buffer SortedIds  { uint sorted_ids[]; };       // (gaussian_count)
-layout(binding = 3) buffer Counters { uint counters[]; };                           // TALLY_*
-layout(binding = 4) writeonly buffer Actions      { uint actions[]; };            // (gaussian_count), FATE_*
+layout(binding = 3) buffer Counters { uint counters[]; };                           // COUNTER_*
+layout(binding = 4) writeonly buffer Actions      { uint actions[]; };            // (gaussian_count), ACTION_*
 layout(binding = 5) writeonly buffer ChildCounts  { uint child_counts[]; }; // (gaussian_count)
 
-// How many may multiply; each adds one Gaussian.
+// The number of Gaussians that may be added; each candidate adds one.
 uint available() {
     uint kept = gaussian_count - counters[COUNTER_PRUNED];
     uint free = max(max_gaussians, kept) - kept;
@@ -48,7 +48,7 @@ void main() {
     uint place = THREAD_INDEX;
     if (place >= gaussian_count) return;
     uint i = sorted_ids[place], key = sorted_keys[place];
-    // Unsigned: what lies before the batch wraps beyond its end.
+    // Unsigned: Gaussians before the batch wrap beyond its end.
     if (i - first_gaussian >= batch_count) return;
     uint first_without = available();
     uint end = counters[COUNTER_CANDIDATES] > first_without ? sorted_keys[first_without] : KEY_KEEP;

@@ -6,9 +6,9 @@
 
 //! Densify moments: one thread per Gaussian writes the moments of its children to the new planes.
 //!
-//! One that stays keeps its moments, a new one begins with zero: moments inherited in the proportion of the gradient
-//! were measured to cost 0.45 dB, because two halves need large steps to part. A dispatch goes from one batch of
-//! Gaussians to one batch of the new. Reference: `src/reference/densify_moments.rs`.
+//! A Gaussian that is kept keeps its moments, a new one starts with zero: inherited moments in proportion to the
+//! gradient cost 0.45 dB in a measurement, because two halves need large steps to separate. A dispatch goes from one
+//! batch of Gaussians to one batch of the new ones. Reference: `src/reference/densify_moments.rs`.
 
 layout(local_size_x = 64) in;
 
@@ -17,11 +17,11 @@ layout(push_constant) uniform Params {
     uint new_gaussian_count;
     uint column_count;
     uint feature_count;
-    uint first_new_gaussian;  // how many of the new lie before those of this dispatch
+    uint first_new_gaussian;  // new Gaussians before those of this dispatch
 };
 
-layout(binding = 0) readonly  buffer Moments    { uint moments[]; };      // planes, of whatever a word holds
-layout(binding = 1) readonly  buffer Actions      { uint actions[]; };        // (gaussian_count), FATE_*
+layout(binding = 0) readonly  buffer Moments    { uint moments[]; };      // planes of words of any content
+layout(binding = 1) readonly  buffer Actions      { uint actions[]; };        // (gaussian_count), ACTION_*
 layout(binding = 2) readonly  buffer Offsets    { uint offsets[]; };      // (gaussian_count), first output
 layout(binding = 3) writeonly buffer NewMoments { uint new_moments[]; };  // planes
 
@@ -30,7 +30,7 @@ void main() {
     if (i >= gaussian_count) return;
     uint action = actions[i];
     for (uint copy_index = 0; copy_index < child_count(action); ++copy_index) {
-        // Unsigned: what lies before the batch wraps beyond its end.
+        // Unsigned: Gaussians before the batch wrap beyond its end.
         uint to = offsets[i] + copy_index - first_new_gaussian;
         if (to >= new_gaussian_count) continue;
         bool begins = is_new(action, copy_index);

@@ -8,10 +8,11 @@
 
 //! Densify scatter: one thread per Gaussian writes the parameters of its children to the new planes.
 //!
-//! The paper's: a new one is at a position drawn from the normal distribution that its parent is (the clone too: the
-//! LITA-GS variant of Kerbl et al. 2023), after a split at 1/1.6 of its scale; draws depend on seed, step, Gaussian and
-//! copy alone. Conserving: the two of a split lie along the parent's longest axis and cover together what it covered. A
-//! dispatch goes from one batch of Gaussians to one batch of the new. Reference: `src/reference/densify_scatter.rs`.
+//! Paper: a new Gaussian is at a position drawn from its parent's normal distribution (also for a clone: the LITA-GS
+//! variant of Kerbl et al. 2023), and has 1/1.6 of its scale after a split; draws depend only on seed, step, Gaussian
+//! and copy. Conserving: the two halves of a split are along the parent's longest axis and together cover the same
+//! area. A dispatch goes from one batch of Gaussians to one batch of the new ones. Reference:
+//! `src/reference/densify_scatter.rs`.
 
 layout(local_size_x = 64) in;
 
@@ -22,14 +23,14 @@ layout(push_constant) uniform Params {
     uint feature_count;
     uint seed;
     uint step;
-    uint first_gaussian;      // how many lie before those of this dispatch
-    uint first_new_gaussian;  // and how many of the new
+    uint first_gaussian;      // Gaussians before those of this dispatch
+    uint first_new_gaussian;  // new Gaussians before those of this dispatch
 };
 
 layout(constant_id = 0) const bool CONSERVING = false;
 
 layout(binding = 0) readonly  buffer Parameters    { float parameters[]; };     // planes
-layout(binding = 1) readonly  buffer Actions         { uint actions[]; };           // (gaussian_count), FATE_*
+layout(binding = 1) readonly  buffer Actions         { uint actions[]; };           // (gaussian_count), ACTION_*
 layout(binding = 2) readonly  buffer Offsets       { uint offsets[]; };         // (gaussian_count), first output
 layout(binding = 3) writeonly buffer NewParameters { float new_parameters[]; }; // planes
 
@@ -43,14 +44,14 @@ void copy(uint from, uint to) {
     }
 }
 
-// What a split changes.
+// The attributes that a split changes.
 struct Shape {
     vec3 mean;
     vec3 log_scales;
     float raw_opacity;
 };
 
-// A draw from the normal distribution that Gaussian i is.
+// A draw from the normal distribution of Gaussian i.
 Shape drawn(uint i, Shape parent, mat3 axes, bool is_split, uint copy_index) {
     uint key = random_bits(random_bits(random_bits(seed) + step) + 2 * (first_gaussian + i) + copy_index);
     Shape child = parent;
@@ -85,7 +86,7 @@ void main() {
     parent.raw_opacity = parameters[RAW_OPACITIES_COLUMN * gaussian_count + i];
     mat3 axes = rotation(unit_quat(LOAD_VEC4(parameters, QUATS_COLUMN, gaussian_count, i)));
     for (uint copy_index = 0; copy_index < child_count(action); ++copy_index) {
-        // Unsigned: what lies before the batch wraps beyond its end.
+        // Unsigned: Gaussians before the batch wrap beyond its end.
         uint to = offsets[i] + copy_index - first_new_gaussian;
         if (to >= new_gaussian_count) continue;
         copy(i, to);

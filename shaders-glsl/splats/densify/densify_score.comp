@@ -8,12 +8,12 @@
 #include "splat.glsl"
 #include "densify_action.glsl"
 
-//! Densify score: one thread per Gaussian makes the key that orders it by how much it asks to multiply.
+//! Densify score: one thread per Gaussian computes the key that orders Gaussians by their need for densification.
 //!
-//! Pruned: fainter than the minimum or with a parameter that is not finite. Of the rest, those whose screen-space
-//! gradient, averaged over the steps that saw them, exceeds the threshold are candidates (Kerbl et al. 2023, section
-//! 5.2), unless splitting them would change what a camera sees by more than a bound. Reference:
-//! `src/reference/densify_score.rs`.
+//! Gaussians with less than the minimum opacity or a non-finite parameter are pruned. Among the others, those whose
+//! screen-space gradient, averaged over the steps in which they were visible, exceeds the threshold are candidates
+//! (Kerbl et al. 2023, section 5.2), unless splitting them would change the view of a camera by more than a bound.
+//! Reference: `src/reference/densify_score.rs`.
 
 layout(local_size_x = 64) in;
 
@@ -23,7 +23,7 @@ layout(push_constant) uniform Params {
     uint  feature_count;
     float gradient_threshold;  // mean norm in normalised device units; exceeded, not met
     float min_raw_opacity;     // before the sigmoid
-    uint  first_gaussian;      // how many lie before those of this dispatch
+    uint  first_gaussian;      // Gaussians before those of this dispatch
     uint  camera_count;
     float near;                // world units
     float largest_change;      // of a camera's view by one split; exceeded, not met
@@ -34,10 +34,10 @@ layout(binding = 1) readonly  buffer GradNormSums { float grad_norm_sums[]; };  
 layout(binding = 2) readonly  buffer VisitCounts  { uint visit_counts[]; };     // (gaussian_count)
 layout(binding = 3) writeonly buffer Keys         { uint keys[]; };             // (gaussian_count), KEY_*
 layout(binding = 4) writeonly buffer Ids          { uint ids[]; };              // (gaussian_count)
-layout(binding = 5) buffer Counters { uint counters[]; };                             // TALLY_*, zero before
+layout(binding = 5) buffer Counters { uint counters[]; };                             // COUNTER_*, initially zero
 layout(binding = 6) readonly  buffer Cameras      { Camera cameras[]; };        // (camera_count)
 
-// Positive phrasing: a NaN fails the test.
+// Written so that a NaN fails.
 bool is_sound(uint i) {
     if (!(parameters[RAW_OPACITIES_COLUMN * gaussian_count + i] >= min_raw_opacity)) return false;
     for (uint plane = 0; plane < PLANE_COUNT; ++plane) {
@@ -49,18 +49,18 @@ bool is_sound(uint i) {
     return true;
 }
 
-// An estimate of the mean squared change of a view where two halves take the place of a Gaussian, in units of the
-// squared contrast of what it covers: the share of the view that it covers, times the square of its opacity and of the
-// relative change of depth. Halves that move across the view show what the Gaussian showed; those that move along the
-// ray are magnified, and may pass what stands before the Gaussian.
+// An estimate of the mean squared change of a view when two halves replace a Gaussian, in units of the squared contrast
+// of the area that it covers: the share of the view that it covers, times the square of its opacity and of the relative
+// change of depth. Halves that move across the view show what the Gaussian showed; halves that move along the ray are
+// magnified, and may pass a surface in front of the Gaussian.
 float view_change(vec3 mean, mat3 axes, float opacity, uint axis, Camera camera) {
     vec3 mean_in_view = camera.view_from_world * vec4(mean, 1.0);
     mat3 view_axes = mat3(camera.view_from_world) * axes;
     float depth = camera_depth(mean_in_view, camera);
     float shift = SPLIT_OFFSET * abs(camera_depth_change(mean_in_view, view_axes[axis], camera));
-    // No half is beyond the near plane.
+    // Both halves are in front of the near plane.
     if (depth + shift <= near) return 0.0;
-    // Where the nearer half is, the footprint is the largest.
+    // The nearer half has the largest footprint.
     depth = max(depth - shift, max(near, NEAREST));
     mean_in_view = camera_at_depth(mean_in_view, depth, camera);
     if (camera_depth(mean_in_view, camera) <= 0.0) return 0.0;
@@ -77,7 +77,7 @@ float view_change(vec3 mean, mat3 axes, float opacity, uint axis, Camera camera)
     return covered.x / size.x * (covered.y / size.y) * change * change;
 }
 
-// Whether a split of the Gaussian changes no camera's view by more than the bound.
+// Whether a split of the Gaussian changes every camera's view by at most the bound.
 bool is_safe_to_split(uint i) {
     vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
     vec3 log_scales = LOAD_VEC3(parameters, LOG_SCALES_COLUMN, gaussian_count, i);
@@ -85,7 +85,7 @@ bool is_safe_to_split(uint i) {
     for (uint k = 0; k < 3; k++) axes[k] *= exp(log_scales[k]);
     float opacity = sigmoid(parameters[RAW_OPACITIES_COLUMN * gaussian_count + i]);
     uint axis = longest_axis(log_scales);
-    // Positive phrasing: a NaN fails the test.
+    // Written so that a NaN fails.
     for (uint k = 0; k < camera_count; ++k)
         if (!(view_change(mean, axes, opacity, axis, cameras[k]) <= largest_change)) return false;
     return true;

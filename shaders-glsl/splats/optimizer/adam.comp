@@ -6,16 +6,16 @@
 
 //! Adam over the planes of include/gaussian.glsl: beta 0.9 and 0.999, epsilon 1e-15.
 //!
-//! m = b1 m + (1 - b1) g, v = b2 v + (1 - b2) g^2, p -= rate / (1 - b1^t) m / (sqrt(v) / sqrt(1 - b2^t) + epsilon).
-//! A thread takes four floats in a row, of one plane or of two. A gradient that is not finite counts as zero, so that
-//! it poisons neither moment; log scales stay within bounds whose exp is finite. Nothing changes while status[0] is
-//! set. Moments are two floats, or both in one word. Kingma and Ba 2015. Reference: `src/reference/adam.rs`.
+//! m = b1 m + (1 - b1) g, v = b2 v + (1 - b2) g^2, p -= rate / (1 - b1^t) m / (sqrt(v) / sqrt(1 - b2^t) + epsilon). A
+//! thread processes four consecutive floats, of one plane or of two. A gradient that is not finite counts as zero, so
+//! that it corrupts neither moment; log scales stay within bounds whose exp is finite. Nothing changes while status[0]
+//! is set. Moments are two floats, or both in one word. Kingma and Ba 2015. Reference: `src/reference/adam.rs`.
 
 layout(local_size_x = 256) in;
 
 layout(push_constant) uniform Params {
     uint  gaussian_count;
-    uint  column_count;         // columns that take part, from the first
+    uint  column_count;         // updated columns, from the first
     uint  feature_count;        // of these, from FEATURES_COLUMN on
     float second_correction;    // 1 / sqrt(1 - b2^t)
     uint  step;                 // t
@@ -28,10 +28,10 @@ layout(binding = 0)           buffer Parameters    { vec4 parameters[]; };      
 layout(binding = 1) readonly  buffer Gradients     { vec4 gradients[]; };       // planes
 layout(binding = 2)           buffer FirstMoments  { vec4 first_moments[]; };   // planes; none with half moments
 layout(binding = 3)           buffer SecondMoments { vec4 second_moments[]; };  // as many
-layout(binding = 4)           buffer BothMoments { vec4 both_moments[]; };  // planes of their bits; half moments alone
+layout(binding = 4)           buffer BothMoments { vec4 both_moments[]; };  // their bits, with half moments
 layout(binding = 5) readonly  buffer Status        { uint status[]; };
 
-// The largest scale leaves the determinant of a projected covariance finite at the near plane, (f / 0.2)^2 times its
+// With the largest scale, the determinant of a projected covariance is finite at the near plane: (f / 0.2)^2 times its
 // square.
 const float LOG_SCALE_MIN = -30.0;
 const float LOG_SCALE_MAX = 13.0;
@@ -51,7 +51,7 @@ void main() {
     uint end = column_count * gaussian_count;
     if (4 * quad >= end || status[0] != 0) return;
     uvec4 i = 4 * quad + uvec4(0, 1, 2, 3);
-    // The last quad can reach into a column that takes no part.
+    // The last quad can extend into a column that is not updated.
     bvec4 takes_part = lessThan(i, uvec4(end));
     vec4 gradient = clamp_gradient(gradients[quad]);
     Moments moments;
@@ -60,7 +60,7 @@ void main() {
     moments = updated(moments, gradient);
     vec4 before = parameters[quad];
     vec4 value = before - adam_step(moments, rates_at(i), second_correction);
-    // Unsigned: what lies before the plane wraps beyond its end.
+    // Unsigned: values before the plane wrap beyond its end.
     bvec4 is_log_scale = lessThan(i - LOG_SCALES_COLUMN * gaussian_count, uvec4(3 * gaussian_count));
     value = mix(value, clamp(value, LOG_SCALE_MIN, LOG_SCALE_MAX), is_log_scale);
     parameters[quad] = mix(before, value, takes_part);

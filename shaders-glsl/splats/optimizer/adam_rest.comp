@@ -4,16 +4,17 @@
 #include "adam_step.glsl"
 #include "half.glsl"
 
-//! Adam over SH coefficients above degree 0 that are kept as 16-bit floats (include/half.glsl), as adam.comp otherwise.
+//! Adam over SH coefficients above degree 0 that are stored as 16-bit floats (include/half.glsl), otherwise as
+//! adam.comp.
 //!
-//! A thread takes four coefficients of a Gaussian. They are stepped as floats and then rounded up or down by chance, of
-//! which the mean is what they were. Reference: `src/reference/adam_rest.rs`.
+//! A thread processes four coefficients of a Gaussian. They are updated as floats and then rounded stochastically,
+//! which preserves the mean. Reference: `src/reference/adam_rest.rs`.
 
 layout(local_size_x = 256) in;
 
 layout(push_constant) uniform Params {
     uint  gaussian_count;
-    uint  first_column;       // columns before the coefficients', of parameters, gradients and moments alike
+    uint  first_column;       // columns before the coefficients, in parameters, gradients and moments
     uint  coefficient_count;  // of each Gaussian
     float rate;               // learning rate / (1 - b1^t)
     float second_correction;  // 1 / sqrt(1 - b2^t)
@@ -26,10 +27,10 @@ layout(binding = 0)           buffer Parameters    { uint parameters[]; };      
 layout(binding = 1) readonly  buffer Gradients     { float gradients[]; };       // planes
 layout(binding = 2)           buffer FirstMoments  { float first_moments[]; };   // planes; none with half moments
 layout(binding = 3)           buffer SecondMoments { float second_moments[]; };  // as many
-layout(binding = 4)           buffer BothMoments   { uint both_moments[]; };     // planes; half moments alone
+layout(binding = 4)           buffer BothMoments   { uint both_moments[]; };     // planes; only with half moments
 layout(binding = 5) readonly  buffer Status        { uint status[]; };
 
-// The two halves of a word, or none beyond a Gaussian's.
+// The two halves of a word, or zero beyond a Gaussian's.
 vec2 halves_at(uint word, bool takes_part) {
     return takes_part ? unpackHalf2x16(parameters[word]) : vec2(0.0);
 }

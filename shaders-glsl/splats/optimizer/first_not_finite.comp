@@ -2,9 +2,9 @@
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
 
-//! The first of some numbers that is NaN or infinite: a thread looks at four in a row.
+//! The first of some values that is NaN or infinite; a thread tests four consecutive ones.
 //!
-//! The least index wins, whichever thread is first; none leaves `first` as it is. Reference:
+//! The lowest index wins, whichever thread is first; without any, `first` is unchanged. Reference:
 //! `src/reference/first_not_finite.rs`.
 
 layout(local_size_x = 256) in;
@@ -14,12 +14,12 @@ layout(push_constant) uniform Params {
 };
 
 layout(binding = 0) readonly buffer Values { vec4 values[]; };
-layout(binding = 1)          buffer First  { uint first[]; };  // [0]: the least index so far
+layout(binding = 1)          buffer First  { uint first[]; };  // [0]: the lowest index so far
 
 void main() {
     uint quad = THREAD_INDEX;
     if (4 * quad >= value_count) return;
-    // By their bits: a compiler may take it that floats are numbers.
+    // Tested by bits, since a compiler may assume that floats are not NaN.
     uvec4 exponents = floatBitsToUint(values[quad]) & 0x7f800000u;
     [[unroll]] for (uint i = 0; i < 4; ++i) {
         uint at = 4 * quad + i;

@@ -20,8 +20,8 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 layout(push_constant, scalar) uniform Params {
     uvec2 size;
     uint tile_columns;
-    uint longest_run;  // splats of a tile that this device follows
-    uint has_limits;   // 1: `limits` holds a depth for each pixel
+    uint longest_run;  // the most splats of a tile that this device can process
+    uint has_limits;   // 1: `limits` has a depth for each pixel
     uint takes_median; // 1: the last channel is the median depth
     float background[MAX_CHANNELS];
 };
@@ -39,7 +39,7 @@ layout(binding = 9)           buffer Status     { uint status[]; };
 layout(binding = 10) readonly buffer Limits     { float limits[]; };  // (H, W) depth beyond which nothing is seen
 
 layout(constant_id = 11) const uint VIEW_DEPTHS = 0;  // 1: the last channel is the depth
-// The depth of a pixel without a limit, and of one where nothing is seen.
+// The depth of a pixel without a limit, and of one where nothing is visible.
 const float NO_DEPTH = 3.4e38;
 
 #include "tile_run.glsl"

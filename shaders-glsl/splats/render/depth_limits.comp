@@ -3,7 +3,7 @@
 #include "kernel.glsl"
 #include "pixels.glsl"
 
-//! Depth limits: a host's depth image to the depths in the view beyond which nothing is seen.
+//! Depth limits: converts a host's depth image to the depths in the view beyond which everything is hidden.
 //!
 //! With e = d where depth is reversed and 1 - d else: z = near far / (near + e (far - near)), and z = near / e before
 //! an infinite far plane. At e = 0 the host drew nothing, and nothing is hidden.

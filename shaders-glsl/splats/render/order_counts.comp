@@ -4,12 +4,12 @@
 #include "partition.glsl"
 #include "status.glsl"
 
-//! Order counts: how many slots precede those of each depth rank within its partition, and those of each partition.
+//! Order counts: the number of slots before those of each depth rank within its partition, and before each partition.
 //!
-//! One subgroup per partition; the last of them to be done makes prefix sums of the partitions' sums and knows the
-//! total. More intersections than the buffers hold raise a flag that stays: the step then renders nothing and updates
-//! nothing; the host grows the buffers, lowers the flag and redoes it. A renderer that truncates keeps those that fit,
-//! the nearest, and raises no flag.
+//! One subgroup per partition; the last to finish computes prefix sums of the partitions' sums, and the total. More
+//! intersections than the buffers hold set a sticky flag: the step then renders and updates nothing; the host grows the
+//! buffers, clears the flag and repeats it. A renderer that truncates keeps the nearest intersections that fit, and
+//! sets no flag.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

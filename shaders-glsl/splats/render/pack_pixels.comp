@@ -29,7 +29,7 @@ layout(binding = 2) readonly  buffer Under  { uint under[]; };    // as `pixels`
 layout(binding = 3) writeonly buffer Pixels { uint pixels[]; };   // (pixels, words)
 layout(binding = 4) writeonly buffer Depths { float depths[]; };  // (pixels) world units; infinite: nothing is seen
 
-// Below it a channel of sRGB is linear.
+// Below this, a channel of sRGB is linear.
 const float LINEAR_END = 0.04045;
 const float LARGEST_HALF = 65504.0;
 const float NOTHING_SEEN = 3.3e38;

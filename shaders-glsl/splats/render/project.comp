@@ -19,15 +19,15 @@ layout(local_size_x = 64) in;
 
 layout(push_constant, scalar) uniform Params {
     uint  camera_index;
-    float near;       // the least depth, world units
+    float near;       // near plane, world units
     uint  gaussian_count;
     uint  sh_degree;  // in use; at most SH_DEGREE
-    uint  first_gaussian;  // how many lie before those of this dispatch
+    uint  first_gaussian;  // Gaussians before those of this dispatch
 };
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 5) const bool RAW_COLORS = false;
-layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 as include/half.glsl has it
+layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in the format of include/half.glsl
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // planes
 layout(binding = 1) writeonly buffer Splats     { ProjectedSplat splats[]; };

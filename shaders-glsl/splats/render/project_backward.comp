@@ -11,10 +11,10 @@
 
 //! Project backward: one lane per Gaussian, from the records of its slots to the gradients of its attributes.
 //!
-//! Sums the records, which gives the gradients of the splat, and reads the chain of `project` backwards; what it needs
-//! of the forward pass it computes again. Also keeps the statistics of density control: the norm of the screen-space
-//! gradient in normalised device units, damped near the camera. A gradient that is not finite raises a flag, so that
-//! neither this step nor later ones change a parameter.
+//! Sums the records, which gives the gradients of the splat, and applies the chain rule through `project`; the required
+//! values of the forward pass are recomputed. Also updates the statistics of density control: the norm of the
+//! screen-space gradient in normalised device units, damped near the camera. A gradient that is not finite sets a flag,
+//! so that neither this step nor later ones change a parameter.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -31,7 +31,7 @@ layout(push_constant, scalar) uniform Params {
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 5) const bool RAW_COLORS = false;
-layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 as include/half.glsl has it
+layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in the format of include/half.glsl
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // planes
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };

@@ -3,7 +3,7 @@
 #include "kernel.glsl"
 #include "partition.glsl"
 
-//! Scan, last of two kernels: the exclusive prefix sums within each partition, on top of what precedes it.
+//! Scan, last of two kernels: the exclusive prefix sums within each partition, plus the sum of the preceding ones.
 //!
 //! One subgroup per partition: SUBGROUP_SIZE values at a time, the running total carried along.
 
@@ -11,7 +11,7 @@ layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(push_constant) uniform Params {
-    uint count_index;  // where in `counts` the number of values lives
+    uint count_index;  // index in `counts` of the number of values
     uint capacity;     // values
 };
 

@@ -3,16 +3,16 @@
 #include "kernel.glsl"
 #include "partition.glsl"
 
-//! Scan, first of two kernels: what precedes each partition of consecutive values, and the total.
+//! Scan, first of two kernels: the sum of the values before each partition of consecutive values, and the total.
 //!
-//! One subgroup sums up each partition; the last of them to be done turns the sums into exclusive prefix sums. Sums are
+//! One subgroup sums each partition; the last of them to be done turns the sums into exclusive prefix sums. Sums are
 //! modulo 2^32.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(push_constant) uniform Params {
-    uint count_index;  // where in `counts` the number of values lives
+    uint count_index;  // index in `counts` of the number of values
     uint capacity;     // values
 };
 
@@ -27,7 +27,7 @@ layout(binding = 4) coherent  buffer Arrivals { uint arrivals[]; };
 void main() {
     uint part = WORKGROUP_INDEX;
     uint count = min(counts[count_index], capacity);
-    // Even no values have a total.
+    // Even without values there is a total.
     uint partition_count = max(partitions_of(count), 1);
     if (part >= partition_count) return;
 

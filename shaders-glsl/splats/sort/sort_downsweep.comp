@@ -4,20 +4,19 @@
 #include "partition.glsl"
 #include "digit.glsl"
 
-//! Radix sort, last kernel of a pass: every pair to its place, pairs of one digit in their old order.
+//! Radix sort, last kernel of a pass: every pair to its place, pairs of one digit in their previous order.
 //!
-//! One subgroup per partition of consecutive keys; shared memory holds, per digit, where the partition's
-//! next key goes. SUBGROUP_SIZE pairs are placed at a time; a pair's rank among them is the number of lower
-//! lanes that hold the same digit.
+//! One subgroup per partition of consecutive keys; shared memory has, per digit, the place of the partition's next key.
+//! SUBGROUP_SIZE pairs are placed at a time; a pair's rank among them is the number of lower lanes with the same digit.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
-// A ballot per bit of the digit, or (up to 32 lanes) a comparison per lane: the latter takes half the time on narrow
-// processors, whose ballots are loops.
+// A ballot per bit of the digit, or (up to 32 lanes) a comparison per lane: the latter takes half the time on CPUs with
+// narrow subgroups, whose ballots are loops.
 layout(constant_id = 1) const bool RANK_BY_BALLOT = true;
 
 layout(push_constant) uniform Params {
-    uint count_index;  // where in `counts` the number of pairs lives
+    uint count_index;  // index in `counts` of the number of pairs
     uint capacity;     // pairs
     uint shift;        // the digit's lowest bit
     uint digit_bits;   // 1 to 8
@@ -47,7 +46,7 @@ void find_first_places(uint part) {
     }
 }
 
-// The lanes that hold a pair of this lane's digit.
+// The lanes that have a pair of this lane's digit.
 uvec4 lanes_of_digit(uint digit, bool holds_pair) {
     if (RANK_BY_BALLOT) {
         uvec4 lanes = subgroupBallot(holds_pair);

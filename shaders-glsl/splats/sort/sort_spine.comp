@@ -3,18 +3,18 @@
 #include "kernel.glsl"
 #include "partition.glsl"
 
-//! Radix sort, between the two kernels of a pass over many partitions: where each begins among the keys of one digit.
+//! Radix sort, between the two kernels of a pass over many partitions: the offset of each among the keys of one digit.
 //!
-//! One subgroup per digit turns the digit's column of the table into exclusive prefix sums and leaves the
-//! column's total, which the downsweep adds up over the smaller digits.
+//! One subgroup per digit turns the digit's column of the table into exclusive prefix sums and writes the column's
+//! total, which the downsweep sums over the smaller digits.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(push_constant) uniform Params {
-    uint count_index;  // where in `counts` the number of keys lives
+    uint count_index;  // index in `counts` of the number of keys
     uint capacity;     // keys
-    uint digit_bits;   // as many digits as they make
+    uint digit_bits;   // there are 2^digit_bits digits
 };
 
 layout(binding = 0) readonly  buffer Counts { uint counts[]; };

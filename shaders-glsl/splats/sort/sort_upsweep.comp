@@ -4,21 +4,21 @@
 #include "partition.glsl"
 #include "digit.glsl"
 
-//! Radix sort, first kernel of a pass: where each partition's keys begin among those of their digit.
+//! Radix sort, first kernel of a pass: the offset of each partition's keys among those of their digit.
 //!
-//! One subgroup per partition of consecutive keys counts them by digit, in shared memory. The last of them to be done
-//! turns each digit's counts into exclusive prefix sums; where one subgroup would take long for the
-//! partitions, `sort_spine` does, with a subgroup for every digit.
+//! One subgroup per partition of consecutive keys counts them by digit, in shared memory. The last subgroup to finish
+//! turns each digit's counts into exclusive prefix sums; for many partitions, `sort_spine` does it instead, with a
+//! subgroup for every digit.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 
 layout(push_constant) uniform Params {
-    uint count_index;  // where in `counts` the number of keys lives
+    uint count_index;  // index in `counts` of the number of keys
     uint capacity;     // keys
     uint shift;        // the digit's lowest bit
     uint digit_bits;   // 1 to 8
-    uint folds_spine;  // not 0: the table becomes prefix sums here
+    uint folds_spine;  // not 0: this kernel computes the prefix sums
 };
 
 layout(binding = 0) readonly  buffer Counts   { uint counts[]; };
@@ -31,7 +31,7 @@ layout(binding = 4) coherent  buffer Arrivals { uint arrivals[]; };
 
 shared uint keys_with_digit[MAX_DIGITS];
 
-// Loads of this many partitions are under way at a time.
+// The number of partitions whose loads are in flight at a time.
 const uint BATCH = 4;
 
 void make_prefix_sums(uint partition_count) {

@@ -1,4 +1,4 @@
-//! Which direction of a model's world is up, and how an exported file is turned by it.
+//! The up direction of a model's world, and the rotation of an exported file that follows from it.
 
 use std::str::FromStr;
 
@@ -9,10 +9,10 @@ use crate::splats::scene::Gaussians;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
-/// Less is no turn, radians.
+/// Smaller angles are no rotation, radians.
 const NO_TURN: f64 = 1e-6;
 
-/// What `--up` names.
+/// A value of `--up`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Up {
     /// The axes stay as they are.
@@ -46,7 +46,7 @@ impl FromStr for Up {
 }
 
 impl ExportArgs {
-    /// What is up in the model's world, as far as that is asked for or known: a unit vector.
+    /// The up direction in the model's world, if given or known: a unit vector.
     pub(super) fn up(&self, config: &TrainConfig) -> Option<DVec3> {
         match self.up {
             Some(Up::Direction(up)) => Some(up),
@@ -55,10 +55,10 @@ impl ExportArgs {
         }
     }
 
-    /// The rotation of the model that brings up to where the format has it, and what to say of it.
+    /// The rotation that maps the model's up direction to that of the format, and a message about it.
     ///
-    /// Every format but a page takes -y of the model's axes for up, which GLB and SPZ call +y. GLB and SPZ, whose
-    /// axes mean something to their readers, are turned by what the run knows; PLY and SOG where `--up` is given.
+    /// In every format except the page, up is -y of the model's axes, which is +y in GLB and SPZ. GLB and SPZ, whose
+    /// readers interpret the axes, are rotated by the run's up direction; PLY and SOG only if `--up` is given.
     pub(super) fn rotation(&self, config: &TrainConfig) -> Option<(DQuat, String)> {
         let has_axes = matches!(self.to, To::Glb | To::Spz);
         if self.to == To::Html || self.up == Some(Up::Keep) || !(has_axes || self.up.is_some()) {
@@ -66,7 +66,7 @@ impl ExportArgs {
         }
         let Some(up) = self.up(config) else {
             tracing::warn!(
-                "{}: does not say what is up, which is taken to be -y of its axes; --up names another direction",
+                "{}: has no up direction, -y of its axes is used; --up names another",
                 self.run.display()
             );
             return None;
@@ -83,7 +83,7 @@ impl ExportArgs {
     }
 }
 
-/// The model turned, or as it is.
+/// The rotated model; unchanged for the identity.
 pub(super) fn turned(gaussians: Gaussians, rotation: DQuat) -> Gaussians {
     if rotation == DQuat::IDENTITY { gaussians } else { gaussians.rotated(rotation) }
 }

@@ -197,7 +197,7 @@ impl Leaderboard<'_> {
             notes.push(format!("Gains are differences to {name}."));
         }
         if self.rows.rows.iter().any(Row::knows_references) {
-            notes.push("Rows marked \"with reference\" were trained on targets that know references; they do \
+            notes.push("Rows marked \"with reference\" were trained on targets that depend on references; they do \
              not compare with the others.".to_owned());
         }
         let mut against: Vec<&str> = self.rows.rows.iter().filter_map(Row::against).collect();

@@ -134,12 +134,12 @@ impl Row {
         (values.len() > 1).then_some([least, greatest])
     }
 
-    /// Whether the targets of a run know references.
+    /// Whether the targets of a run depend on references.
     pub(super) fn knows_references(&self) -> bool {
         self.metrics.iter().any(|metrics| metrics.get(WITH_REFERENCE).is_some())
     }
 
-    /// What scores compare with, unless these are reference images.
+    /// The images that scores compare with, unless these are the references.
     pub(super) fn against(&self) -> Option<&str> {
         self.metrics.iter().find_map(|metrics| metrics.get(AGAINST)?.as_str())
     }

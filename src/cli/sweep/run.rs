@@ -55,7 +55,7 @@ impl Run {
         Ok(Self { name, point, folder, arguments, config, args })
     }
 
-    /// Whether the run directory holds this run, finished.
+    /// Whether the run directory contains this run, finished.
     pub(super) fn is_finished(&self) -> Result<bool> {
         let path = self.folder.join("config.toml");
         if !path.exists() {
@@ -71,7 +71,7 @@ impl Run {
         let found = TrainConfig { tile, frame, up: own.up.and(found.up), ..found };
         if found != own {
             let differs = difference(&found.to_toml()?, &own.to_toml()?);
-            let problem = format!("holds another run ({differs}); choose another --out");
+            let problem = format!("contains another run ({differs}); choose another --out");
             return Err(Error::output(&self.folder, problem));
         }
         Ok(self.metrics().is_some())

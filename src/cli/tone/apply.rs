@@ -40,8 +40,8 @@ pub struct ApplyArgs {
     #[arg(long, value_name = "NAME|FILE", value_parser = words::curves::<CurveChoice>())]
     #[arg(default_value_t = ToneSettings::default().curve.into())]
     pub curve: CurveChoice,
-    /// Camera profile from `nightsplat tone fit --profile`, in place of a curve; scores are marked as knowing its
-    /// references
+    /// Camera profile from `nightsplat tone fit --profile`, in place of a curve; scores are marked, as they depend on
+    /// its references
     #[arg(long, value_name = "FILE", conflicts_with_all = ["curve", "gain", "brightness", "colour", "theta"])]
     pub profile: Option<PathBuf>,
     /// Folder for the results, under the same names [default: write nothing]
@@ -281,7 +281,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     set.colours.say();
     let exposure = set.scene.exposure;
     let Some(mut scene) = scene(&views) else {
-        let nothing = || Error::input(&args.input, "holds no photograph");
+        let nothing = || Error::input(&args.input, "contains no photograph");
         return Err(unusable.unwrap_or_else(nothing));
     };
     let views = views.into_iter().map(|(listed, report)| (listed.name.clone(), report)).collect();
@@ -312,13 +312,13 @@ fn settings(args: &ApplyArgs, curve: &CurveChoice) -> Result<ToneSettings> {
     Ok(settings)
 }
 
-/// A curve with the statistics that it needs of the whole set.
+/// A curve with its statistics of the whole dataset, if it has any.
 struct CurveOnSet {
     pseudo_gt: PseudoGt,
     scene: SceneTone,
     /// Masks hide white.
     inverted: bool,
-    /// What was made of the colours of what is mapped.
+    /// Counts of converted and unsupported colours.
     colours: ColourCounts,
 }
 
@@ -340,7 +340,8 @@ impl CurveOnSet {
                 measured.push(MeasuredPhotograph::of(&without(&photograph, &gaps)));
             }
             if measured.is_empty() && settings.scene_statistics {
-                let problem = "--scene-statistics needs training photographs, and there are none";
+                let problem =
+                    "--scene-statistics requires training photographs, and there are none";
                 return Err(Error::Usage(problem.to_owned()));
             }
         }

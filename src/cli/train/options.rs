@@ -33,8 +33,8 @@ struct SeveralSettings {
     /// Tone curve: a name from `nightsplat tone list`, or a .toml, .csv or .cube file [default: {tone.curve}]
     #[arg(long, value_name = "NAME|FILE", value_parser = words::curves::<CurveChoice>())]
     curve: Option<CurveChoice>,
-    /// Camera profile from `nightsplat tone fit --profile`, in place of a curve; scores are marked as knowing its
-    /// references
+    /// Camera profile from `nightsplat tone fit --profile`, in place of a curve; scores are marked, as they depend on
+    /// its references
     #[arg(long, value_name = "FILE", conflicts_with_all = ["curve", "gain", "brightness", "colour", "theta"])]
     profile: Option<PathBuf>,
     /// Gain constant c of the curve, or auto to measure the gain, as the curve auto does [default: {tone.gain_c of
@@ -130,7 +130,7 @@ fn help(row: &Setting) -> String {
 }
 
 impl TrainOptions {
-    /// Whether the command line sets a setting.
+    /// Whether the command line gives a setting.
     pub(in crate::cli) fn gives(&self, key: &str) -> bool {
         self.single.0.iter().any(|(row, _)| row.key == key)
     }

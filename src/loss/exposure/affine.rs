@@ -18,16 +18,16 @@ impl Affine {
     /// The identity.
     pub const IDENTITY: Self = Self { gain: [1.0; 3], bias: [0.0; 3] };
 
-    /// The affine that maps `from` nearest to `to`, by least squares for each channel. A channel that is constant in
-    /// `from` gets a bias only.
+    /// The affine that maps `from` to `to`, by least squares for each channel. A channel that is constant in `from`
+    /// gets a bias only.
     ///
     /// # Errors
-    /// [`Error::Usage`] where the images differ in size or have no pixels.
+    /// [`Error::Usage`] if the images differ in size or have no pixels.
     pub fn least_squares(from: &Image, to: &Image) -> Result<Self> {
         let pixels = from.pixel_count();
         let is_pair = (from.width, from.height) == (to.width, to.height);
         if !is_pair || pixels == 0 {
-            let problem = "only images of one size, with pixels, can be brought near each other";
+            let problem = "the images must have the same size, and pixels";
             return Err(Error::Usage(problem.to_owned()));
         }
         let mut affine = Self::IDENTITY;
@@ -54,7 +54,7 @@ impl Affine {
         Ok(affine)
     }
 
-    /// Applies it to an image.
+    /// Applies the affine to an image.
     #[must_use]
     pub fn applied(&self, image: &Image) -> Image {
         let pixels = image.pixel_count();
@@ -65,7 +65,7 @@ impl Affine {
         Image { data: image.data.iter().enumerate().map(value).collect(), ..*image }
     }
 
-    /// The same exposures relative to their mean, so that the mean is the identity.
+    /// The exposures relative to their mean: the mean of the result is the identity.
     pub fn about_their_mean(exposures: &[Self]) -> Vec<Self> {
         let mean = |of: &dyn Fn(&Self) -> f64| {
             exposures.iter().map(of).sum::<f64>() / exposures.len().max(1) as f64

@@ -5,7 +5,7 @@
 //! IMG_0001,-1.02,0.71,0.72,0.7,0.004,0.002,0.001
 //! ```
 //!
-//! Columns but `name` may be left out, and cells be empty.
+//! Only `name` is required; cells may be empty.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -26,9 +26,9 @@ const COLUMNS: [&str; 8] =
 pub struct KnownExposure {
     /// The view's name.
     pub name: String,
-    /// The stops by which the photograph is brighter than at EV 0, in linear light.
+    /// The brightness of the photograph relative to EV 0, in stops of linear light.
     pub ev: Option<f64>,
-    /// The exposure on encoded values of the target.
+    /// The exposure of encoded values of the target.
     pub affine: Option<Affine>,
 }
 
@@ -62,7 +62,7 @@ pub fn save(path: &Path, exposures: &[(String, Affine)]) -> Result<()> {
 /// Reads the rows of a table; a name may have the extension of its photograph.
 ///
 /// # Errors
-/// The file cannot be read, has a column that there is not, a line that is no line of it, or a view twice.
+/// The file cannot be read, has an unknown column, an invalid line, or a view twice.
 pub fn load(path: &Path) -> Result<Vec<KnownExposure>> {
     let text = input::text(path)?;
     let refused = |problem: String| Error::input(path, problem);
@@ -79,7 +79,7 @@ pub fn load(path: &Path) -> Result<Vec<KnownExposure>> {
         let exposure = parsed(&columns, line)
             .map_err(|problem| refused(format!("line {}: {problem}", number + 1)))?;
         if !names.insert(exposure.name.clone()) {
-            let problem = format!("line {}: `{}` comes twice", number + 1, exposure.name);
+            let problem = format!("line {}: `{}` occurs twice", number + 1, exposure.name);
             return Err(refused(problem));
         }
         known.push(exposure);
@@ -100,7 +100,7 @@ fn parsed(columns: &[&str], line: &str) -> Result<KnownExposure, String> {
             return Ok(None);
         }
         let value = cell.parse::<f64>().ok().filter(|value| value.is_finite());
-        value.map(Some).ok_or_else(|| format!("{column} is `{cell}`, which is no number"))
+        value.map(Some).ok_or_else(|| format!("{column} is `{cell}`, which is not a number"))
     };
     let three = |of: &str| -> Result<Option<[f64; 3]>, String> {
         match [
@@ -110,7 +110,7 @@ fn parsed(columns: &[&str], line: &str) -> Result<KnownExposure, String> {
         ] {
             [Some(r), Some(g), Some(b)] => Ok(Some([r, g, b])),
             [None, None, None] => Ok(None),
-            _ => Err(format!("{of} needs all of red, green and blue, or none")),
+            _ => Err(format!("{of} needs red, green and blue, or none of them")),
         }
     };
     let (gain, bias) = (three("gain")?, three("bias")?);
@@ -134,7 +134,7 @@ mod tests {
     }
 
     #[test]
-    fn a_table_survives_its_file() {
+    fn a_table_is_read_back_from_its_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("exposures.csv");
         let affine = Affine { gain: [0.7, 1.0 / 3.0, 2.5], bias: [0.125, -1e-7, 0.0] };
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn cells_may_be_empty_and_columns_be_left_out() {
+    fn cells_may_be_empty_and_columns_omitted() {
         let known = read("name,ev\nb.JPG, -1.5\n\na,\n").unwrap();
         assert_eq!((known[0].name.as_str(), known[0].ev, known[0].affine), ("b", Some(-1.5), None));
         assert_eq!((known[1].name.as_str(), known[1].ev), ("a", None));
@@ -157,16 +157,16 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_table_is_refused_with_its_line() {
+    fn an_invalid_table_is_refused_with_its_line() {
         for (text, part) in [
             ("", "begins with ``"),
             ("view,ev\n", "name,ev,gain_r"),
             ("name,evs\n", "evs"),
             ("name,ev\na\n", "line 2"),
             ("name,ev\na,many\n", "`many`"),
-            ("name,ev\na,nan\n", "no number"),
-            ("name,ev\na,1\na.png,1\n", "line 3: `a` comes twice"),
-            ("name,gain_r\na,1\n", "all of red, green and blue"),
+            ("name,ev\na,nan\n", "not a number"),
+            ("name,ev\na,1\na.png,1\n", "line 3: `a` occurs twice"),
+            ("name,gain_r\na,1\n", "needs red, green and blue"),
             ("name,gain_r,gain_g,gain_b\na,1,0,1\n", "above 0"),
         ] {
             let message = read(text).unwrap_err().to_string();
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gain_of_the_encoded_square_root_is_worth_about_a_stop() {
+    fn an_encoded_gain_of_sqrt_2_is_about_a_stop() {
         let affine = |gain: f64| Affine { gain: [gain; 3], bias: [0.0; 3] };
         assert_eq!(Affine::IDENTITY.stops(), 0.0);
         let grey = |stops: f32| srgb_from_linear(MIDDLE_GREY * stops.exp2());

@@ -1,4 +1,4 @@
-//! The memory of the denoiser: the maps of a stage, or of every stage where memory allows, and gradients.
+//! The memory of the denoiser: the maps of one stage, or of every stage if memory allows, and gradients.
 
 use glam::UVec2;
 
@@ -10,7 +10,7 @@ use super::DenoiserSettings;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 
-/// What determines the lengths of the buffers.
+/// The sizes that determine the lengths of the buffers.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct DenoiserExtent {
     pub(super) pixels: usize,
@@ -43,7 +43,7 @@ impl DenoiserExtent {
     }
 
     /// # Errors
-    /// The device does not bind what a view of `size` takes.
+    /// A view of `size` exceeds what the device can bind.
     pub(super) fn check(self, gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> Result<()> {
         let channels = settings.channels;
         let map = settings.channels().max(RGB as usize) * self.pixels;
@@ -61,7 +61,7 @@ impl DenoiserExtent {
         }
     }
 
-    /// What [`DenoiserMemory::new`] takes.
+    /// The bytes that [`DenoiserMemory::new`] allocates.
     #[cfg(feature = "testing")]
     pub(super) fn bytes(self, settings: DenoiserSettings) -> u64 {
         let images = settings.stages as usize + 3;
@@ -74,7 +74,7 @@ impl DenoiserExtent {
 /// State of a stage between its forward and its backward pass.
 #[derive(Debug)]
 pub(super) struct Activations {
-    /// f of every repeat, each (C, H, W); where f is packed, that of the first, and two buffers that alternate for the
+    /// f of every repeat, each (C, H, W); if f is packed, that of the first, and two buffers that alternate for the
     /// later ones.
     features: Vec<Buffer<f32>>,
     /// conv(f) of every repeat, repeats x (C, H, W).
@@ -86,7 +86,8 @@ pub(super) struct Activations {
     pub(super) update: Buffer<f32>,
 }
 
-/// Maps of f: (repeats + 1), or three where the backward pass reads those between the first and the last packed.
+/// The number of maps of f: repeats + 1, or three if the backward pass reads the packed form of those between the first
+/// and the last.
 fn feature_maps(settings: DenoiserSettings) -> usize {
     let all = settings.repeats as usize + 1;
     match settings.precision {
@@ -96,7 +97,7 @@ fn feature_maps(settings: DenoiserSettings) -> usize {
 }
 
 impl Activations {
-    /// f of a repeat; where f is packed, that of the first or of one of the last two that were written.
+    /// f of a repeat; if f is packed, only of the first or of the two written last.
     pub(super) fn features(&self, repeat: usize) -> &Buffer<f32> {
         &self.features[self.slot(repeat)]
     }
@@ -196,8 +197,7 @@ impl EarlierStages {
         self.extent
     }
 
-    /// The activations of stage `k` in a view of this extent: its own where they are kept, else those that all stages
-    /// share.
+    /// The activations of stage `k` in a view of this extent: its own if they are kept, else the shared ones.
     pub(super) fn of<'a>(
         &'a mut self,
         k: usize,
@@ -212,7 +212,7 @@ impl EarlierStages {
 /// The memory of one view.
 #[derive(Debug)]
 pub(super) struct DenoiserMemory {
-    /// Of the last stage, and of those before it without activations of their own.
+    /// Of the last stage, and of earlier ones without their own activations.
     pub(super) activations: Activations,
     /// `R_1` to `R_K`, each (3, H, W).
     pub(super) denoised: Vec<Buffer<f32>>,

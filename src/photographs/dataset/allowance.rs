@@ -1,4 +1,4 @@
-//! Memory that loading may use.
+//! A limit on the memory that loading may use.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -11,7 +11,7 @@ impl Allowance {
         Self(AtomicU64::new(bytes))
     }
 
-    /// Takes `bytes` if they are left.
+    /// Takes `bytes` if they are available.
     pub(super) fn take(&self, bytes: u64) -> bool {
         let left_after = |left: u64| left.checked_sub(bytes);
         self.0.fetch_update(Ordering::Relaxed, Ordering::Relaxed, left_after).is_ok()
@@ -23,7 +23,7 @@ mod tests {
     use super::Allowance;
 
     #[test]
-    fn what_is_taken_never_exceeds_the_allowance() {
+    fn allocations_never_exceed_the_allowance() {
         let allowance = Allowance::new(10);
         assert!(allowance.take(6));
         assert!(!allowance.take(5));

@@ -1,6 +1,7 @@
-//! Black borders and corners that belong to no scene: what undistorting leaves where the lens saw nothing, and bars.
+//! Black borders and corners outside the scene: blank areas of undistorted photographs, and bars.
 //!
-//! Such black touches the border, lies in the same place in all views and ends abruptly; the black of a dark scene does not.
+//! Such black touches the border, is at the same position in all views and ends abruptly, unlike the black of a dark
+//! scene.
 
 use std::collections::BTreeMap;
 
@@ -8,27 +9,27 @@ use super::source::{Source, shown};
 use super::{Photograph, Split};
 use crate::photographs::image::{Image, Mask, PictureFile};
 
-/// Black is at most this, encoded: what JPEG makes of 0 within a block of it.
+/// The maximum encoded value of black: JPEG turns 0 into up to this within a block.
 const BLACK: f32 = 1.5 / 255.0;
-/// What is brighter than this shows something.
+/// Brighter pixels are part of the scene.
 const SOMETHING: f32 = 4.0 / 255.0;
 /// How many photographs of a size are looked at, and how many are needed.
 const LOOKED_AT: usize = 12;
 const NEEDED: usize = 3;
-/// The part of the photographs that is black in the same place.
+/// The share of the photographs that must be black at a position.
 const MAX_VIEWS: f64 = 0.9;
-/// The least part of a photograph that matters.
+/// The minimum area of a border, as a share of the photograph.
 const LEAST_AREA: f64 = 0.002;
-/// The part of its outline at which black must end abruptly.
+/// The share of its outline at which black must end abruptly.
 const LEAST_ABRUPT: f64 = 0.5;
-/// In most views black from the border on is at most this many times what all have in common: a sky whose horizon moves
-/// has more.
+/// In most views, the black connected to the border is at most this many times the common black: a sky with a moving
+/// horizon has more.
 const MOST_EXTRA: f64 = 1.2;
-/// What JPEG makes of black in a block that shows something as well is below this.
+/// JPEG turns black in a block with content into less than this.
 const DIM: f32 = 8.0 / 255.0;
-/// A block of JPEG, pixels: so far around black what is dim in most views is black.
+/// A block of JPEG, pixels: within this distance of black, pixels that are dim in most views are black.
 const BLOCK: usize = 8;
-/// How far interpolation carries black into what shows something, pixels.
+/// How far interpolation spreads black, pixels.
 const REACH: usize = 2;
 
 /// The pixels that show nothing, as indices into a plane, ascending; by width and height of the photographs as stored.

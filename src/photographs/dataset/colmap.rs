@@ -21,11 +21,11 @@ pub(super) struct ModelImage {
     pub(super) camera: u32,
     /// Path relative to the image folder.
     pub(super) name: String,
-    /// `None` where the model's numbers are no pose (NaN, or a rotation of length zero).
+    /// `None` if the model's numbers are not a pose (NaN, or a rotation of length zero).
     pub(super) view_from_world: Option<DAffine3>,
 }
 
-/// A triangulated point. Its colour is left in the file: it may come from normal-light photographs.
+/// A triangulated point. Its colour is not read: it may come from normal-light photographs.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct ModelPoint {
     pub(super) position: DVec3,
@@ -33,7 +33,7 @@ pub(super) struct ModelPoint {
     pub(super) images: Vec<u32>,
 }
 
-/// The models in the folders of a place, or itself where they hold none.
+/// The models in the subfolders of a folder, or the folder itself if there are none.
 pub(super) fn models_in(place: &Path, needed: &[&str]) -> Vec<PathBuf> {
     let folders = tree::entries(place).unwrap_or_default();
     let mut models: Vec<PathBuf> =
@@ -45,12 +45,13 @@ pub(super) fn models_in(place: &Path, needed: &[&str]) -> Vec<PathBuf> {
     models
 }
 
-/// A folder that is a model itself.
+/// A folder that is itself a model.
 pub(super) fn model_in(folder: &Path, needed: &[&str]) -> Option<PathBuf> {
     needed.iter().all(|stem| file(folder, stem).is_some()).then(|| folder.to_owned())
 }
 
-/// The model that places the most photographs that exist, and how many each of several places; none of none.
+/// The model with the most registered photographs that exist, and the count of each if there are several; `None` if
+/// there is none.
 pub(super) fn largest(
     models: &[PathBuf],
     exists: impl Fn(&str) -> bool,
@@ -76,7 +77,7 @@ pub(super) fn read_cameras(folder: &Path) -> Result<BTreeMap<u32, Lens>> {
     }
 }
 
-/// The registered photographs, in the file's order.
+/// The registered photographs, in file order.
 pub(super) fn read_images(folder: &Path) -> Result<Vec<ModelImage>> {
     match required(folder, "images")? {
         Encoded::Binary(path) => binary::images(&path),
@@ -84,7 +85,7 @@ pub(super) fn read_images(folder: &Path) -> Result<Vec<ModelImage>> {
     }
 }
 
-/// The points whose position is finite, by id; both encodings give the same order.
+/// The points with finite positions, by id; both encodings give the same order.
 pub(super) fn read_points(folder: &Path) -> Result<Vec<ModelPoint>> {
     let points = match required(folder, "points3D")? {
         Encoded::Binary(path) => binary::points(&path)?,
@@ -132,7 +133,7 @@ const MODELS: [(&str, usize); 18] = [
     ("EQUIRECTANGULAR", 2),
 ];
 
-/// Those of them that are rendered, or undistorted on load.
+/// The models that are rendered natively, or undistorted on load.
 pub(super) const SUPPORTED: [&str; 11] = [
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -147,7 +148,7 @@ pub(super) const SUPPORTED: [&str; 11] = [
     "FISHEYE",
 ];
 
-/// What to do about photographs of a model that is not supported.
+/// The remedy for photographs of an unsupported model.
 pub(super) fn remedy(model: &str) -> &'static str {
     const PANORAMAS: [&str; 6] =
         ["EQUIRECTANGULAR", "SPHERICAL", "PANORAMA", "PANO", "CYLINDRICAL", "OMNIDIRECTIONAL"];
@@ -158,7 +159,7 @@ pub(super) fn remedy(model: &str) -> &'static str {
     }
 }
 
-/// A camera of a model by name; the error is what to tell the user.
+/// A camera of a model by name; the error is a message for the user.
 fn lens(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Lens, String> {
     let none = Distortion::default();
     let fisheye = Distortion { is_fisheye: true, ..none };

@@ -3,12 +3,12 @@
 use super::loaded::Loaded;
 use super::{LoadOptions, Split};
 
-/// A photograph whose mean is at most this, encoded, is dark.
+/// A photograph whose encoded mean is at most this is dark.
 const DARK: f32 = 0.25;
 /// A normal-light image is brighter than its dark photograph by more than this factor.
 const BRIGHTER: f32 = 1.3;
 
-/// Treats reference images that are as dark as the photographs as photographs, with a warning.
+/// Turns reference images that are as dark as the photographs into photographs, with a warning.
 pub(super) fn drop_from(loaded: &mut [Loaded], options: &LoadOptions) {
     let is_trained_on =
         |own: &&Loaded| own.view.as_ref().is_some_and(|view| view.split == Split::Train);
@@ -30,8 +30,8 @@ pub(super) fn drop_from(loaded: &mut [Loaded], options: &LoadOptions) {
         dropped.push(name.as_str());
     }
     tracing::warn!(
-        "{} reference images are as dark as the photographs (mean {reference:.3} and {photograph:.3}; {} the first), so they \
-         are none: test views are scored against their own targets",
+        "{} reference images are as dark as the photographs (mean {reference:.3} and {photograph:.3}; {} the first), \
+             so they are none: test views are scored against their own targets",
         dropped.len(),
         dropped.first().copied().unwrap_or_default()
     );

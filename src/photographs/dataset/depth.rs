@@ -1,4 +1,4 @@
-//! Depth maps beside photographs.
+//! Depth maps next to photographs.
 
 use std::path::Path;
 
@@ -6,10 +6,10 @@ use super::prepare::{Preparation, check_excess};
 use crate::photographs::image::Image;
 use crate::{Error, Result};
 
-/// The depth map as the view's camera sees it, (H, W); larger is farther.
+/// The depth map as seen by the view's camera, (H, W); larger is farther.
 ///
 /// # Errors
-/// The file is no image, has far more pixels than its view, is the same everywhere or holds a value that is not finite.
+/// The file is not an image, has far more pixels than its view, is constant, or has a value that is not finite.
 pub(super) fn depth_map(
     path: &Path,
     preparation: &Preparation<'_>,
@@ -33,7 +33,7 @@ pub(super) fn depth_map(
     if depth.iter().all(|&value| value == depth[0]) {
         return Err(Error::input(path, "is the same everywhere"));
     }
-    // Only ratios count; the squares of what lies beyond would not be floats.
+    // Only ratios matter; the squares of larger values would overflow.
     let largest = depth.iter().fold(0.0_f32, |largest, value| largest.max(value.abs()));
     if !(1e-12..1e12).contains(&largest) {
         depth.iter_mut().for_each(|value| *value /= largest);

@@ -1,4 +1,4 @@
-//! Which dataset it is: names, sizes, poses and pixels of what is trained on, as checksums.
+//! The identity of a dataset: names, sizes, poses and pixels of the training photographs, as checksums.
 
 use std::collections::BTreeMap;
 
@@ -10,10 +10,10 @@ use crate::Result;
 use crate::base::hash::{self, Hasher};
 use crate::camera::CameraModel;
 
-/// What distinguishes one dataset from another, as it was loaded.
+/// The identity of a dataset as it was loaded.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Fingerprint {
-    /// Camera and photograph of each view that is for training, by name.
+    /// Checksums of camera and photograph of each view for training, by name.
     views: BTreeMap<String, [String; 2]>,
     /// The points.
     points: String,
@@ -35,7 +35,7 @@ impl Fingerprint {
         Ok(Self { views: views.collect::<Result<_>>()?, points: hash::text(points.finish()) })
     }
 
-    /// All of it in one checksum.
+    /// One checksum of everything.
     pub fn checksum(&self) -> String {
         let mut hasher = Hasher::default();
         for (name, [camera, pixels]) in &self.views {
@@ -45,7 +45,7 @@ impl Fingerprint {
         hash::text(hasher.finish())
     }
 
-    /// The first thing in which the dataset that `self` was taken of differs from another.
+    /// The first difference from another dataset, in words; `None` if they are equal.
     pub fn difference(&self, other: &Self) -> Option<String> {
         let missing =
             |a: &Self, b: &Self| a.views.keys().find(|name| !b.views.contains_key(*name)).cloned();
@@ -82,7 +82,7 @@ fn camera(View { camera, .. }: &View) -> u64 {
 }
 
 fn pixels(view: &View) -> Result<u64> {
-    // A photograph that is not kept was looked at while it was decoded.
+    // The checksum of a photograph that is not kept was computed while it was decoded.
     let not_kept = view.original.as_ref().filter(|_| view.image.is_none());
     let known = not_kept.and_then(Original::checksum);
     let image = if known.is_some() { None } else { view.loaded()? };

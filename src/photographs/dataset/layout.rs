@@ -1,4 +1,4 @@
-//! Where a dataset has its listing: in the folder that is named, above it, or in an archive.
+//! The location of a dataset's listing: in the given folder, above it, or in an archive.
 
 use std::path::{Path, PathBuf};
 
@@ -7,17 +7,17 @@ use crate::base::tree;
 use crate::photographs::image::files::{is_hidden, photographs_in};
 use crate::{Error, Result};
 
-/// A dataset's folder and what lists its photographs.
+/// A dataset's folder and the listing of its photographs.
 #[derive(Clone, Debug)]
 pub(super) struct Layout {
-    /// What paths are relative to.
+    /// The folder that paths are relative to.
     pub(super) root: PathBuf,
-    /// The place of a COLMAP model that was named itself.
+    /// The COLMAP model that the user named, if any.
     named: Option<PathBuf>,
 }
 
-/// Where COLMAP and its users put models below a dataset's root, most likely first; a folder may hold several in folders.
-/// The root itself may be one, as what tools export is; `distorted` is of 3DGS's converter.
+/// Folders of COLMAP models below a dataset's root, most likely first; a folder may contain several in subfolders. The
+/// root itself may be a model, as in exports of some tools; `distorted` is written by the converter of 3DGS.
 const MODEL_FOLDERS: [&str; 8] = [
     "sparse",
     "colmap_sparse",
@@ -28,14 +28,14 @@ const MODEL_FOLDERS: [&str; 8] = [
     "",
     "undistorted/sparse",
 ];
-/// How far above a model its photographs may lie: `distorted/sparse/0`.
+/// How far above a model its photographs may be: `distorted/sparse/0`.
 const MOST_ABOVE: usize = 3;
 
 impl Layout {
-    /// The layout of what a user names: a dataset's folder or archive, its transforms file, or its COLMAP model.
+    /// The layout of a path that a user gives: a dataset's folder or archive, its transforms file, or its COLMAP model.
     ///
     /// # Errors
-    /// [`Error::Input`] where it is neither, or an archive that cannot be read.
+    /// [`Error::Input`] if it is none of these, or an unreadable archive.
     pub(super) fn of(given: &Path) -> Result<Self> {
         tree::check(given)
             .map_err(|error| Error::input(given, format!("cannot be read: {error}")))?;
@@ -56,7 +56,7 @@ impl Layout {
         if own.has_listing() {
             return Ok(own.above_model().unwrap_or(own));
         }
-        // An archive often holds one folder, and that the dataset.
+        // An archive often contains a single folder, which is the dataset.
         if tree::archive_of(given) == Some(given)
             && let [only] = folders_in(given).as_slice()
         {
@@ -70,7 +70,7 @@ impl Layout {
         if self.named.is_some() { vec![] } else { transforms::find(&self.root) }
     }
 
-    /// The COLMAP models with what `needed` lists, of the first place that has any, by name.
+    /// The COLMAP models that have all `needed` files, from the first location with any, by name.
     pub(super) fn models(&self, needed: &[&str]) -> Vec<PathBuf> {
         if let Some(place) = &self.named {
             return colmap::models_in(place, needed);
@@ -81,7 +81,7 @@ impl Layout {
         });
         let mut known = known.filter(|models: &Vec<PathBuf>| !models.is_empty());
         known.next().unwrap_or_else(|| {
-            // A folder of any name; one that holds photographs as well is a dataset of its own.
+            // A folder of any name; one that also contains photographs is a separate dataset.
             let bare = folders_in(&self.root).into_iter().filter(|folder| !has_photographs(folder));
             bare.filter_map(|folder| colmap::model_in(&folder, needed)).collect()
         })
@@ -92,7 +92,7 @@ impl Layout {
         !self.listings().is_empty() || !self.models(&CAMERAS).is_empty()
     }
 
-    /// Of a model that was named itself the layout of the dataset around it.
+    /// The layout of the dataset around a model that was named.
     fn above_model(&self) -> Option<Self> {
         let given = &self.root;
         let folders = folders_in(given);
@@ -108,7 +108,7 @@ impl Layout {
         Some(Self { root, named: Some(given) })
     }
 
-    /// What there is in place of a dataset, and the remedy.
+    /// What was found instead of a dataset, with the remedy.
     pub(super) fn no_dataset(&self) -> String {
         let root = &self.root;
         let expected = "transforms_train.json, transforms.json or a COLMAP model in sparse/0";
@@ -125,13 +125,14 @@ impl Layout {
         match photographs_in(root).map_or(0, |photographs| photographs.len()) {
             0 => format!("holds no dataset; expected {expected}"),
             count => format!(
-                "holds no dataset but {count} photographs, whose poses are not known; find them with `nightsplat pose {} --out DATASET` (expected {expected})",
+                "holds no dataset but {count} photographs, whose poses are not known; find them with \
+                 `nightsplat pose {} --out DATASET` (expected {expected})",
                 root.display()
             ),
         }
     }
 
-    /// A dataset in a folder below, two levels deep at most.
+    /// A dataset in a subfolder, at most two levels deep.
     fn below(&self) -> Option<PathBuf> {
         let first = folders_in(&self.root);
         let second: Vec<PathBuf> = first.iter().flat_map(|folder| folders_in(folder)).collect();
@@ -140,10 +141,10 @@ impl Layout {
     }
 }
 
-/// What a model needs to list photographs with cameras.
+/// The files that a model needs to list photographs with cameras.
 pub(super) const CAMERAS: [&str; 2] = ["cameras", "images"];
 
-/// The folders of a folder, by name, without hidden ones.
+/// The visible subfolders of a folder, by name.
 fn folders_in(folder: &Path) -> Vec<PathBuf> {
     let mut folders = tree::entries(folder).unwrap_or_default();
     folders.retain(|path| !is_hidden(path) && tree::is_dir(path));
@@ -151,7 +152,7 @@ fn folders_in(folder: &Path) -> Vec<PathBuf> {
     folders
 }
 
-/// Whether photographs lie in a folder, or in one of its folders.
+/// Whether there are photographs in a folder or in one of its subfolders.
 fn has_photographs(folder: &Path) -> bool {
     let directly = |folder: &Path| photographs_in(folder).is_ok_and(|paths| !paths.is_empty());
     directly(folder) || folders_in(folder).iter().any(|folder| directly(folder))

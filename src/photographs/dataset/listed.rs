@@ -1,4 +1,4 @@
-//! What a listing says of its views, before any pixel is read.
+//! Views as listed, before any pixel is read.
 
 use std::path::PathBuf;
 
@@ -13,16 +13,16 @@ use crate::photographs::image::MaskFile;
 #[derive(Clone, Debug)]
 pub(super) struct ListedView {
     pub(super) name: String,
-    /// Path as listed, relative to the root; where the photograph was found elsewhere, that path.
+    /// Path as listed, relative to the root; if the photograph was found elsewhere, that path.
     pub(super) listed: String,
-    /// Path below the folder of all photographs.
+    /// Path relative to the common folder of all photographs.
     pub(super) below: String,
     /// `None`: the split rule decides.
     pub(super) split: Option<Split>,
-    /// The listed file, where it exists.
+    /// The listed file, if it exists.
     pub(super) file: Option<PathBuf>,
     pub(super) lens: Lens,
-    /// Rigid; the world is the listing's.
+    /// A rigid transform from the listing's world.
     pub(super) view_from_world: DAffine3,
     /// The mask that the listing names.
     pub(super) mask: Option<MaskFile>,
@@ -34,7 +34,7 @@ pub(super) struct ListedView {
 pub(super) struct Listing {
     pub(super) frames: Vec<ListedView>,
     pub(super) skipped: Vec<String>,
-    /// What was chosen, and what lies there unused; a line each.
+    /// Choices that were made, and unused files; one line each.
     pub(super) remarks: Vec<String>,
     /// Points that the listing names.
     pub(super) clouds: Vec<Cloud>,

@@ -1,4 +1,4 @@
-//! What a dataset lists: photographs with their cameras, before any pixel is read.
+//! The listing of a dataset: photographs with their cameras, before any pixel is read.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -10,7 +10,7 @@ use super::{colmap, names, transforms, unused};
 use crate::photographs::image::files::{self, Files};
 use crate::{Error, Result};
 
-/// The views by name, all different; their photographs are looked for in `images` where it is given.
+/// The views by name, which is unique; their photographs are searched in `images` if given.
 pub(super) fn list(layout: &Layout, images: Option<&Path>, files: &Files) -> Result<Listing> {
     let root = layout.root.as_path();
     let mut listing = Listing::default();
@@ -60,7 +60,8 @@ fn list_colmap(
             (folder.strip_prefix(root).unwrap_or(folder).display(), counts.iter().sum::<usize>());
         let counts: Vec<String> = counts.iter().map(usize::to_string).collect();
         listing.remarks.push(format!(
-            "{}: COLMAP left {} models, of {} photographs; {taken}, the largest, is taken, and what the others place of these {all} is not",
+            "{}: COLMAP left {} models, of {} photographs; {taken}, the largest, is taken, and what the others place \
+             of these {all} is not",
             root.display(),
             models.len(),
             counts.join(", "),

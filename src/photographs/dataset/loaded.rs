@@ -1,4 +1,4 @@
-//! A view with what its files told while they were decoded.
+//! A decoded view with measurements of its files.
 
 use super::View;
 use super::original::Original;
@@ -6,7 +6,7 @@ use super::original::Original;
 /// A decoded view.
 pub(super) struct Loaded {
     pub(super) name: String,
-    /// `None`: a training view whose photograph does not decode.
+    /// `None` for a training view whose photograph cannot be decoded.
     pub(super) view: Option<View>,
     /// Why files were left out, one line each.
     pub(super) problems: Vec<String>,

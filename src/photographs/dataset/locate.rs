@@ -1,4 +1,5 @@
-//! Where listed photographs lie: at their paths, or under the same names elsewhere, since a listing may be of another machine.
+//! The locations of listed photographs: their paths, or the same names elsewhere, since a listing may be from another
+//! machine.
 
 use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -10,27 +11,28 @@ use crate::base::tree;
 use crate::photographs::image::MaskFile;
 use crate::photographs::image::files::{Files, is_hidden};
 
-/// A photograph as it is listed.
+/// A listed photograph.
 pub(super) struct Wanted {
     /// With slashes.
     pub(super) path: String,
     /// The folders that the path may be relative to.
     pub(super) places: Vec<PathBuf>,
-    /// Absent test photographs are no sign that the listing is of another machine: some datasets keep them back.
+    /// Missing test photographs do not indicate that the listing is from another machine: some datasets withhold them.
     pub(super) is_test: bool,
 }
 
-/// Where it is.
+/// The location of a photograph.
 #[derive(Clone, Debug)]
 pub(super) struct Found {
-    /// Relative to the root; as it was listed where the file is absent or lies elsewhere.
+    /// Relative to the root; as listed if the file is missing or outside.
     pub(super) listed: String,
-    /// Path below the folder of all photographs.
+    /// Path relative to the common folder of all photographs.
     pub(super) below: String,
     pub(super) file: Option<PathBuf>,
 }
 
-/// Folders that tools put photographs into, by which one is taken where several hold all names: the last ones are shrunk.
+/// Folders that tools write photographs to, in order of preference if several contain all names; the last ones are
+/// downscaled.
 const PREFERRED: [&str; 10] = [
     "low",
     "images_low",
@@ -43,15 +45,15 @@ const PREFERRED: [&str; 10] = [
     "images_8",
     "image",
 ];
-/// Beginnings of folders that hold other things under the photographs' names.
+/// Prefixes of folders that contain other files with the photographs' names.
 const OTHERS: [&str; 8] =
     ["mask", "depth", "normal", "segment", "semantic", "dynamic_mask", "high", "flow"];
-/// How deep photographs are looked for, and in how many folders.
+/// Depth and number of the folders in which photographs are searched.
 const MOST_DEEP: usize = 3;
 const MOST_FOLDERS: usize = 1000;
 
-/// Finds the photographs: in `images` where that is given; at their paths; or those that are absent under the same names
-/// in the one folder that holds most of them, which is a remark.
+/// Finds the photographs: in `images` if given, or at their paths; missing ones under the same names in the only folder
+/// with most of them, which is reported.
 pub(super) fn photographs(
     (root, images): (&Path, Option<&Path>),
     wanted: Vec<Wanted>,
@@ -70,7 +72,8 @@ pub(super) fn photographs(
         match elsewhere(root, &paths, &used, files) {
             Elsewhere::In(folder, rests) => {
                 listing.remarks.push(format!(
-                    "{}: {} of its photographs are not where it lists them ({} the first); those of the same names in {} are taken",
+                    "{}: {} of its photographs are not where it lists them ({} the first); those of the same names \
+                     in {} are taken",
                     root.display(),
                     rests.iter().filter(|(_, file)| file.is_some()).count(),
                     paths.first().copied().unwrap_or_default(),
@@ -83,7 +86,8 @@ pub(super) fn photographs(
                 }
             }
             Elsewhere::InSeveral(folders) => listing.skipped.push(format!(
-                "{}: {} photographs are not where it lists them ({} the first), and {} hold files of their names; choose one with --images",
+                "{}: {} photographs are not where it lists them ({} the first), and {} hold files of their \
+                 names; choose one with --images",
                 root.display(),
                 paths.len(),
                 paths.first().copied().unwrap_or_default(),
@@ -95,7 +99,7 @@ pub(super) fn photographs(
     found
 }
 
-/// Resolves the masks and depth maps that a listing names; says which are absent.
+/// Resolves the masks and depth maps of a listing; reports missing ones.
 pub(super) fn beside(root: &Path, files: &Files, listing: &mut Listing) {
     let Listing { frames, remarks, .. } = listing;
     let folders = folders_below(root, &[]);
@@ -108,7 +112,7 @@ pub(super) fn beside(root: &Path, files: &Files, listing: &mut Listing) {
             name.to_ascii_lowercase().contains(kind)
         });
         let elsewhere = own.cloned().chain(beside).find_map(|folder| files.find(&folder, name));
-        // A name alone, without an ending that tells them apart, is the photograph's as well.
+        // A name without a distinct ending is also that of the photograph.
         files.find(root, &listed).or(elsewhere).filter(|file| Some(file) != photograph)
     };
     let mut absent: BTreeMap<&str, Vec<String>> = BTreeMap::new();
@@ -136,7 +140,7 @@ pub(super) fn beside(root: &Path, files: &Files, listing: &mut Listing) {
     }
 }
 
-/// At the path that is listed.
+/// At the listed path.
 fn at_path(root: &Path, wanted: &Wanted, files: &Files) -> Found {
     for place in &wanted.places {
         if let Some(file) = files.find(place, &wanted.path) {
@@ -157,13 +161,13 @@ fn at_path(root: &Path, wanted: &Wanted, files: &Files) -> Found {
     Found { below: below(wanted), listed, file: None }
 }
 
-/// What lies below the folder of all photographs, of a path as listed: listings of several places name it from there.
+/// The part of a listed path below the folder of all photographs: listings of several locations use it as a name.
 fn below(wanted: &Wanted) -> String {
     let is_from_root = wanted.places.len() < 2;
     if is_from_root { below_first(&wanted.path) } else { &wanted.path }.to_owned()
 }
 
-/// In a folder that the user names.
+/// In a folder given by the user.
 fn in_folder(root: &Path, folder: &Path, wanted: &Wanted, files: &Files) -> Found {
     let path = wanted.path.as_str();
     let name = path.rsplit('/').next().unwrap_or(path);
@@ -193,7 +197,7 @@ fn relative(root: &Path, folder: &Path) -> String {
     }
 }
 
-/// What of a path may be the same on another machine, and the file there.
+/// Parts of a path that may be the same on another machine, and the file there.
 type Rests = Vec<(String, Option<PathBuf>)>;
 
 enum Elsewhere {
@@ -202,7 +206,7 @@ enum Elsewhere {
     Nowhere,
 }
 
-/// The folder below the root that holds files of the same names.
+/// The folder below the root that contains files of the same names.
 fn elsewhere(root: &Path, paths: &[&str], used: &HashSet<PathBuf>, files: &Files) -> Elsewhere {
     let folders = folders_below(root, &OTHERS);
     let mut candidates = best(&folders, &rests(paths), used, files);
@@ -226,8 +230,8 @@ fn elsewhere(root: &Path, paths: &[&str], used: &HashSet<PathBuf>, files: &Files
     }
 }
 
-/// The folders that hold the most of the files, at least half of them; of the ways to cut the paths the longest that finds
-/// any.
+/// The folders that contain the most files, at least half of them. Of the ways to shorten the paths, the longest with a
+/// match is used.
 fn best(
     folders: &[PathBuf],
     ways: &[Vec<String>],
@@ -258,7 +262,7 @@ fn best(
     vec![]
 }
 
-/// The paths below what they have in common, and their names alone.
+/// The paths below their common folder, and the names alone.
 fn rests(paths: &[&str]) -> Vec<Vec<String>> {
     let parts = |path: &&str| -> Vec<String> {
         let parts = path.split('/').filter(|part| !matches!(*part, "" | "." | ".."));
@@ -276,7 +280,7 @@ fn rests(paths: &[&str]) -> Vec<Vec<String>> {
     ways
 }
 
-/// The root and the folders below it, but hidden ones and those whose names begin as given.
+/// The root and the folders below it, except hidden ones and those with the given prefixes.
 fn folders_below(root: &Path, without: &[&str]) -> Vec<PathBuf> {
     let mut found = vec![root.to_owned()];
     let mut level = vec![root.to_owned()];

@@ -1,5 +1,5 @@
-//! Masks of views: the one that a listing names, `masks/NAME.png`, or `masks/NAME.jpg.png` as COLMAP calls them,
-//! `dynamic_mask_NAME.png` beside the photograph, and the photographs' own alpha.
+//! Masks of views: the listed one, `masks/NAME.png`, or `masks/NAME.jpg.png` as in COLMAP, `dynamic_mask_NAME.png` next
+//! to the photograph, and the photograph's alpha.
 
 use std::path::Path;
 
@@ -7,9 +7,9 @@ use super::listed::ListedView;
 use crate::photographs::image::MaskFile;
 use crate::photographs::image::files::Files;
 
-/// Where masks lie below the root.
+/// The folder of masks below the root.
 const FOLDER: &str = "masks";
-/// How the names of masks begin that lie beside their photographs and mark what moves (instant-ngp).
+/// Prefix of masks next to their photographs, of moving objects (instant-ngp).
 const MOVING: &str = "dynamic_mask_";
 
 /// The mask of a photograph.
@@ -25,7 +25,7 @@ pub(super) fn find(root: &Path, frame: &ListedView, files: &Files) -> Option<Mas
     own.map(MaskFile::shown).or_else(|| moving(frame, files))
 }
 
-/// The mask of what moves.
+/// The mask of moving objects.
 fn moving(frame: &ListedView, files: &Files) -> Option<MaskFile> {
     let file = frame.file.as_ref()?;
     let name = file.file_name()?.to_str()?;
@@ -33,7 +33,7 @@ fn moving(frame: &ListedView, files: &Files) -> Option<MaskFile> {
     Some(MaskFile { path, is_inverted: true })
 }
 
-/// Whether a file is a mask that lies among photographs.
+/// Whether a file is a mask in a folder of photographs.
 pub(crate) fn is_beside(file: &Path) -> bool {
     file.file_name().is_some_and(|name| name.to_string_lossy().starts_with(MOVING))
 }

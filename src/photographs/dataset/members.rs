@@ -1,4 +1,4 @@
-//! Which views take part: some are left out by name, some kept from training.
+//! Changes to the set of views: some are left out by name, some held out from training.
 
 use std::collections::HashSet;
 
@@ -16,7 +16,7 @@ impl Dataset {
         self.views.iter().filter(|view| view.split == Split::Test)
     }
 
-    /// Leaves out views by name; points forget them.
+    /// Leaves out views by name, also from the tracks of points.
     pub fn leave_out(&mut self, names: &[String]) {
         let names: HashSet<&str> = names.iter().map(String::as_str).collect();
         let stays = |view: &View| !names.contains(view.name.as_str());
@@ -30,7 +30,8 @@ impl Dataset {
     }
 }
 
-/// Holds out `count` of the training views, an eighth of them at most: views that cover where the cameras stand and look.
+/// Holds out `count` of the training views, at most an eighth: views that cover the positions and directions of the
+/// cameras.
 pub(super) fn with_held_out(mut views: Vec<View>, count: usize) -> Vec<View> {
     const MOST: usize = 8;
     let mut training: Vec<&mut View> = views.iter_mut().filter(|view| view.is_train()).collect();

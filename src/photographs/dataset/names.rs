@@ -1,4 +1,5 @@
-//! Names of views: by the photograph's file, and where folders hold equal files, as those of a rig do, by folder and file.
+//! Names of views: the photograph's file name, with the folder if several folders contain files of the same name, as
+//! those of a rig.
 
 use std::collections::BTreeSet;
 
@@ -6,27 +7,27 @@ use super::listed::ListedView;
 pub(super) use crate::photographs::image::files::normalized;
 use crate::photographs::image::files::stem;
 
-/// A path as one file name, so that what is written of a view needs no folders: `a_001` of `a/001.png`.
+/// A path as one file name, so that files of a view need no folders: `a_001` for `a/001.png`.
 fn flat(path: &str) -> String {
     let folder = path.rsplit_once('/').map_or("", |(folder, _)| folder);
     let parts = folder.split('/').filter(|part| !part.is_empty() && *part != ".");
     normalized(&parts.chain([stem(path)]).collect::<Vec<_>>().join("_"))
 }
 
-/// What lies below the first folder of a path.
+/// The part of a path below its first folder.
 pub(super) fn below_first(path: &str) -> &str {
     path.split_once('/').map_or(path, |(_, below)| below)
 }
 
-/// The names that a view may have whose photograph is listed at `path`, the longest first.
+/// The possible names of a view whose photograph is listed at `path`, longest first.
 pub(super) fn possible(path: &str) -> [String; 3] {
     let path = path.trim_start_matches("./");
     [flat(path), flat(below_first(path)), normalized(stem(path))]
 }
 
-/// Puts folders into every name where two photographs in different folders have one: those below the folder of all
-/// photographs, or where these are equal as well (`train/r_0`, `test/r_0`) all of the path. Of one pose they are one photograph
-/// that is listed twice (`low/0`, `high/0`), and nothing is renamed.
+/// Adds folders to all names if two photographs in different folders have the same name: the path below the folder of
+/// all photographs, or the complete path if that is ambiguous as well (`train/r_0`, `test/r_0`). With one pose they are
+/// one photograph that is listed twice (`low/0`, `high/0`), and nothing is renamed.
 pub(super) fn disambiguate(frames: &mut [ListedView]) {
     let are_distinct =
         |names: &[String]| names.iter().collect::<BTreeSet<_>>().len() == names.len();

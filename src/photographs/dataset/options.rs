@@ -1,4 +1,4 @@
-//! How a dataset is loaded.
+//! Options of loading a dataset.
 
 use std::ops::Bound;
 use std::path::PathBuf;
@@ -9,67 +9,68 @@ use crate::base::tree;
 use crate::photographs::white_balance::WhiteBalance;
 use crate::{Error, Result};
 
-/// The factors by which photographs may shrink.
+/// The range of the downscaling factor.
 pub const DOWNSCALE: Rule = Rule::Number(Bound::Included(1.0), Bound::Unbounded);
 
-/// How a dataset is loaded.
+/// Options of loading a dataset.
 #[derive(Clone, Debug)]
 pub struct LoadOptions {
-    /// Factor by which width and height shrink, at least 1; sizes are rounded to whole pixels.
+    /// Factor on width and height, at least 1; sizes are rounded to whole pixels.
     pub downscale: f64,
-    /// The longest side of a view, pixels: photographs that exceed it behind `downscale` shrink to it; 0: they do not.
+    /// Maximum longest side of a view, pixels: photographs that are larger after `downscale` are reduced to it; 0: no
+    /// limit.
     pub max_resolution: u32,
-    /// Every so many views by name are held out, whatever split the dataset has; 0: none; left out: the dataset's own
-    /// split, else every eighth.
+    /// Every Nth view by name is held out, instead of the dataset's split; 0: none. `None`: the dataset's own split,
+    /// else every eighth.
     pub test_every: Option<usize>,
-    /// Bytes that the decoded photographs to train on may take: where they take more, none is kept, and each is read anew
-    /// whenever it is looked at; none: no limit.
+    /// Bytes that the decoded training photographs may take: if they exceed this, none is kept, and each is decoded
+    /// again on every use. `None`: no limit.
     pub keep: Option<u64>,
-    /// The folder that holds the photographs by their listed names, in place of where the listing says they are.
+    /// The folder with the photographs under their listed names, instead of their listed paths.
     pub images: Option<PathBuf>,
     /// Which pixels the cameras are of, where a photograph's Exif turns or mirrors it and sizes do not tell.
     pub orientation: PixelOrientation,
     /// A folder of reference images by name, in place of what is found beside the input.
     pub reference: Option<PathBuf>,
-    /// Whether test views load their dark photograph too, where there is one.
+    /// Whether test views also load their dark photograph, if any.
     pub load_low_test: bool,
-    /// How many training views are kept from training, an eighth of them at most, to tell when it has converged.
+    /// Number of training views, at most an eighth, that are held out to detect convergence.
     pub hold_out: usize,
-    /// Masks hide what is white, not what is black.
+    /// Masks hide white instead of black.
     pub invert_masks: bool,
-    /// Black borders that photographs have in the same place, as undistorting leaves them, are masked.
+    /// Mask black borders that photographs have in the same place, as undistorting leaves them.
     pub mask_borders: bool,
-    /// Gains of the channels of the photographs; reference images stay as they are.
+    /// Gains of the channels of the photographs; reference images are unchanged.
     pub white_balance: Option<WhiteBalance>,
-    /// At which size training photographs are measured while they are decoded, if they are not kept at that size.
+    /// The size at which training photographs are measured while they are decoded, if they are not kept at that size.
     pub measured: MeasuredSize,
-    /// Photographs of a fisheye are undistorted to a pinhole's, too, as those of every other lens are; without it the
-    /// fisheye itself is trained on.
+    /// Undistort photographs of a fisheye to a pinhole's, as for every other lens, instead of training with the fisheye
+    /// model.
     pub undistort: bool,
-    /// What is looked for as the training views' depth.
+    /// Depth maps of the training views.
     pub depth: DepthOptions,
 }
 
-/// At which size a curve is applied to photographs, and what it follows from is measured.
+/// The size at which a curve is applied to photographs, and at which these are measured for it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum MeasuredSize {
-    /// They are not measured.
+    /// No measurement.
     #[default]
     None,
-    /// Their own.
+    /// The original size.
     Own,
-    /// That of the view's camera.
+    /// The size of the view's camera.
     Loaded,
 }
 
-/// Where depth maps come from: `STEM.*` or `depth_STEM.*` in a folder.
+/// The location of depth maps: `STEM.*` or `depth_STEM.*` in a folder.
 #[derive(Clone, Debug, Default)]
 pub struct DepthOptions {
-    /// Whether depth is loaded at all.
+    /// Whether depth maps are loaded.
     pub load: bool,
-    /// The folder; none: `depth/` or `depth_maps/` of the dataset.
+    /// The folder; `None`: `depth/` or `depth_maps/` of the dataset.
     pub folder: Option<PathBuf>,
-    /// The maps hold disparity, larger is nearer: they are negated.
+    /// The maps are disparity, in which larger is nearer; they are negated.
     pub is_disparity: bool,
 }
 
@@ -103,22 +104,22 @@ impl LoadOptions {
         (side(width), side(height))
     }
 
-    /// Pixels of a photograph of this size to a pixel of it as loaded, each way.
+    /// The downscaling factor of a photograph of this size.
     pub(crate) fn shrink(&self, width: u32, height: u32) -> f64 {
         self.downscale * self.beyond(width, height)
     }
 
-    /// How many times the longest side exceeds `max_resolution` behind `downscale`.
+    /// The factor by which the longest side exceeds `max_resolution` after `downscale`.
     fn beyond(&self, width: u32, height: u32) -> f64 {
         let longest = f64::from(width.max(height)) / self.downscale;
         let limit = f64::from(self.max_resolution);
         if self.max_resolution > 0 { (longest / limit).max(1.0) } else { 1.0 }
     }
 
-    /// Refuses options that make no sense.
+    /// Refuses invalid options.
     ///
     /// # Errors
-    /// [`Error::Setting`], and [`Error::Input`] for a folder that is not there.
+    /// [`Error::Setting`], and [`Error::Input`] for a missing folder.
     pub(super) fn check(&self) -> Result<()> {
         let refused = |key: &str, value: f64, rule: &dyn ToString| {
             let (key, value, rule) = (key.to_owned(), value.to_string(), rule.to_string());

@@ -1,4 +1,4 @@
-//! Photographs that are not in memory as they are stored on disk.
+//! Photographs that are decoded again from disk.
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -16,23 +16,23 @@ use crate::photographs::image::{Image, Orientation, PictureFile};
 use crate::photographs::tone::MeasuredPhotograph;
 use crate::photographs::white_balance::WhiteBalanceGains;
 
-/// A photograph that was shrunk on loading, or is not kept.
+/// A photograph that was downscaled on loading, or is not kept.
 #[derive(Clone, Debug)]
 pub struct Original {
     path: PathBuf,
-    /// Fitted to the photograph's size.
+    /// The lens at the photograph's size.
     lens: Lens,
     /// As [`super::LoadOptions::undistort`].
     undistort: bool,
-    /// From what is stored to what the camera took.
+    /// The rotation from the stored pixels to those of the camera.
     orientation: Orientation,
     /// White balance of a photograph.
     pub(super) gains: Option<WhiteBalanceGains>,
-    /// The statistics of the photograph, and of which size.
+    /// The statistics of the photograph, and the size they were measured at.
     pub(super) measured: Option<(MeasuredSize, MeasuredPhotograph)>,
-    /// Of the pixels as they are loaded, where they are not kept.
+    /// The checksum of the pixels as loaded, if they are not kept.
     pub(super) checksum: Option<Hasher>,
-    /// The photograph at its own size, if memory allows, until it is released.
+    /// The photograph at its original size, if memory allows, until it is released.
     stored: Arc<Mutex<Option<Packed>>>,
 }
 
@@ -50,17 +50,17 @@ impl Original {
         }
     }
 
-    /// Width and height, undistorted.
+    /// Width and height after undistortion.
     pub(super) fn size(&self) -> UVec2 {
         UVec2::new(self.lens.width, self.lens.height)
     }
 
-    /// Keeps the photograph at its own size in memory.
+    /// Keeps the photograph at its original size in memory.
     pub(super) fn store(&mut self, photograph: Packed) {
         self.stored = Arc::new(Mutex::new(Some(photograph)));
     }
 
-    /// The photograph at its own size, undistorted: from memory, or decoded again.
+    /// The photograph at its original size, undistorted: from memory, or decoded again.
     pub(super) fn load(&self) -> Result<Image> {
         let stored = self.stored.lock().unwrap_or_else(PoisonError::into_inner);
         match &*stored {
@@ -85,12 +85,12 @@ impl Original {
         self.measured.as_ref().filter(|(own, _)| *own == size).map(|(_, measured)| measured)
     }
 
-    /// Of the pixels as they are loaded, where they are not kept.
+    /// The checksum of the pixels as loaded, if they are not kept.
     pub(super) fn checksum(&self) -> Option<Hasher> {
         self.checksum
     }
 
-    /// Frees the memory of the photograph at its own size.
+    /// Frees the memory of the photograph at its original size.
     pub(crate) fn release(&self) {
         *self.stored.lock().unwrap_or_else(PoisonError::into_inner) = None;
     }

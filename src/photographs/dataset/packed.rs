@@ -1,8 +1,8 @@
-//! Photographs in memory in as few bits as give every value back.
+//! Photographs in memory, in the fewest bits that restore every value.
 
 use crate::photographs::image::Image;
 
-/// A photograph whose values are whole codes of 8 or 16 bits, or any.
+/// A photograph whose values are 8-bit or 16-bit codes, or arbitrary.
 #[derive(Clone, Debug)]
 pub(super) struct Packed {
     width: u32,
@@ -34,7 +34,7 @@ impl Packed {
         Self { width: image.width, height: image.height, values }
     }
 
-    /// Bytes of memory that it takes.
+    /// The bytes of memory that it takes.
     pub(super) fn bytes(&self) -> u64 {
         let bytes = match &self.values {
             Values::Eight(codes) => size_of_val(codes.as_slice()),
@@ -54,7 +54,7 @@ impl Packed {
     }
 }
 
-/// The number of steps from 0 to 1 that every value is a whole number of, to the bit; none where there is none.
+/// The largest code, such that all values are exact multiples of its inverse; `None` if there is none.
 fn codes(image: &Image) -> Option<f32> {
     [EIGHT, SIXTEEN].into_iter().find(|&steps| {
         let is_code = |&value: &f32| {
@@ -70,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_photograph_comes_back_to_the_bit_in_as_many_bytes_as_it_has_codes() {
+    fn a_photograph_is_restored_to_the_bit_from_the_fewest_bytes() {
         let of = |value: &dyn Fn(u32) -> f32| Image::from_fn(16, 16, |x, y| [value(16 * y + x); 3]);
         let eight = of(&|i| i as f32 / 255.0);
         let sixteen = of(&|i| (251 * i + i % 2) as f32 / 65_535.0);

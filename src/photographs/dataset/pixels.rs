@@ -1,4 +1,4 @@
-//! From files to views: decode, check against the camera, undistort, shrink. Parallel over views.
+//! From files to views: decode, check against the camera, undistort, downscale. Parallel over views.
 
 use std::collections::HashMap;
 use std::path::PathBuf;
@@ -28,16 +28,16 @@ use crate::photographs::tone::MeasuredPhotograph;
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 
-/// The shortest side that leaves something to train on, pixels.
+/// The minimum side of a view, pixels.
 const MIN_SIDE: u32 = 16;
 
-/// Of a decoded photograph.
+/// Size of a decoded pixel.
 const BYTES_PER_PIXEL: u64 = 12;
 
 /// Sees a training photograph as it is stored, with its mask, while it is decoded; from any thread.
 pub(crate) type Look<'a> = &'a (dyn Fn(&str, &Image, Option<&Mask>) + Sync);
 
-/// The views in order of name. Files that do not decode are named in `skipped`.
+/// The views in order of name. Files that cannot be decoded are named in `skipped`.
 pub(super) fn load(
     mut sources: Vec<Source>,
     layout: &Layout,
@@ -58,7 +58,7 @@ pub(super) fn load(
     let mut groups: Vec<(Lens, Vec<Source>)> = Vec::new();
     let mut places = HashMap::new();
     for source in fitted.collect::<Result<Vec<_>>>()? {
-        // Debug tells every two lenses apart.
+        // The Debug output distinguishes all lenses.
         let place = *places.entry(format!("{:?}", source.lens)).or_insert(groups.len());
         match groups.get_mut(place) {
             Some((_, group)) => group.push(source),
@@ -85,7 +85,7 @@ pub(super) fn load(
     };
     let mut loaded: Vec<Loaded> = vec![];
     while !groups.is_empty() {
-        // What was read goes with its group.
+        // Files that were read are dropped with their group.
         let now: Vec<_> = groups.drain(..groups.len().min(at_once)).collect();
         let now = now.into_par_iter().map(|(lens, group)| load_group(&lens, group, &loading));
         loaded.extend(now.collect::<Result<Vec<_>>>()?.into_iter().flatten());
@@ -104,7 +104,7 @@ pub(super) fn load(
 /// What loading the views has in common.
 struct Loading<'a> {
     options: &'a LoadOptions,
-    /// How many photographs are decoded side by side.
+    /// Number of photographs that are decoded concurrently.
     at_once: usize,
     look: Option<Look<'a>>,
     /// White balance of the photographs.
@@ -117,14 +117,14 @@ struct Loading<'a> {
     colours: &'a [ColourCounts; 2],
 }
 
-/// Bytes that `keep` leaves for photographs at their own size, where a curve is applied to those: it needs the statistics
-/// of all of them first.
+/// Bytes that `keep` leaves for photographs at their original size, if a curve is applied at that size: it requires the
+/// statistics of all of them first.
 fn bytes_for_originals(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> u64 {
     let most = options.keep.filter(|_| options.measured == MeasuredSize::Own);
     most.unwrap_or_default().saturating_sub(kept_bytes(groups, options))
 }
 
-/// What photographs and reference images take as they are loaded.
+/// Bytes of the photographs and reference images as loaded.
 fn kept_bytes(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> u64 {
     let bytes = |(lens, group): &(Lens, Vec<Source>)| {
         let size = options.loaded_size(lens.width, lens.height);
@@ -158,7 +158,8 @@ fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOption
     if let Some(most) = excess {
         let [bytes, most] = [bytes, most].map(|bytes| bytes as f64 / f64::from(1 << 30));
         tracing::info!(
-            "the photographs take {bytes:.1} GiB decoded, the cache has {most:.1}: they are read anew when they are looked at"
+            "the photographs take {bytes:.1} GiB decoded, the cache has {most:.1}: they are read anew when they are \
+             looked at"
         );
     }
     let keep = if excess.is_some() { Some(0) } else { options.keep };
@@ -166,7 +167,8 @@ fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOption
 }
 
 impl Source {
-    /// Finds how its pictures are turned, and fits the listed lens to the photograph, without one to the reference image.
+    /// Finds the rotation of its images, and fits the listed lens to the photograph, or to the reference image if there
+    /// is none.
     ///
     /// # Errors
     /// [`Error::Input`] where the picture has another shape than its camera.
@@ -235,7 +237,7 @@ fn load_group(lens: &Lens, mut group: Vec<Source>, loading: &Loading<'_>) -> Res
     Ok(loaded)
 }
 
-/// The mean of an image, of some of its values.
+/// The mean of a subset of an image's values.
 fn mean(image: &Image) -> f32 {
     let some = image.data.iter().step_by(97);
     let count = some.len().max(1) as f32;
@@ -261,8 +263,7 @@ struct Decoded {
     turns: Turns,
 }
 
-/// What memory holds of a photograph or reference image: its pixels as they are loaded, and its file where those are not
-/// all of it.
+/// The pixels of a photograph or reference image as loaded, and its file if these are not all of it.
 type InMemory = (Option<Image>, Option<Original>);
 
 impl ViewLoader<'_> {

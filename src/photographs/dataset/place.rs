@@ -1,4 +1,4 @@
-//! Where a scene lies, how large it is, and what lies so far from it that it is none of it.
+//! Position and size of a scene, and points too far away to belong to it.
 
 use glam::DVec3;
 
@@ -7,22 +7,23 @@ use super::{Dataset, View};
 use crate::camera::{Camera, TrainingFrame, frame, upwards};
 
 impl Dataset {
-    /// The scene's size as 3DGS takes it: 1.1 times the largest distance of a training camera to their mean, world units.
-    /// Where all stand in one spot, half of the points are within it; without points it is 1.
+    /// The scene's size as in 3DGS: 1.1 times the largest distance of a training camera from their mean, world units.
+    /// If all are at one position, half of the points are within it; without points it is 1.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn extent(&self) -> f64 {
         self.place().1
     }
 
-    /// Where the scene is trained.
+    /// The coordinate frame of training.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn frame(&self) -> TrainingFrame {
         let (center, extent) = self.place();
         TrainingFrame::new(center, extent)
     }
 
-    /// The world's up direction, a unit vector: perpendicular to the horizontal axes of the training cameras. A NeRF-style
-    /// listing has z up by convention, which is exact where cameras are not held level; it is taken unless they lie on a side.
+    /// The world's up direction, a unit vector: perpendicular to the horizontal axes of the training cameras. A
+    /// NeRF-style listing has z up by convention, which is exact even if cameras are not level; it is used unless the
+    /// cameras are rotated by a quarter turn.
     pub fn up(&self) -> DVec3 {
         const MIN_COSINE: f64 = 0.7;
         let cameras: Vec<Camera> = self.train_views().map(View::upright_camera).collect();
@@ -31,7 +32,7 @@ impl Dataset {
         if has_convention && up.z > MIN_COSINE { DVec3::Z } else { up }
     }
 
-    /// The middle of the training cameras, and the extent.
+    /// The mean position of the training cameras, and the extent.
     fn place(&self) -> (DVec3, f64) {
         let centers = self.train_views().map(|view| view.camera.center());
         let (center, spread) = frame::spread(&centers.collect::<Vec<DVec3>>());
@@ -47,25 +48,25 @@ impl Dataset {
         (center, typical.unwrap_or(1.0))
     }
 
-    /// Leaves out the points that no number of the device holds or that lie a million extents away: they are of no use, and
-    /// what they are made of would not stay finite.
+    /// Leaves out points that the device cannot represent or that are a million extents away: they are useless, and
+    /// their Gaussians would not stay finite.
     pub(super) fn leave_out_far_points(&mut self) {
         const MAX_EXTENTS: f64 = 1e6;
         let (center, extent) = self.place();
         let before = self.points.len();
-        // Positive phrasing: a NaN fails the test too.
+        // A positive condition: it is false for NaN.
         self.points.retain(|point| point.position.distance(center) <= MAX_EXTENTS * extent);
         let gone = before - self.points.len();
         if gone > 0 {
             tracing::warn!(
-                "{}: {gone} of {before} points lie more than a million times the cameras' extent away, or nowhere; they are \
-                 left out",
+                "{}: {gone} of {before} points lie more than a million times the cameras' extent away, or nowhere; \
+                 they are left out",
                 self.root.display()
             );
         }
     }
 
-    /// Says which training cameras stand far from all others.
+    /// Warns about training cameras far from all others.
     pub(super) fn warn_of_other_worlds(&self) {
         let (center, extent) = self.place();
         for view in self.train_views() {

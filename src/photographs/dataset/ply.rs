@@ -103,8 +103,9 @@ mod tests {
     fn every_encoding_gives_the_same_points() {
         let head = |format: &str, kind: &str| {
             format!(
-                "ply\r\nformat {format} 1.0\r\ncomment end\r\nelement vertex 2\r\nproperty uchar red\r\nproperty {kind} y\r\n\
-                 property {kind} x\r\nproperty int16 k\r\nproperty {kind} z\r\nelement face 0\r\n\
+                "ply\r\nformat {format} 1.0\r\ncomment end\r\nelement vertex 2\r\n\
+                 property uchar red\r\nproperty {kind} y\r\nproperty {kind} x\r\n\
+                 property int16 k\r\nproperty {kind} z\r\nelement face 0\r\n\
                  property list uchar int vertex_indices\r\nend_header\r\n"
             )
         };

@@ -14,7 +14,7 @@ use crate::Result;
 use crate::base::tree;
 use crate::photographs::image::files::is_hidden;
 
-/// The largest camera-centre error, relative to the cameras' extent, at which two worlds count as the same.
+/// The maximum error of camera centres, relative to the cameras' extent, at which two worlds are the same.
 const MAX_WORLD_RESIDUAL: f64 = 0.01;
 
 /// The points of the dataset, in the views' world: those of its COLMAP model, which know the photographs that see them;
@@ -63,7 +63,8 @@ fn warn_of_unread(layout: &Layout, models: &[PathBuf]) {
     files.sort();
     if let Some(first) = files.first() {
         tracing::warn!(
-            "{}: is not read; points come from a COLMAP model, from `ply_file_path` of a transforms.json or from points3D.ply",
+            "{}: is not read; points come from a COLMAP model, from `ply_file_path` of a transforms.json or from \
+             points3D.ply",
             first.display()
         );
     }
@@ -82,10 +83,10 @@ fn read(file: &Path) -> Option<Vec<DVec3>> {
     None
 }
 
-/// Points of a listing's world. Where the listing applied a transform to its cameras, it may have left it out of the points:
-/// of the two worlds the one that more photographs show counts.
+/// The points in a listing's world. If the listing applied a transform to its cameras, it may not have applied it to
+/// the points: of the two worlds, the one whose points are visible in more photographs is used.
 fn placed(cloud: &Cloud, points: Vec<DVec3>, views: &[View]) -> Vec<Point> {
-    /// Of a cloud seen from the wrong place about as much is seen; this much more is no chance.
+    /// In the wrong world, about as many points are visible by chance; this factor is not chance.
     const CLEARLY_MORE: f64 = 1.1;
     let seen = |to_views: DAffine3| {
         let step = points.len().div_ceil(1000);

@@ -1,4 +1,4 @@
-//! From a decoded picture to what its view shows.
+//! From a decoded image to that of its view.
 
 use std::path::Path;
 
@@ -10,12 +10,12 @@ use crate::camera::{Camera, CameraModel, Lens};
 use crate::photographs::image::{Image, Mask, Orientation, PictureFile};
 use crate::{Error, Result};
 
-/// How the photographs of one lens become what their views show.
+/// The conversion of the photographs of one lens to the images of their views.
 #[derive(Debug)]
 pub(super) struct Preparation<'a> {
-    /// Fitted to the photographs' size.
+    /// The lens at the photographs' size.
     pub(super) lens: &'a Lens,
-    /// `None` where the lens is rendered as it is.
+    /// `None` if the lens is rendered natively.
     pub(super) undistortion: Option<Undistortion>,
     /// Width and height that the views are loaded at.
     pub(super) size: (u32, u32),
@@ -25,7 +25,8 @@ impl<'a> Preparation<'a> {
     /// With `undistort`, a fisheye is undistorted as a polynomial lens always is.
     ///
     /// # Errors
-    /// No pinhole sees inside the photograph only: the distortion describes no lens. `name` is the view or file to name.
+    /// No pinhole sees only the inside of the photograph: the distortion is not that of a lens. `name` is the view or
+    /// file in the message.
     pub(super) fn new(
         lens: &'a Lens,
         undistort: bool,
@@ -40,25 +41,25 @@ impl<'a> Preparation<'a> {
         Ok(Self { lens, undistortion, size })
     }
 
-    /// The picture as its view shows it, of the lens's size: undistorted where that is asked for.
+    /// The image as its view shows it, at the lens's size: undistorted if requested.
     ///
     /// # Errors
-    /// Its shape is not that of the lens.
+    /// Its aspect ratio is not that of the lens.
     pub(super) fn whole(&self, image: Image, path: &Path) -> Result<Image> {
         let &Lens { width, height, .. } = self.lens;
         let size = (image.width, image.height);
         if self.lens.fitted(size.0, size.1).is_none() {
             return Err(disagreement(path, size, self.lens));
         }
-        // A reference image may be of another resolution than the photograph.
+        // A reference image may have another resolution than the photograph.
         let image = if size == (width, height) { image } else { image.resized(width, height) };
         Ok(self.undistorted(image))
     }
 
-    /// The same at the size that the view is loaded at.
+    /// As [`Self::whole`], at the size of the loaded view.
     ///
     /// # Errors
-    /// As there.
+    /// Those of [`Self::whole`].
     pub(super) fn loaded(&self, image: Image, path: &Path) -> Result<Image> {
         self.whole(image, path).map(|image| self.shrunk(image))
     }
@@ -75,10 +76,10 @@ impl<'a> Preparation<'a> {
         }
     }
 
-    /// Which pixels of a view count, of the mask as its photograph is stored; `None` where all do.
+    /// The usable pixels of a view, for a mask of the photograph as stored; `None` if all are usable.
     ///
     /// # Errors
-    /// The photograph's shape is not that of the lens.
+    /// The photograph's aspect ratio is not that of the lens.
     pub(super) fn mask(
         &self,
         stored: &Mask,
@@ -89,7 +90,7 @@ impl<'a> Preparation<'a> {
         Ok(Mask::of_plane(&self.loaded(plane, path)?))
     }
 
-    /// The camera of its views at the world's origin, of the size that they are loaded at.
+    /// The camera of its views at the world's origin, at the size of the loaded views.
     pub(super) fn camera(&self) -> Camera {
         let camera = native_camera(self.lens);
         let camera = match self.undistortion {
@@ -101,11 +102,11 @@ impl<'a> Preparation<'a> {
         camera.resized(self.size.0, self.size.1)
     }
 
-    /// Refuses a lens that is rendered as it is and shows nothing at three quarters of its pixels: the circle of a fisheye
-    /// in a wide picture covers more than a quarter.
+    /// Refuses a natively rendered lens that sees nothing at three quarters of its pixels: the circle of a fisheye in a
+    /// wide image covers more than a quarter.
     ///
     /// # Errors
-    /// As said; `name` is the view to name.
+    /// The lens is refused; `name` is the view in the message.
     pub(super) fn check_coverage(&self, name: &str) -> Result<()> {
         const MOST_UNSEEN: f64 = 0.75;
         let &Lens { width, height, .. } = self.lens;
@@ -125,7 +126,7 @@ fn no_lens(name: &str) -> Error {
     )
 }
 
-/// A lens at the world's origin, as it is rendered where it is not undistorted.
+/// A lens at the world's origin, as rendered without undistortion.
 fn native_camera(lens: &Lens) -> Camera {
     Camera {
         width: lens.width,
@@ -137,12 +138,12 @@ fn native_camera(lens: &Lens) -> Camera {
     }
 }
 
-/// Refuses a file by the size that it declares, before that costs memory.
+/// Refuses a file by its declared size, before memory is allocated.
 ///
 /// # Errors
-/// The picture has another shape than its camera, or far more pixels.
+/// The image has another aspect ratio than its camera, or far more pixels.
 pub(super) fn check_size(path: &Path, file: &PictureFile, turns: Turns, lens: &Lens) -> Result<()> {
-    // A file without a readable header is named when it is decoded.
+    // A file without a readable header is reported when it is decoded.
     let Ok(size) = file.size() else { return Ok(()) };
     let (width, height) = turns.loading.size(size);
     if lens.fitted(width, height).is_none() {
@@ -152,7 +153,7 @@ pub(super) fn check_size(path: &Path, file: &PictureFile, turns: Turns, lens: &L
 }
 
 /// # Errors
-/// The picture has far more pixels than its camera.
+/// The image has far more pixels than its camera.
 pub(super) fn check_excess(path: &Path, size: (u32, u32), lens: &Lens) -> Result<()> {
     const MAX_TIMES: u64 = 64;
     if pixel_count(size) > MAX_TIMES * pixel_count((lens.width, lens.height)) {
@@ -170,7 +171,7 @@ pub(super) fn pixel_count((width, height): (u32, u32)) -> u64 {
     u64::from(width) * u64::from(height)
 }
 
-/// The error of a picture whose shape, upright or not, is not its camera's.
+/// The error for an image whose aspect ratio, upright or not, is not its camera's.
 pub(super) fn disagreement(path: &Path, (width, height): (u32, u32), lens: &Lens) -> Error {
     let (w, h) = (lens.width, lens.height);
     let (seen_width, seen_height) = Orientation::of(path).size((width, height));

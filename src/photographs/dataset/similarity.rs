@@ -1,7 +1,7 @@
 //! The similarity between two worlds, from the same camera centres in both.
 //!
 //! Least squares in closed form: rotation by Horn's quaternion (B. K. P. Horn, "Closed-form solution of absolute
-//! orientation using unit quaternions", 1987: never a mirror image), scale and translation after Umeyama 1991.
+//! orientation using unit quaternions", 1987: never a reflection), scale and translation after Umeyama 1991.
 
 use glam::{DMat3, DQuat, DVec3};
 use nalgebra::{Matrix4, SymmetricEigen};
@@ -12,12 +12,12 @@ pub(super) struct Similarity {
     scale: f64,
     rotation: DQuat,
     translation: DVec3,
-    /// The largest distance left between a pair, relative to the largest distance of a target to their mean.
+    /// The largest remaining distance of a pair, relative to the largest distance of a target from their mean.
     pub(super) residual: f64,
 }
 
 impl Similarity {
-    /// From `(source, target)` pairs; `None` for fewer than three or where all lie on one line.
+    /// From `(source, target)` pairs; `None` for fewer than three or if all are collinear.
     pub(super) fn solve(pairs: &[(DVec3, DVec3)]) -> Option<Self> {
         let count = pairs.len() as f64;
         let source_mean = pairs.iter().map(|pair| pair.0).sum::<DVec3>() / count;
@@ -61,12 +61,12 @@ fn on_a_line(offsets: impl Iterator<Item = DVec3> + Clone) -> bool {
     let longest =
         offsets.clone().fold(DVec3::ZERO, |a, b| if b.length() > a.length() { b } else { a });
     let widest = offsets.map(|offset| offset.cross(longest).length()).fold(0.0, f64::max);
-    // Positive phrasing: no spread at all is a line too.
+    // A positive condition: zero spread is also collinear.
     let spans_a_plane = widest > 1e-6 * longest.length_squared();
     !spans_a_plane
 }
 
-/// The rotation that best turns sources into targets, of the sum of `source * target^T`.
+/// The rotation that best maps sources to targets, from the sum of `source * target^T`.
 fn horn_rotation(covariance: DMat3) -> DQuat {
     let s = |row: usize, column: usize| covariance.col(column)[row];
     let (xx, yy, zz) = (s(0, 0), s(1, 1), s(2, 2));
@@ -109,13 +109,13 @@ mod tests {
     }
 
     #[test]
-    fn a_mirrored_world_leaves_a_large_residual() {
+    fn a_mirrored_world_has_a_large_residual() {
         let pairs: Vec<_> = centers().iter().map(|c| (*c, DVec3::new(-c.x, c.y, c.z))).collect();
         assert!(Similarity::solve(&pairs).is_none_or(|solved| solved.residual > 0.05));
     }
 
     #[test]
-    fn centres_on_a_line_or_in_one_spot_determine_nothing() {
+    fn collinear_or_coincident_centres_determine_nothing() {
         let line: Vec<_> =
             (0..5).map(|i| (DVec3::X * f64::from(i), DVec3::Y * f64::from(i))).collect();
         assert!(Similarity::solve(&line).is_none());

@@ -12,26 +12,26 @@ use crate::base::tree;
 use crate::camera::Lens;
 use crate::photographs::image::{Image, MaskFile, Orientation, PictureFile};
 
-/// What a view is made of.
+/// The files and the camera of a view.
 #[derive(Clone, Debug)]
 pub(super) struct Source {
     pub(super) name: String,
     pub(super) split: Split,
-    /// As listed; fitted to the photograph's size here.
+    /// As listed; `fit` scales it to the photograph's size.
     pub(super) lens: Lens,
     pub(super) view_from_world: DAffine3,
     pub(super) input: Option<PathBuf>,
     pub(super) reference: Option<PathBuf>,
     pub(super) mask: Option<MaskFile>,
     pub(super) depth: Option<PathBuf>,
-    /// Photograph and reference image, where they are read already.
+    /// Photograph and reference image, if they are already read.
     pub(super) read: [Option<Arc<PictureFile>>; 2],
     /// How photograph and reference image are turned.
     pub(super) turns: [Turns; 2],
 }
 
 impl Source {
-    /// Of the files of the photograph, its reference image, its mask and its depth.
+    /// The files of the photograph, its reference image, its mask and its depth.
     pub(super) fn new(
         (name, split): (String, Split),
         (lens, view_from_world): (Lens, DAffine3),
@@ -42,8 +42,8 @@ impl Source {
         Self { name, split, lens, view_from_world, input, reference, mask, depth, read, turns }
     }
 
-    /// Reads the files of the photograph and of the reference image; gives the header of each, where it is readable, and
-    /// keeps what is read while `memory` allows.
+    /// Reads the files of the photograph and of the reference image; returns the header of each, if readable, and keeps
+    /// the files while `memory` allows.
     pub(super) fn headers(&mut self, memory: &Allowance) -> [Option<Header>; 2] {
         let paths = [self.input.as_deref(), self.reference.as_deref()];
         let mut headers = [None; 2];
@@ -83,5 +83,6 @@ pub(super) fn shown(file: PictureFile) -> Option<Image> {
     Some(image)
 }
 
-/// What files may take that are read before they are decoded, bytes: those beyond are opened once for their size, and again.
+/// Maximum size of files that are read before they are decoded, bytes: others are opened once for their size, and
+/// again.
 pub(super) const MAX_READ: u64 = 1 << 28;

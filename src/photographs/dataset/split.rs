@@ -1,4 +1,4 @@
-//! Which views are held out.
+//! The split into training and test views.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -9,17 +9,17 @@ use crate::Result;
 use crate::base::{input, tree};
 use crate::photographs::image::files::Files;
 
-/// Every eighth of the name-sorted views is held out where nothing else says which.
+/// Every eighth of the name-sorted views is held out by default.
 pub(super) const TEST_EVERY: usize = 8;
 
-/// The list of test photographs, beside the photographs or in the model, as 3DGS has it.
+/// The list of test photographs, next to the photographs or in the model, as in 3DGS.
 pub(super) fn test_list(root: &Path) -> Option<PathBuf> {
     let places = ["test.txt", "sparse/0/test.txt"].map(|place| root.join(place));
     places.into_iter().find(|path| tree::is_file(path))
 }
 
-/// Frames that the listing did not assign: by `test.txt` (a name a line), else every eighth. Sorted by name already. Where
-/// it is asked for, every so many instead, whatever else says; 0: none.
+/// Assigns the frames, sorted by name, that the listing did not assign: by `test.txt` (a name per line), else every
+/// eighth. With `test_every`, every Nth instead of any other rule; 0: none.
 pub(super) fn split(
     root: &Path,
     frames: &mut [ListedView],
@@ -62,7 +62,7 @@ pub(super) fn split(
     Ok(())
 }
 
-/// Says where the dataset has a split that is asked to give way to another.
+/// Warns if the dataset has a split that another one replaces.
 pub(super) fn log_split(root: &Path, frames: &[ListedView], options: &LoadOptions) {
     let own = if frames.iter().any(|frame| frame.split.is_some()) {
         Some("its transforms files")
@@ -78,8 +78,8 @@ pub(super) fn log_split(root: &Path, frames: &[ListedView], options: &LoadOption
     }
 }
 
-/// Holds out every so many views by name in place of the dataset's own split. A listed test view of which there is no dark
-/// photograph cannot be trained on: it stays a pose.
+/// Holds out every Nth view by name instead of the dataset's own split. A listed test view without a dark photograph
+/// cannot be trained on: it stays a pose.
 fn split_anew(root: &Path, frames: &mut [ListedView], every: usize, files: &Files) {
     let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
     let training_folders: BTreeSet<String> =

@@ -1,4 +1,4 @@
-//! Whether a dataset is what it was, told without decoding a photograph.
+//! Detects without decoding whether a dataset has changed.
 
 use std::path::Path;
 
@@ -13,9 +13,9 @@ use crate::base::tree;
 use crate::photographs::image::files::Files;
 
 impl Dataset {
-    /// A checksum of what is listed below `root`: views with their cameras and splits, and of every file that they or the points
-    /// are read from its path, length and time of change. Equal stamps are of the same dataset; one that was copied, or whose
-    /// photographs were written again, has another although it may hold the same pixels.
+    /// A checksum of the listing below `root`: views with their cameras and splits, and path, length and time of change
+    /// of every file of the views or the points. Equal stamps mean the same dataset; one that was copied, or whose
+    /// photographs were rewritten, has another stamp even with the same pixels.
     ///
     /// # Errors
     /// As [`Dataset::photographs`].
@@ -30,7 +30,7 @@ impl Dataset {
         let mut hasher = Hasher::default();
         hasher.write(READING);
         for source in sources(root, &frames, options, &files, &mut skipped) {
-            // Debug tells every two cameras apart.
+            // The Debug output distinguishes all cameras.
             let view = format!("{} {:?} {:?}", source.name, source.split, source.lens);
             hasher.write(view.as_bytes());
             hasher.write_numbers(&source.view_from_world.to_cols_array());
@@ -58,7 +58,7 @@ const READING: &[u8] = b"in sRGB, turned by what points show";
 fn write_file(hasher: &mut Hasher, path: &Path) {
     hasher.write(path.as_os_str().as_encoded_bytes());
     let Ok((length, changed)) = tree::metadata(path) else { return };
-    // Debug tells every two times apart.
+    // The Debug output distinguishes all times.
     let changed = format!("{changed:?}");
     hasher.write(&length.to_le_bytes());
     hasher.write(changed.as_bytes());

@@ -1,8 +1,8 @@
-//! A small dark multi-view set made from an analytic scene, with the true normal-light photograph of every view.
+//! A small dark multi-view dataset of an analytic scene, with the true normal-light photograph of every view.
 //!
 //! The scene is ray-traced in linear light. The reference is the encoded render, 2x2 supersampled. The dark photograph
-//! is the same light divided by [`DARKENING`], with the shot and read noise of a small sensor, encoded and quantised
-//! to 8 bits: what a camera stores when the exposure is far too short.
+//! is the same light divided by [`DARKENING`], with the shot and read noise of a small sensor, encoded and quantised to
+//! 8 bits: as a camera stores it if the exposure is far too short.
 
 use std::f64::consts::PI;
 use std::fmt::Write as _;
@@ -24,26 +24,26 @@ mod room;
 /// How much darker the dark photographs are, in linear light.
 pub const DARKENING: f64 = 25.0;
 
-/// Electrons that a pixel holds at the reference's white.
+/// Electrons of a pixel at the reference's white.
 const FULL_WELL: f64 = 9000.0;
 
 /// Standard deviation of the read noise, electrons.
 const READ_NOISE: f64 = 2.0;
 
-/// How the dark photographs of a set are taken.
+/// The exposure and noise of the dark photographs of a dataset.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Capture {
     /// How much darker they are than the references, in linear light.
     pub darkening: f64,
-    /// Electrons that a pixel holds at the reference's white: shot noise has the variance of signal / this.
+    /// Electrons of a pixel at the reference's white: shot noise has the variance of signal / this.
     pub full_well: f64,
     /// Standard deviation of the read noise, electrons.
     pub read_noise: f64,
-    /// By how many stops each view is brighter than the others, in turn, from the first on.
+    /// Extra stops of the views, cyclically, from the first on.
     pub stops: Vec<f64>,
 }
 
-/// A small sensor, far too short.
+/// A small sensor, far too short an exposure.
 impl Default for Capture {
     fn default() -> Self {
         Self {
@@ -63,17 +63,17 @@ impl Capture {
     }
 }
 
-/// Every this many views, from the first, one is for testing.
+/// Every this many views, from the first, one is a test view.
 const TEST_EVERY: usize = 8;
 
-/// The streams of random numbers drawn from the seed; the room's textures use stream 0.
+/// The streams of random numbers of the seed; the room's textures use stream 0.
 const NOISE_STREAM: u64 = 1;
 const POINT_STREAM: u64 = 2;
 
-/// What [`write()`] makes.
+/// Options of [`write()`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SyntheticOptions {
-    /// Photographs, at least 2; every 8th is for testing.
+    /// Photographs, at least 2; every 8th is a test view.
     pub views: usize,
     /// Pixels per row, at least 16.
     pub width: u32,
@@ -81,7 +81,7 @@ pub struct SyntheticOptions {
     pub height: u32,
     /// Changes the textures, the noise and the sampled points.
     pub seed: u64,
-    /// Taken with a fisheye that sees 130 degrees across the picture's longer side; black outside its circle.
+    /// Use a fisheye that sees 130 degrees across the image's longer side; black outside its circle.
     pub fisheye: bool,
 }
 
@@ -91,10 +91,10 @@ impl Default for SyntheticOptions {
     }
 }
 
-/// The fisheye of such a set.
+/// The fisheye of such a dataset.
 const FISHEYE: KannalaBrandt = KannalaBrandt { coefficients: [0.03, -0.008, 0.002, -0.0004] };
 
-/// What it sees off its axis at the middle of the picture's shorter sides, radians.
+/// The angle off its axis at the middle of the image's shorter sides, radians.
 const FISHEYE_REACH: f64 = 65.0 * PI / 180.0;
 
 impl SyntheticOptions {
@@ -116,23 +116,23 @@ impl SyntheticOptions {
     }
 }
 
-/// Writes the set to `dir` in the layout of the LOM benchmark: `low/` and `high/` (PNG), `transforms_train.json`,
+/// Writes the dataset to `dir` in the layout of the LOM benchmark: `low/` and `high/` (PNG), `transforms_train.json`,
 /// `transforms_test.json`, `transforms_val.json`, and a COLMAP text model in `colmap_sparse/0`.
 ///
-/// The model's points lie on surfaces that at least two views see, to the precision of a good reconstruction; their
+/// The model's points are on surfaces that at least two views see, to the precision of a good reconstruction; their
 /// colours are all grey, because the colours of a real one come from photographs that training must not see. Equal
 /// options give equal bytes. Files of an earlier set are replaced.
 ///
 /// # Errors
-/// [`Error::Usage`] for options that make no sense, [`Error::Output`] where a file cannot be written.
+/// [`Error::Usage`] for invalid options, [`Error::Output`] if a file cannot be written.
 pub fn write(dir: impl AsRef<Path>, options: &SyntheticOptions) -> Result<()> {
     write_captured(dir, options, &Capture::default())
 }
 
-/// As [`write()`], with dark photographs taken another way.
+/// As [`write()`], with another exposure and noise of the dark photographs.
 ///
 /// # Errors
-/// As there.
+/// As [`write()`].
 pub fn write_captured(
     dir: impl AsRef<Path>,
     options: &SyntheticOptions,
@@ -145,7 +145,8 @@ pub fn write_captured(
         fs::create_dir_all(folder)
             .map_err(|error| Error::output(folder, format!("cannot be made: {error}")))?;
     }
-    // The lists of frames are what makes the set look complete, so an earlier set's go first and ours come last.
+    // The lists of frames make the dataset look complete, so those of an earlier dataset are removed first, and new
+    // ones are written last.
     for split in ["train", "test", "val"] {
         let list = dir.join(format!("transforms_{split}.json"));
         if list.exists() {
@@ -189,8 +190,8 @@ fn file_name(view: usize) -> String {
     format!("{view:03}.png")
 }
 
-/// Cameras on a part of a sphere before the scene, spread evenly by a low-discrepancy sequence (Roberts' R2), so that
-/// every 8th lies among the others.
+/// Cameras on a part of a sphere in front of the scene, spread evenly by a low-discrepancy sequence (Roberts' R2), so
+/// that every 8th is among the others.
 fn camera(view: usize, options: &SyntheticOptions) -> Camera {
     const AZIMUTH: f64 = 0.75; // radians to either side
     const ELEVATION: (f64, f64) = (0.24, 0.62); // radians
@@ -222,13 +223,13 @@ fn camera(view: usize, options: &SyntheticOptions) -> Camera {
     }
 }
 
-/// The unit direction, in the world, of the ray through a place in pixels; none outside a fisheye's circle.
+/// The unit direction, in the world, of the ray through a pixel position; `None` outside a fisheye's circle.
 fn ray(camera: &Camera, pixel: DVec2) -> Option<DVec3> {
     let in_view = camera.in_view(pixel, 1.0)?;
     Some((camera.view_from_world.matrix3.transpose() * in_view).normalize())
 }
 
-/// Linear radiance, row by row, the mean of 2x2 rays per pixel.
+/// Linear radiance in row-major order, the mean of 2x2 rays per pixel.
 fn render(room: &Room, camera: &Camera) -> Vec<DVec3> {
     const OFFSETS: [DVec2; 4] = [
         DVec2::new(0.25, 0.25),
@@ -253,7 +254,7 @@ fn reference(radiance: &[DVec3], camera: &Camera) -> Image {
     photograph(camera, |pixel, channel| radiance[pixel][channel])
 }
 
-/// The photograph that was exposed too short.
+/// The underexposed photograph.
 fn dark_photograph(
     radiance: &[DVec3],
     camera: &Camera,
@@ -266,7 +267,7 @@ fn dark_photograph(
     }
     photograph(camera, |pixel, channel| {
         let electrons = full_well * radiance[pixel][channel] / darkening;
-        // Shot noise is Poisson; at tens of electrons the normal distribution of equal variance is close.
+        // Shot noise is Poisson; at tens of electrons, the normal distribution of equal variance is close.
         let deviation = (electrons + read_noise * read_noise).sqrt();
         (electrons + deviation * noise.normal(3 * pixel as u64 + channel as u64)) / full_well
     })
@@ -282,7 +283,7 @@ fn photograph(camera: &Camera, linear: impl Fn(usize, usize) -> f64) -> Image {
     })
 }
 
-/// The list of a split's frames, as instant-ngp writes it: poses are world-from-camera in OpenGL axes.
+/// The list of a split's frames, in the format of instant-ngp: poses are world-from-camera in OpenGL axes.
 fn transforms(cameras: &[Camera], folder: &str, views: &[usize]) -> Value {
     let Camera { width, height, focal, principal_point, model, .. } = cameras[0];
     let frame = |&view: &usize| {
@@ -309,7 +310,7 @@ fn transforms(cameras: &[Camera], folder: &str, views: &[usize]) -> Value {
         for (key, value) in [("k1", k1), ("k2", k2), ("k3", k3), ("k4", k4)] {
             list[key] = value.into();
         }
-        // Of a pinhole.
+        // Keys of a pinhole.
         for key in ["camera_angle_x", "camera_angle_y", "p1", "p2"] {
             list.as_object_mut().map(|list| list.remove(key));
         }
@@ -317,13 +318,13 @@ fn transforms(cameras: &[Camera], folder: &str, views: &[usize]) -> Value {
     list
 }
 
-/// A sparse point: its position and the views that see it with where they do, pixels.
+/// A sparse point: its position and the views that see it, with the pixel positions.
 struct SparsePoint {
     position: DVec3,
     track: Vec<(usize, DVec2)>,
 }
 
-/// Points on the surfaces that at least two views see.
+/// Points on surfaces that at least two views see.
 fn sparse_points(room: &Room, cameras: &[Camera], seed: u64) -> Vec<SparsePoint> {
     const DRAWS: u64 = 2400;
     const DRAWS_PER_POINT: u64 = 16;
@@ -338,7 +339,7 @@ fn sparse_points(room: &Room, cameras: &[Camera], seed: u64) -> Vec<SparsePoint>
         let seen =
             |(view, camera): (usize, &Camera)| Some((view, seen_at(room, camera, position)?));
         let track: Vec<_> = cameras.iter().enumerate().filter_map(seen).collect();
-        // Each normal draw takes two counters.
+        // Each normal sample takes two counters.
         let error = DVec3::from_array(
             [2, 3, 4].map(|draw| stream.normal(index * DRAWS_PER_POINT / 2 + draw)),
         );
@@ -347,7 +348,7 @@ fn sparse_points(room: &Room, cameras: &[Camera], seed: u64) -> Vec<SparsePoint>
     (0..DRAWS).into_par_iter().filter_map(sample).collect()
 }
 
-/// Where a camera sees a position on a surface, unless something hides it.
+/// The pixel position at which a camera sees a position on a surface, unless it is occluded.
 fn seen_at(room: &Room, camera: &Camera, position: DVec3) -> Option<DVec2> {
     const TOLERANCE: f64 = 1e-3;
     let pixel = camera.project(position)?;
@@ -357,7 +358,7 @@ fn seen_at(room: &Room, camera: &Camera, position: DVec3) -> Option<DVec2> {
     (inside && first.distance(position) < TOLERANCE).then_some(pixel)
 }
 
-/// The files of a COLMAP text model, name and content.
+/// The files of a COLMAP text model, by name and content.
 fn colmap_model(room: &Room, cameras: &[Camera], seed: u64) -> [(&'static str, String); 3] {
     const GREY: &str = "128 128 128";
     let points = sparse_points(room, cameras, seed);
@@ -377,7 +378,7 @@ fn colmap_model(room: &Room, cameras: &[Camera], seed: u64) -> [(&'static str, S
     let mut observation_counts = vec![0; cameras.len()];
     let mut point_list =
         String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
-    // Writing to a string cannot fail, so the results below hold nothing.
+    // Writing to a string cannot fail, so the results below are ignored.
     for (index, SparsePoint { position, track }) in points.iter().enumerate() {
         let id = index + 1;
         let _ = write!(point_list, "{id} {} {} {} {GREY} 0.5", position.x, position.y, position.z);

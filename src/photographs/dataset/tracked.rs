@@ -1,5 +1,5 @@
-//! Which pixels cameras are of where sizes do not tell, found from tracked points: a point looks alike in all photographs
-//! that show it, if each is looked up where its camera has the point.
+//! The pixels that cameras refer to, if sizes are ambiguous, from tracked points: a point looks alike in all
+//! photographs that show it, if each is sampled where its camera projects the point.
 
 use rayon::prelude::*;
 
@@ -150,8 +150,8 @@ fn place(source: &Source, point: &Point) -> Option<[f64; 2]> {
     is_seen.then_some(place)
 }
 
-/// The mean correlation of what photographs show of a point, each with its own mean and contrast divided out, and of how
-/// many pairs that is; `None` where no two show one point.
+/// The mean correlation of the values of a point in pairs of photographs, normalised by the mean and contrast of each
+/// photograph, and the number of pairs; `None` if no two show the same point.
 fn agreement<'a>(
     views: impl Iterator<Item = &'a Vec<(usize, f64)>>,
     points: usize,

@@ -1,7 +1,7 @@
 //! NeRF-style listings: `transforms_{train,test,val}.json` or one `transforms.json`.
 //!
-//! `transform_matrix` is view to world in OpenGL axes (x right, y up, z back). Intrinsics stand at the top, in a frame,
-//! or both: the frame's win.
+//! `transform_matrix` is view to world in OpenGL axes (x right, y up, z back). Intrinsics are at the top level, in a
+//! frame, or both: the frame's take precedence.
 
 mod intrinsics;
 mod keys;
@@ -30,7 +30,7 @@ struct Transforms {
     #[serde(flatten)]
     shared: Intrinsics,
     frames: Vec<ListedFrame>,
-    /// Held-out frames of the same form (`ScanNet++`).
+    /// Held-out frames in the same format (`ScanNet++`).
     #[serde(default)]
     test_frames: Vec<ListedFrame>,
     ply_file_path: Option<String>,
@@ -42,7 +42,7 @@ struct Transforms {
     others: Map<String, Value>,
 }
 
-/// Names of files by split (nerfstudio).
+/// File names by split (nerfstudio).
 #[derive(Deserialize)]
 struct StatedSplits {
     train_filenames: Option<Vec<String>>,
@@ -65,9 +65,9 @@ struct ListedFrame {
     others: Map<String, Value>,
 }
 
-/// The files that make up a listing below `root`, with the split each stands for; empty where there is none.
+/// The files of a listing below `root`, with the split of each; empty if there is none.
 ///
-/// `transforms_val.json` often repeats test views: it counts only where there is no test listing.
+/// `transforms_val.json` often repeats test views: it is used only if there is no test listing.
 pub(super) fn find(root: &Path) -> Vec<(PathBuf, Option<Split>)> {
     let existing = |name: &str| Some(root.join(name)).filter(|path| tree::is_file(path));
     let held_out = existing("transforms_test.json").or_else(|| existing("transforms_val.json"));
@@ -78,16 +78,16 @@ pub(super) fn find(root: &Path) -> Vec<(PathBuf, Option<Split>)> {
     }
 }
 
-/// One file of a listing, read but not looked at.
+/// A parsed file of a listing.
 struct Read<'a> {
     path: &'a Path,
     transforms: Transforms,
 }
 
-/// Reads the files of a listing; a frame without a usable pose or size goes to `skipped`.
+/// Reads the files of a listing; frames without a usable pose or size are added to `skipped`.
 ///
 /// # Errors
-/// [`Error::Input`] where a file is no listing, or a frame has intrinsics that are not supported.
+/// [`Error::Input`] if a file is not a listing, or a frame has unsupported intrinsics.
 pub(super) fn read(
     (root, images): (&Path, Option<&Path>),
     listings: &[(PathBuf, Option<Split>)],
@@ -154,7 +154,7 @@ fn parse(path: &Path) -> Result<Transforms> {
     })
 }
 
-/// A path as listings are compared: with slashes, without what points to where it stands.
+/// A normalised path for comparison: with slashes, without `.` components.
 fn listed_path(path: &str) -> String {
     let path = path.replace('\\', "/");
     path.trim_start_matches("./").to_owned()
@@ -167,7 +167,7 @@ struct TrainingFrame {
     view_from_world: DAffine3,
 }
 
-/// Takes the frames of a file that have a pose and are not marked to be left out.
+/// Adds the frames of a file that have a pose and are not marked as bad.
 fn usable_frames(
     path: &Path,
     transforms: &mut Transforms,
@@ -223,7 +223,7 @@ fn usable_frames(
     frames
 }
 
-/// What was mended of the matrices of a file.
+/// Corrections of the matrices of a file.
 #[derive(Default)]
 struct Mended {
     is_transposed: bool,
@@ -263,12 +263,12 @@ impl Mended {
     }
 }
 
-/// What a listing says of a frame's split.
+/// The split of a frame according to a listing.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Stated {
     Nothing,
     As(Split),
-    /// There are lists, and it is in none.
+    /// There are lists, but the frame is in none.
     Neither,
 }
 
@@ -282,8 +282,8 @@ impl Stated {
 }
 
 impl StatedSplits {
-    /// The split of a frame by its own key, else by the lists. As with files, a validation list counts only where there is no
-    /// test list.
+    /// The split of a frame by its own key, else by the lists. As with files, a validation list is used only if there
+    /// is no test list.
     fn of(&self, name: &str, own: Option<&str>) -> Stated {
         match own {
             Some("train") => return Stated::As(Split::Train),
@@ -340,13 +340,13 @@ fn cloud(
     Some(Cloud { file, applied })
 }
 
-/// Python writes NaN and Infinity bare, which JSON does not know; as null they are reported with their frame.
+/// Replaces the bare NaN and Infinity of Python, which are not JSON, by null, which is reported with its frame.
 fn nan_as_null(text: &str) -> String {
     let quoted = |(index, part): (usize, &str)| match index % 2 {
         0 => part.replace("-Infinity", "null").replace("Infinity", "null").replace("NaN", "null"),
         _ => part.to_owned(),
     };
-    // Between quotes nothing changes; an escaped quote swaps inside and outside, so such a file is left alone.
+    // Text between quotes is unchanged; an escaped quote swaps inside and outside, so a file with one is left alone.
     if text.contains("\\\"") {
         return text.to_owned();
     }

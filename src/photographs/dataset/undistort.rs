@@ -1,9 +1,9 @@
-//! Undistortion: a photograph through a real lens becomes the photograph a pinhole would have taken.
+//! Undistortion: a photograph through a real lens becomes that of a pinhole.
 //!
-//! The pinhole keeps the image's size and the principal point; its focal lengths are scaled by one factor, the
-//! smallest at which every output pixel still lies inside the input (`OpenCV`'s alpha = 0): no blank pixels, and no
-//! more of the picture lost than that needs. Of a fisheye it shows [`WIDEST`] off the axis at most: a pinhole spends ever
-//! more of its pixels on what lies beyond, and has none for what lies at 90 degrees.
+//! The pinhole keeps the image's size and the principal point; its focal lengths are scaled by one factor, the smallest
+//! at which every output pixel is inside the input (`OpenCV`'s alpha = 0): no blank pixels, and no more of the image is
+//! lost than necessary. Of a fisheye it shows at most [`WIDEST`] off the axis: a pinhole spends ever more pixels on
+//! larger angles, and cannot show 90 degrees.
 
 use glam::DVec2;
 use rayon::prelude::*;
@@ -11,10 +11,11 @@ use rayon::prelude::*;
 use crate::camera::Lens;
 use crate::photographs::image::Image;
 
-/// What the corner of a pinhole sees off the axis, degrees: 120 across the picture, where a pixel of a fisheye covers four.
+/// The angle off the axis at the corner of a pinhole, degrees: 120 across the image, where a pixel of a fisheye covers
+/// four.
 pub(super) const WIDEST: f64 = 60.0;
 
-/// Where each pixel of the pinhole image lies in the photograph; made once per lens.
+/// The position of each pixel of the pinhole image in the photograph; computed once per lens.
 #[derive(Debug)]
 pub(super) struct Undistortion {
     /// The pinhole's focal lengths, pixels.
@@ -26,7 +27,7 @@ pub(super) struct Undistortion {
 }
 
 impl Undistortion {
-    /// `None` where no pinhole sees inside the photograph only: the coefficients make no lens.
+    /// `None` if no pinhole sees only the inside of the photograph: the coefficients are not those of a lens.
     pub(super) fn new(lens: &Lens) -> Option<Self> {
         let zoom = zoom(lens)?;
         let focal = lens.focal * zoom;
@@ -64,11 +65,11 @@ fn in_photograph(lens: &Lens, focal: DVec2, pixel: DVec2) -> DVec2 {
         + lens.principal_point
 }
 
-/// The smallest factor on the focal lengths with which every output pixel's centre lies among the input's.
+/// The smallest factor on the focal lengths with which the centre of every output pixel is inside the input.
 fn zoom(lens: &Lens) -> Option<f64> {
     const STEP: f64 = 1.01;
     const RANGE: f64 = 4.0;
-    // From no change outwards, not by bisection over the whole range: far out the polynomial folds back inside.
+    // From factor 1 outwards, not by bisection over the whole range: far out, the polynomial folds back inside.
     let (mut inside, mut outside) = (1.0, 1.0);
     if sees_only_the_photograph(lens, 1.0) {
         while sees_only_the_photograph(lens, outside) {
@@ -114,17 +115,17 @@ fn fits(lens: &Lens, zoom: f64, widest: f64) -> bool {
     };
     let columns = (0..lens.width).map(|x| f64::from(x) + 0.5);
     let rows = (0..lens.height).map(|y| f64::from(y) + 0.5);
-    // The map is continuous and one-to-one, so the border's inside being inside is enough.
+    // The map is continuous and one-to-one, so it suffices that the border is inside.
     columns.into_iter().all(|x| inside(DVec2::new(x, 0.5)) && inside(DVec2::new(x, last.y)))
         && rows.into_iter().all(|y| inside(DVec2::new(0.5, y)) && inside(DVec2::new(last.x, y)))
 }
 
-/// Catmull-Rom over 4x4 pixels, edges repeated, kept within the range of those pixels: dark noise must not turn
-/// into negative light.
+/// Catmull-Rom over 4x4 pixels, edges repeated, clamped to the range of those pixels: dark noise must not become
+/// negative light.
 struct Taps {
     columns: [usize; 4],
     across: [f32; 4],
-    /// Where the four rows begin.
+    /// Start indices of the four rows.
     rows: [usize; 4],
     down: [f32; 4],
 }
@@ -145,7 +146,7 @@ impl Taps {
                 for plane in 0..N {
                     let value = planes[plane][row + column];
                     sum[plane] += weight * value;
-                    // Not `min` and `max`, which look for a NaN first.
+                    // Not `min` and `max`, which first check for NaN.
                     low[plane] = if value < low[plane] { value } else { low[plane] };
                     high[plane] = if value > high[plane] { value } else { high[plane] };
                 }
@@ -206,7 +207,7 @@ mod tests {
         [wave(9.0, 2.0), wave(-3.0, 8.0), wave(5.0, -7.0)]
     }
 
-    /// The undistorted position by brute force: a grid that closes in on the distorted one.
+    /// The undistorted position by brute force: a grid that converges to the distorted one.
     fn undistorted(distortion: Distortion, target: DVec2) -> DVec2 {
         let mut best = target;
         let mut reach = 0.2;
@@ -231,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn the_undistorted_photograph_is_what_a_pinhole_sees() {
+    fn the_undistorted_photograph_is_that_of_a_pinhole() {
         for distortion in LENSES {
             let lens = lens(distortion);
             let map = Undistortion::new(&lens).unwrap();
@@ -239,13 +240,13 @@ mod tests {
             let pinhole = image_of(&lens, map.focal, Distortion::default());
             let worst =
                 ours.data.iter().zip(&pinhole.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            // Half a pixel off would be 2e-2; what remains is the repeated edge.
+            // An offset of half a pixel would give 2e-2; the rest is the repeated edge.
             assert!(worst < 4e-3, "{distortion:?}: {worst}");
         }
     }
 
     #[test]
-    fn no_output_pixel_is_blank_and_the_zoom_is_no_larger_than_that_needs() {
+    fn no_output_pixel_is_blank_and_the_zoom_is_the_smallest_possible() {
         for distortion in LENSES {
             let lens = lens(distortion);
             let factor = zoom(&lens).unwrap();
@@ -259,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_fisheye_the_pinhole_shows_the_middle_and_that_is_known() {
+    fn a_fisheye_is_cropped_to_its_middle_and_marked_as_cropped() {
         let distortion = Distortion { k1: 0.02, is_fisheye: true, ..NONE };
         // 85 degrees at the corners, and 40.
         for (focal, is_cropped) in [(40.0, true), (90.0, false)] {
@@ -287,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn interpolation_makes_no_value_that_its_pixels_do_not_span() {
+    fn interpolation_stays_within_the_range_of_its_pixels() {
         let plane =
             [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0];
         for x in (0..=40).map(|step| step as f32 / 10.0) {

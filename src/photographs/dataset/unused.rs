@@ -1,4 +1,4 @@
-//! What lies beside a dataset's photographs and is not used, said so that nobody wonders.
+//! Files next to a dataset's photographs that are not used, which are reported.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -8,7 +8,7 @@ use super::masks;
 use crate::base::tree;
 use crate::photographs::image::files::{photographs_in, unread_in};
 
-/// A line where most photographs have no pose, and one for each folder with pictures that are not read.
+/// A line if most photographs have no pose, and one for each folder of images that are not read.
 pub(super) fn remarks(root: &Path, frames: &[ListedView]) -> Vec<String> {
     let used: BTreeSet<&Path> = frames.iter().filter_map(|frame| frame.file.as_deref()).collect();
     let images = root.join("images");
@@ -18,7 +18,7 @@ pub(super) fn remarks(root: &Path, frames: &[ListedView]) -> Vec<String> {
     if all_below {
         add_folders_below(&images, &mut folders);
     }
-    // Beside a folder of dark photographs its normal-light twin has the other half of the listing.
+    // Next to a folder of dark photographs, its normal-light counterpart has the other half of the listing.
     let stems: BTreeSet<_> = used.iter().filter_map(|file| file.file_stem()).collect();
     let is_used = |file: &PathBuf| {
         let has_twin =
@@ -34,7 +34,8 @@ pub(super) fn remarks(root: &Path, frames: &[ListedView]) -> Vec<String> {
     if let Some(first) = without_pose.first().filter(|_| 2 * count > of) {
         let first = first.strip_prefix(root).unwrap_or(first).display();
         remarks.push(format!(
-            "{}: {count} of {of} photographs have no pose and are not used, {first} the first; `nightsplat pose` finds those of dark photographs",
+            "{}: {count} of {of} photographs have no pose and are not used, {first} the first; `nightsplat pose` \
+             finds those of dark photographs",
             root.display()
         ));
     }

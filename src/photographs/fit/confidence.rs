@@ -1,4 +1,4 @@
-//! How well the pairs determine the constants.
+//! Standard errors of the fitted constants.
 
 use nalgebra::{DMatrix, SymmetricEigen};
 
@@ -6,10 +6,11 @@ use super::model::Model;
 use super::solve::{Group, Solution};
 use super::{Estimate, Residuals};
 
-/// Nearer to a bound than this share of the range, a constant lies at it.
+/// A constant within this share of its range from a bound counts as at the bound.
 const AT_BOUND: f64 = 1e-5;
 
-/// Below this ratio of the least to the greatest eigenvalue of the correlations' inverse, constants are not told apart.
+/// Below this ratio of the smallest to the largest eigenvalue of the inverse correlations, constants are not determined
+/// separately.
 const SINGULAR: f64 = 1e-9;
 
 pub(super) struct Confidence {
@@ -35,7 +36,7 @@ pub(super) fn of(
         .collect();
     let inner: Vec<usize> = (0..values.len()).filter(|&index| !at_bound[index]).collect();
 
-    // The sums of squared psi and of psi', and of the gradients' products.
+    // Sums of psi squared, of psi', and of the products of gradients.
     let limit = solution.delta.unwrap_or(f64::INFINITY);
     let [mut psi2, mut slope] = [0.0; 2];
     let mut normal = DMatrix::<f64>::zeros(inner.len(), inner.len());
@@ -76,7 +77,7 @@ pub(super) fn of(
     Confidence { estimates: (0..values.len()).map(estimate).collect(), effective_values }
 }
 
-/// N / (1 + (m - 1) rho), rho the intraclass correlation of residuals by the analysis of variance of one way.
+/// N / (1 + (m - 1) rho), with rho the intraclass correlation of the residuals from a one-way analysis of variance.
 fn effective_values(residuals: &Residuals) -> f64 {
     let Residuals { count, weighted_squares: squares, means, .. } = residuals;
     let photographs = means.len() as f64;
@@ -93,7 +94,7 @@ fn effective_values(residuals: &Residuals) -> f64 {
     count / (1.0 + (size - 1.0) * rho)
 }
 
-/// The diagonal of the inverse of a normal matrix; none where it has none.
+/// The diagonal of the inverse of a normal matrix; `None` if it is singular.
 fn diagonal_of_inverse(normal: &DMatrix<f64>) -> Option<Vec<f64>> {
     let size = normal.nrows();
     let scale: Vec<f64> = (0..size).map(|i| normal[(i, i)].sqrt()).collect();

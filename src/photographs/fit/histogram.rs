@@ -1,15 +1,15 @@
-//! Joint histograms of dark values and reference values: what a fit needs of millions of pixels.
+//! Joint histograms of dark and reference values: what a fit requires of millions of pixels.
 
 use crate::photographs::tone::measurable;
 
-/// Reference values are counted by 8-bit code value.
+/// Reference values are counted as 8-bit code values.
 const LEVELS: usize = 256;
 
-/// The bits of an f32 that tell columns apart drop the last twelve: values of 8-bit files stay apart, values closer than
-/// 2^-11 of each other share a column.
+/// The key of a column drops the last twelve bits of an f32: values of 8-bit files have different columns, values
+/// closer than a factor of 2^-11 share one.
 const KEY_SHIFT: u32 = 12;
 
-/// The key of the greatest value, 65504.
+/// The key of the largest value, 65504.
 const LARGEST_KEY: usize = (65504.0_f32.to_bits() >> KEY_SHIFT) as usize;
 
 /// Pixels of one reference value, within a column.
@@ -25,20 +25,20 @@ impl Cell {
         f64::from(self.level) / (LEVELS - 1) as f64
     }
 
-    /// How many pixels, each times its weight.
+    /// The number of pixels, times their weight.
     pub fn count(self) -> f64 {
         self.count
     }
 }
 
-/// Pixels whose dark value is alike.
+/// Pixels with the same dark value.
 #[derive(Clone, Debug, Default)]
 pub struct Column {
     /// The mean of their dark values.
     pub x: f64,
-    /// How many they are.
+    /// Their number.
     pub count: f64,
-    /// The sum of their reference values, as exact as f64.
+    /// The sum of their reference values, in f64.
     pub sum_y: f64,
     /// The sum of the squares of their reference values.
     pub sum_y2: f64,
@@ -46,14 +46,14 @@ pub struct Column {
     pub cells: Vec<Cell>,
 }
 
-/// Columns by ascending dark value, none of them empty.
+/// Columns in the order of their dark values; none is empty.
 #[derive(Clone, Debug, Default)]
 pub struct Histogram {
     /// The columns.
     pub columns: Vec<Column>,
 }
 
-/// A column that is being filled.
+/// A column under construction.
 #[derive(Clone)]
 struct OpenColumn {
     sums: [f64; 3],
@@ -73,8 +73,8 @@ impl OpenColumn {
 }
 
 impl Histogram {
-    /// The pixels of one plane, (H, W) each: one column per dark value, exact for 8-bit photographs. Reference values
-    /// count within [0, 1], dark values as the statistics take them.
+    /// The histogram of one plane, (H, W) each: one column per dark value, exact for 8-bit photographs. Reference
+    /// values are clamped to [0, 1], dark values as in [`Statistics`](crate::photographs::tone::Statistics).
     pub fn of(dark: &[f32], reference: &[f32]) -> Self {
         let key = |x: f32| (measurable(x).to_bits() >> KEY_SHIFT) as usize;
         let mut columns = vec![0_u32; LARGEST_KEY + 1];
@@ -99,10 +99,10 @@ impl Histogram {
         Self { columns: open.iter().filter_map(OpenColumn::closed).collect() }
     }
 
-    /// Several histograms in one of `bins` columns, each with a factor for its dark values and a weight for its counts.
+    /// Merges several histograms into one of `bins` columns, each with a factor for its dark values and a weight for
+    /// its counts.
     ///
-    /// Of a value t the bin is that of t / (1 + t): fine in the shadows, and the few values far above 1 have bins of
-    /// their own instead of deciding the width of all.
+    /// Bins are uniform in t / (1 + t): fine in the shadows, and the few values far above 1 do not widen the others.
     pub fn pooled<'a>(parts: impl IntoIterator<Item = (&'a Self, [f64; 2])>, bins: usize) -> Self {
         let mut open = vec![OpenColumn::EMPTY; bins];
         for (histogram, [factor, weight]) in parts {
@@ -122,12 +122,13 @@ impl Histogram {
         Self { columns: open.iter().filter_map(OpenColumn::closed).collect() }
     }
 
-    /// How many pixels it counts.
+    /// The number of pixels, times their weights.
     pub fn count(&self) -> f64 {
         self.columns.iter().map(|column| column.count).sum()
     }
 
-    /// The sums of the residuals y - f(x) and of their squares over all pixels, exact but for what columns share.
+    /// The sums of the residuals y - f(x) and of their squares over all pixels, exact except for values that share a
+    /// column.
     pub fn residuals(&self, f: impl Fn(f64) -> f64) -> [f64; 2] {
         self.columns.iter().fold([0.0; 2], |[sum, squares], column| {
             let (y, Column { count, sum_y, sum_y2, .. }) = (f(column.x), column);
@@ -141,7 +142,7 @@ mod tests {
     use super::Histogram;
 
     #[test]
-    fn sums_are_those_of_the_pixels_however_they_are_pooled() {
+    fn sums_are_those_of_the_pixels_for_any_pooling() {
         let dark: Vec<f32> = (0..5000).map(|i| (i % 61) as f32 / 255.0).collect();
         let reference: Vec<f32> = (0..5000).map(|i| (i * 7 % 256) as f32 / 255.0).collect();
         let histogram = Histogram::of(&dark, &reference);
@@ -156,7 +157,7 @@ mod tests {
         let pooled = Histogram::pooled([(&histogram, [4.0, 0.5]), (&histogram, [4.0, 1.5])], 4096);
         assert_eq!((pooled.count(), pooled.columns.len()), (10_000.0, 61));
         assert!(close(pooled.residuals(|t| f(t / 4.0)).map(|sum| sum / 2.0)));
-        // Every column's cells are its pixels.
+        // The cells of every column contain its pixels.
         for column in &pooled.columns {
             let sum: f64 = column.cells.iter().map(|cell| cell.count() * cell.y()).sum();
             assert!((sum - column.sum_y).abs() < 1e-4 * column.count);
@@ -164,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn values_without_meaning_and_no_values_at_all_are_counted_as_the_statistics_do() {
+    fn invalid_values_and_empty_planes_are_counted_as_in_the_statistics() {
         let histogram =
             Histogram::of(&[f32::NAN, -1.0, f32::INFINITY, 1e9], &[2.0, f32::NAN, 0.5, 0.5]);
         let x: Vec<f64> = histogram.columns.iter().map(|column| column.x).collect();

@@ -1,4 +1,4 @@
-//! A family as a function of the numbers that a fit may change.
+//! A family as a function of its fitted values.
 
 use super::{FitOptions, Pair};
 use crate::photographs::tone::{
@@ -7,7 +7,7 @@ use crate::photographs::tone::{
 };
 use crate::{Error, Result};
 
-/// Where a number belongs among the [`ToneSettings`].
+/// The place of a fitted value in [`ToneSettings`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum SettingSlot {
     Shape(usize),
@@ -17,7 +17,7 @@ enum SettingSlot {
     BaseGain,
 }
 
-/// A setting that no family lists among its constants; it starts where the family has it.
+/// A setting that is not among a family's constants; it starts at the family's value.
 const fn setting(name: &'static str, low: f64, high: f64) -> Constant {
     Constant { name, default: low, start: low, bounds: [low, high] }
 }
@@ -26,7 +26,7 @@ const ALPHA: Constant = setting("alpha", 0.0, 0.5);
 const GAIN_C: Constant = setting("gain_c", 0.0, 20.0);
 const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
 
-/// A family with the list of what is fitted.
+/// A family with the list of its fitted values.
 #[derive(Clone, Debug)]
 pub(super) struct Model {
     pub(super) family: &'static Family,
@@ -35,7 +35,7 @@ pub(super) struct Model {
     pub(super) free: Vec<Constant>,
 }
 
-/// What the exposure of a photograph makes of a curve.
+/// The effect of a photograph's exposure on its curve.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Exposure {
     statistics: Statistics,
@@ -43,7 +43,7 @@ pub(super) struct Exposure {
 }
 
 impl Exposure {
-    /// Of several photographs together: t is all there is.
+    /// For several photographs together: only t matters.
     pub(super) const POOLED: Self = Self {
         statistics: Statistics {
             p10: 1.0,
@@ -67,7 +67,7 @@ impl Exposure {
 
 impl Model {
     /// # Errors
-    /// [`Error::Usage`] where the family has nothing to fit.
+    /// [`Error::Usage`] if the family has nothing to fit.
     pub(super) fn new(family: &'static Family, options: &FitOptions) -> Result<Self> {
         let mut places: Vec<SettingSlot> =
             (0..family.constants.len()).map(SettingSlot::Shape).collect();
@@ -113,7 +113,7 @@ impl Model {
         self.family.white == White::ChannelMeans
     }
 
-    /// Whether the shape f has constants; otherwise the curve rises whatever black level, white and gain are.
+    /// Whether the shape f has constants; otherwise the curve rises for any black level, white and gain.
     pub(super) fn has_shape(&self) -> bool {
         !self.family.constants.is_empty()
     }
@@ -133,12 +133,12 @@ impl Model {
         settings
     }
 
-    /// What a photograph of this exposure gets with these values.
+    /// The curve of a photograph of this exposure with these values.
     pub(super) fn curve(&self, values: &[f64], exposure: &Exposure) -> Curve<f64> {
         self.curve_of(&CurveInputs::from(&self.settings(values)), exposure)
     }
 
-    /// The same with its derivatives by every value.
+    /// [`Self::curve`] with its derivatives with respect to every value.
     pub(super) fn slopes(&self, values: &[f64], exposure: &Exposure) -> Slopes {
         let numbers = CurveInputs::<Dual>::from(&self.settings(values));
         let by = |&place: &SettingSlot| {
@@ -171,7 +171,7 @@ impl Model {
 /// The curve of a photograph, or of one of its channels, as a function of t = x / p90.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Curve<T> {
-    /// A `CURVE_*`.
+    /// A `CURVE_*` number.
     number: u32,
     p90: f64,
     curve: PhotographCurve<T>,
@@ -183,14 +183,14 @@ impl<T: Real> Curve<T> {
         clamped(self.raw_at(t))
     }
 
-    /// At t, before it is clamped.
+    /// At t, unclamped.
     pub(super) fn raw_at(&self, t: f64) -> T {
         let PhotographCurve { white, offset, gain, constants } = &self.curve;
         curve_at(self.number, T::of(t * self.p90) / *white, [*offset, *gain], constants)
     }
 }
 
-/// The derivatives of a curve by every value of its model; those that are no numbers count as 0.
+/// The derivatives of a curve with respect to every value of its model; those that are not finite count as 0.
 #[derive(Clone, Debug)]
 pub(super) struct Slopes(Vec<Curve<Dual>>);
 
@@ -200,7 +200,7 @@ impl Slopes {
         self.0.iter().map(move |curve| counted(curve.at(t)))
     }
 
-    /// Of the curve at t before it is clamped.
+    /// Of the unclamped curve at t.
     pub(super) fn raw_at(&self, t: f64) -> impl Iterator<Item = f64> {
         self.0.iter().map(move |curve| counted(curve.raw_at(t)))
     }
@@ -210,7 +210,7 @@ fn counted(number: Dual) -> f64 {
     if number.derivative.is_finite() { number.derivative } else { 0.0 }
 }
 
-/// The PSNR over all pixels and channels of what `settings` makes of the dark photograph, dB.
+/// The PSNR over all pixels and channels of the dark photograph tone-mapped with `settings`, dB.
 pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
     let model = Model { family: settings.curve.family(), places: vec![], free: vec![] };
     let numbers = CurveInputs::<f64>::from(settings);
@@ -230,7 +230,7 @@ mod tests {
     use crate::photographs::tone::{FAMILIES, ToneCurve};
 
     #[test]
-    fn every_family_is_what_the_kernels_make_of_it() {
+    fn every_family_agrees_with_the_kernels() {
         let statistics = Statistics {
             p10: 0.01,
             p80: 0.11,
@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_are_those_of_central_differences() {
+    fn gradients_agree_with_central_differences() {
         let statistics = Statistics {
             p10: 0.02,
             p80: 0.2,

@@ -11,12 +11,12 @@ use crate::photographs::tone::Statistics;
 use crate::photographs::tone::{luminance, measurable};
 use crate::{Error, Result};
 
-/// Folders that hold the dark photographs of a scene.
+/// Folders of the dark photographs of a scene.
 const DARK_FOLDERS: [&str; 2] = ["low", "images_low"];
-/// Folders that hold those in normal light, of the same names.
+/// Folders of the normal-light photographs, with the same names.
 const NORMAL_FOLDERS: [&str; 3] = ["high", "normal", "images"];
 
-/// Pairs that were taken in one place.
+/// Pairs of one scene.
 #[derive(Clone, Debug)]
 pub struct FitScene {
     /// The folder's name.
@@ -25,7 +25,7 @@ pub struct FitScene {
     pub pairs: Vec<Pair>,
 }
 
-/// A dark photograph and its reference, reduced to what a fit needs.
+/// A dark photograph and its reference, reduced to the data that a fit requires.
 #[derive(Clone, Debug)]
 pub struct Pair {
     /// The dark photograph.
@@ -39,10 +39,10 @@ pub struct Pair {
 }
 
 impl Pair {
-    /// The pair of two images; `path` is how it is named.
+    /// The pair of two images; `path` is its name.
     ///
     /// # Errors
-    /// [`Error::Input`] where the images differ in size or have no pixels.
+    /// [`Error::Input`] if the images differ in size or have no pixels.
     pub fn new(path: impl Into<PathBuf>, dark: &Image, reference: &Image) -> Result<Self> {
         let path = path.into();
         let size = |image: &Image| (image.width, image.height);
@@ -73,7 +73,7 @@ impl Pair {
         })
     }
 
-    /// Whether the 90th percentile is 0, so that t = x / p90 means nothing.
+    /// Whether the 90th percentile is 0, and t = x / p90 undefined.
     pub fn is_black(&self) -> bool {
         self.statistics.p90 <= 1e-6
     }
@@ -86,8 +86,7 @@ impl FitScene {
     /// Photographs without a partner, and black ones, are left out with a warning.
     ///
     /// # Errors
-    /// [`Error::Input`] names the folder where no pair is left, the file that cannot be read, and the pair whose sizes
-    /// differ.
+    /// [`Error::Input`] if the folder has no pair left, a file cannot be read, or the sizes of a pair differ.
     pub fn load(folder: &Path, normal: Option<&Path>) -> Result<Self> {
         let (files, dark) = files_of(folder, normal)?;
         let colours = ColourCounts::default();
@@ -122,10 +121,10 @@ pub(super) fn name_of(folder: &Path) -> String {
     name.file_name().unwrap_or(name.as_os_str()).to_string_lossy().into_owned()
 }
 
-/// The pairs of a scene by name, never none, and the folder of the dark photographs.
+/// The pairs of a scene by name, at least one, and the folder of the dark photographs.
 ///
 /// # Errors
-/// As [`FitScene::load`], but for what is in the files.
+/// Those of [`FitScene::load`], except for the contents of files.
 pub(super) fn files_of(folder: &Path, normal: Option<&Path>) -> Result<(Vec<Files>, PathBuf)> {
     let (dark, normal) = match normal {
         Some(normal) => (folder.to_owned(), normal.to_owned()),
@@ -157,7 +156,8 @@ fn subfolders(folder: &Path) -> Result<(PathBuf, PathBuf)> {
         |names: &[&str]| names.iter().map(|name| folder.join(name)).find(|path| path.is_dir());
     first(&DARK_FOLDERS).zip(first(&NORMAL_FOLDERS)).ok_or_else(|| {
         let problem = if folder.is_dir() {
-            "holds no pairs: it needs folders `low` and `high` (or `normal`, or `images`), or the folder in normal light by itself, named with --normal"
+            "contains no pairs: it requires folders `low` and `high` (or `normal`, or `images`), or a \
+             folder of normal-light photographs named with --normal"
         } else {
             "is not a folder; name the folder of the pairs"
         };

@@ -1,16 +1,16 @@
 //! A camera profile from pairs of photographs: [`Profile`], by robust least squares on colours.
 //!
-//! The channels of a profile do not depend on each other. For each one in turn, until nothing moves:
+//! The channels of a profile are independent. For each of them, until convergence:
 //!
 //! ```text
-//! segments    non-negative least squares of the 16 rises, given u = a v + b, with a light penalty on bends
-//! a, b        a damped Gauss-Newton step, given the segments; u is rescaled to [0, 1] behind it
-//! weights     Huber's, by the residuals of both
+//! segments    non-negative least squares of the 16 rises, given u = a v + b, with a light penalty on curvature
+//! a, b        a damped Gauss-Newton step, given the segments; u is then rescaled to [0, 1]
+//! weights     Huber's, from the residuals of both
 //! ```
 //!
-//! Dark values are brought to one exposure first: v = 1 - exp(-k x) with the gain k that the rule of the automatic curve
-//! gives the photograph ([`Exposure`]). It follows the exposure and lies within [0, 1], so that segments of equal width are
-//! all used; as t = x / p90 the same fit scored .6 dB less on its own scene and on others.
+//! Dark values are normalised to one exposure first: v = 1 - exp(-k x), where k is the gain of the automatic curve for
+//! the photograph ([`Exposure`]). v is within [0, 1], so all segments of equal width are used; with t = x / p90
+//! instead, the same fit scored 0.6 dB less on its own scene and on others.
 
 use std::path::{Path, PathBuf};
 
@@ -26,22 +26,23 @@ use crate::{Error, Result};
 
 const KNOTS: usize = SEGMENTS as usize + 1;
 
-/// Colours that a fit looks at, over all photographs.
+/// The number of colours in a fit, over all photographs.
 const COLOURS: usize = 200_000;
 /// Rounds of segments, weights and mixing.
 const ROUNDS: usize = 30;
-/// Sweeps of the descent to the rises.
+/// Sweeps of the coordinate descent.
 const SWEEPS: usize = 400;
-/// The weight of squared bends of the segments beside the mean squared residual: what no colour falls on goes straight on.
+/// The weight of the squared curvature of the segments relative to the mean squared residual: segments without colours
+/// continue straight.
 const BEND: f64 = 1e-5;
-/// Of a channel's u, what lies below 0 and above 1 together.
+/// The share of a channel's u below 0 and above 1.
 const CUT: f64 = 1e-3;
-/// Least scale of the residuals, as for curves.
+/// The smallest scale of the residuals, as for curves.
 const MIN_SCALE: f64 = 0.25 / 255.0;
-/// The file's digits: 4 behind the point, a fortieth of a code value. More are not determined by 8-bit references.
+/// Units of the file's 4 decimals, a fortieth of a code value. 8-bit references do not determine more.
 const UNITS: f64 = 1e4;
 
-/// The pairs of a scene as colours, brought to one exposure.
+/// The pairs of a scene as colours, normalised to one exposure.
 #[derive(Clone, Debug)]
 pub struct ColourScene {
     /// The folder's name.
@@ -50,7 +51,7 @@ pub struct ColourScene {
     pub pairs: Vec<ColourPair>,
 }
 
-/// Dark colours of a photograph times its gain, and what they are in its reference.
+/// Dark colours of a photograph times its gain, and the colours of its reference.
 #[derive(Clone, Debug)]
 pub struct ColourPair {
     /// The dark photograph.
@@ -59,8 +60,7 @@ pub struct ColourPair {
     pub colours: Vec<[[f32; 3]; 2]>,
 }
 
-/// How well a profile does on pairs, as the mean of their PSNRs over all channels, dB, beside the automatic curve without
-/// a reference.
+/// The mean PSNR of pairs over all channels, dB, for a profile and for the automatic curve, which needs no reference.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ProfileScores {
     /// The profile.
@@ -74,17 +74,17 @@ pub struct ProfileScores {
 pub struct ProfileFold {
     /// The scene's name, or that of the part.
     pub name: String,
-    /// How many pairs it holds.
+    /// Its number of pairs.
     pub pairs: usize,
-    /// Of a profile of all other pairs.
+    /// Scores of a profile fitted to all other pairs.
     pub scores: ProfileScores,
 }
 
 impl ColourScene {
-    /// Pairs as [`super::FitScene::load`] finds them.
+    /// The pairs that [`super::FitScene::load`] finds.
     ///
     /// # Errors
-    /// As there.
+    /// Those of [`super::FitScene::load`].
     pub fn load(folder: &Path, normal: Option<&Path>) -> Result<Self> {
         let (files, dark) = files_of(folder, normal)?;
         let share = (COLOURS / files.len()).max(1);
@@ -96,13 +96,13 @@ impl ColourScene {
         let photographs = files.par_iter().map(load).collect::<Result<Vec<_>>>()?;
         colours.say();
         let Some(exposure) = Exposure::of(photographs.iter().map(|(_, y)| y), None) else {
-            let problem = "every photograph is as good as black: a profile takes one pair at least";
+            let problem = "every photograph is almost black: a profile needs at least one pair";
             return Err(Error::input(dark, problem));
         };
         let mut pairs = vec![];
         for (mut pair, luminance) in photographs {
             if crate::photographs::tone::is_black(&luminance) {
-                tracing::warn!("left out: {} is as good as black", pair.path.display());
+                tracing::warn!("left out: {} is almost black", pair.path.display());
                 continue;
             }
             let gain = exposure.gain_of(&luminance, None) as f32;
@@ -113,7 +113,7 @@ impl ColourScene {
     }
 }
 
-/// About `count` colours of a pair, evenly spaced, and the luminance of all of the dark photograph.
+/// About `count` colours of a pair, evenly spaced, and the luminance of the whole dark photograph.
 fn sampled(
     path: &Path,
     dark: &Image,
@@ -131,7 +131,7 @@ fn sampled(
     let colour = |image: &Image, i: usize| {
         [0, 1, 2].map(|channel| measurable(image.data[channel * pixels + i]))
     };
-    // An odd step does not keep to the columns of an even width.
+    // An odd step changes its column from row to row.
     let step = (pixels / count).max(1) | 1;
     let both = |i| [colour(dark, i), colour(reference, i).map(|y| y.min(1.0))];
     let colours = (0..pixels).step_by(step).map(both).collect();
@@ -139,17 +139,17 @@ fn sampled(
     Ok((ColourPair { path: path.to_owned(), colours }, luminance))
 }
 
-/// The profile of all pairs; residuals beyond `huber` times their scale weigh less.
+/// Fits a profile to all pairs; residuals beyond `huber` times their scale are weighted down.
 ///
 /// # Errors
-/// [`Error::Usage`] where there is no pair or `huber` is not above 0, [`Error::Input`] where the photographs are of one
+/// [`Error::Usage`] if there is no pair or `huber` is not above 0, [`Error::Input`] if the photographs have a single
 /// colour.
 pub fn fit_profile(scenes: &[(&str, Vec<&ColourPair>)], huber: f64) -> Result<Profile> {
     let pairs: Vec<&ColourPair> = scenes.iter().flat_map(|(_, pairs)| pairs).copied().collect();
     let Some(first) = pairs.first() else {
-        return Err(Error::Usage("there are no pairs: a profile takes one at least".to_owned()));
+        return Err(Error::Usage("there are no pairs: a profile needs at least one".to_owned()));
     };
-    // Positive phrasing: a NaN fails the test too.
+    // Written so that a NaN fails.
     let is_positive = huber > 0.0;
     if !is_positive {
         let problem = format!("huber is {huber}; it must be above 0");
@@ -165,14 +165,14 @@ pub fn fit_profile(scenes: &[(&str, Vec<&ColourPair>)], huber: f64) -> Result<Pr
         Channel::fit(channel, &inputs, &outputs, huber)
     });
     let fitted = fitted.collect::<Option<Vec<Channel>>>().ok_or_else(|| {
-        let problem = "is of one colour, as are all pairs: there is nothing to fit a profile to";
+        let problem = "has a single colour, as all pairs do: there is nothing to fit a profile to";
         Error::input(&first.path, problem)
     })?;
     let rounded = |x: f64| (UNITS * x).round() / UNITS;
     let of = |channel: usize| {
         let Channel { mix, values } = &fitted[channel];
         let gain = mix.fixed_rows::<3>(0).sum();
-        // The last weight takes what rounding leaves, so that the row still sums to 1.
+        // The last weight absorbs the rounding, so that the row still sums to 1.
         let [r, g] = [0, 1].map(|from| rounded(mix[from] / gain));
         let values: Vec<f64> = values.iter().map(|y| rounded(y.clamp(0.0, 1.0))).collect();
         ([r, g, rounded(1.0 - r - g)], rounded(gain), rounded(mix[3]), values)
@@ -201,7 +201,7 @@ struct Channel {
 }
 
 impl Channel {
-    /// None where u has no range.
+    /// `None` if u has no range.
     fn fit(
         channel: usize,
         inputs: &[SVector<f64, 4>],
@@ -227,7 +227,7 @@ impl Channel {
         Some(fitted)
     }
 
-    /// The segment of u, and how far along it u lies.
+    /// The segment of u, and the position of u within it.
     fn place(&self, input: &SVector<f64, 4>) -> (usize, f64) {
         let place = f64::from(SEGMENTS) * self.mix.dot(input).clamp(0.0, 1.0);
         let segment = (place as usize).min(KNOTS - 2);
@@ -242,7 +242,7 @@ impl Channel {
         })
     }
 
-    /// The value at 0 and the rises, none of them negative, by coordinate descent on the normal equations.
+    /// The value at 0 and the non-negative rises, by coordinate descent on the normal equations.
     fn fit_segments(&mut self, inputs: &[SVector<f64, 4>], outputs: &[f64], weights: &[f64]) {
         type Square = SMatrix<f64, KNOTS, KNOTS>;
         let (mut normal, mut right) = (Square::zeros(), SVector::<f64, KNOTS>::zeros());
@@ -265,7 +265,7 @@ impl Channel {
                 }
             }
         }
-        // A value at a knot is the sum of the rises up to there.
+        // The value at a knot is the sum of the rises up to it.
         let sums = Square::from_fn(|row, column| f64::from(u8::from(column <= row)));
         let (normal, right) = (sums.transpose() * normal * sums, sums.transpose() * right);
         let mut rises = SVector::<f64, KNOTS>::from_fn(|i, _| match i {
@@ -282,7 +282,7 @@ impl Channel {
         self.values = std::array::from_fn(|i| values[i]);
     }
 
-    /// A step of weights and bias, taken only if it helps; the damping of the next one. None where u has no range left.
+    /// A step of weights and bias, taken only if it helps; returns the next damping, or `None` if u has no range left.
     fn step(
         &mut self,
         inputs: &[SVector<f64, 4>],
@@ -312,7 +312,7 @@ impl Channel {
             .lu()
             .solve(&right)
             .map(|step| Self { mix: self.mix + step, values: self.values });
-        // Grey must get brighter with light.
+        // Grey must become brighter with more light.
         let helps =
             |moved: &Self| moved.mix.fixed_rows::<3>(0).sum() > 0.05 && loss(moved) < loss(self);
         match moved.filter(helps) {
@@ -325,7 +325,7 @@ impl Channel {
     }
 }
 
-/// The mix that has u from 0 to 1 on the inputs but for [`CUT`] of them; none where they are all one.
+/// The mix that maps the inputs to u from 0 to 1, except for a share of [`CUT`]; `None` if all are equal.
 fn stretched(mix: SVector<f64, 4>, inputs: &[SVector<f64, 4>]) -> Option<SVector<f64, 4>> {
     let mut u: Vec<f64> = inputs.iter().map(|input| mix.dot(input)).collect();
     let last = u.len() - 1;
@@ -349,17 +349,17 @@ pub fn profile_scores(profile: &Profile, pairs: &[&ColourPair]) -> ProfileScores
             });
             -10.0 * (squares.sum::<f64>() / (3 * pair.colours.len()) as f64).log10()
         };
-        // In order: a sum of floats depends on it.
+        // In order, since a sum of floats depends on it.
         let scores: Vec<f64> = pairs.par_iter().map(psnr).collect();
         scores.iter().sum::<f64>() / pairs.len() as f64
     };
     ProfileScores { profile: mean(&|t| profile.value(t)), auto: mean(&|t| t.map(|t| soft(t, 1.0))) }
 }
 
-/// Leaves out each scene in turn, of a single one every `folds`-th pair, and scores a profile of the others on it.
+/// Leaves out each scene in turn (of a single scene, every `folds`-th pair), and scores a profile of the others on it.
 ///
 /// # Errors
-/// [`Error::Usage`] where there is a single pair or fold; those of [`fit_profile`].
+/// [`Error::Usage`] for a single pair or fold; those of [`fit_profile`].
 pub fn cross_validate_profile(
     scenes: &[ColourScene],
     folds: usize,
@@ -371,8 +371,8 @@ pub fn cross_validate_profile(
             if count < 2 {
                 let pairs = scene.pairs.len();
                 return Err(Error::Usage(format!(
-                    "{pairs} pairs in {folds} folds leave none to fit to or none to validate on; it takes two pairs in \
-                     two folds"
+                    "{pairs} pairs in {folds} folds leave none to fit to or none to validate on; use at least two \
+                     pairs in two folds"
                 )));
             }
             let fold = |index: usize| {

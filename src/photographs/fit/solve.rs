@@ -1,4 +1,4 @@
-//! Least squares: Levenberg-Marquardt within the bounds, restarted from several places, reweighted after Huber.
+//! Least squares: Levenberg-Marquardt within bounds, from several starts, with Huber's weights.
 
 use levenberg_marquardt::{LeastSquaresProblem, LevenbergMarquardt};
 use nalgebra::{DMatrix, DVector, Dyn, Owned};
@@ -8,14 +8,14 @@ use super::{Channels, FitOptions, Histogram, Pair, Weighting};
 use crate::base::random::Stream;
 use crate::photographs::tone::Statistics;
 
-/// Values that share a curve of t.
+/// Values with the same curve of t.
 pub(super) struct Group {
     pub(super) exposure: Exposure,
     /// Of t = x / p90.
     pub(super) histogram: Histogram,
 }
 
-/// The pairs with their weights as the model sees them: all in one group where t alone decides.
+/// The pairs with their weights, grouped by curve: a single group if only t matters.
 fn groups(model: &Model, pairs: &[&Pair], weights: &[f64], options: &FitOptions) -> Vec<Group> {
     let all = pairs.iter().zip(weights).flat_map(|(pair, &weight)| {
         parts(model, pair, options.channels).into_iter().map(move |(exposure, histograms)| {
@@ -32,7 +32,7 @@ fn groups(model: &Model, pairs: &[&Pair], weights: &[f64], options: &FitOptions)
     }
 }
 
-/// The histograms of a pair that are fitted, by the exposure they share.
+/// The fitted histograms of a pair, with their exposures.
 pub(super) fn parts<'a>(
     model: &Model,
     pair: &'a Pair,
@@ -49,7 +49,7 @@ pub(super) fn parts<'a>(
     vec![(exposure(0), histograms)]
 }
 
-/// How many values of a pair are fitted, and the sums of their residuals and of the squares.
+/// The number of fitted values of a pair, and the sums of their residuals and of the squares.
 pub(super) fn pair_residuals(
     model: &Model,
     values: &[f64],
@@ -70,47 +70,47 @@ pub(super) fn pair_residuals(
     found
 }
 
-/// What a fit found.
+/// The result of a fit.
 pub(super) struct Solution {
     pub(super) values: Vec<f64>,
-    /// Of each pair; of all values together the mean is 1.
+    /// Of each pair; the mean over all values is 1.
     pub(super) weights: Vec<f64>,
-    /// Residuals beyond it weigh less; none where all weigh the same.
+    /// The residual beyond which weights decrease; `None` if all are equal.
     pub(super) delta: Option<f64>,
     /// Whether the clamped curve never falls, to within [`TOLERANCE`].
     pub(super) rises: bool,
-    /// Whether the curve never passes 1, to within [`TOLERANCE`].
+    /// Whether the curve never exceeds 1, to within [`TOLERANCE`].
     pub(super) bounded: bool,
 }
 
-/// A column with its weight and the mean of its reference values, under the weights of its cells.
+/// A column with its weight and its mean reference value, under the weights of its cells.
 struct Row {
     group: usize,
     t: f64,
-    /// Of all weights.
+    /// The sum of all weights.
     weight: f64,
     y: f64,
 }
 
-/// How far a constraint may be broken.
+/// Tolerated violation of a constraint.
 const TOLERANCE: f64 = 1e-6;
-/// How much a broken constraint weighs against the residuals, one after another until it holds.
+/// Weights of a violated constraint relative to the residuals, in turn until it is satisfied.
 const STRENGTHS: [f64; 3] = [1e1, 1e3, 1e5];
-/// Where constraints are held to, points of t.
+/// Number of points of t at which constraints are tested.
 const GRID: usize = 128;
-/// Constraints hold at least up to this t.
+/// Constraints are tested at least up to this t.
 const MIN_END: f64 = 3.0;
-/// Random places that are looked at, and the best of them that a fit begins from, beside the table's start.
+/// Number of random points to evaluate, and of the best among them to start from, in addition to the table's start.
 const PLACES: usize = 24;
 const STARTS: usize = 3;
 /// Evaluations of a descent, per constant.
 const PATIENCE: usize = 30;
-/// Rounds of reweighting, and those of them that estimate the residuals' scale anew.
+/// Rounds of reweighting, and the number of them that estimate the residuals' scale again.
 const ROUNDS: usize = 30;
 const SCALE_ROUNDS: usize = 6;
-/// A round that moves no constant by more than this share of its range is the last.
+/// The reweighting ends when no constant moves by more than this share of its range.
 const SETTLED: f64 = 1e-6;
-/// The least scale of the residuals: a quarter of an 8-bit code value, as rounding leaves it.
+/// The smallest scale of the residuals: a quarter of an 8-bit code value, due to rounding.
 const MIN_SCALE: f64 = 0.25 / 255.0;
 
 pub(super) struct Solver<'a> {
@@ -118,7 +118,7 @@ pub(super) struct Solver<'a> {
     pairs: &'a [&'a Pair],
     options: &'a FitOptions,
     pub(super) groups: Vec<Group>,
-    /// Where constraints are tested, of a photograph like the mean of all.
+    /// Points at which constraints are tested, for a photograph of mean statistics.
     grid: Vec<f64>,
     exposure: Exposure,
 }
@@ -134,7 +134,7 @@ impl<'a> Solver<'a> {
         };
         let last = groups.iter().filter_map(|group| group.histogram.columns.last());
         let end = last.map(|column| column.x).fold(MIN_END, f64::max);
-        // Evenly in t / (1 + t), as the columns.
+        // Evenly in t / (1 + t), like the columns.
         let t = |i: usize| {
             let share = i as f64 / (GRID - 1) as f64 * end / (1.0 + end);
             share / (1.0 - share)
@@ -176,7 +176,7 @@ impl<'a> Solver<'a> {
         Solution { values, weights, delta, rises: fall <= TOLERANCE, bounded: excess <= TOLERANCE }
     }
 
-    /// The weight of every pair: one over the mean of its squared residuals.
+    /// The weight of every pair: the inverse of its mean squared residual.
     fn weights(&self, values: &[f64]) -> Vec<f64> {
         let of_pair = |pair: &&Pair| {
             let (count, squares) = pair_residuals(self.model, values, pair, self.options.channels);
@@ -188,12 +188,13 @@ impl<'a> Solver<'a> {
         weights.into_iter().map(|(_, weight)| weight / mean).collect()
     }
 
-    /// The residuals' scale: 1.4826 times the median of their sizes, the standard deviation were they normal.
+    /// The scale of the residuals: 1.4826 times the median of their magnitudes, the standard deviation if they are
+    /// normal.
     fn scale(&self, values: &[f64]) -> f64 {
         (1.4826 * quantile(&mut self.sizes(values), 0.5)).max(MIN_SCALE)
     }
 
-    /// The size of every cell's residual, with its count.
+    /// The magnitude of every cell's residual, with its count.
     pub(super) fn sizes(&self, values: &[f64]) -> Vec<(f64, f64)> {
         let mut sizes = vec![];
         for (group, curve) in self.groups.iter().zip(self.curves(values)) {
@@ -210,8 +211,8 @@ impl<'a> Solver<'a> {
         self.groups.iter().map(|group| self.model.curve(values, &group.exposure)).collect()
     }
 
-    /// A row per column, towards the family's own curve as far as the options say: within one the model has one value, so the weighted mean is all that counts. Without values
-    /// every cell weighs by its count.
+    /// A row per column, drawn towards the family's own curve by the prior. The model has one value within a column, so
+    /// only the weighted mean matters. Without values, cells are weighted by their counts.
     fn rows(&self, weight: &dyn Fn(f64) -> f64, values: &[f64]) -> Vec<Row> {
         let (mut rows, curves) = (vec![], self.curves(values));
         for (index, group) in self.groups.iter().enumerate() {
@@ -249,7 +250,7 @@ impl<'a> Solver<'a> {
         rows
     }
 
-    /// The best of what several starts lead to.
+    /// The best result of several starts.
     fn best_of_many_starts(&self, rows: &[Row]) -> Vec<f64> {
         let free = &self.model.free;
         let start: Vec<f64> = free.iter().map(|constant| constant.start).collect();
@@ -303,14 +304,14 @@ impl<'a> Solver<'a> {
         problem
     }
 
-    /// The deepest fall of the clamped curve from point to point, and the most by which it passes 1.
+    /// The largest fall of the clamped curve between neighbouring points, and its largest excess over 1.
     fn violations(&self, values: &[f64]) -> [f64; 2] {
         self.broken(values)
             .into_iter()
             .fold([0.0; 2], |[fall, excess], [a, b]| [f64::max(fall, a), f64::max(excess, b)])
     }
 
-    /// Of every point of the grid, by how much the clamped curve falls to the next, and passes 1.
+    /// For every point of the grid, the fall of the clamped curve to the next, and its excess over 1.
     fn broken(&self, values: &[f64]) -> Vec<[f64; 2]> {
         let curve = self.model.curve(values, &self.exposure);
         let raw: Vec<f64> = self.grid.iter().map(|&t| curve.raw_at(t)).collect();
@@ -320,13 +321,13 @@ impl<'a> Solver<'a> {
     }
 }
 
-/// The start, or what is inside the bounds next to it.
+/// The start, moved into the bounds.
 fn constant_start(constant: &crate::photographs::tone::Constant) -> f64 {
     let [low, high] = constant.bounds;
     constant.start.clamp(low + 0.01 * (high - low), high - 0.01 * (high - low))
 }
 
-/// Where on the whole line a value between the bounds lies: the logit of its share.
+/// The unbounded value of a constant within its bounds: the logit of its share of the range.
 fn place_of(constant: &crate::photographs::tone::Constant, value: f64) -> f64 {
     let [low, high] = constant.bounds;
     let share = ((value - low) / (high - low)).clamp(1e-6, 1.0 - 1e-6);
@@ -339,7 +340,7 @@ fn within(constant: &crate::photographs::tone::Constant, place: f64) -> f64 {
     low + (high - low) / (1.0 + (-place).exp())
 }
 
-/// The value below which `share` of the counts lie, of (value, count); 0 of none.
+/// The value below which `share` of the counts are, from (value, count); 0 if empty.
 pub(super) fn quantile(sizes: &mut [(f64, f64)], share: f64) -> f64 {
     sizes.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
     let mut left = share * sizes.iter().map(|(_, count)| count).sum::<f64>();
@@ -350,7 +351,7 @@ pub(super) fn quantile(sizes: &mut [(f64, f64)], share: f64) -> f64 {
     found.map_or(0.0, |(size, _)| *size)
 }
 
-/// Residuals: one per row, then two per point of the grid, 0 where the constraint holds.
+/// Residuals: one per row, then two per point of the grid, which are 0 if the constraint is satisfied.
 struct Problem<'a> {
     solver: &'a Solver<'a>,
     rows: &'a [Row],

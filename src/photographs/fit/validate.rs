@@ -1,4 +1,4 @@
-//! Scores on pairs that a fit has not seen.
+//! Scores on held-out pairs.
 
 use serde::Serialize;
 
@@ -6,16 +6,16 @@ use super::{FitOptions, FitScene, Pair, Scores, fit, mean_psnr, mean_squared_err
 use crate::photographs::tone::Family;
 use crate::{Error, Result};
 
-/// A scene, or a part of one, that was held out.
+/// A held-out scene, or a held-out part of one.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Fold {
     /// The scene's name, or that of the fold.
     pub name: String,
-    /// How many pairs it holds.
+    /// Its number of pairs.
     pub pairs: usize,
-    /// The means over its pairs, dB; the fit is to all others.
+    /// The mean PSNR of its pairs, dB, for a fit to all others.
     pub psnr: Scores,
-    /// The means of its pairs' mean squared errors, of values in [0, 1].
+    /// The mean squared error of its pairs, for values in [0, 1].
     pub squared_error: Scores,
 }
 
@@ -30,10 +30,10 @@ pub struct HeldOut {
     pub squared_error: Scores,
 }
 
-/// Fits to all scenes but one, once for each; of a single scene to all but every `folds`-th pair, as many times.
+/// Fits to all scenes except one, for each in turn; in a single scene, to all except every `folds`-th pair.
 ///
 /// # Errors
-/// [`Error::Usage`] where there is a single pair, or fewer than two folds; those of [`fit`].
+/// [`Error::Usage`] for a single pair or fewer than two folds; those of [`fit`].
 pub fn cross_validate(
     family: &'static Family,
     scenes: &[FitScene],
@@ -71,7 +71,8 @@ fn split(scenes: &[FitScene], folds: usize) -> Result<Vec<(String, Vec<&Pair>)>>
         let count = scene.pairs.len().min(folds);
         if count < 2 {
             return Err(Error::Usage(format!(
-                "{} pairs in {folds} folds leave none to fit to or none to validate on; it takes two pairs in two folds",
+                "{} pairs in {folds} folds leave none to fit to or none to validate on; use at least two \
+                 pairs in two folds",
                 scene.pairs.len()
             )));
         }

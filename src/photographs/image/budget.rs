@@ -1,4 +1,4 @@
-//! How large a picture may say that it is, before memory is set aside for it.
+//! Limits on the declared size of an image, checked before memory is allocated.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -7,18 +7,18 @@ use super::exr_file;
 use super::source::{Source, reader};
 use crate::{Error, Result};
 
-/// More than any camera takes: 16 384 x 16 384.
+/// More than any camera: 16 384 x 16 384.
 const MAX_PIXELS: u64 = 1 << 28;
 
-/// What the samples of all layers of an EXR file may take, bytes; it decodes to all of them at once.
+/// The limit for the samples of all layers of an EXR file, which are decoded at once, bytes.
 const MAX_BYTES: u64 = 1 << 33;
 
-/// Refuses a file that declares more than that.
+/// Checks the declared size of a file.
 ///
 /// # Errors
-/// [`Error::Input`] names the file and its size.
+/// [`Error::Input`] with the file and its size if it exceeds the limits.
 pub(super) fn check(path: &Path, bytes: &[u8]) -> Result<()> {
-    // What has no readable header is named when it is decoded.
+    // A file without a readable header is refused by its decoder.
     let excess = if bytes.starts_with(&exr_file::MAGIC) {
         excess_of_exr(bytes)
     } else {
@@ -35,7 +35,7 @@ pub(super) fn check(path: &Path, bytes: &[u8]) -> Result<()> {
 
 fn excess_of_size(width: u64, height: u64) -> Option<String> {
     let is_more = width.saturating_mul(height) > MAX_PIXELS;
-    is_more.then(|| format!("says that it is {width}x{height}, more than 268 megapixels"))
+    is_more.then(|| format!("declares {width}x{height}, more than 268 megapixels"))
 }
 
 fn excess_of_exr(bytes: &[u8]) -> Option<String> {
@@ -55,14 +55,14 @@ fn excess_of_exr(bytes: &[u8]) -> Option<String> {
     });
     let gigabytes = total >> 30;
     let is_more = total > MAX_BYTES;
-    pixels.or(is_more.then(|| format!("says that its layers take {gigabytes} GiB, more than 8")))
+    pixels.or(is_more.then(|| format!("declares layers of {gigabytes} GiB, more than 8")))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// The header of a PNG of a size, with the checksum that it must have.
+    /// The header of a PNG of this size, with its checksum.
     fn png(width: u32, height: u32) -> Vec<u8> {
         let mut bytes = Vec::new();
         let encoder = ::image::codecs::png::PngEncoder::new(&mut bytes);
@@ -97,7 +97,7 @@ mod tests {
         let path = Path::new("bomb");
         let refused = |bytes: &[u8], part: &str| {
             let message = check(path, bytes).unwrap_err().to_string();
-            assert!(message.contains("bomb: says") && message.contains(part), "{message}");
+            assert!(message.contains("bomb: declares") && message.contains(part), "{message}");
         };
         refused(&png(20_000, 20_000), "20000x20000");
         check(path, &png(16_384, 16_384)).unwrap();

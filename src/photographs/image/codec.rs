@@ -1,4 +1,4 @@
-//! Photographs from and to files: PNG, JPEG, WebP, TIFF and EXR in, PNG and EXR out.
+//! Image files: reads PNG, JPEG, WebP, TIFF and EXR, writes PNG, JPEG and EXR.
 
 use std::io::{BufReader, Cursor};
 use std::path::{Path, PathBuf};
@@ -20,7 +20,7 @@ use crate::base::output::write_whole;
 use crate::base::{input, tree};
 use crate::{Error, Result};
 
-/// The file of a picture, read whole.
+/// An image file, read whole.
 #[derive(Clone, Debug)]
 pub(crate) struct PictureFile {
     path: PathBuf,
@@ -29,7 +29,7 @@ pub(crate) struct PictureFile {
 
 impl PictureFile {
     /// # Errors
-    /// [`Error::Input`] names the file when it cannot be read.
+    /// [`Error::Input`] if the file cannot be read.
     pub(crate) fn open(path: &Path) -> Result<Self> {
         #[cfg(test)]
         openings::count(path);
@@ -39,7 +39,7 @@ impl PictureFile {
     /// Width and height, from its header alone.
     ///
     /// # Errors
-    /// [`Error::Input`] names the file when it is no image.
+    /// [`Error::Input`] if the file is not an image.
     pub(crate) fn size(&self) -> Result<(u32, u32)> {
         if is_raw(&self.path) {
             return raw_size(&self.path, self.bytes.clone());
@@ -48,24 +48,24 @@ impl PictureFile {
         size_of_reader(&self.path, reader.map_err(|error| unreadable(&self.path, &error))?)
     }
 
-    /// How it is turned to be what people see, by its Exif.
+    /// Its Exif orientation.
     pub(crate) fn orientation(&self) -> Orientation {
         Orientation::read(&mut Cursor::new(self.bytes.as_slice()))
     }
 
-    /// The photograph in sRGB, and its alpha: that of a PNG, WebP or TIFF file, or 0 where a value of an EXR file is not finite,
-    /// in all three planes; none where the file hides nothing.
+    /// The photograph in sRGB, and its alpha in all three planes: that of a PNG, WebP or TIFF file, or 0 at values of
+    /// an EXR file that are not finite; `None` if nothing is transparent.
     ///
     /// # Errors
-    /// As [`Image::load`].
+    /// Those of [`Image::load`].
     pub(crate) fn decode(self) -> Result<(Image, Option<Image>)> {
         self.decode_counted(&ColourCounts::default())
     }
 
-    /// The same; what was made of its colours is counted.
+    /// [`Self::decode`] that counts colour conversions in `counters` instead of logging them.
     ///
     /// # Errors
-    /// As [`Image::load`].
+    /// Those of [`Image::load`].
     pub(crate) fn decode_counted(self, counters: &ColourCounts) -> Result<(Image, Option<Image>)> {
         let Decoded { image, alpha, conversion } = decode(&self.path, self.bytes, Meaning::Colour)?;
         counters.add(conversion);
@@ -101,7 +101,7 @@ fn decode(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Decoded> {
     Ok(Decoded { image, alpha, conversion })
 }
 
-/// The alpha of a decoded picture in all three planes; none of one that hides nothing.
+/// The alpha of a decoded image in all three planes; `None` if it is opaque.
 fn alpha_of(decoded: &DynamicImage) -> Option<Image> {
     if !decoded.color().has_alpha() {
         return None;
@@ -113,7 +113,7 @@ fn alpha_of(decoded: &DynamicImage) -> Option<Image> {
     hides.then(|| Image { width, height, data: alpha.repeat(3) })
 }
 
-/// How often each file was opened, by tests.
+/// Counts how often each file is opened, for tests.
 #[cfg(test)]
 pub(crate) mod openings {
     use std::collections::HashMap;
@@ -126,7 +126,7 @@ pub(crate) mod openings {
         *COUNTS.lock().unwrap().entry(path.to_owned()).or_default() += 1;
     }
 
-    /// Those of the files below a folder.
+    /// The counts of the files below a folder.
     pub(crate) fn below(folder: &Path) -> Vec<(PathBuf, usize)> {
         let counts = COUNTS.lock().unwrap();
         let own = counts.iter().filter(|(path, _)| path.starts_with(folder));
@@ -157,17 +157,17 @@ fn size_of_reader(path: &Path, reader: ImageReader<Box<dyn Source + '_>>) -> Res
 }
 
 impl Image {
-    /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file as it is stored, not turned; the content
-    /// decides, not the file's name.
+    /// Reads an 8- or 16-bit PNG or TIFF, a JPEG, a WebP or an EXR file in its stored orientation; the content
+    /// determines the format, not the file's name.
     ///
-    /// Colours become sRGB by the file's ICC profile, the chunks of a PNG, the chromaticities of an EXR or Exif; a profile that
-    /// cannot be used is named in a warning, and the values count as sRGB. What sRGB does not hold is clipped.
-    /// Alpha is dropped, grey is repeated, camera RAW (feature `raw`) is linear light. Of an EXR file the first layer's R, G and B
-    /// (or Y) are taken as linear light; values that are negative or not finite become 0, with a warning that counts them
-    /// ([`super::Mask::load`] hides the pixels of the latter).
+    /// Colours are converted to sRGB by the file's ICC profile, the chunks of a PNG, the chromaticities of an EXR, or
+    /// Exif; a profile that cannot be used is named in a warning, and the values count as sRGB. Colours outside sRGB
+    /// are clipped. Alpha is dropped, grey is repeated, and camera RAW (feature `raw`) is linear light. The R, G and B
+    /// (or Y) of an EXR file's first layer are linear light; values that are negative or not finite become 0, with a
+    /// warning that counts them ([`super::Mask::load`] masks the latter).
     ///
     /// # Errors
-    /// [`Error::Input`] names the file when it cannot be read, is cut short or is of another format.
+    /// [`Error::Input`] if the file cannot be read, is truncated or has another format.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
         let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
         let Decoded { image, conversion, .. } = decode(&path, bytes, Meaning::Colour)?;
@@ -177,18 +177,19 @@ impl Image {
         Ok(image)
     }
 
-    /// The same for many photographs: what was made of their colours is counted, and not said.
+    /// [`Image::load`] that counts colour conversions in `counters` instead of logging them.
     ///
     /// # Errors
-    /// As [`Image::load`].
+    /// Those of [`Image::load`].
     pub(crate) fn load_counted(path: &Path, counters: &ColourCounts) -> Result<Self> {
         Ok(PictureFile::open(path)?.decode_counted(counters)?.0)
     }
 
-    /// The same for numbers that are no colour, such as depth: they are taken as they are stored, also negative ones of EXR.
+    /// [`Image::load`] for values that are not colours, such as depth: they are read as stored, including negative ones
+    /// of EXR.
     ///
     /// # Errors
-    /// As [`Image::load`].
+    /// Those of [`Image::load`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
         let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
@@ -198,7 +199,7 @@ impl Image {
     /// Width and height of an image file, from its header alone.
     ///
     /// # Errors
-    /// [`Error::Input`] names the file when it is no image.
+    /// [`Error::Input`] if the file is not an image.
     pub fn size_of(path: impl AsRef<Path>) -> Result<(u32, u32)> {
         let path = path.as_ref();
         if is_raw(path) {
@@ -210,15 +211,15 @@ impl Image {
     /// Writes an 8-bit RGB PNG: values clamped to [0, 1], rounded to nearest.
     ///
     /// # Errors
-    /// [`Error::Output`] names the file; nothing half-written is left under its name.
+    /// [`Error::Output`] if the file cannot be written; no partial file is left.
     pub fn save_png8(&self, path: impl AsRef<Path>) -> Result<()> {
         self.save_png(path.as_ref(), &self.to_rgb8(), ExtendedColorType::Rgb8)
     }
 
-    /// The file that [`Image::save_png8`] writes.
+    /// The bytes of the file that [`Image::save_png8`] writes.
     ///
     /// # Errors
-    /// None but for what no memory is left for.
+    /// [`Error::Output`] if the image cannot be encoded.
     pub(crate) fn to_png8(&self) -> Result<Vec<u8>> {
         let mut file = Vec::new();
         PngEncoder::new(&mut file)
@@ -235,7 +236,7 @@ impl Image {
     /// A JPEG file of a quality from 1 to 100, values clamped to [0, 1].
     ///
     /// # Errors
-    /// [`Error::Output`] where the image has no pixels, or more to a side than JPEG counts.
+    /// [`Error::Output`] if the image has no pixels, or a longer side than JPEG allows.
     pub(crate) fn to_jpeg(&self, quality: u8) -> Result<Vec<u8>> {
         let mut file = Vec::new();
         JpegEncoder::new_with_quality(&mut file, quality)
@@ -244,10 +245,10 @@ impl Image {
         Ok(file)
     }
 
-    /// Writes a JPEG of little loss, values clamped to [0, 1], with an Exif segment, where there is one, behind its start.
+    /// Writes a JPEG of high quality, values clamped to [0, 1], with the given Exif segment.
     ///
     /// # Errors
-    /// [`Error::Output`] names the file; nothing half-written is left under its name.
+    /// [`Error::Output`] if the file cannot be written; no partial file is left.
     pub(crate) fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()> {
         const QUALITY: u8 = 97;
         let file = self.to_jpeg(QUALITY)?;
@@ -258,7 +259,7 @@ impl Image {
     /// Writes a 16-bit RGB PNG: values clamped to [0, 1], rounded to nearest.
     ///
     /// # Errors
-    /// [`Error::Output`] names the file; nothing half-written is left under its name.
+    /// [`Error::Output`] if the file cannot be written; no partial file is left.
     pub fn save_png16(&self, path: impl AsRef<Path>) -> Result<()> {
         let samples =
             self.interleaved().map(|value| (value.clamp(0.0, 1.0) * 65_535.0).round() as u16);
@@ -266,18 +267,18 @@ impl Image {
         self.save_png(path.as_ref(), &bytes, ExtendedColorType::Rgb16)
     }
 
-    /// Writes a 32-bit float EXR in linear light, unclamped: [`Image::load`] gives the same values back to rounding.
+    /// Writes a 32-bit float EXR in linear light, unclamped; [`Image::load`] restores the values up to rounding.
     ///
     /// # Errors
-    /// [`Error::Output`] names the file; nothing half-written is left under its name.
+    /// [`Error::Output`] if the file cannot be written; no partial file is left.
     pub fn save_exr(&self, path: impl AsRef<Path>) -> Result<()> {
         exr_file::save(self, path.as_ref(), linear_from_srgb)
     }
 
-    /// The same for numbers that are no colour: they are written as they are.
+    /// [`Image::save_exr`] for values that are not colours, without conversion.
     ///
     /// # Errors
-    /// As [`Image::save_exr`].
+    /// Those of [`Image::save_exr`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn save_exr_as_stored(&self, path: impl AsRef<Path>) -> Result<()> {
         exr_file::save(self, path.as_ref(), |value| value)
@@ -297,7 +298,7 @@ impl Image {
     }
 }
 
-/// What phones write has no free decoder: the message says what converts it.
+/// Refuses HEIC, which phones write and no free decoder reads, with a remedy.
 fn refuse_heic(path: &Path, bytes: &[u8]) -> Result<()> {
     let brands: [&[u8]; 6] = [b"heic", b"heix", b"hevc", b"heim", b"mif1", b"msf1"];
     let is_heic = bytes.get(4..8) == Some(b"ftyp")
@@ -305,8 +306,7 @@ fn refuse_heic(path: &Path, bytes: &[u8]) -> Result<()> {
     if is_heic { Err(Error::input(path, format!("is HEIC; {HEIC_REMEDY}"))) } else { Ok(()) }
 }
 
-/// What is damaged is told from what is whole and not read, such as a TIFF of floats, which does not say whether they are linear
-/// light.
+/// Distinguishes damaged files from unsupported ones, such as a TIFF of floats, which may or may not be linear light.
 fn undecodable(path: &Path, error: &ImageError) -> Error {
     match error {
         ImageError::Unsupported(kind)
@@ -356,7 +356,7 @@ mod tests {
     use super::super::tests::{gradient, worst};
     use super::*;
 
-    /// A path in a folder that goes when the second is dropped.
+    /// A path in a temporary folder, which is removed when the second value is dropped.
     fn file(name: &str) -> (PathBuf, tempfile::TempDir) {
         let folder = tempfile::tempdir().unwrap();
         (folder.path().join(name), folder)
@@ -388,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_saved_is_loaded_to_the_formats_precision() {
+    fn a_saved_image_is_loaded_to_the_precision_of_its_format() {
         let image = gradient(7, 5);
         let (path, _folder) = file("a");
         image.save_png8(&path).unwrap();
@@ -432,7 +432,7 @@ mod tests {
     }
 
     #[test]
-    fn a_jpeg_is_loaded_whole_or_refused() {
+    fn a_jpeg_is_loaded_completely_or_refused() {
         let (path, _folder) = file("a.jpg");
         ImageBuffer::from_fn(64, 48, |x, y| Rgb([(x * 3) as u8, (y * 4) as u8, 90]))
             .save(&path)
@@ -451,7 +451,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_no_image_is_named() {
+    fn the_error_names_a_file_that_is_not_an_image() {
         let (path, _folder) = file("noise.png");
         assert!(Image::load(&path).unwrap_err().to_string().contains("noise.png: cannot be read"));
         let (exr, _exr_folder) = file("whole.exr");
@@ -471,7 +471,7 @@ mod tests {
     }
 
     #[test]
-    fn a_failed_write_leaves_nothing_behind() {
+    fn a_failed_write_leaves_no_file() {
         let (path, folder) = file("taken");
         std::fs::create_dir(&path).unwrap();
         let error = gradient(4, 4).save_png8(&path).unwrap_err();

@@ -1,12 +1,13 @@
-//! Colours as a file stores them become sRGB.
+//! Converts the colours of a file to sRGB.
 //!
 //! ```text
-//! sRGB = encode(M decode(stored))      decode: a curve per channel; M: linear light of the file's primaries to sRGB's
+//! sRGB = encode(M decode(stored))      decode: a curve per channel; M: from linear light of the file's primaries to
+//! sRGB's
 //! ```
 //!
-//! Of a profile that has tables as well, the matrix is used; one of tables alone cannot be. What is sRGB to one code value of
-//! 8 bits keeps its values to the bit. What is converted is rounded to multiples of 1/65535: fine enough under any tone curve,
-//! and 16 bits keep it.
+//! If a profile has a matrix and tables, the matrix is used; a profile of tables alone cannot be used. Colours that are
+//! sRGB to within one 8-bit code value keep their bits. Converted values are rounded to multiples of 1/65535, which is
+//! fine enough under any tone curve and exact in 16 bits.
 
 mod counters;
 mod metadata;
@@ -27,22 +28,22 @@ use self::metadata::{Statement, statements};
 use super::{Image, linear_from_srgb, srgb_from_linear};
 pub(crate) use counters::ColourCounts;
 
-/// What was made of the colours of a file.
+/// The result of a conversion.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Conversion {
-    /// The colour space that it was converted from, and the fraction of its pixels that sRGB does not hold; none where the
-    /// values are sRGB as they are stored, or are taken for it.
+    /// The original colour space, and the fraction of pixels outside sRGB; `None` if the values are sRGB as stored, or
+    /// assumed to be.
     pub(crate) from: Option<(String, f64)>,
-    /// What it says that is not understood, in words.
+    /// Metadata that cannot be used, in words.
     pub(crate) unknown: Option<String>,
 }
 
-/// So far two matrices between linear colours may differ by what files round.
+/// How much two matrices between linear colours may differ by the rounding of files.
 const ROUNDING: f64 = 2e-3;
-/// Steps from 0 to 1 of what is converted.
+/// Quantisation levels of converted values.
 const LEVELS: f32 = 65_535.0;
 
-/// Converts a decoded picture to sRGB by what its file says.
+/// Converts a decoded image to sRGB by the metadata of its file.
 pub(super) fn convert(image: &mut Image, bytes: &[u8]) -> Conversion {
     let mut unknown = None;
     for statement in statements(bytes) {
@@ -58,12 +59,13 @@ pub(super) fn convert(image: &mut Image, bytes: &[u8]) -> Conversion {
     Conversion { from: None, unknown }
 }
 
-/// Converts linear light of other primaries to that of sRGB's. What would be negative becomes 0; what was, stays.
+/// Converts linear light of other primaries to those of sRGB. Values that become negative are set to 0; negative input
+/// is kept.
 pub(super) fn convert_linear(image: &mut Image, chromaticities: Chromaticities) -> Conversion {
     /// A code value of 8 bits near black.
     const MARGIN: f64 = 1.0 / 255.0 / 12.92;
     let Some(matrix) = to_srgb(chromaticities) else {
-        let unknown = Some("chromaticities of no primaries".to_owned());
+        let unknown = Some("invalid chromaticities".to_owned());
         return Conversion { from: None, unknown };
     };
     if matrix.abs_diff_eq(DMat3::IDENTITY, ROUNDING) {
@@ -83,16 +85,16 @@ pub(super) fn convert_linear(image: &mut Image, chromaticities: Chromaticities) 
             image.data[plane * count + at] = value.max(0.0) as f32;
         }
     }
-    let name = known_name(matrix).unwrap_or("primaries of its own").to_owned();
+    let name = known_name(matrix).unwrap_or("other primaries").to_owned();
     Conversion { from: Some((name, outside as f64 / count.max(1) as f64)), unknown: None }
 }
 
-/// The matrix from linear light of these primaries to that of sRGB; none where the primaries are none.
+/// The matrix from linear light of these primaries to that of sRGB; `None` if the chromaticities are invalid.
 fn to_srgb(chromaticities: Chromaticities) -> Option<DMat3> {
     from_d50(to_d50(chromaticities))
 }
 
-/// The matrix to linear sRGB of colorants, XYZ at D50 as a profile has them.
+/// The matrix to linear sRGB from colorants in XYZ at D50, as in a profile.
 fn from_d50(colorants: DMat3) -> Option<DMat3> {
     const D65: [f64; 2] = [0.3127, 0.3290];
     const SRGB: Chromaticities = [D65, [0.64, 0.33], [0.30, 0.60], [0.15, 0.06]];
@@ -123,20 +125,20 @@ fn colorants(profile: &ColorProfile) -> DMat3 {
 
 type Curve = Box<dyn Fn(f32) -> f32 + Send + Sync>;
 
-/// How stored values become sRGB.
+/// A colour space that is converted to sRGB.
 struct ColourSpace {
     name: String,
-    /// Of each channel to linear light.
+    /// From each channel to linear light.
     curves: [Curve; 3],
     /// From there to the linear light of sRGB.
     matrix: DMat3,
 }
 
 impl ColourSpace {
-    /// `None` of sRGB.
+    /// `None` for sRGB.
     ///
     /// # Errors
-    /// What cannot be used, in words.
+    /// The metadata that cannot be used, in words.
     fn of(statement: &Statement) -> Result<Option<Self>, String> {
         let space = match statement {
             Statement::Srgb => return Ok(None),
@@ -177,7 +179,7 @@ impl ColourSpace {
                 let curves = curves([&profile.red_trc, &profile.green_trc, &profile.blue_trc]);
                 let (matrix, curves) =
                     matrix.zip(curves).ok_or_else(|| unusable("no matrix and curves"))?;
-                // Of sRGB's primaries with another curve, their name says nothing.
+                // If the primaries are sRGB's and the curve is another, their name says nothing.
                 let known = known_name(matrix).filter(|known| *known != "sRGB");
                 Ok(Self { name: known.map_or(name, str::to_owned), curves, matrix })
             }
@@ -203,7 +205,7 @@ impl ColourSpace {
             TransferCharacteristics::Reserved | TransferCharacteristics::Unspecified => {
                 return Err(unusable("no transfer function"));
             }
-            // Video is graded on a display, and every player shows it as if it were sRGB.
+            // Video is graded on a display, and players show it as if it were sRGB.
             TransferCharacteristics::Bt709
             | TransferCharacteristics::Bt601
             | TransferCharacteristics::Bt202010bit
@@ -219,7 +221,7 @@ impl ColourSpace {
             full_range: true,
         };
         let matrix = from_d50(colorants(&ColorProfile::new_from_cicp(profile)));
-        let matrix = matrix.ok_or_else(|| unusable("no primaries"))?;
+        let matrix = matrix.ok_or_else(|| unusable("unknown primaries"))?;
         let curve = |_| match is_srgb_curve {
             true => srgb_curve(),
             false => Box::new(move |value: f32| transfer.linearize(f64::from(value)) as f32),
@@ -234,14 +236,12 @@ impl ColourSpace {
         exponent: Option<f64>,
     ) -> Result<Self, String> {
         let matrix = match chromaticities {
-            Some(chromaticities) => {
-                to_srgb(chromaticities).ok_or("chromaticities of no primaries")?
-            }
+            Some(chromaticities) => to_srgb(chromaticities).ok_or("invalid chromaticities")?,
             None => DMat3::IDENTITY,
         };
         let known = known_name(matrix);
-        // Where there is no chunk for it, the curve of sRGB and Display P3 is written as 1/2.2, and ffmpeg writes that of video,
-        // which is shown as if it were sRGB, as 1/1.961.
+        // Without a chunk of its own, the curve of sRGB and Display P3 is written as 1/2.2; ffmpeg writes that of
+        // video, which is shown as sRGB, as 1/1.961.
         let is_srgb_curve = |exponent: &f64| {
             let is_near = |of: f64, by: f64| (exponent - of).abs() < by;
             is_near(1.961, 0.005)
@@ -254,7 +254,7 @@ impl ColourSpace {
             }
             None => srgb_curve(),
         };
-        let primaries = known.unwrap_or("primaries of its own");
+        let primaries = known.unwrap_or("other primaries");
         let name = match exponent {
             Some(exponent) if known != Some("Adobe RGB") => {
                 format!("{primaries} at gamma {exponent:.2}")
@@ -264,7 +264,7 @@ impl ColourSpace {
         Ok(Self { name, curves: std::array::from_fn(curve), matrix })
     }
 
-    /// Whether its primaries are sRGB's to a rounding, and it moves no grey by more than a code value of 8 bits.
+    /// Whether its primaries equal sRGB's up to rounding, and no grey changes by more than an 8-bit code value.
     fn is_srgb(&self) -> bool {
         let moves = |code: u8| {
             let grey = f32::from(code) / 255.0;
@@ -274,17 +274,17 @@ impl ColourSpace {
         self.matrix.abs_diff_eq(DMat3::IDENTITY, ROUNDING) && !(0..=255).any(moves)
     }
 
-    /// A pixel of linear light of this space in sRGB, unclamped.
+    /// The sRGB encoding of linear light in this space, unclamped.
     fn encoded(&self, linear: [f32; 3]) -> [f32; 3] {
         let linear = self.matrix * DVec3::from_array(linear.map(f64::from));
         linear.to_array().map(|value| encode(value as f32))
     }
 
-    /// Converts an image; gives the fraction of its pixels that sRGB does not hold, and clamps them.
+    /// Converts an image and clamps it; returns the fraction of pixels outside sRGB.
     fn apply(&self, image: &mut Image) -> f64 {
-        /// So far beyond 0 or 1 a value is no rounding.
+        /// A value farther beyond 0 or 1 is not due to rounding.
         const MARGIN: f32 = 1.0 / 255.0;
-        // Every value of a file of 8 or 16 bits is one of these.
+        // Every value of an 8- or 16-bit file is one of these.
         let levels = || (0..=LEVELS as u32).map(|level| level as f32 / LEVELS);
         let tables = self.curves.each_ref().map(|curve| levels().map(curve).collect::<Vec<f32>>());
         let count = image.pixel_count();
@@ -295,7 +295,7 @@ impl ColourSpace {
             .into_par_iter()
             .map(|at| self.encoded([linear(0, at), linear(1, at), linear(2, at)]))
             .collect();
-        // Positive phrasing: a NaN is outside.
+        // Written so that a NaN is outside.
         let is_held = |value: &f32| (-MARGIN..=1.0 + MARGIN).contains(value);
         let outside = pixels.iter().filter(|pixel| !pixel.iter().all(is_held)).count();
         for (plane, values) in image.data.chunks_exact_mut(count.max(1)).enumerate() {
@@ -317,7 +317,7 @@ fn srgb_curve() -> Curve {
     Box::new(linear_from_srgb)
 }
 
-/// What a profile calls itself, in quotes.
+/// The description of a profile, in quotes.
 fn description(profile: &ColorProfile) -> Option<String> {
     const MOST: usize = 60;
     let text = match profile.description.as_ref()? {
@@ -331,7 +331,7 @@ fn description(profile: &ColorProfile) -> Option<String> {
     (!text.is_empty()).then(|| format!("\"{text}\""))
 }
 
-/// The name of the colour space whose primaries these are, by the matrix to linear sRGB.
+/// The name of the colour space with these primaries, from the matrix to linear sRGB.
 fn known_name(matrix: DMat3) -> Option<&'static str> {
     static KNOWN: OnceLock<[(&str, Option<DMat3>); 5]> = OnceLock::new();
     let known = KNOWN.get_or_init(|| {

@@ -1,18 +1,18 @@
-//! What a file of pixels is decoded to.
+//! The result of decoding an image file.
 
 use super::Image;
 use super::colour::Conversion;
 
-/// What the numbers of a file are.
+/// The meaning of the values of a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Meaning {
-    /// Colours, which become sRGB.
+    /// Colours, which are converted to sRGB.
     Colour,
-    /// Something else, such as a depth or a mask, which is taken as it is stored.
+    /// Other values, such as depth or a mask, which are kept as stored.
     Number,
 }
 
-/// What a file holds.
+/// The contents of a file.
 pub(super) struct Decoded {
     pub(super) image: Image,
     pub(super) alpha: Option<Image>,
@@ -20,7 +20,7 @@ pub(super) struct Decoded {
 }
 
 impl Decoded {
-    /// Values that are no colours, or sRGB already.
+    /// Values that are not colours, or are sRGB already.
     pub(super) fn as_stored(image: Image, alpha: Option<Image>) -> Self {
         Self { image, alpha, conversion: Conversion::default() }
     }

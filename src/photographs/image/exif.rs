@@ -1,4 +1,4 @@
-//! What a camera writes of its exposure.
+//! Exposure and lens in Exif.
 
 use std::io::BufReader;
 use std::path::Path;
@@ -7,9 +7,8 @@ use ::exif::{Exif, In, Reader, Tag, Value};
 
 use crate::base::tree;
 
-/// The stops of a photograph's exposure, log2(t S / N^2) of its exposure time t in seconds, ISO speed S and f-number N: of
-/// two photographs of one thing that of one more stop shows twice the linear light. None where the file does not say all
-/// three.
+/// The exposure of a photograph in stops, log2(t S / N^2) with the exposure time t in seconds, ISO speed S and f-number
+/// N: one more stop doubles the linear light. `None` unless the file has all three.
 pub fn exposure_value(path: &Path) -> Option<f64> {
     let file = tree::open(path).ok()?;
     let exif = Reader::new().read_from_container(&mut BufReader::new(file)).ok()?;
@@ -18,8 +17,7 @@ pub fn exposure_value(path: &Path) -> Option<f64> {
     Some((time * number(Tag::PhotographicSensitivity)? / aperture.powi(2)).log2())
 }
 
-/// Camera, lens and focal length as a file names them, where it names any: of a phone with several lenses the numbers alone
-/// differ.
+/// Camera, lens and focal length from Exif, if there are any; the lenses of a phone may differ in the numbers only.
 #[cfg(feature = "cli")]
 pub(crate) fn lens_name(path: &Path) -> Option<String> {
     let file = tree::open(path).ok()?;
@@ -34,7 +32,7 @@ pub(crate) fn lens_name(path: &Path) -> Option<String> {
     (!named.is_empty()).then(|| named.join(", "))
 }
 
-/// The first number of a tag, where it is above 0 and finite.
+/// The first value of a tag, if it is positive and finite.
 fn positive(exif: &Exif, tag: Tag) -> Option<f64> {
     let field = exif.get_field(tag, In::PRIMARY)?;
     let number = match &field.value {
@@ -48,10 +46,10 @@ fn positive(exif: &Exif, tag: Tag) -> Option<f64> {
 mod tests {
     use super::*;
 
-    /// A JPEG's first bytes with an Exif segment of these tags: id, then numerator and denominator, or a short.
+    /// The first bytes of a JPEG with an Exif segment of these tags: id, then numerator and denominator, or a short.
     fn with_exif(path: &Path, tags: &[(u16, [u32; 2])]) {
         let mut tiff = b"II*\0\x08\0\0\0".to_vec();
-        // IFD 0 points to the Exif IFD right behind it.
+        // IFD 0 points to the Exif IFD right after it.
         tiff.extend(1u16.to_le_bytes());
         tiff.extend(0x8769u16.to_le_bytes());
         tiff.extend([4, 0, 1, 0, 0, 0]);
@@ -82,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn time_aperture_and_speed_make_stops() {
+    fn stops_follow_from_time_aperture_and_speed() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.jpg");
         let (time, aperture, speed) = ((0x829a, [1, 50]), (0x829d, [28, 10]), (0x8827, [400, 0]));

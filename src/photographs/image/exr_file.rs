@@ -1,4 +1,4 @@
-//! EXR: numbers as they are, linear light by convention.
+//! EXR files: linear light by convention, or plain numbers.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -12,14 +12,14 @@ use super::{Image, srgb_from_linear};
 use crate::base::output::write_whole;
 use crate::{Error, Result};
 
-/// What an EXR file begins with.
+/// The magic number of EXR files.
 pub(super) const MAGIC: [u8; 4] = [0x76, 0x2F, 0x31, 0x01];
 
-/// The first layer's R, G and B (or Y), and where not all values of a pixel are finite. Colours are encoded as sRGB; those that
-/// are negative or not finite become 0, with a warning that counts them.
+/// The first layer's R, G and B (or Y), and the mask of its finite pixels. Colours are encoded as sRGB; those that are
+/// negative or not finite become 0, with a warning that counts them.
 ///
 /// # Errors
-/// [`Error::Input`] names the file when it is damaged or has no such channels.
+/// [`Error::Input`] if the file is damaged or lacks these channels.
 pub(super) fn load(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Decoded> {
     let (mut image, chromaticities) = decoded(path, bytes)?;
     let alpha = finite_part(&image);
@@ -49,7 +49,7 @@ pub(super) fn load(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Deco
     Ok(Decoded { image, alpha, conversion })
 }
 
-/// 1 where all values of a pixel are finite, 0 elsewhere, in all three planes; none where all are.
+/// 1 at pixels whose values are all finite, 0 elsewhere, in all three planes; `None` if all are finite.
 fn finite_part(Image { width, height, data }: &Image) -> Option<Image> {
     if data.iter().all(|value| value.is_finite()) {
         return None;
@@ -60,7 +60,7 @@ fn finite_part(Image { width, height, data }: &Image) -> Option<Image> {
     Some(Image { width: *width, height: *height, data: shown.repeat(3) })
 }
 
-/// The first layer's R, G and B (or Y), as they are, and the chromaticities of its primaries.
+/// The first layer's R, G and B (or Y) as stored, and the chromaticities of its primaries.
 fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>)> {
     let bytes: Box<dyn Source> = Box::new(Cursor::new(bytes));
     let image = exr::prelude::read()
@@ -97,7 +97,7 @@ fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>
 /// Writes R, G and B as 32-bit floats, each value through `to_exr_value`.
 ///
 /// # Errors
-/// [`Error::Output`] names the file; nothing is left of it.
+/// [`Error::Output`] if the file cannot be written; no partial file is left.
 pub(super) fn save(image: &Image, path: &Path, to_exr_value: fn(f32) -> f32) -> Result<()> {
     let channels = SpecificChannels::rgb(|Vec2(x, y): Vec2<usize>| {
         let [red, green, blue] = image.pixel(x as u32, y as u32).map(to_exr_value);

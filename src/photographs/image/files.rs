@@ -1,4 +1,4 @@
-//! Finding photographs: all of a folder, or one by the path a listing gives, with or without its extension.
+//! Finds photographs: all of a folder, or one by its listed path, with or without extension.
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, HashMap};
@@ -9,28 +9,29 @@ use unicode_normalization::UnicodeNormalization;
 use crate::base::tree;
 use crate::{Error, Result};
 
-/// Endings of the files that [`super::Image::load`] reads.
+/// Extensions of the files that [`super::Image::load`] reads.
 const READABLE: [&str; 7] = ["png", "jpg", "jpeg", "exr", "tif", "tiff", "webp"];
-/// Endings of other pictures and clips: no part of a name either. What follows another dot is.
+/// Extensions of other images and clips. Any other suffix after a dot belongs to the name.
 const UNREADABLE: [&str; 10] =
     ["bmp", "hdr", "gif", "avif", "jxl", "heic", "heif", "mp4", "mov", "mkv"];
-/// Those of camera RAW, which are read with the feature `raw`.
+/// Extensions of camera RAW, which is read with the feature `raw`.
 const RAW: [&str; 10] = ["dng", "cr2", "cr3", "nef", "arw", "raf", "rw2", "orf", "pef", "srw"];
 /// Whether camera RAW is read.
 pub(super) const READS_RAW: bool = cfg!(feature = "raw");
-/// What becomes of camera RAW where it is not.
+/// The remedy if it is not.
 pub(super) const RAW_REMEDY: &str =
     "install nightsplat with `--features raw`, or convert it to 16-bit TIFF or EXR";
 
-/// Whether a file is camera RAW, by its name: its content begins as that of a TIFF.
+/// Whether a file is camera RAW, by its name: its content begins like a TIFF.
 pub(super) fn is_raw(path: &Path) -> bool {
     is_one_of(&RAW, &path.extension().unwrap_or_default().to_string_lossy())
 }
 
-/// Those of them that a phone writes and other programs convert.
+/// Extensions of files from phones, which other programs convert.
 const HEIC: [&str; 2] = ["heic", "heif"];
-/// How they are converted.
-pub(super) const HEIC_REMEDY: &str = "convert it first, `heif-convert IN.heic OUT.png` of libheif, or on macOS `sips -s format png IN.heic --out OUT.png`";
+/// The programs that convert them.
+pub(super) const HEIC_REMEDY: &str = "convert it first, `heif-convert IN.heic OUT.png` of libheif, or on macOS \
+     `sips -s format png IN.heic --out OUT.png`";
 
 /// A photograph's name: the file name without an image's extension.
 pub(crate) fn stem(listed: &str) -> &str {
@@ -46,7 +47,7 @@ pub(crate) fn stem(listed: &str) -> &str {
 /// The photographs of a folder that can be read, by path.
 ///
 /// # Errors
-/// [`Error::Input`] where the folder cannot be read.
+/// [`Error::Input`] if the folder cannot be read.
 pub(crate) fn photographs_in(folder: &Path) -> Result<Vec<PathBuf>> {
     let unreadable = |error| Error::input(folder, format!("cannot be read: {error}"));
     let mut paths = files_in(folder).map_err(unreadable)?;
@@ -57,7 +58,7 @@ pub(crate) fn photographs_in(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// The pictures and clips of a folder that are not read, by ending, in a line; none where there are none.
+/// A line that counts the images and clips of a folder that are not read, by extension; `None` if there are none.
 pub(crate) fn unread_in(folder: &Path) -> Option<String> {
     let mut counts: BTreeMap<String, usize> = BTreeMap::new();
     for path in files_in(folder).unwrap_or_default() {
@@ -81,15 +82,15 @@ pub(crate) fn unread_in(folder: &Path) -> Option<String> {
     (!listed.is_empty()).then(|| format!("{folder}: not read: {}{remedy}", listed.join(", ")))
 }
 
-/// Looks photographs up and remembers what the folders hold.
+/// Finds photographs, and caches the listings of folders.
 #[derive(Debug, Default)]
 pub(crate) struct Files {
     folders: RefCell<HashMap<PathBuf, BTreeMap<String, PathBuf>>>,
 }
 
 impl Files {
-    /// The file at `folder/listed`; where there is none, the one there that differs by its extension only, or by how Unicode
-    /// composes its letters. What a path of an archive leads to outside it is not found.
+    /// The file `folder/listed`; without one, the file there that differs only in its extension or in the Unicode
+    /// normalisation of its name. A path that leads out of an archive is not found.
     pub(crate) fn find(&self, folder: &Path, listed: &str) -> Option<PathBuf> {
         let exact = folder.join(listed);
         if tree::archive_of(folder).is_some_and(|archive| !exact.starts_with(archive)) {
@@ -105,7 +106,7 @@ impl Files {
     }
 }
 
-/// A name as names are compared: of the ways in which Unicode writes a letter, the composed one.
+/// A name in Unicode normalisation form C, for comparisons.
 pub(crate) fn normalized(name: &str) -> String {
     if name.is_ascii() { name.to_owned() } else { name.nfc().collect() }
 }
@@ -113,12 +114,12 @@ pub(crate) fn normalized(name: &str) -> String {
 fn by_stem(folder: &Path) -> BTreeMap<String, PathBuf> {
     let paths = files_in(folder).unwrap_or_default().into_iter();
     let named = |path: PathBuf| Some((normalized(stem(path.file_name()?.to_str()?)), path));
-    // Of two files with one stem the first by name, whatever order the disk lists them in.
+    // Of two files with the same stem, the first by name is taken, in any order of the disk.
     paths.rev().filter_map(named).collect()
 }
 
-/// Every file of a folder, sorted, but those that begin with a dot: a Mac leaves `._NAME.JPG` beside every photograph on the
-/// disks of others.
+/// Every file of a folder, sorted, except those that begin with a dot: macOS writes `._NAME.JPG` next to every
+/// photograph on foreign disks.
 fn files_in(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     let mut paths = tree::entries(folder)?;
     paths.retain(|path| !is_hidden(path) && tree::is_file(path));
@@ -126,7 +127,7 @@ fn files_in(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     Ok(paths)
 }
 
-/// Whether a file or folder begins with a dot, or is what a Mac adds to an archive.
+/// Whether a file or folder begins with a dot, or is one that macOS adds to an archive.
 pub(crate) fn is_hidden(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     name.starts_with('.') || name == "__MACOSX"

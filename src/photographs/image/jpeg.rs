@@ -1,6 +1,6 @@
-//! JPEG as libjpeg decodes it: accurate integer DCT, smooth chroma upsampling.
+//! JPEG decoded by libjpeg: accurate integer DCT, smooth chroma upsampling.
 //!
-//! Other decoders round otherwise, by fractions of a code value; a tone curve multiplies that by ten.
+//! Other decoders round differently, by fractions of a code value, and a tone curve multiplies these by ten.
 
 mod structure;
 mod warnings;
@@ -13,33 +13,33 @@ use mozjpeg::{ColorSpace, Decompress};
 use super::{Image, from_interleaved};
 use crate::{Error, Result};
 
-/// What a JPEG file begins with.
+/// The magic number of JPEG files.
 pub(super) const MAGIC: [u8; 2] = [0xFF, 0xD8];
 
-/// The image; none where the file holds a colour space that libjpeg does not turn into RGB.
+/// The image; `None` if libjpeg cannot convert its colour space to RGB.
 ///
 /// # Errors
-/// [`Error::Input`] names the file when it is cut short, damaged or of a kind that libjpeg does not read.
+/// [`Error::Input`] if the file is truncated, damaged or of a kind that libjpeg does not read.
 pub(super) fn load(path: &Path, bytes: &[u8]) -> Result<Option<Image>> {
-    // libjpeg's errors unwind. The structure leaves it none to find; the catch is for what that may have missed.
+    // Errors of libjpeg unwind. The structure is checked first, so there should be none; this catches the rest.
     let decoded = structure::is_sound(bytes).then(|| catch_unwind(|| decode(bytes)).ok()?.ok());
     decoded.flatten().ok_or_else(|| {
         let message =
-            "this JPEG is cut short, damaged or of a rare kind; copy it again or save it as PNG";
+            "this JPEG is truncated, damaged or of a rare kind; copy it again or save it as PNG";
         Error::input(path, message)
     })
 }
 
-/// The segments of a JPEG file before its coded data: marker, and what follows the length.
+/// The segments of a JPEG file before its coded data: marker, and the bytes after the length.
 pub(super) fn segments(bytes: &[u8]) -> impl Iterator<Item = (u8, &[u8])> {
     let mut rest = bytes.get(MAGIC.len()..).unwrap_or_default();
     std::iter::from_fn(move || {
-        // Any number of 0xFF may stand before a marker.
+        // Any number of 0xFF bytes may precede a marker.
         while rest.starts_with(&[0xFF, 0xFF]) {
             rest = &rest[1..];
         }
         let [0xFF, marker @ 0xC0..=0xFE, high, low, ..] = *rest else { return None };
-        // What comes before the picture has a length; what does not is the picture.
+        // Segments before the image have a length; the image has none.
         let length = usize::from(u16::from_be_bytes([high, low]));
         if marker == 0xDA || length < 2 {
             return None;
@@ -50,7 +50,8 @@ pub(super) fn segments(bytes: &[u8]) -> impl Iterator<Item = (u8, &[u8])> {
     })
 }
 
-/// The Exif segment of a JPEG file, marker and length before it, said to be stored upright and in sRGB; none where it has none.
+/// The Exif segment of a JPEG file, with marker and length, changed to an upright orientation and sRGB; `None` if there
+/// is none.
 pub fn exif_segment(bytes: &[u8]) -> Option<Vec<u8>> {
     const EXIF: u8 = 0xE1;
     const HEAD: &[u8] = b"Exif\0\0";
@@ -62,7 +63,7 @@ pub fn exif_segment(bytes: &[u8]) -> Option<Vec<u8>> {
     Some([&[0xFF, EXIF], &length[..], HEAD, &tiff].concat())
 }
 
-/// Sets the orientation and the colour space of Exif data to 1: as stored, and sRGB.
+/// Sets the orientation of Exif data to upright, and its colour space to sRGB: both are 1.
 fn set_stored_as_seen(tiff: &mut [u8]) -> Option<()> {
     const ORIENTATION: u16 = 0x0112;
     const EXIF_DIRECTORY: u16 = 0x8769;
@@ -78,7 +79,7 @@ fn set_stored_as_seen(tiff: &mut [u8]) -> Option<()> {
     };
     let one = if is_little { [1, 0] } else { [0, 1] };
     let mut directories = vec![word(tiff, 4)?];
-    // The second is that of the photograph; none is entered twice.
+    // The second directory is that of the photograph; none is visited twice.
     while let Some(first) = directories.pop() {
         for entry in 0..usize::from(short(tiff, first)?) {
             let at = first + 2 + 12 * entry;
@@ -92,13 +93,13 @@ fn set_stored_as_seen(tiff: &mut [u8]) -> Option<()> {
     Some(())
 }
 
-/// The image of a file of sound structure, whose coded data has to be whole; what lies between it and the end does not matter.
+/// Decodes a file of valid structure. Its coded data must be complete; bytes between it and the end are ignored.
 fn decode(bytes: &[u8]) -> std::io::Result<Option<Image>> {
     let file = Decompress::with_err(warnings::counting()).from_mem(bytes)?;
     if matches!(file.color_space(), ColorSpace::JCS_CMYK | ColorSpace::JCS_YCCK) {
         return Ok(None);
     }
-    // Of the segments before the picture: none of its pixels.
+    // Warnings about segments before the image do not affect its pixels.
     warnings::take();
     let mut file = file.rgb()?;
     let (width, height) = (file.width() as u32, file.height() as u32);
@@ -115,7 +116,7 @@ fn decode(bytes: &[u8]) -> std::io::Result<Option<Image>> {
 mod tests {
     use super::*;
 
-    /// The file, and its pixels as libjpeg decodes them: FNV-1a of the bytes of red, green and blue.
+    /// Files, and the pixels that libjpeg decodes: FNV-1a of the bytes of red, green and blue.
     const PICTURES: [(&str, u64); 10] = [
         ("grey.jpg", 0x3c2f_b2ff_2b1b_2c78),
         ("grey_progressive.jpg", 0xa9ca_851e_396d_a86c),
@@ -135,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn every_kind_of_picture_has_the_pixels_that_libjpeg_gives_it() {
+    fn every_kind_of_jpeg_has_the_pixels_that_libjpeg_decodes() {
         for (name, expected) in PICTURES {
             let image = load(Path::new(name), &fixture(name)).unwrap().unwrap();
             assert_eq!((image.width, image.height), (37, 29), "{name}");
@@ -147,7 +148,7 @@ mod tests {
         }
     }
 
-    /// Asserts that libjpeg decodes what passes for sound; whether it does.
+    /// Asserts that libjpeg decodes a file whose structure is valid; returns whether it is.
     fn decodes_if_sound(bytes: &[u8], name: &str, damage: impl std::fmt::Debug) -> bool {
         let is_sound = structure::is_sound(bytes);
         assert!(!is_sound || catch_unwind(|| decode(bytes)).is_ok(), "{name}: {damage:x?}");
@@ -198,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_of_which_two_thirds_are_missing_is_refused_though_it_has_an_end() {
+    fn an_image_without_two_thirds_of_its_data_is_refused_though_it_has_an_end() {
         for (name, _) in PICTURES {
             let whole = fixture(name);
             let scan = whole.windows(2).position(|marker| marker == [0xFF, 0xDA]).unwrap();
@@ -206,13 +207,13 @@ mod tests {
                 let length = scan + (whole.len() - scan) / part;
                 let cut = [&whole[..length], &[0xFF, 0xD9]].concat();
                 let message = load(Path::new("photo.jpg"), &cut).unwrap_err().to_string();
-                assert!(message.contains("photo.jpg: this JPEG is cut short"), "{name}: {message}");
+                assert!(message.contains("photo.jpg: this JPEG is truncated"), "{name}: {message}");
             }
         }
     }
 
     #[test]
-    fn bytes_between_the_picture_and_its_end_do_no_harm() {
+    fn bytes_between_the_image_and_its_end_are_ignored() {
         let whole = fixture("420.jpg");
         let (picture, end) = whole.split_at(whole.len() - 2);
         let padded = [picture, &[0; 8], end].concat();
@@ -221,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn a_jpeg_cut_short_anywhere_is_refused() {
+    fn a_jpeg_truncated_anywhere_is_refused() {
         for (name, _) in PICTURES {
             let whole = fixture(name);
             assert!(
@@ -232,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_that_claims_more_than_its_file_can_hold_is_refused() {
+    fn an_image_that_declares_more_than_its_file_can_contain_is_refused() {
         let mut bytes = fixture("420.jpg");
         let at = bytes.windows(2).position(|marker| marker == [0xFF, 0xC1]).unwrap();
         bytes[at + 5..at + 9].fill(0xFF);
@@ -242,7 +243,7 @@ mod tests {
     #[test]
     fn a_damaged_jpeg_is_refused_by_name() {
         let path = Path::new("photo.jpg");
-        // Start and end of an image with nothing between, and a frame header of no size.
+        // An image without content, and a frame header without a size.
         let empty = [0xFF, 0xD8, 0xFF, 0xD9];
         let no_size = [0xFF, 0xD8, 0xFF, 0xC0, 0, 11, 8, 0, 0, 0, 0, 1, 1, 0x11, 0, 0xFF, 0xD9];
         for bytes in [&empty[..], &no_size] {

@@ -1,4 +1,4 @@
-//! Which pixels of a photograph count: numbers that its alpha channel and its mask show.
+//! Masks of photographs, from alpha channels and mask files.
 
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
@@ -7,8 +7,7 @@ use super::Image;
 use super::{Orientation, codec::PictureFile};
 use crate::{Error, Result};
 
-/// A weight for every pixel of an image: 1 where it counts, 0 where it is hidden. A pixel that shows something hidden, be it
-/// in part, is hidden.
+/// A weight for every pixel of an image: 1 if it counts, 0 if it is masked. A pixel that is masked in part is masked.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mask {
     /// Pixels per row.
@@ -19,11 +18,11 @@ pub struct Mask {
     pub weights: Vec<f32>,
 }
 
-/// The file of a mask, and its sense.
+/// The file of a mask, and its polarity.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct MaskFile {
     pub(crate) path: PathBuf,
-    /// It marks what is hidden, not what counts.
+    /// White pixels are masked, instead of black ones.
     pub(crate) is_inverted: bool,
 }
 
@@ -35,7 +34,7 @@ impl MaskFile {
 }
 
 impl Mask {
-    /// The weights of an image's first plane; none where every pixel counts.
+    /// The weights of an image's first plane; `None` if every pixel counts.
     #[cfg(any(feature = "io", test))]
     pub(crate) fn of_plane(image: &Image) -> Option<Self> {
         let weights: Vec<f32> = image.data[..image.pixel_count()].iter().map(whole).collect();
@@ -43,26 +42,26 @@ impl Mask {
         weights.iter().any(|&weight| weight < 1.0).then_some(Self { width, height, weights })
     }
 
-    /// The same as an image, whose planes are alike.
+    /// The mask as an image of three equal planes.
     pub(crate) fn to_image(&self) -> Image {
         Image { width: self.width, height: self.height, data: self.weights.repeat(3) }
     }
 
-    /// What hides pixels of a photograph, as it is stored: its own alpha, values of EXR that are not finite, and the file of a
-    /// mask, which hides what is black, or where it is inverted what is white. None where nothing does.
+    /// The mask of a photograph as stored: transparent pixels, EXR values that are not finite, and the black pixels of
+    /// a mask file, or its white ones if inverted. `None` if nothing is masked.
     ///
     /// # Errors
-    /// [`Error::Input`] names a file that cannot be read, or a mask of another shape than its photograph.
+    /// [`Error::Input`] for a file that cannot be read, or a mask with another aspect ratio than its photograph.
     pub fn load(photograph: &Path, file: Option<&Path>, inverted: bool) -> Result<Option<Self>> {
         let (image, alpha) = PictureFile::open(photograph)?.decode()?;
         let file = file.map(|path| MaskFile::shown(path.to_owned()));
         Self::over(photograph, (&image, alpha.as_ref()), file.as_ref(), inverted)
     }
 
-    /// The same of a photograph that is decoded, with its alpha.
+    /// [`Mask::load`] for a decoded photograph with its alpha.
     ///
     /// # Errors
-    /// As [`Mask::load`].
+    /// Those of [`Mask::load`].
     pub(crate) fn over(
         photograph: &Path,
         (image, alpha): (&Image, Option<&Image>),
@@ -84,11 +83,11 @@ impl Mask {
             let ((w, h), (width, height)) = (own, size);
             let problem = if upright != size && is_of_shape(upright) {
                 format!(
-                    "is {w}x{h}, its photograph {width}x{height} as stored; save the mask as the photograph is stored"
+                    "is {w}x{h}, its photograph {width}x{height} as stored; save the mask in the stored orientation"
                 )
             } else {
                 format!(
-                    "is {w}x{h}, its photograph {width}x{height}; a mask is of its photograph's shape"
+                    "is {w}x{h}, its photograph {width}x{height}; a mask has the aspect ratio of its photograph"
                 )
             };
             return Err(Error::input(file, problem));
@@ -103,7 +102,7 @@ impl Mask {
         Ok(Self::of_plane(&mask))
     }
 
-    /// The mask that hides some pixels of an image; none of none.
+    /// The mask that masks some pixels of an image; `None` if there are none.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn hiding(image: &Image, pixels: &[usize]) -> Option<Self> {
         let mut weights = vec![1.0; image.pixel_count()];
@@ -111,7 +110,7 @@ impl Mask {
         let Image { width, height, .. } = *image;
         (!pixels.is_empty()).then_some(Self { width, height, weights })
     }
-    /// A mask of an image of this size that hides these pixels beside those that `own` hides; none of none.
+    /// A mask of this size that masks these pixels in addition to those of `own`; `None` if there are none.
     pub(crate) fn hiding_too(
         own: Option<Self>,
         (width, height): (u32, u32),
@@ -126,7 +125,7 @@ impl Mask {
         Some(mask)
     }
 
-    /// The mask of an image of another size.
+    /// The mask resized for an image of another size.
     pub(crate) fn resized(&self, width: u32, height: u32) -> Cow<'_, Self> {
         if (width, height) == (self.width, self.height) {
             return Cow::Borrowed(self);
@@ -136,19 +135,20 @@ impl Mask {
         Cow::Owned(Self { width, height, weights: data.iter().map(whole).collect() })
     }
 
-    /// Whether no pixel counts.
+    /// Whether every pixel is masked.
     pub(crate) fn hides_all(&self) -> bool {
         self.hidden().len() == self.weights.len()
     }
 
-    /// The pixels that do not count: indices into a plane, ascending.
+    /// The masked pixels: indices into a plane, ascending.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn hidden(&self) -> Vec<usize> {
         let hides = |&(_, &weight): &(usize, &f32)| weight < 0.5;
         self.weights.iter().enumerate().filter(hides).map(|(pixel, _)| pixel).collect()
     }
 
-    /// An image whose hidden pixels are black: of what they showed nothing is left, not even where windows reach.
+    /// Sets the masked pixels of an image to black, so that nothing of them remains, even within windows of other
+    /// pixels.
     pub(crate) fn blacked_out(&self, mut image: Image) -> Image {
         let pixels = image.pixel_count();
         for pixel in self.resized(image.width, image.height).hidden() {
@@ -157,7 +157,7 @@ impl Mask {
         image
     }
 
-    /// Whether one of the four pixels around a place, in pixels, is hidden in part.
+    /// Whether one of the four pixels around a position, in pixels, is masked in part.
     pub(crate) fn hides_around(&self, place: glam::DVec2) -> bool {
         let [column, row] = (place - 0.5).floor().to_array();
         let at = |value: f64, side: u32| (value.max(0.0) as u32).min(side - 1) as usize;
@@ -167,7 +167,7 @@ impl Mask {
         })
     }
 
-    /// The planes of an image without the pixels that do not count.
+    /// The planes of an image without the masked pixels.
     pub(crate) fn counted(&self, image: &Image) -> Vec<f32> {
         let own = self.resized(image.width, image.height);
         let pixels = image.pixel_count().max(1);
@@ -176,7 +176,7 @@ impl Mask {
     }
 }
 
-/// The weight of what counts to this part; interpolation rounds.
+/// The weight of a pixel that counts in part: 1 up to rounding of the interpolation, else 0.
 fn whole(part: &f32) -> f32 {
     f32::from(*part > 0.999)
 }

@@ -1,4 +1,4 @@
-//! How a photograph is turned: cameras store what the sensor saw, and say in Exif which way is up.
+//! Exif orientation: cameras store the sensor's image, and its rotation in Exif.
 
 use std::io::{BufRead, BufReader, Seek};
 use std::path::Path;
@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::Image;
 use crate::base::tree;
 
-/// The orientation of Exif, 1 to 8: how an image is turned, and whether it is mirrored, to be what people see.
+/// An Exif orientation, 1 to 8: the rotation of an image, and whether it is mirrored, for display.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Orientation(u8);
 
@@ -20,15 +20,15 @@ impl Default for Orientation {
 }
 
 impl Orientation {
-    /// As it is stored.
+    /// As stored.
     pub const UPRIGHT: Self = Self(1);
 
-    /// What a file says; upright where it says nothing.
+    /// The orientation of a file; upright if it has none.
     pub fn of(path: &Path) -> Self {
         tree::open(path).map_or(Self::UPRIGHT, |file| Self::read(&mut BufReader::new(file)))
     }
 
-    /// What the bytes of a file say; upright where they say nothing.
+    /// The orientation in the bytes of a file; upright if there is none.
     pub(super) fn read(file: &mut (impl BufRead + Seek)) -> Self {
         let mut tagged = || {
             let exif = Reader::new().read_from_container(file).ok()?;
@@ -38,12 +38,12 @@ impl Orientation {
         tagged().map_or(Self::UPRIGHT, Self)
     }
 
-    /// Width and height behind turning.
+    /// Width and height for display.
     pub fn size(self, (width, height): (u32, u32)) -> (u32, u32) {
         if self.0 >= 5 { (height, width) } else { (width, height) }
     }
 
-    /// Clockwise quarter turns, after which only a mirrored image is to be mirrored from left to right.
+    /// Clockwise quarter turns, to be followed by a horizontal flip if the image is mirrored.
     pub(crate) fn quarters(self) -> u32 {
         match self.0 {
             5 | 6 => 1,
@@ -53,17 +53,17 @@ impl Orientation {
         }
     }
 
-    /// The orientation without its turn: mirrored from left to right, or upright.
+    /// The orientation without its rotation: mirrored horizontally, or upright.
     pub(crate) fn mirror(self) -> Self {
         if matches!(self.0, 2 | 4 | 5 | 7) { Self(2) } else { Self::UPRIGHT }
     }
 
-    /// The orientation without its mirror: a turn alone.
+    /// The orientation without its mirroring: a rotation alone.
     pub(crate) fn turn(self) -> Self {
         Self([1, 6, 3, 8][self.quarters() as usize])
     }
 
-    /// Column and row of what is stored that lie at `x` and `y` of what is seen; `width` and `height` are the stored.
+    /// Maps display to storage coordinates, column and row; `width` and `height` are those of the stored image.
     fn stored(self, (x, y): (usize, usize), (width, height): (usize, usize)) -> (usize, usize) {
         match self.0 {
             2 => (width - 1 - x, y),
@@ -79,7 +79,7 @@ impl Orientation {
 }
 
 impl Image {
-    /// The image as it is seen.
+    /// The image as displayed.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn turned(self, orientation: Orientation) -> Self {
         if orientation == Orientation::UPRIGHT {
@@ -103,9 +103,9 @@ impl Image {
 mod tests {
     use super::*;
 
-    /// A letter F, as people hold it up: bright where it is inked.
+    /// A letter F, upright; `#` is bright.
     const UPRIGHT: [&str; 4] = ["###", "#..", "##.", "#.."];
-    /// As a camera that is held in each of the eight ways stores it (Exif 2.32, 4.6.4, Orientation).
+    /// The same as stored by a camera held in each of the eight ways (Exif 2.32, 4.6.4, Orientation).
     const STORED: [&[&str]; 8] = [
         &["###", "#..", "##.", "#.."],
         &["###", "..#", ".##", "..#"],
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn every_orientation_is_turned_upright() {
+    fn every_orientation_is_rotated_upright() {
         let upright = drawn(&UPRIGHT);
         for (index, rows) in STORED.iter().enumerate() {
             let orientation = Orientation(index as u8 + 1);

@@ -1,4 +1,4 @@
-//! Camera RAW: what the sensor counted, in linear light, its white as the camera balanced it, as sRGB has its colours.
+//! Camera RAW: sensor values in linear light, white-balanced as by the camera, in the primaries of sRGB.
 
 use std::panic::catch_unwind;
 use std::path::Path;
@@ -12,7 +12,7 @@ use super::{Image, from_interleaved, srgb_from_linear};
 use crate::base::input;
 use crate::{Error, Result};
 
-/// Black and white level, mosaic, white balance, colour matrix, borders: all that leaves light linear.
+/// Black and white level, demosaicing, white balance, colour matrix and crop: all steps that keep light linear.
 const STEPS: [ProcessingStep; 6] = [
     ProcessingStep::Rescale,
     ProcessingStep::Demosaic,
@@ -22,10 +22,10 @@ const STEPS: [ProcessingStep; 6] = [
     ProcessingStep::CropDefault,
 ];
 
-/// The photograph of a RAW file as the sensor lies, encoded.
+/// Reads a RAW file in the sensor's orientation, and encodes it.
 ///
 /// # Errors
-/// [`Error::Input`] names a file that is damaged, or of a camera that is not known.
+/// [`Error::Input`] if the file is damaged, or its camera is unknown.
 pub(super) fn load(path: &Path, bytes: Vec<u8>) -> Result<Image> {
     let developed = decoded(path, bytes, false, |raw| {
         RawDevelop::new_with(&STEPS).develop_intermediate(raw).map_err(|error| error.to_string())
@@ -38,16 +38,16 @@ pub(super) fn load(path: &Path, bytes: Vec<u8>) -> Result<Image> {
             return Err(unreadable(path, "four colours without a matrix"));
         }
     };
-    // Positive phrasing: a NaN is black.
+    // Written so that a NaN is black.
     let encode = |value: f32| if value > 0.0 { srgb_from_linear(value) } else { 0.0 };
     let values: Vec<f32> = values.into_iter().map(encode).collect();
     Ok(from_interleaved(size.w as u32, size.h as u32, &values))
 }
 
-/// Width and height of what [`load`] makes of a file.
+/// Width and height of the image that [`load`] reads.
 ///
 /// # Errors
-/// As there.
+/// Those of [`load`].
 pub(super) fn size_of(path: &Path, bytes: Vec<u8>) -> Result<(u32, u32)> {
     decoded(path, bytes, true, |raw| {
         let area = raw.crop_area.or(raw.active_area).map(|area| area.d);
@@ -56,7 +56,7 @@ pub(super) fn size_of(path: &Path, bytes: Vec<u8>) -> Result<(u32, u32)> {
     })
 }
 
-/// What `of` makes of the sensor's numbers, which are left out of a dummy.
+/// Decodes a file and applies `of`; a dummy decode omits the sensor values.
 fn decoded<T>(
     path: &Path,
     bytes: Vec<u8>,
@@ -72,7 +72,7 @@ fn decoded<T>(
         };
         of(&raw.map_err(|error| error.to_string())?)
     };
-    // Of what it does not know, the decoder panics here and there.
+    // The decoder panics on some unknown input.
     let decoded = catch_unwind(decode).unwrap_or_else(|_| Err("its decoder gave up".to_owned()));
     decoded.map_err(|problem| unreadable(path, &problem))
 }

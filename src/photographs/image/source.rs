@@ -1,4 +1,4 @@
-//! Where the bytes of a picture come from, and what is said of those that are none.
+//! Sources of image bytes, and the error for bytes that are not an image.
 
 use std::io::{BufRead, Seek};
 use std::path::Path;
@@ -7,12 +7,12 @@ use ::image::ImageReader;
 
 use crate::Error;
 
-/// A file or memory, behind one type: every decoder is compiled anew for each that it reads from.
+/// A file or memory as one type: decoders are compiled for each type that they read from.
 pub(super) trait Source: BufRead + Seek {}
 
 impl<T: BufRead + Seek> Source for T {}
 
-/// The reader of a picture, of the format that its content is of.
+/// A reader of an image, for the format of its content.
 pub(super) fn reader<'a>(
     source: impl Source + 'a,
 ) -> std::io::Result<ImageReader<Box<dyn Source + 'a>>> {
@@ -20,7 +20,7 @@ pub(super) fn reader<'a>(
     ImageReader::new(source).with_guessed_format()
 }
 
-/// The error of bytes that no decoder takes.
+/// The error for bytes that no decoder accepts.
 pub(super) fn not_an_image(path: &Path, error: &dyn std::error::Error) -> Error {
     Error::input(
         path,

@@ -1,4 +1,4 @@
-//! Photographs from the host, one at a time, in tiles where one exceeds what the device binds.
+//! Tone-maps photographs on the host, one at a time, in tiles if one exceeds what the device binds.
 
 use super::PseudoGt;
 use crate::Result;
@@ -7,7 +7,7 @@ use crate::photographs::image::Image;
 use crate::photographs::tone::ToneMapping;
 
 impl PseudoGt {
-    /// The target that a photograph becomes, of its own size.
+    /// The target of a photograph, at its own size.
     ///
     /// # Errors
     /// The device is out of memory or lost.

@@ -1,4 +1,4 @@
-//! How bright a target is to be: the gain that the luminance of dark photographs asks for.
+//! The brightness of targets: a gain chosen from the luminance of dark photographs.
 //!
 //! ```text
 //! soft(x; k) = delta + (1 - delta) (1 - exp(-k x))                       delta = 0.075
@@ -7,17 +7,17 @@
 //! ln k_v     = s ln gain(view) + (1 - s) around(view)
 //! around(v)  = sum_w a_vw ln gain(w) / sum_w a_vw            a_vw = exp(-|p_v - p_w|^2 / (2 h^2)), h = 0.15
 //! s          = tau^2 / (tau^2 + 0.1^2)
-//! lift       = mean soft(Y; k) / mean Y, over the scene
+//! brightening = mean soft(Y; k) / mean Y, over the scene
 //! ```
 //!
-//! H is the histogram of the encoded luminance Y of one photograph, or of all training photographs together. p is where a
-//! camera stands, in units of the standard deviation of the positions, and the direction in which it looks; tau is the root
-//! mean square of ln gain(v) - around(v) over the views. So views that show the same have targets that agree, unless their
-//! exposures differ. Where cameras are not known, ln gain(scene) takes the place of around(v), and s is max(0.75, sigma^2 /
-//! (sigma^2 + 0.1^2)), sigma the standard deviation of ln gain over the views. A cubic mean lies between mean exposure (power 1) and exposure for the
-//! highlights (infinity): a scene rich in contrast is exposed lower, as a photographer does. Lamps and windows leave it
-//! unbounded, so the mean, of which 0.46 is the encoded 18 % grey, is the guard. Power and constants come from pairs of low-
-//! and normal-light photographs (LOL, LOM, `RealX3D`).
+//! H is the histogram of the encoded luminance Y of one photograph, or of all training photographs together. p is a
+//! camera's position, in units of the standard deviation of all positions, together with its viewing direction; tau is
+//! the root mean square of ln gain(v) - around(v) over the views. So views of the same content have consistent targets,
+//! unless their exposures differ. If the cameras are unknown, ln gain(scene) replaces around(v), and s is max(0.75,
+//! sigma^2 / (sigma^2 + 0.1^2)), with sigma the standard deviation of ln gain over the views. A cubic mean is between
+//! average metering (power 1) and metering for the highlights (infinity): a scene of high contrast gets less exposure,
+//! as a photographer would choose. Lamps and windows make it unbounded, so the mean is limited (18 % grey is 0.46 when
+//! encoded). Power and constants were chosen on pairs of low- and normal-light photographs (LOL, LOM, `RealX3D`).
 
 use serde::Serialize;
 
@@ -28,43 +28,44 @@ use crate::camera::{Camera, CameraPoses};
 /// The black level of [`soft`].
 pub(super) const BLACK_LEVEL: f64 = 0.075;
 
-/// What the cubic mean of the luminance is brought to before the curve.
+/// The cubic mean of the luminance times the gain.
 const CUBIC_MEAN: f64 = 0.90;
 
-/// The least and the greatest mean luminance of a target.
+/// Minimum and maximum of a target's mean luminance.
 const MEANS: [f64; 2] = [0.44, 0.54];
 
-/// The gains that may come out.
+/// Minimum and maximum of the gain.
 const GAINS: [f64; 2] = [1e-3, 128.0];
 
-/// The least weight of a view's own gain where cameras are not known.
+/// The minimum weight of a view's own gain if cameras are unknown.
 const MIN_SHARE: f64 = 0.75;
 
-/// The spread of ln gain between views, or between those near each other, at which their own gains have half the weight.
+/// The spread of ln gain, between all views or neighbouring ones, at which views' own gains have half the weight.
 const NOISE: f64 = 0.1;
 
-/// h: how far apart cameras are whose views have about one gain.
+/// h: the distance of cameras whose views have similar gains.
 const REACH: f64 = 0.15;
 
-/// Of a larger scene the cameras at even distances in the list, at most this many, say what gain its surroundings have: the time is linear in the photographs.
+/// In a larger scene, only this many cameras, evenly spread in the list, are used as neighbours: the time is then
+/// linear in the number of photographs.
 const MAX_POSES: usize = 1024;
 
-/// Lifts up to the first leave the photograph as it is; from the second on the curve has its whole weight.
+/// Up to the first brightening, photographs are left unchanged; from the second on, the curve has full weight.
 const WELL_LIT: [f64; 2] = [1.5, 2.0];
 
-/// A photograph whose 99 % quantile is below this is as good as black: two code values of 8 bits.
+/// A photograph whose 99 % quantile is lower is almost black: two 8-bit code values.
 const BLACK: f64 = 2.0 / 255.0;
 
-/// delta + (1 - delta) (1 - exp(-k x)): the curve whose mean the rule is about.
+/// delta + (1 - delta) (1 - exp(-k x)): the curve to which the rule applies.
 pub fn soft(x: f64, gain: f64) -> f64 {
     BLACK_LEVEL + (1.0 - BLACK_LEVEL) * (gain * x).one_minus_exp()
 }
 
-/// What the rule finds for a set of photographs.
+/// The exposure of a set of photographs.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(into = "SerializedExposure")]
 pub struct Exposure {
-    /// The gain of all training photographs together, those that are black left out.
+    /// The gain of all training photographs together, except black ones.
     pub gain: f64,
     /// The mean luminance of the targets at that gain.
     pub target: f64,
@@ -72,28 +73,29 @@ pub struct Exposure {
     pub mean: f64,
     /// sigma: the standard deviation of ln gain over the views.
     pub spread: f64,
-    /// How much of the differences between the views' own gains is in the gains of their targets: the slope of ln k.
+    /// How much of the differences between the views' own gains remains in the gains of their targets: the slope of ln
+    /// k.
     pub share: f64,
-    /// How many photographs are as good as black.
+    /// The number of almost black photographs.
     pub black: usize,
-    /// The mean luminance that was asked for in place of the rule's.
+    /// The requested mean luminance, in place of the rule's.
     brightness: Option<f64>,
-    /// The views' own gains by their cameras, where these are known.
+    /// The gains of views by their cameras, if known.
     around: Option<NeighbourGains>,
 }
 
-/// Gains by where they were found.
+/// Gains by camera.
 #[derive(Clone, Debug, PartialEq)]
 struct NeighbourGains {
     poses: CameraPoses,
-    /// ln gain of each place.
+    /// ln gain of each camera.
     gains: Vec<f64>,
     /// s: the weight of a view's own gain.
     own: f64,
 }
 
 impl NeighbourGains {
-    /// around(v): the mean of ln gain over the places near a camera, the nearest of which always counts.
+    /// around(v): the mean of ln gain over the cameras near this one; the nearest always counts.
     fn ln_gain(&self, camera: &Camera) -> f64 {
         let squares: Vec<f64> = self.poses.squared_distances(camera).collect();
         let nearest = squares.iter().copied().fold(f64::INFINITY, f64::min);
@@ -106,7 +108,7 @@ impl NeighbourGains {
 
 impl Exposure {
     /// The exposure of a set, from the luminance of its training photographs. `brightness` is the mean luminance of the
-    /// targets where the rule is not to find it. None where every photograph is as good as black.
+    /// targets, instead of the rule's. `None` if every photograph is almost black.
     pub fn of<'a>(
         views: impl IntoIterator<Item = &'a LuminanceHistogram>,
         brightness: Option<f64>,
@@ -139,7 +141,7 @@ impl Exposure {
         })
     }
 
-    /// The same where the cameras of the training photographs are known.
+    /// [`Exposure::of`] with the cameras of the training photographs.
     #[must_use]
     pub fn seen_by<'a>(
         self,
@@ -172,14 +174,13 @@ impl Exposure {
         Self { share: share.clamp(0.0, 1.0), around: Some(around), ..self }
     }
 
-    /// The same with one gain for every photograph.
+    /// The exposure with one gain for every photograph.
     #[must_use]
     pub fn shared(self) -> Self {
         Self { share: 0.0, around: None, ..self }
     }
 
-    /// k of a photograph of the scene, of training or not, and of its camera where that is known; one as good as black has
-    /// the scene's.
+    /// k of any photograph of the scene, with its camera if known; one that is almost black has the scene's gain.
     pub fn gain_of(&self, view: &LuminanceHistogram, camera: Option<&Camera>) -> f64 {
         if is_black(view) {
             return self.gain;
@@ -193,13 +194,13 @@ impl Exposure {
         (share * own + (1.0 - share) * other).exp()
     }
 
-    /// How many times brighter the targets are than the photographs, on the mean.
+    /// The mean brightness of the targets over that of the photographs.
     pub fn brightening(&self) -> f64 {
         self.target / self.mean
     }
 
-    /// The weight of the curve beside the photograph as it is: 0 of a well-lit set, 1 of a dark one and wherever a
-    /// brightness was asked for.
+    /// The weight of the curve relative to the unchanged photograph: 0 for a well-lit set, 1 for a dark one or with a
+    /// requested brightness.
     pub fn weight(&self) -> f64 {
         let [none, whole] = WELL_LIT;
         if self.brightness.is_some() {
@@ -209,7 +210,7 @@ impl Exposure {
         }
     }
 
-    /// What was found, and why, in a sentence.
+    /// The result and its reason, in a sentence.
     pub fn reason(&self) -> String {
         let Self { gain, target, mean, spread, black, .. } = self;
         let brightening = self.brightening();
@@ -224,7 +225,7 @@ impl Exposure {
         };
         let left_out = match black {
             0 => String::new(),
-            count => format!("; {count} as good as black, left out of the measurement"),
+            count => format!("; {count} almost black, left out of the measurement"),
         };
         format!(
             "mean luminance {mean:.3}, {brightening:.1} times that is {target:.2}: {verdict}{varies}{left_out}"
@@ -232,11 +233,10 @@ impl Exposure {
     }
 }
 
-/// What a picture at one gain is at another, with so much weight of the curve: the values from which others are
-/// interpolated, ascending.
+/// The values from which values at one gain are interpolated to another, at this weight of the curve; ascending.
 pub fn exposed_anew([from, to]: [f64; 2], weight: f64) -> Vec<[f32; 2]> {
     const KNOTS: u32 = 1024;
-    // Evenly spaced in what the curve makes of them, up to where it is white.
+    // Evenly spaced in the output of the curve, up to its white.
     let knot = |i: u32| {
         let x = -(1.0 - f64::from(i) / f64::from(KNOTS + 1)).ln() / from.min(to);
         [from, to].map(|gain| ((1.0 - weight) * x.min(1.0) + weight * soft(x, gain)) as f32)
@@ -244,7 +244,7 @@ pub fn exposed_anew([from, to]: [f64; 2], weight: f64) -> Vec<[f32; 2]> {
     (0..=KNOTS).map(knot).collect()
 }
 
-/// The exposure as JSON has it.
+/// The exposure in JSON.
 #[derive(Serialize)]
 struct SerializedExposure {
     gain: f64,
@@ -267,19 +267,19 @@ impl From<Exposure> for SerializedExposure {
     }
 }
 
-/// Says that nothing can be lifted.
+/// The error if every photograph is black.
 pub(crate) fn all_black(path: &std::path::Path) -> crate::Error {
-    let problem = "every photograph is as good as black (99 % of its pixels are below 2 of 255); expose longer, or name \
+    let problem = "every photograph is almost black (99 % of its pixels are below 2 of 255); expose longer, or name \
                    a curve with --curve";
     crate::Error::input(path, problem)
 }
 
-/// The weight of a view's own gain beside the scene's, by the variance of ln gain over the views.
+/// The weight of a view's own gain relative to the scene's, from the variance of ln gain over the views.
 fn share_without_cameras(variance: f64) -> f64 {
     MIN_SHARE.max(variance / (variance + NOISE * NOISE))
 }
 
-/// Whether a photograph shows next to nothing.
+/// Whether a photograph is almost black.
 pub fn is_black(view: &LuminanceHistogram) -> bool {
     view.quantile(0.99) < BLACK
 }
@@ -306,7 +306,7 @@ fn gain_at(luminance: &LuminanceHistogram, mean: f64) -> f64 {
     solved(GAINS, |gain| mean_of_soft(luminance, gain) < mean)
 }
 
-/// The strength between two that is the first not to be too low, by bisection of its logarithm; an end where there is none.
+/// The first strength within bounds that is not too low, by bisection of its logarithm; a bound if there is none.
 pub(super) fn solved(bounds: [f64; 2], is_low: impl Fn(f64) -> bool) -> f64 {
     let [mut low, mut high] = bounds.map(f64::ln);
     for _ in 0..50 {

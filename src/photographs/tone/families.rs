@@ -1,4 +1,4 @@
-//! What a row of the table of curves holds, and the values, derivatives and gradients it gives.
+//! Rows of the table of curves: values, derivatives and gradients.
 
 mod catalogue;
 
@@ -7,27 +7,27 @@ use super::real::{Dual, Real, within};
 pub(crate) use catalogue::{Constants, curve_shape};
 pub use catalogue::{FAMILIES, ToneCurve};
 
-/// How black level and gain join a curve's shape f.
+/// How black level and gain are applied to a curve's shape f.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum OffsetMode {
-    /// delta0 + b f(t), b = 1 + c Y: AP3's.
+    /// delta0 + b f(t), b = 1 + c Y, as AP3.
     Added,
-    /// delta0 + (1 - delta0) f(g t), g = g0 + c Y: ASE's.
+    /// delta0 + (1 - delta0) f(g t), g = g0 + c Y, as ASE.
     Rescaled,
 }
 
-/// The value that t = 1 stands for.
+/// The value that t = 1 corresponds to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum White {
-    /// 1: the photograph as stored.
+    /// 1: t is the photograph's value.
     One,
     /// The mean over all channels, divided by theta.
     Mean,
     /// The 90th percentile of the luminance.
     P90,
-    /// 1 / gain with the gain theta / p80, from 1 to 6.
+    /// 1 / gain with the gain theta / p80, limited to 1 to 6.
     P80,
-    /// One gain for the luminance, theta over its mean, from 1 to 6.
+    /// One gain for the luminance, theta over its mean, limited to 1 to 6.
     MeanLuminance,
     /// Each channel's mean divided by theta.
     ChannelMeans,
@@ -38,11 +38,11 @@ pub enum White {
 pub struct Constant {
     /// Its name in the formula and in TOML files.
     pub name: &'static str,
-    /// Its value where none is given.
+    /// Its default value.
     pub default: f64,
-    /// Where a fit begins.
+    /// The start of a fit.
     pub start: f64,
-    /// The least and the greatest value that a fit may try.
+    /// Minimum and maximum in a fit.
     pub bounds: [f64; 2],
 }
 
@@ -51,48 +51,48 @@ pub struct Constant {
 pub struct Family {
     /// The row's curve.
     pub curve: ToneCurve,
-    /// The name on the command line, in files and on plots.
+    /// The name on the command line, in files and in plots.
     pub name: &'static str,
-    /// Other names that are understood.
+    /// Alternative names.
     pub aliases: &'static [&'static str],
     /// The value in terms of t and the constants, before it is clamped to [0, 1].
     pub formula: &'static str,
-    /// Where formula and constants come from.
+    /// The source of formula and constants.
     pub source: &'static str,
     /// The constants in the formula's order.
     pub constants: &'static [Constant],
-    /// The values of t between which the formula acts; beyond, the curve is constant.
+    /// The range of t in which the formula applies; beyond, the curve is constant.
     #[cfg_attr(not(feature = "testing"), expect(dead_code, reason = "what tests hold a curve to"))]
     pub domain: [f64; 2],
-    /// With its default constants the clamped curve never falls.
+    /// Whether the clamped curve never falls, with its default constants.
     pub monotone: bool,
-    /// With its default constants the curve never passes 1, so nothing clips.
+    /// Whether the curve never exceeds 1 with its default constants, so nothing clips.
     pub bounded: bool,
-    /// Data determine the constants one by one; otherwise a fit finds one of many that are alike.
+    /// Whether data determine each constant; otherwise a fit finds one of many equivalent solutions.
     #[cfg_attr(not(feature = "testing"), expect(dead_code, reason = "what tests hold a curve to"))]
     pub identifiable: bool,
-    /// How black level and gain join the shape.
+    /// How black level and gain are applied to the shape.
     pub law: OffsetMode,
-    /// The value that t = 1 stands for.
+    /// The value that t = 1 corresponds to.
     pub white: White,
-    /// alpha where none is given: the highest black level.
+    /// alpha, the highest black level, by default.
     pub alpha: f64,
-    /// c where none is given: the gain per mean luminance.
+    /// c, the gain per mean luminance, by default.
     pub gain_c: f64,
 }
 
 impl Family {
-    /// The constants where none are given.
+    /// The default constants.
     pub fn defaults(&self) -> Vec<f64> {
         self.constants.iter().map(|constant| constant.default).collect()
     }
 
-    /// The shape f(t) without black level, gain and clamp; t outside [0, 1e7], or no number, counts as the end it is at.
+    /// The shape f(t) without black level, gain and clamp; t is clamped to [0, 1e7], and a NaN is 0.
     pub fn shape(&self, t: f64, constants: &[f64]) -> f64 {
         curve_shape(self.curve as u32, within(t), &padded(constants))
     }
 
-    /// df/dt, exact; at a knee that of one of the sides.
+    /// df/dt, exact; at a knee, the derivative of one side.
     #[cfg(feature = "testing")]
     pub fn derivative(&self, t: f64, constants: &[f64]) -> f64 {
         let constants = padded(constants).map(Dual::of);
@@ -119,7 +119,7 @@ impl Family {
     }
 }
 
-/// The constants as the kernels hold them.
+/// The constants, padded for the kernels.
 pub(super) fn padded(constants: &[f64]) -> Constants<f64> {
     std::array::from_fn(|index| constants.get(index).copied().unwrap_or(0.0))
 }

@@ -8,16 +8,16 @@ use super::{Profile, Table, ToneCurve, ToneSettings};
 use crate::base::input;
 use crate::{Error, Result};
 
-/// What `--curve` names.
+/// The value of `--curve`.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CurveChoice {
     /// A curve of the table.
     Named(ToneCurve),
-    /// A TOML file with settings (a run's config.toml too), or a CSV or .cube file with values.
+    /// A TOML file with settings (also a run's config.toml), or a CSV or .cube file with values.
     File(PathBuf),
 }
 
-/// The extensions of files that hold a curve.
+/// The extensions of curve files.
 const EXTENSIONS: [&str; 3] = ["toml", "csv", "cube"];
 
 impl FromStr for CurveChoice {
@@ -56,10 +56,10 @@ impl From<ToneCurve> for CurveChoice {
 }
 
 impl CurveChoice {
-    /// The curve with the constants that its row or its file gives.
+    /// The curve with the constants of its row or file.
     ///
     /// # Errors
-    /// [`Error::Input`] names the file and what is wrong in it.
+    /// [`Error::Input`] with the file and its problem.
     pub fn settings(&self) -> Result<ToneSettings> {
         match self {
             Self::Named(curve) => Ok(ToneSettings::new(*curve)),
@@ -69,14 +69,14 @@ impl CurveChoice {
 }
 
 impl ToneSettings {
-    /// Reads a curve from a file: `.csv` and `.cube` hold a [`Table`], everything else is TOML with the settings, at the
-    /// top or below `[tone]`.
+    /// Reads a curve from a file: a [`Table`] from `.csv` and `.cube`, otherwise settings from TOML, at the top or in
+    /// `[tone]`.
     ///
     /// # Errors
-    /// [`Error::Input`] names the file and what is wrong in it.
+    /// [`Error::Input`] with the file and its problem.
     pub fn load(path: &Path) -> Result<Self> {
         let text = input::text(path)?;
-        let wrong = |problem: String| Error::input(path, format!("is no tone curve: {problem}"));
+        let wrong = |problem: String| Error::input(path, format!("is not a tone curve: {problem}"));
         let settings = match extension(path).as_str() {
             "csv" => Self::of_table(Table::from_csv(&text).map_err(wrong)?),
             "cube" => Self::of_table(Table::from_cube(&text).map_err(wrong)?),
@@ -88,14 +88,14 @@ impl ToneSettings {
 }
 
 impl Profile {
-    /// Reads a profile that `nightsplat tone fit --profile` wrote.
+    /// Reads a profile written by `nightsplat tone fit --profile`.
     ///
     /// # Errors
-    /// [`Error::Input`] names the file and what is wrong in it.
+    /// [`Error::Input`] with the file and its problem.
     pub fn load(path: &Path) -> Result<Self> {
         let text = input::text(path)?;
         let wrong =
-            |problem: String| Error::input(path, format!("is no camera profile: {problem}"));
+            |problem: String| Error::input(path, format!("is not a camera profile: {problem}"));
         let profile: Self =
             toml::from_str(&text).map_err(|error| wrong(error.message().replace('\n', " ")))?;
         profile.check().map_err(wrong)?;
@@ -108,7 +108,7 @@ fn from_toml(text: &str) -> Result<ToneSettings, String> {
     let mut whole: toml::Table = text.parse().map_err(|error| one_line(&error))?;
     let tone = match whole.remove("tone") {
         Some(toml::Value::Table(tone)) => tone,
-        Some(_) => return Err("`tone` is no table".to_owned()),
+        Some(_) => return Err("`tone` is not a table".to_owned()),
         None => whole,
     };
     if tone.contains_key("segments") {

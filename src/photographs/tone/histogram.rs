@@ -1,28 +1,28 @@
-//! How often each luminance occurs in a photograph, or in several.
+//! Histograms of the luminance of one or several photographs.
 
 use super::statistics::{luminance, measurable};
 
-/// The bits of a luminance to the right of its bin's number: 128 bins an octave are left.
+/// Bits of a luminance that its bin number drops: 128 bins per octave remain.
 const BIN_SHIFT: u32 = 16;
 
-/// The number of the first bin: 2^-15, a hundredth of a code value of 8 bits.
+/// The number of the first bin: 2^-15, a hundredth of an 8-bit code value.
 const FIRST_BIN: u32 = 14 << 10;
 
-/// The bins reach to 2^17.
+/// The bins extend to 2^17.
 const BINS: usize = 4096;
 
-/// How many pixels have which luminance, in bins a 128th of an octave wide; everything below 2^-15 counts as 0.
+/// The number of pixels per luminance, in bins of a 128th of an octave; everything below 2^-15 counts as 0.
 ///
-/// What is read from it is off by 0.4 % at most, where all pixels are equal, and by far less in a photograph.
+/// Derived values have an error of at most 0.4 % (if all pixels are equal), and far less for a photograph.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LuminanceHistogram {
-    /// The bins that are not empty, ascending, with the number of their pixels: a small part of all.
+    /// The non-empty bins, ascending, with their numbers of pixels.
     counts: Vec<(u32, u64)>,
     black: u64,
 }
 
 impl LuminanceHistogram {
-    /// That of a planar (3, H, W) photograph, sRGB-encoded; NaN and negative values count as 0.
+    /// The histogram of a planar (3, H, W) photograph, sRGB-encoded; NaN and negative values count as 0.
     pub fn of(planes: &[f32]) -> Self {
         let (red, rest) = planes.split_at(planes.len() / 3);
         let (green, blue) = rest.split_at(red.len());
@@ -58,7 +58,7 @@ impl LuminanceHistogram {
         self.black + self.counts.iter().map(|(_, count)| count).sum::<u64>()
     }
 
-    /// The least luminance that `fraction` of the pixels do not exceed; 0 of no pixels.
+    /// The smallest luminance that `fraction` of the pixels do not exceed; 0 without pixels.
     pub fn quantile(&self, fraction: f64) -> f64 {
         let rank = fraction * self.pixel_count().saturating_sub(1) as f64;
         let mut below = 0;
@@ -70,7 +70,7 @@ impl LuminanceHistogram {
         at_rank.map_or(0.0, |(luminance, _)| luminance)
     }
 
-    /// The mean over the pixels of a function of their luminance; 0 of no pixels.
+    /// The mean over the pixels of a function of their luminance; 0 without pixels.
     pub fn mean_of(&self, value: impl Fn(f64) -> f64) -> f64 {
         let sum: f64 =
             self.levels().map(|(luminance, count)| count as f64 * value(luminance)).sum();
@@ -82,14 +82,14 @@ impl LuminanceHistogram {
         self.mean_of(|luminance| luminance)
     }
 
-    /// The cubic mean of the luminance, between the mean and the highlights; what exceeds the 99.9 % quantile counts as that:
-    /// hot pixels.
+    /// The cubic mean of the luminance, between the mean and the highlights; higher values are clamped to the 99.9 %
+    /// quantile, against hot pixels.
     pub fn cubic_mean(&self) -> f64 {
         let hot = self.quantile(0.999);
         self.mean_of(|luminance| luminance.min(hot).powi(3)).cbrt()
     }
 
-    /// The luminances that occur, ascending, with the number of their pixels: 0 and the middles of the bins.
+    /// The luminances of non-empty bins (0, or the centres of bins), ascending, with their numbers of pixels.
     fn levels(&self) -> impl Iterator<Item = (f64, u64)> + '_ {
         let middle = |bin: u32| {
             let number = FIRST_BIN + bin;
@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_luminance_finds_its_bin_within_half_a_percent() {
+    fn every_luminance_is_binned_within_half_a_percent() {
         for x in [3.1e-5_f32, 1e-4, 0.0039, 0.0041, 0.5, 1.0, 1.5, 30.0, 65504.0] {
             let histogram = LuminanceHistogram::of(&[x; 3]);
             assert_eq!(histogram.pixel_count(), 1);
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn a_quantile_leaves_out_the_hot_pixels_and_a_sum_is_that_of_both() {
+    fn a_quantile_excludes_hot_pixels_and_histograms_add_up() {
         let mut planes = vec![0.25_f32; 3 * 1000];
         for plane in 0..3 {
             planes[1000 * plane] = 1.0;

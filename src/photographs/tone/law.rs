@@ -1,6 +1,6 @@
-//! The law of the curves: what settings and a photograph's statistics make of a family, and its value at x, in any
-//! arithmetic: f64 for the parameters that the kernels get, dual numbers for the derivatives of a fit, f32 for the
-//! kernels' references.
+//! The formula of the curves: from settings and a photograph's statistics to the curve's parameters, and its value at
+//! x. It is generic over the number type: f64 for the kernels' parameters, dual numbers for the derivatives of a fit,
+//! f32 for the kernels' references.
 
 use super::Statistics;
 use super::families::{Constants, Family, OffsetMode, White, curve_shape};
@@ -8,16 +8,16 @@ use super::real::{Real, within};
 use crate::kernels::ToneParameters;
 use crate::kernels::curves::*;
 
-/// The least value that linear scaling maps to 1: it keeps a black photograph black.
+/// The smallest white of linear scaling: it keeps a black photograph black.
 const MIN_WHITE: f64 = 1e-12;
 
-/// Added to a mean before it divides.
+/// Added to a mean that is a divisor.
 const EPSILON: f64 = 1e-6;
 
-/// The gains that `p80` and `lum_preserve` may take.
+/// Minimum and maximum gain of `p80` and `lum_preserve`.
 const GAINS: [f64; 2] = [1.0, 6.0];
 
-/// The numbers of [`ToneSettings`].
+/// The numeric settings of [`ToneSettings`].
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CurveInputs<T> {
     pub(crate) theta: T,
@@ -28,18 +28,18 @@ pub(crate) struct CurveInputs<T> {
     pub(crate) constants: Constants<T>,
 }
 
-/// The curve of one photograph: [`ToneParameters`] in any arithmetic.
+/// The curve of one photograph: [`ToneParameters`] in any number type.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct PhotographCurve<T> {
-    /// The value that t = 1 stands for.
+    /// The value that t = 1 corresponds to.
     pub(crate) white: T,
     pub(crate) offset: T,
     pub(crate) gain: T,
-    /// Where each channel has a white of its own, the first three are these.
+    /// The first three are the white of each channel, if channels differ.
     pub(crate) constants: Constants<T>,
 }
 
-/// The curve that these numbers give a photograph with these statistics. `white` is the family's, or its table's.
+/// The curve of a photograph with these statistics. `white` is the family's, or its table's.
 pub(crate) fn law<T: Real>(
     family: &Family,
     white: White,
@@ -92,7 +92,7 @@ pub(crate) fn tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> f32 {
     clamped(curve_at(curve, x / tone.white, [tone.offset, tone.gain], &tone.constants))
 }
 
-/// The curve at t = x / white, before it is clamped.
+/// The curve at t = x / white, unclamped.
 pub(crate) fn curve_at<T: Real>(curve: u32, t: T, [offset, gain]: [T; 2], c: &Constants<T>) -> T {
     let one = T::of(1.0);
     match curve {
@@ -109,7 +109,7 @@ pub(crate) fn curve_at<T: Real>(curve: u32, t: T, [offset, gain]: [T; 2], c: &Co
     }
 }
 
-/// Within [0, 1]; a NaN becomes black.
+/// Clamped to [0, 1]; a NaN becomes black.
 pub(crate) fn clamped<T: Real>(y: T) -> T {
     if y > T::of(0.0) { y.at_most(T::of(1.0)) } else { T::of(0.0) }
 }

@@ -1,4 +1,4 @@
-//! From what was measured of a scene's photographs to the curve of each.
+//! From the measurements of a scene's photographs to the curve of each.
 
 use super::exposure::{Exposure, solved};
 use super::histogram::LuminanceHistogram;
@@ -6,55 +6,55 @@ use super::law::{clamped, curve_at};
 use super::{Statistics, ToneCurve, ToneParameters, ToneSettings};
 use crate::camera::Camera;
 
-/// The strengths that a curve may be solved for.
+/// Minimum and maximum of a solved gain.
 const STRENGTHS: [f64; 2] = [1e-3, 1e4];
 
-/// What is measured of a photograph.
+/// Measurements of a photograph.
 #[derive(Clone, Debug)]
 pub struct MeasuredPhotograph {
     /// Percentiles and means.
     pub statistics: Statistics,
-    /// The whole distribution of its luminance.
+    /// The histogram of its luminance.
     pub luminance: LuminanceHistogram,
-    /// The camera that took it, where that is known.
+    /// Its camera, if known.
     pub camera: Option<Camera>,
 }
 
 impl MeasuredPhotograph {
-    /// Of the planes (3, pixels) of a photograph.
+    /// Measures the planes (3, pixels) of a photograph.
     pub fn of(planes: &[f32]) -> Self {
         let (statistics, luminance) = (Statistics::of(planes), LuminanceHistogram::of(planes));
         Self { statistics, luminance, camera: None }
     }
 
-    /// The same of a photograph that `camera` took.
+    /// Adds the camera.
     #[must_use]
     pub fn seen_by(self, camera: &Camera) -> Self {
         Self { camera: Some(*camera), ..self }
     }
 }
 
-/// What the curves of a scene's photographs have in common.
+/// The shared part of the curves of a scene's photographs.
 #[derive(Clone, Debug, Default)]
 pub struct SceneTone {
-    /// The means over the training photographs, where one curve serves all.
+    /// The means over the training photographs, if one curve is used for all.
     statistics: Option<Statistics>,
-    /// How bright the targets are to be, where that is found.
+    /// The exposure of the targets, if it is automatic.
     pub exposure: Option<Exposure>,
 }
 
-/// How a photograph becomes a target.
+/// How a photograph is tone-mapped to its target.
 #[derive(Clone, Copy, Debug)]
 pub struct ToneMapping {
     /// The curve.
     pub parameters: ToneParameters,
-    /// k of soft(x; k), of whose mean luminance the target is; where it follows from the exposure.
+    /// k of soft(x; k), whose mean luminance the target has, if it follows from the exposure.
     pub gain: Option<f64>,
 }
 
 impl ToneSettings {
-    /// What the training photographs of a scene decide together; none where their exposure is asked for and all are as
-    /// good as black, or there are none.
+    /// The shared part of the curves of a scene, from its training photographs; `None` if their exposure is needed and
+    /// all are almost black, or there are none.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn scene(&self, training: &[MeasuredPhotograph]) -> Option<SceneTone> {
         let exposure = if self.takes_exposure() {
@@ -73,7 +73,7 @@ impl ToneSettings {
         Some(SceneTone { statistics, exposure })
     }
 
-    /// How a photograph of the scene is lifted.
+    /// The tone mapping of a photograph of the scene.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn tone_mapping(
         &self,
@@ -90,14 +90,14 @@ impl ToneSettings {
             ToneCurve::Auto | ToneCurve::Profile => gain,
             _ => self.strength(&parameters, &photograph.luminance, gain),
         };
-        // What is known of a camera holds for bright photographs too.
+        // A profile applies to bright photographs, too.
         let weight = if self.profile.is_some() { 1.0 } else { exposure.weight() };
         let (white, weight) = ((1.0 / strength) as f32, weight as f32);
         let parameters = ToneParameters { white, gain: 1.0, weight, ..parameters };
         ToneMapping { parameters, gain: Some(gain) }
     }
 
-    /// The factor on x at which the curve has the mean luminance of soft(x; gain).
+    /// The factor on x that gives the curve the mean luminance of soft(x; gain).
     fn strength(&self, tone: &ToneParameters, luminance: &LuminanceHistogram, gain: f64) -> f64 {
         let target = luminance.mean_of(|y| super::soft(y, gain));
         let (curve, law) = (self.curve.constant(), [f64::from(tone.offset), 1.0]);

@@ -1,31 +1,31 @@
-//! A camera profile: what one referenced scene says of a camera's colours.
+//! Camera profiles: the colours of a camera, learned from one scene with references.
 
 use serde::{Deserialize, Serialize};
 
 use super::real::Real;
 use crate::kernels::pseudo_gt::{PROFILE_WIDTH, SEGMENTS};
 
-/// The largest weight, gain or bias that a profile may have.
+/// Limit of the weights, gains and biases of a profile.
 const LARGEST: f64 = 1e3;
 
-/// How far the weights of a channel may be from 1 together: what rounding leaves.
+/// How much the sum of a channel's weights may differ from 1, due to rounding.
 const ROUNDING: f64 = 1e-3;
 
-/// A camera profile, fitted to photographs whose normal-light twins are known, and frozen:
+/// A camera profile, fitted to pairs of dark and normal-light photographs, then fixed:
 ///
 /// ```text
-/// v_c = 1 - exp(-k x_c)                          k: the gain that the luminance of the photographs asks for
+/// v_c = 1 - exp(-k x_c)                          k: the gain from the luminance of the photographs
 /// u_c = gain_c (M v)_c + bias_c                  the rows of M sum to 1, so that grey stays grey
-/// y_c = segments_c at u_c                        17 values that never fall, straight between them, u from 0 to 1
+/// y_c = segments_c at u_c                        17 non-decreasing values, linearly interpolated, u from 0 to 1
 /// ```
 ///
-/// What it makes knows its references: scores of it are compared with nothing that has none.
+/// Its targets depend on reference images: their scores are not comparable with scores without references.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Profile {
-    /// The referenced scene it was fitted to.
+    /// The scene with references that it was fitted to.
     pub reference: String,
-    /// How many pairs of that scene.
+    /// The number of pairs of that scene.
     pub pairs: usize,
     /// M, by rows.
     pub matrix: [[f64; 3]; 3],
@@ -38,29 +38,32 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// Refuses what is no profile, with the reason.
+    /// Checks the profile.
     ///
     /// # Errors
-    /// A number is not finite or beyond reason, the rows of the matrix do not keep grey, or a channel falls.
+    /// A number is not finite or exceeds its limit, the rows of the matrix do not preserve grey, or a channel
+    /// decreases.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn check(&self) -> Result<(), String> {
         if self.pairs == 0 {
-            return Err("it was fitted to 0 pairs; it takes one at least".to_owned());
+            return Err("it was fitted to 0 pairs; it needs at least one".to_owned());
         }
         let numbers = self.matrix.iter().flatten().chain(&self.gain).chain(&self.bias);
-        // Positive phrasing: a NaN fails the tests too.
+        // Written so that a NaN fails.
         let beyond = |number: &&f64| {
             let is_usable = number.abs() <= LARGEST;
             !is_usable
         };
         if let Some(number) = numbers.chain(self.segments.iter().flatten()).find(beyond) {
-            return Err(format!("it holds {number}; every number must be within {LARGEST} of 0"));
+            return Err(format!(
+                "it contains {number}; every number must be within {LARGEST} of 0"
+            ));
         }
         for (channel, name) in ["red", "green", "blue"].into_iter().enumerate() {
             let (sum, gain) = (self.matrix[channel].iter().sum::<f64>(), self.gain[channel]);
             if (sum - 1.0).abs() > ROUNDING {
                 return Err(format!(
-                    "the weights of {name} in `matrix` sum to {sum:.4}; a row must sum to 1, its strength is the gain"
+                    "the weights of {name} in `matrix` sum to {sum:.4}; a row must sum to 1; scale with `gain`"
                 ));
             }
             if gain <= 0.0 {
@@ -73,7 +76,7 @@ impl Profile {
             }
             if let Some(pair) = values.windows(2).find(|pair| pair[1] < pair[0]) {
                 return Err(format!(
-                    "the segments of {name} fall from {} to {}; they must not",
+                    "the segments of {name} fall from {} to {}; they must not decrease",
                     pair[0], pair[1]
                 ));
             }
@@ -84,20 +87,20 @@ impl Profile {
         Ok(())
     }
 
-    /// What a score of its results is to be called.
+    /// The label of scores with this profile.
     pub(crate) fn label(&self) -> String {
         let Self { reference, pairs, .. } = self;
         let pairs = if *pairs == 1 { "a pair".to_owned() } else { format!("{pairs} pairs") };
         format!("a camera profile of {pairs} of {reference}")
     }
 
-    /// The colour, in [0, 1], of k x.
+    /// The colour of k x, in [0, 1].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn value(&self, t: [f64; 3]) -> [f64; 3] {
         profiled(t, &self.numbers())
     }
 
-    /// (3, `PROFILE_WIDTH`) numbers as the kernel takes them.
+    /// (3, `PROFILE_WIDTH`) numbers for the kernel.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn rows(&self) -> Vec<f32> {
         self.numbers().into_iter().map(|number| number as f32).collect()
@@ -114,7 +117,7 @@ impl Profile {
     }
 }
 
-/// The colour that a profile makes of t = k x, in [0, 1]; `profile` is (3, `PROFILE_WIDTH`).
+/// The colour of t = k x under a profile, in [0, 1]; `profile` is (3, `PROFILE_WIDTH`).
 pub(crate) fn profiled<T: Real>(t: [T; 3], profile: &[T]) -> [T; 3] {
     let [zero, one] = [0.0, 1.0].map(T::of);
     let unit = |x: T| x.at_least(zero).at_most(one);
@@ -135,7 +138,7 @@ pub(crate) fn profiled<T: Real>(t: [T; 3], profile: &[T]) -> [T; 3] {
 mod tests {
     use super::*;
 
-    /// Mixes channels a little, and bends each in its own way.
+    /// A profile that mixes channels a little, and bends each differently.
     fn bent() -> Profile {
         let segments = [0.8, 1.0, 1.3]
             .map(|power: f64| (0..=16).map(|i| (f64::from(i) / 16.0).powf(power)).collect());
@@ -150,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn a_profile_is_straight_between_its_values_and_keeps_to_its_ends() {
+    fn a_profile_is_linear_between_its_values_and_constant_beyond_its_ends() {
         let mut profile = bent();
         profile.matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
         (profile.gain, profile.bias) = ([1.0; 3], [0.0; 3]);
@@ -168,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_profile_is_named() {
+    fn an_invalid_profile_is_refused_with_the_reason() {
         let refused = |change: fn(&mut Profile), part: &str| {
             let mut profile = bent();
             change(&mut profile);

@@ -1,11 +1,11 @@
-//! The numbers that a curve is written for once: f32 as the shaders compute, f64 to compare with, and dual numbers,
-//! whose derivative is exact.
+//! The number types of the curves' formulas: f32 as in the shaders, f64 as the reference, and dual numbers, whose
+//! derivatives are exact.
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
 use crate::kernels::curves::LARGEST_T;
 
-/// What the formulas of the curves need of a number.
+/// The functions that the formulas of the curves require.
 pub trait Real:
     Copy
     + PartialOrd
@@ -23,7 +23,7 @@ pub trait Real:
     fn one_minus_exp(self) -> Self;
     /// ln(1 + x) without cancellation.
     fn ln_1p(self) -> Self;
-    /// x^p for x > 0; 0 for every other x.
+    /// x^p for x > 0; 0 otherwise.
     fn power(self, p: Self) -> Self;
     /// The square root.
     fn sqrt(self) -> Self;
@@ -47,7 +47,7 @@ pub trait Real:
     }
 }
 
-/// What the primitive floats have of their own.
+/// The functions of the primitive floats.
 macro_rules! standard_functions {
     () => {
         fn exp(self) -> Self {
@@ -72,7 +72,7 @@ impl Real for f32 {
     fn of(x: f64) -> Self {
         x as Self
     }
-    /// The shader's way.
+    /// As in the shader.
     fn one_minus_exp(self) -> Self {
         if self < 0.01 {
             self * (1.0 - self * (0.5 - self * (1.0 / 6.0)))
@@ -195,7 +195,7 @@ impl Real for Dual {
     }
 }
 
-/// What lies outside (0, [`LARGEST_T`]), or is no number, counts as the end it is at, a NaN as black.
+/// Clamps to (0, [`LARGEST_T`]); a NaN counts as black.
 pub(crate) fn within<T: Real>(t: T) -> T {
     if t > T::of(0.0) { t.at_most(T::of(LARGEST_T)) } else { T::of(0.0) }
 }
@@ -204,9 +204,9 @@ pub(crate) fn within<T: Real>(t: T) -> T {
 mod tests {
     use super::Real;
 
-    /// As a difference from 1 it would be off by a thousandth of itself where it is small.
+    /// The difference from 1 would have a relative error of a thousandth for small arguments.
     #[test]
-    fn one_minus_exp_is_exact_to_a_few_roundings_where_it_is_small_too() {
+    fn one_minus_exp_has_few_roundings_for_small_arguments_too() {
         for i in 0..4000 {
             let x = 1e-8 * 1.006_f32.powi(i);
             let (single, double) = (x.one_minus_exp(), f64::from(x).one_minus_exp());

@@ -1,4 +1,4 @@
-//! A curve with all its constants, as the command line, TOML files and run directories give it.
+//! A curve with all its constants, as on the command line, in TOML files and in run directories.
 
 use std::any::Any;
 use std::collections::BTreeMap;
@@ -14,55 +14,55 @@ use super::{Profile, Statistics, Table, ToneCurve, ToneParameters};
 use crate::base::settings::{self, Rule, Setting};
 use crate::{Error, Result};
 
-/// lambda where none is given: the references of views keep more colour than single curves leave.
+/// lambda by default: the reference images keep more of the colours than single curves do.
 const COLOUR: f64 = 1.0 / 3.0;
 
-/// A shape that passes this near p90 has a pole there.
+/// A larger value of a shape indicates a pole near p90.
 const LARGEST_SHAPE: f64 = 1e8;
 
-/// A curve and its constants; what a photograph adds to them are its percentiles and means.
+/// A curve and its constants; percentiles and means are added per photograph.
 ///
-/// In TOML everything but `curve` may be left out; where there are `[constants]`, all of the family's must be there.
+/// In TOML, everything except `curve` is optional; `[constants]`, if present, must have all of the family's.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "SerializedToneSettings", into = "SerializedToneSettings")]
 pub struct ToneSettings {
     /// The family.
     pub curve: ToneCurve,
-    /// c: how much a brighter photograph raises the gain.
+    /// c: the gain per mean luminance of the photograph.
     pub gain_c: f64,
-    /// theta: the mean over all channels that the linear curve aims at, before clipping.
+    /// theta: the target mean of the linear curve over all channels, before clipping.
     pub theta: f64,
     /// alpha: the highest black level.
     pub alpha: f64,
-    /// beta: how fast the black level falls as p10 approaches p90; 0: it is alpha for every photograph.
+    /// beta: how fast the black level falls as p10 approaches p90; 0: alpha for every photograph.
     pub beta: f64,
-    /// g0: the gain of ASE on a black photograph.
+    /// g0: the gain of ASE for a black photograph.
     pub base_gain: f64,
-    /// Whether one curve serves a scene: its statistics are the means over the training views, its gain that of all of
-    /// them together.
+    /// Whether one curve is used for a scene: its statistics are the means over the training views, its gain that of
+    /// all of them together.
     pub scene_statistics: bool,
-    /// Whether the gain is solved for the brightness that the photographs ask for: t is k x then, in place of x / white,
-    /// and c and g0 have no say. The automatic curve has no other.
+    /// Whether the gain is solved for a brightness chosen from the photographs: then t is k x instead of x / white, and
+    /// c and g0 are not used. Always set for the automatic curve.
     pub auto_gain: bool,
-    /// The mean luminance of the targets, in place of the one that is found.
+    /// The mean luminance of the targets; by default chosen from the photographs.
     pub brightness: Option<f64>,
-    /// lambda: how much of the automatic curve keeps the ratios of the channels.
+    /// lambda: the share of the automatic curve that keeps the ratios of the channels.
     pub colour: f64,
-    /// Whether a photograph is lifted at its own size and shrunk behind that. References were shrunk behind their own tone
+    /// Whether a photograph is tone-mapped before it is resized. Reference images were resized after their own tone
     /// curve, and the mean of a curve is not the curve of a mean.
     pub full_resolution: bool,
     /// The family's constants in the order of its formula.
     pub constants: Vec<f64>,
     /// The values of [`ToneCurve::Table`].
     pub table: Option<Table>,
-    /// What [`ToneCurve::Profile`] is made of.
+    /// The profile of [`ToneCurve::Profile`].
     pub profile: Option<Profile>,
 }
 
-/// What the kernels can compute with, in 32 bits.
+/// Largest value for the kernels, which compute in 32 bits.
 const MOST: f64 = 1e30;
 
-/// Settings that belong to a curve: they do not outlast the choice of another one.
+/// Settings that belong to a curve: choosing another curve resets them.
 pub(crate) const OF_CURVE: [&str; 8] =
     ["gain_c", "alpha", "auto_gain", "colour", "full_resolution", "constants", "table", "profile"];
 
@@ -83,37 +83,39 @@ impl ToneSettings {
     /// A row for each setting.
     pub(crate) const SETTINGS: &'static [Setting] = settings::settings! { rows "tone."
         /// The tone curve: a name that `nightsplat tone list` lists.
-        curve => Rule::Text("a curve that `nightsplat tone list` lists", |name| name.parse::<ToneCurve>().is_ok()), "--curve NAME|FILE";
-        /// c: how much a brighter photograph raises the curve's gain.
+        curve => Rule::Text("a curve that `nightsplat tone list` lists", |name| name.parse::<ToneCurve>().is_ok()),
+           "--curve NAME|FILE";
+        /// c: the gain per mean luminance of the photograph.
         gain_c, "the curve's" => Rule::from_to(0.0, MOST), "--gain C|auto";
         /// Target mean of the curve linear over all channels, before clipping.
         theta => Rule::above(0.0, MOST), "--theta T";
         /// alpha: the highest black level.
         alpha, "the curve's" => Rule::SHARE;
-        /// beta: how fast the black level falls as p10 approaches p90; 0: it is alpha for every photograph.
+        /// beta: how fast the black level falls as p10 approaches p90; 0: alpha for every photograph.
         beta => Rule::from_to(0.0, MOST);
-        /// g0: the gain of ASE on a black photograph.
+        /// g0: the gain of ASE for a black photograph.
         base_gain => Rule::above(0.0, MOST);
-        /// One curve serves a scene: its statistics are the means over the training views, its gain that of all of them.
+        /// Use one curve for a scene: its statistics are the means over the training views, its gain that of all of
+        /// them together.
         scene_statistics => Rule::Flag;
-        /// The gain is the one that the photographs ask for, and c and g0 have no say. The curve auto has no other.
+        /// Choose the gain from the photographs; c and g0 are then not used. Always on for the curve auto.
         auto_gain, "the curve's" => Rule::Flag;
         /// Mean luminance of the targets, with an automatic gain.
         brightness, "chosen between 0.44 and 0.54" => Rule::from_to(0.1, 0.9), "--brightness T";
         /// Share of the curve auto that keeps the ratios of the channels.
         colour => Rule::SHARE, "--colour L";
-        /// A photograph is lifted at its own size and shrunk after that.
+        /// Tone-map photographs before they are resized.
         full_resolution, "as auto_gain" => Rule::Flag;
         /// The constants of the curve's formula, by name.
         constants, "the curve's" => Rule::Table("a table with every constant of the curve");
-        /// The values of the curve `table`, as --curve reads them from a .csv or .cube file.
+        /// The values of the curve `table`, read by --curve from a .csv or .cube file.
         table, "none" => Rule::Table("a table of values");
-        /// The camera profile of the curve `profile`, as --profile reads it.
+        /// The camera profile of the curve `profile`, read by --profile.
         profile, "none" => Rule::Table("a camera profile");
     };
 
-    /// The family's constants, and the paper's for LOM; c is 3 for ASE and 1 for AP3. The automatic curve lifts before
-    /// photographs are shrunk, the others behind it.
+    /// A curve with its default constants, those of the paper for LOM; c is 3 for ASE and 1 for AP3. The automatic
+    /// curve is applied before photographs are resized, the others after.
     pub fn new(curve: ToneCurve) -> Self {
         let family = curve.family();
         let is_auto = curve == ToneCurve::Auto;
@@ -136,8 +138,8 @@ impl ToneSettings {
         }
     }
 
-    /// Another curve with its own constants, c and alpha; theta, beta, g0, brightness and the choice of statistics stay. The
-    /// same curve keeps everything.
+    /// Another curve with its own constants, c and alpha; theta, beta, g0, brightness and the kind of statistics are
+    /// kept. The same curve keeps everything.
     #[must_use]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn with_curve(&self, curve: ToneCurve) -> Self {
@@ -148,7 +150,7 @@ impl ToneSettings {
         Self { theta, beta, base_gain, scene_statistics, brightness, ..Self::new(curve) }
     }
 
-    /// The same curve with another gain. One that the photographs ask for belongs to photographs at their own size.
+    /// The same curve with another gain. An automatic gain implies full resolution.
     #[must_use]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn with_gain(self, gain: GainChoice) -> Self {
@@ -161,13 +163,13 @@ impl ToneSettings {
         }
     }
 
-    /// The same with every number as the shortest decimal that is the same number to the kernels, which compute in 32 bits.
+    /// The settings with every number as the shortest decimal that has the same f32, the precision of the kernels.
     #[must_use]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn rounded(self) -> Self {
         let round = |value: f64| {
             let single = value as f32;
-            // Of no consequence to a kernel, and hundreds of digits long.
+            // Without effect in a kernel, and hundreds of digits long.
             let single = if single.is_subnormal() { 0.0 } else { single };
             single.to_string().parse().unwrap_or(value)
         };
@@ -190,21 +192,21 @@ impl ToneSettings {
         Self { table: Some(table), ..Self::new(ToneCurve::Table) }
     }
 
-    /// The curve of a camera profile, which follows the exposure of the photographs as the automatic curve does.
+    /// The curve of a camera profile, which follows the exposure of the photographs like the automatic curve.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn of_profile(profile: Profile) -> Self {
         Self { profile: Some(profile), ..Self::new(ToneCurve::Profile) }
     }
 
-    /// What the targets know of reference images, where they know any: results are labelled with it.
+    /// What the targets take from reference images, if anything; results are labelled with it.
     pub(crate) fn knows_references(&self) -> Option<String> {
         self.profile.as_ref().map(Profile::label)
     }
 
-    /// Refuses constants that leave a curve undefined, decreasing or above white at black.
+    /// Checks the constants: the curve must be defined, and its black level within [0, 1].
     ///
     /// # Errors
-    /// [`Error::Setting`], and [`Error::Usage`] for what does not go together.
+    /// [`Error::Setting`], and [`Error::Usage`] for settings that exclude each other.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn check(&self) -> Result<()> {
         let values: [(&str, &dyn Any); 7] = [
@@ -222,7 +224,7 @@ impl ToneSettings {
         self.check_gain().and_then(|()| self.check_constants()).map_err(Error::Usage)
     }
 
-    /// Whether what sets the brightness goes together.
+    /// Checks the settings of brightness against each other.
     fn check_gain(&self) -> Result<(), String> {
         let name = self.curve.name();
         let has_gain = self.curve.is_formula() && self.curve != ToneCurve::None;
@@ -243,13 +245,13 @@ impl ToneSettings {
         let is_exposed = matches!(self.curve, ToneCurve::Auto | ToneCurve::Profile);
         if self.auto_gain && !is_exposed && !has_gain {
             return Err(format!(
-                "the curve `{name}` has no gain that could be solved for; name `auto`, `ase` or `ap3`"
+                "the curve `{name}` has no automatic gain; use `auto`, `ase` or `ap3`"
             ));
         }
         if self.brightness.is_some() && !self.takes_exposure() {
             return Err(format!(
-                "the curve `{name}` has the brightness that its gain gives it; tone.brightness is for a gain that is \
-                 automatic"
+                "the brightness of the curve `{name}` follows from its gain; tone.brightness requires an \
+                 automatic gain"
             ));
         }
         Ok(())
@@ -289,20 +291,20 @@ impl ToneSettings {
                 ));
             }
         }
-        // Positive phrasing: a NaN fails the test too.
+        // Written so that a NaN fails.
         let is_defined = |t: f64| family.shape(t, &self.constants).abs() <= LARGEST_SHAPE;
         let undefined = (0..=1000).map(|i| f64::from(i) * 0.01).find(|&t| !is_defined(t));
         match undefined {
             Some(t) => Err(format!(
-                "the constants of `{name}` leave it undefined at t = {t}; its formula is {}",
+                "`{name}` is undefined at t = {t} with these constants; its formula is {}",
                 family.formula
             )),
             None => Ok(()),
         }
     }
 
-    /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90. The automatic curve has alpha for
-    /// every photograph.
+    /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90. For the automatic curve it is
+    /// alpha.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn offset(&self, ratio: f64) -> f64 {
         if self.curve == ToneCurve::Auto {
@@ -312,8 +314,7 @@ impl ToneSettings {
         }
     }
 
-    /// The curve that these settings give a photograph with these statistics; where the gain follows from the exposure, it
-    /// is another ([`Self::tone_mapping`]).
+    /// The curve of a photograph with these statistics; with an automatic gain, use [`Self::tone_mapping`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn parameters(&self, statistics: &Statistics) -> ToneParameters {
         if self.curve == ToneCurve::Profile {
@@ -341,7 +342,7 @@ impl ToneSettings {
         }
     }
 
-    /// The value that t = 1 stands for.
+    /// The value that t = 1 corresponds to.
     pub(crate) fn white(&self) -> White {
         match &self.table {
             Some(table) => table.input.white(),
@@ -350,9 +351,8 @@ impl ToneSettings {
         }
     }
 
-    /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics; of a table of three channels, and of a
-    /// profile, green.
-    /// `lum_preserve` and `per_channel` are shown as they map grey.
+    /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics. A table of three channels, or a
+    /// profile, is evaluated for green, `lum_preserve` and `per_channel` for grey.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn value(&self, t: f64, statistics: &Statistics) -> f64 {
         let grey = Statistics { channel_means: [statistics.mean; 3], ..*statistics };
@@ -361,7 +361,7 @@ impl ToneSettings {
             white = constants[0];
         }
         let t = match self.curve {
-            // As it is without a scene that says k: over k x.
+            // Without a scene that determines k: a function of k x.
             ToneCurve::Auto | ToneCurve::Profile => t,
             _ => t * f64::from(statistics.p90) / f64::from(white),
         };
@@ -372,7 +372,7 @@ impl ToneSettings {
         }
     }
 
-    /// Statistics that leave a curve as its formula has it: no black level, gain 1, and t = 1 where it has white.
+    /// Statistics for the plain formula of a curve: no black level, gain 1, and t = 1 at its white.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn plain_statistics(&self) -> Statistics {
         let theta = self.theta as f32;
@@ -381,12 +381,12 @@ impl ToneSettings {
     }
 }
 
-/// What `--gain` says.
+/// The value of `--gain`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum GainChoice {
-    /// The gain that the photographs ask for.
+    /// A gain chosen from the photographs.
     Auto,
-    /// c: how much a brighter photograph raises the gain.
+    /// c: the gain per mean luminance of the photograph.
     C(f64),
 }
 
@@ -400,7 +400,7 @@ impl FromStr for GainChoice {
         let number = text.parse();
         number
             .map(Self::C)
-            .map_err(|_| Error::Usage(format!("`{text}` is no gain; a number, or auto")))
+            .map_err(|_| Error::Usage(format!("`{text}` is not a gain; use a number, or auto")))
     }
 }
 
@@ -410,12 +410,12 @@ impl Default for ToneSettings {
     }
 }
 
-/// The settings as TOML has them.
+/// The settings in TOML.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SerializedToneSettings {
     curve: Option<ToneCurve>,
-    /// What `curve` was called once.
+    /// The former name of `curve`.
     #[serde(skip_serializing)]
     family: Option<ToneCurve>,
     gain_c: Option<f64>,
@@ -454,7 +454,7 @@ impl TryFrom<SerializedToneSettings> for ToneSettings {
             });
             if written.curve.is_some() {
                 return Err(
-                    "it names its family twice, as `curve` and as `family`; leave `family` out"
+                    "it names its curve twice, as `curve` and as `family`; remove `family`"
                         .to_owned(),
                 );
             }

@@ -1,6 +1,6 @@
-//! What a curve knows of a photograph: percentiles and means.
+//! Statistics of a photograph for its curve: percentiles and means.
 
-/// Added to both percentiles, so that a black photograph divides by something.
+/// Added to both percentiles, which are divisors.
 const EPSILON: f32 = 1e-6;
 
 /// The statistics of one photograph, over all its pixels, on sRGB-encoded values.
@@ -23,7 +23,7 @@ pub struct Statistics {
 }
 
 impl Statistics {
-    /// The statistics of a planar (3, H, W) photograph; of no pixels at all, those of a black one.
+    /// The statistics of a planar (3, H, W) photograph; without pixels, those of a black one.
     pub fn of(planes: &[f32]) -> Self {
         let (red, rest) = planes.split_at(planes.len() / 3);
         let (green, blue) = rest.split_at(red.len());
@@ -47,7 +47,7 @@ impl Statistics {
         }
     }
 
-    /// The mean of each: the statistics of a scene, from those of its training views; none of nothing.
+    /// Mean of each, the statistics of a scene from those of its training views; `None` if empty.
     pub fn mean_of(views: &[Self]) -> Option<Self> {
         let mean = |of: &dyn Fn(&Self) -> f32| {
             let sum: f64 = views.iter().map(|view| f64::from(of(view))).sum();
@@ -63,7 +63,7 @@ impl Statistics {
         })
     }
 
-    /// p10 and p90 as they are, without the 1e-6: what the paper prints.
+    /// p10 and p90 without the added 1e-6, as the paper prints them.
     pub fn percentiles(&self) -> [f64; 2] {
         [self.p10, self.p90].map(|value| (f64::from(value) - f64::from(EPSILON)).max(0.0))
     }
@@ -74,28 +74,28 @@ impl Statistics {
         if p90 > 0.0 { p10 / p90 } else { 1.0 }
     }
 
-    /// r = p10 / p90, in [0, 1]: how little the shadows are crushed.
+    /// r = p10 / p90, in [0, 1]: low if shadows are crushed.
     pub fn ratio(&self) -> f64 {
         (f64::from(self.p10) / f64::from(self.p90)).clamp(0.0, 1.0)
     }
 }
 
-/// BT.601 luminance of an RGB value, of the values as they are.
+/// BT.601 luminance of an RGB value, without linearisation.
 pub(crate) fn luminance([r, g, b]: [f32; 3]) -> f32 {
     0.299 * r + 0.587 * g + 0.114 * b
 }
 
-/// A value the statistics can take: finite, not negative.
+/// A value that the statistics accept: finite and not negative.
 pub(crate) fn measurable(x: f32) -> f32 {
-    // Positive phrasing: a NaN fails it too.
+    // Written so that a NaN fails.
     if x > 0.0 { x.min(65504.0) } else { 0.0 }
 }
 
-/// The `tenths` / 10 quantile of non-negative values, linear between the two neighbours of its rank
-/// as `torch.quantile` has it; reorders the values. 0 of no values.
+/// The `tenths` / 10 quantile of non-negative values, linear between the two neighbours of its rank as in
+/// `torch.quantile`; reorders the values. 0 without values.
 pub fn percentile(values: &mut [f32], tenths: usize) -> f32 {
     let Some(last) = values.len().checked_sub(1) else { return 0.0 };
-    // The rank q (n - 1) is split in integers: in f32 it is wrong beyond 2^24 values.
+    // The rank q (n - 1) is split in integers: in f32 it is inexact beyond 2^24 values.
     let (rank, weight) = (tenths * last / 10, (tenths * last % 10) as f32 / 10.0);
     let (_, &mut lower, above) = values.select_nth_unstable_by(rank, f32::total_cmp);
     let upper = above.iter().copied().min_by(f32::total_cmp).unwrap_or(lower);

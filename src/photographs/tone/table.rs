@@ -7,7 +7,7 @@ use super::families::White;
 use super::law::clamped;
 use super::real::Real;
 
-/// What a table's first column holds.
+/// The meaning of a table's first column.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TableInput {
@@ -27,26 +27,26 @@ impl TableInput {
     }
 }
 
-/// Values of a curve between which it is interpolated by monotone cubics (Fritsch and Carlson 1980); beyond its ends it
-/// is constant.
+/// Values of a curve, interpolated by monotone cubics (Fritsch and Carlson 1980); beyond its ends the curve is
+/// constant.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Table {
-    /// What `x` holds.
+    /// The meaning of `x`.
     #[serde(default)]
     pub input: TableInput,
     /// Ascending, at least two.
     pub x: Vec<f64>,
-    /// The curve's values at `x`, in [0, 1] where they are not to clip: one row for all channels, or one per channel.
+    /// The curve's values at `x`, in [0, 1] unless they clip: one row for all channels, or one per channel.
     pub y: Vec<Vec<f64>>,
 }
 
 impl Table {
-    /// Reads lines of `t,y` or `t,red,green,blue`. A first line of names may say `x` in place of `t`: the table then acts
-    /// on stored values. Blank lines and lines that begin with `#` are passed over.
+    /// Reads lines of `t,y` or `t,red,green,blue`. A first line of names may have `x` instead of `t`: the table then
+    /// acts on stored values. Blank lines and lines that begin with `#` are ignored.
     ///
     /// # Errors
-    /// What is wrong, with the line.
+    /// The problem, with its line.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn from_csv(text: &str) -> Result<Self, String> {
         let mut rows = Rows::default();
@@ -73,7 +73,7 @@ impl Table {
     /// Reads a one-dimensional .cube file; it acts on stored values.
     ///
     /// # Errors
-    /// What is wrong, with the line.
+    /// The problem, with its line.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn from_cube(text: &str) -> Result<Self, String> {
         let mut rows = Rows::default();
@@ -82,13 +82,15 @@ impl Table {
             let cells: Vec<&str> = text.split_whitespace().collect();
             let number = |index: usize| {
                 let cell = cells.get(index).copied().unwrap_or_default();
-                cell.parse::<f64>().map_err(|_| format!("line {line}: `{cell}` is no number"))
+                cell.parse::<f64>().map_err(|_| format!("line {line}: `{cell}` is not a number"))
             };
             match cells[0] {
                 "TITLE" => {}
                 "LUT_1D_SIZE" => size = number(1)? as usize,
                 "LUT_3D_SIZE" => {
-                    return Err(format!("line {line}: a 3D table is no tone curve; save a 1D one"));
+                    return Err(format!(
+                        "line {line}: a 3D table is not a tone curve; save a 1D one"
+                    ));
                 }
                 "DOMAIN_MIN" | "DOMAIN_MAX" => {
                     let bound = number(1)?;
@@ -113,7 +115,7 @@ impl Table {
     pub(super) fn check(&self) -> Result<(), String> {
         if self.x.len() < 2 {
             return Err(format!(
-                "a table of {} values is no curve; give at least two",
+                "a table of {} values is not a curve; give at least two",
                 self.x.len()
             ));
         }
@@ -122,9 +124,9 @@ impl Table {
         }
         let mut values = self.x.iter().chain(self.y.iter().flatten());
         if let Some(value) = values.find(|value| value.is_nan() || value.abs() > 1e30) {
-            return Err(format!("a table holds {value}; every value must be finite"));
+            return Err(format!("a table contains {value}; every value must be finite"));
         }
-        // Also as the device has them.
+        // Also in f32, as on the device.
         match self.x.windows(2).find(|pair| pair[0] as f32 >= pair[1] as f32) {
             Some(pair) => Err(format!(
                 "the first column of a table must ascend, but {} follows {}; sort it",
@@ -134,7 +136,7 @@ impl Table {
         }
     }
 
-    /// (3, K) knots (x, y, slope) as the kernel takes them.
+    /// (3, K) knots (x, y, slope) for the kernel.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn knots(&self) -> Vec<Vec3> {
         let channels = (0..3).map(|channel| self.channel(channel));
@@ -144,7 +146,7 @@ impl Table {
             .collect()
     }
 
-    /// The table at `x`, in [0, 1], of a channel from 0 to 2.
+    /// The table at `x`, in [0, 1], for a channel from 0 to 2.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn value(&self, x: f64, channel: usize) -> f64 {
         clamped(interpolate(&self.channel(channel), x))
@@ -160,7 +162,7 @@ impl Table {
 /// The cubic Hermite curve through knots (x, y, slope); beyond the ends it is constant.
 pub(crate) fn interpolate<T: Real>(knots: &[[T; 3]], x: T) -> T {
     let [first, last] = [knots[0], knots[knots.len() - 1]];
-    // Positive phrasing: a NaN counts as the lower end.
+    // Written so that a NaN counts as the lower end.
     let x = if x > first[0] { x.at_most(last[0]) } else { first[0] };
     let upper = knots.partition_point(|knot| knot[0] <= x).min(knots.len() - 1);
     let ([x0, y0, d0], [x1, y1, d1]) = (knots[upper - 1], knots[upper]);
@@ -172,7 +174,7 @@ pub(crate) fn interpolate<T: Real>(knots: &[[T; 3]], x: T) -> T {
     y0 + rise * s + s * left * (a * left + b * s)
 }
 
-/// The lines that say something, with their number from 1.
+/// The lines with content, with their numbers from 1.
 fn content(text: &str) -> impl Iterator<Item = (usize, &str)> {
     let lines = text.trim_start_matches('\u{feff}').lines().map(str::trim);
     (1..).zip(lines).filter(|(_, line)| !line.is_empty() && !line.starts_with('#'))
@@ -185,18 +187,18 @@ struct Rows {
 }
 
 impl Rows {
-    /// Takes a line of numbers; the first is the input where `x` does not give it.
+    /// Reads a line of numbers; the first is the input unless `x` is given.
     fn push(&mut self, line: usize, cells: &[&str], x: Option<f64>) -> Result<(), String> {
         let number = |cell: &&str| {
             let value = cell.parse::<f64>().ok().filter(|value| value.is_finite());
-            value.ok_or_else(|| format!("line {line}: `{cell}` is no number"))
+            value.ok_or_else(|| format!("line {line}: `{cell}` is not a number"))
         };
         let mut numbers = cells.iter().map(number).collect::<Result<Vec<f64>, _>>()?;
         let x = x.unwrap_or_else(|| numbers.remove(0));
         if !matches!(numbers.len(), 1 | 3) || (!self.y.is_empty() && self.y.len() != numbers.len())
         {
             return Err(format!(
-                "line {line}: {} values; one, or red, green and blue, are needed, in every line alike",
+                "line {line}: {} values; every line needs one, or red, green and blue",
                 numbers.len()
             ));
         }

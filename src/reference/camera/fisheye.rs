@@ -4,23 +4,24 @@ use glam::{DVec2, DVec3};
 
 use super::ImagePoint;
 
-/// What is seen at the angle t off the axis lies `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)` from the principal point.
+/// A point at the angle t off the axis is at the distance `t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)` from the
+/// principal point.
 #[derive(Clone, Debug)]
 pub struct Fisheye {
     /// k1 to k4.
     pub distortion: [f64; 4],
-    /// Nothing is seen so far off the axis or farther, radians.
+    /// Points at this angle off the axis or more are not seen, radians.
     pub largest_angle: f64,
 }
 
-/// A point in polar coordinates, and what the polynomial makes of its angle.
+/// A point in polar coordinates, with its distorted radius.
 struct Ray {
     distance: f64,
     across: DVec2,
     sine: f64,
     cosine: f64,
     radius: f64,
-    /// The first two derivatives of the radius by the angle.
+    /// The first two derivatives of the radius with respect to the angle.
     slope: f64,
     bend: f64,
     /// radius / sine, and its derivative.
@@ -41,15 +42,15 @@ impl Fisheye {
         let (sine, cosine) = (off_axis / distance, point.z / distance);
         let t = off_axis.atan2(point.z);
         let power = |exponent: usize| t.powi(exponent as i32);
-        // The derivative of 1 + k1 t^2 + .. times t to a power, of an order: terms with their factors.
+        // The derivative of an order of 1 + k1 t^2 + .., times a power of t: terms with their factors.
         let sum = |factor: &dyn Fn(f64) -> f64, less: usize| -> f64 {
             let terms = self.distortion.iter().zip(1..);
             terms.map(|(k, i)| k * factor((2 * i + 1) as f64) * power(2 * i + 1 - less)).sum()
         };
         let factor = 1.0 + sum(&|_| 1.0, 1);
         let ratio = if sine > 0.0 { t / sine } else { 1.0 };
-        // t / sin t = 1 + t^2 / 6 + 7 t^4 / 360 + 31 t^6 / 15120 + ..., whose derivative near the axis cancels in
-        // closed form.
+        // t / sin t = 1 + t^2 / 6 + 7 t^4 / 360 + 31 t^6 / 15120 + ...; near the axis, the closed form of its
+        // derivative cancels.
         let d_ratio = if t < 0.02 {
             t / 3.0 + 7.0 / 90.0 * power(3) + 31.0 / 2520.0 * power(5)
         } else {
@@ -78,7 +79,7 @@ impl Fisheye {
         ImagePoint { at: radius * n, jacobian: [row(DVec2::X), row(DVec2::Y)] }
     }
 
-    /// By distance, angle and turn about the axis.
+    /// With respect to distance, angle and azimuth.
     pub(super) fn backward(&self, point: DVec3, d_place: DVec2, d_rows: [DVec3; 2]) -> DVec3 {
         let ray = self.ray(point);
         let n = ray.across;
@@ -99,7 +100,7 @@ impl Fisheye {
         d_xy.extend(by_distance * cosine - by_angle * sine) / (distance * distance)
     }
 
-    /// By k1 to k4.
+    /// With respect to k1 to k4.
     #[cfg(feature = "testing")]
     pub(super) fn distortion_backward(
         &self,

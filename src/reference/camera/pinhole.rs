@@ -7,14 +7,14 @@ use super::ImagePoint;
 /// x / z and y / z.
 #[derive(Clone, Debug)]
 pub struct Pinhole {
-    /// Where the Jacobian of the projection is taken at the least.
+    /// The lower bound of x / z and y / z for the Jacobian of the projection.
     pub min_slope: DVec2,
-    /// And at the most.
+    /// The upper bound.
     pub max_slope: DVec2,
 }
 
 impl Pinhole {
-    /// x / z and y / z, no farther than the Jacobian is taken.
+    /// x / z and y / z, clamped to the bounds of the Jacobian.
     pub fn clamped_slope(&self, point: DVec3) -> DVec2 {
         let slope = point.truncate() / point.z;
         slope.max(self.min_slope).min(self.max_slope)

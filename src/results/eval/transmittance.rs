@@ -1,7 +1,7 @@
-//! Leftover transmittance: how much of the background a model lets through.
+//! Residual transmittance: how much of the background a model lets through.
 //!
-//! A dark surface needs no Gaussians before a black background, and neither a loss nor a score tells the hole from the surface.
-//! What the blend leaves of the light behind it does: the product of 1 - alpha over all splats of a pixel.
+//! Over a black background, a dark surface needs no Gaussians, and neither loss nor score tells a hole from a dark
+//! surface. The residual transmittance of the blend does: the product of 1 - alpha over all splats of a pixel.
 
 use serde::Serialize;
 
@@ -10,21 +10,22 @@ use crate::Result;
 use crate::photographs::dataset::{Dataset, View};
 use crate::train::{Background, Rendered};
 
-/// More in the mean over a view is a hole. No view of a model of a real scene leaves more than .095, after 400 to 3 500 steps before
+/// A view with a higher mean has a hole. No view of a model of a real scene exceeds 0.095 after 400 to 3 500 steps over
 /// black (docs/benchmarks.md).
 pub const MAX_RESIDUAL_TRANSMITTANCE: f64 = 0.1;
 
-/// The leftover transmittance of a view, 0 where the model is opaque, 1 where nothing is.
+/// The residual transmittance of a view: 0 if the model is opaque, 1 if it is empty.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ResidualTransmittance {
-    /// Over the pixels that count.
+    /// Mean over the unmasked pixels.
     pub mean: f64,
-    /// The 99 % quantile over these pixels.
+    /// The 99 % quantile of these pixels.
     pub q99: f64,
 }
 
 impl ResidualTransmittance {
-    /// That of a view's render, over the pixels that its mask shows; none where there are none, or it is no render.
+    /// Residual transmittance of a render over the pixels that the view's mask keeps; `None` without any, or if the
+    /// image is not a render.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn of(rendered: &Rendered, view: &View) -> Option<Self> {
         let mut counted = rendered.transmittances.clone()?;
@@ -36,7 +37,7 @@ impl ResidualTransmittance {
         Self::of_pixels(&mut counted)
     }
 
-    /// Sorts them in part.
+    /// Partially sorts `pixels`.
     fn of_pixels(pixels: &mut [f32]) -> Option<Self> {
         let rank = (99 * pixels.len()).div_ceil(100).checked_sub(1)?;
         let mean = pixels.iter().copied().map(f64::from).sum::<f64>() / pixels.len() as f64;
@@ -44,7 +45,7 @@ impl ResidualTransmittance {
         Some(Self { mean, q99: (*q99).into() })
     }
 
-    /// The mean of each over several views; none of none.
+    /// The mean of each over several views; `None` if there are none.
     pub(crate) fn mean(views: impl Iterator<Item = Self>) -> Option<Self> {
         let (mut sum, mut count) = (Self { mean: 0.0, q99: 0.0 }, 0);
         for Self { mean, q99 } in views {
@@ -55,8 +56,8 @@ impl ResidualTransmittance {
     }
 }
 
-/// What to say of the views of a model that was trained before `background`: one line on the one with the largest hole, and
-/// a remedy; none where every view has at most [`MAX_RESIDUAL_TRANSMITTANCE`].
+/// A warning about the view with the largest hole, with a remedy, for a model trained over `background`; `None` if no
+/// view exceeds [`MAX_RESIDUAL_TRANSMITTANCE`].
 pub fn hole_warning<'a>(
     views: impl IntoIterator<Item = (&'a str, ResidualTransmittance)>,
     background: Background,
@@ -68,13 +69,13 @@ pub fn hole_warning<'a>(
     let (name, worst) = open.clone().max_by(|(_, a), (_, b)| a.mean.total_cmp(&b.mean))?;
     let cause = match background {
         Background::Black => {
-            "what is dark can stay empty before black; train with `--background random`"
+            "dark surfaces can stay empty over black; train with `--background random`"
         }
-        Background::Random => "no photograph shows what is there; take some that do",
+        Background::Random => "no photograph shows this area; take some that do",
     };
     Some(format!(
-        "view {name}: {:.0} % of the background shows through the model (above {:.0} % in {} of {} views): {cause}, or mask what \
-         is to stay empty",
+        "view {name}: {:.0} % of the background shows through the model (above {:.0} % in {} of {} views): {cause}, or \
+         mask what is to stay empty",
         100.0 * worst.mean,
         100.0 * MAX_RESIDUAL_TRANSMITTANCE,
         open.count(),
@@ -82,8 +83,8 @@ pub fn hole_warning<'a>(
     ))
 }
 
-/// Warns of holes in what was scored of a model that was trained before `background`; where nothing was, in some of its
-/// training views, which `render` draws.
+/// Warns of holes in the scored views of a model that was trained over `background`; without scored views, in some of
+/// the training views, which `render` renders.
 ///
 /// # Errors
 /// Those of `render`.
@@ -93,7 +94,7 @@ pub fn warn_of_holes(
     background: Background,
     mut render: impl FnMut(&View) -> Result<Rendered>,
 ) -> Result<()> {
-    /// The number of training views that are looked at, evenly spread.
+    /// The maximum number of training views to render, evenly spread.
     const MOST: usize = 8;
     let own = |view: &ViewScore| Some((view.name.clone(), view.residual_transmittance?));
     let mut residual_transmittances: Vec<(String, ResidualTransmittance)> =
@@ -117,7 +118,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_mean_and_the_99_percent_quantile_are_of_the_pixels() {
+    fn residual_transmittance_has_the_mean_and_the_99_percent_quantile_of_the_pixels() {
         let mut pixels: Vec<f32> = (0..200).rev().map(|k| k as f32 / 256.0).collect();
         let residual_transmittance = ResidualTransmittance::of_pixels(&mut pixels).unwrap();
         // 198 of 200 have at most 197 / 256.
@@ -139,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn the_worst_view_is_named_once_with_what_helps() {
+    fn the_warning_names_the_worst_view_and_a_remedy() {
         let residual_transmittance = |mean| ResidualTransmittance { mean, q99: 1.0 };
         let views = [
             ("a", residual_transmittance(0.3)),

@@ -1,6 +1,7 @@
-//! Binary glTF with `KHR_gaussian_splatting`: every number as it was trained. Source: the extension's text.
+//! Binary glTF with `KHR_gaussian_splatting`, at full precision. Source: the text of the extension.
 //!
-//! The axes are OpenGL's, and the coefficients turn with them: not every reader turns what a node would.
+//! The axes are OpenGL's, and the coefficients are rotated with them: not every reader rotates coefficients with a
+//! node.
 
 use serde_json::{Map, Value, json};
 
@@ -12,17 +13,17 @@ use crate::{Error, Result};
 const FLOAT: u32 = 5126;
 const EXTENSION: &str = "KHR_gaussian_splatting";
 
-/// One attribute: its name, its type, and the numbers.
+/// One attribute: name, type and values.
 struct Plane {
     name: String,
     kind: &'static str,
     values: Vec<f32>,
 }
 
-/// The file.
+/// Encodes a model.
 ///
 /// # Errors
-/// [`Error::Usage`]: it would pass four gigabytes, the most that the format has.
+/// [`Error::Usage`] if the file would exceed 4 GiB, the limit of the format.
 pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>> {
     let gaussians = half_turn(gaussians);
     let planes = planes(&gaussians);
@@ -54,7 +55,7 @@ fn planes(gaussians: &Gaussians) -> Vec<Plane> {
     let opacity: Vec<f32> = gaussians.raw_opacities().iter().map(|&raw| sigmoid(raw)).collect();
     let rotation =
         gaussians.quats().iter().map(|&quat| unit(quat)).flat_map(|[w, x, y, z]| [x, y, z, w]);
-    // What a reader without the extension shows as points, in the linear light of glTF.
+    // Point colours for readers without the extension, in the linear light of glTF.
     let seen = |dc: f32| linear_from_srgb((0.5 + SH_C0 * dc).clamp(0.0, 1.0));
     let colors = gaussians.dc().iter().zip(&opacity);
     let colors = colors.flat_map(|(dc, &opacity)| [seen(dc.x), seen(dc.y), seen(dc.z), opacity]);
@@ -92,7 +93,7 @@ fn description(gaussians: &Gaussians, planes: &[Plane], provenance: &Provenance)
         attributes.insert(name.clone(), index.into());
         offset += bytes;
     }
-    // glTF asks for the bounds of positions.
+    // glTF requires the bounds of positions.
     let bound = |start: f32, pick: fn(f32, f32) -> f32| {
         let all = gaussians.means().iter().map(|mean| mean.to_array());
         let bound = all.fold([start; 3], |a, b| [0, 1, 2].map(|axis| pick(a[axis], b[axis])));
@@ -134,7 +135,7 @@ mod tests {
     use crate::results::export::tests::drawn;
 
     #[test]
-    fn every_attribute_is_where_the_description_says() {
+    fn every_attribute_is_at_the_stated_place() {
         for degree in 0..=3 {
             let model = drawn(9, degree);
             let provenance = Provenance { dataset: "chair".into(), ..Provenance::default() };

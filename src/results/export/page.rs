@@ -1,7 +1,7 @@
-//! One page with the model, a viewer for it and pictures to compare with: opens from disk, needs nothing but WebGL 2.
+//! One page with the model, its viewer, and images to compare with. It opens from disk and needs only WebGL 2.
 //!
-//! The viewer projects, shades and blends as the kernels do, so that a test view on the page is the render of `eval` but for
-//! the half floats that the page holds.
+//! The viewer projects, shades and blends as the kernels do: a test view on the page equals the render of `eval` up to
+//! the rounding of the model to half floats.
 
 use glam::DVec3;
 use half::f16;
@@ -17,31 +17,31 @@ use crate::splats::render::RenderSettings;
 use crate::splats::scene::Gaussians;
 use crate::{Error, Result};
 
-/// A bookmark: a camera, and pictures of what it saw.
+/// A bookmark: a camera and images of its view.
 #[derive(Clone, Debug)]
 pub struct Bookmark {
     /// The view's name.
     pub name: String,
-    /// In the coordinates of the Gaussians: a pinhole.
+    /// A pinhole camera in the coordinates of the Gaussians.
     pub camera: Camera,
-    /// Each with what it is.
+    /// Captions and images.
     pub pictures: Vec<(String, Image)>,
 }
 
-/// What the page shows.
+/// The contents of a page.
 #[derive(Clone, Debug)]
 pub struct Page<'a> {
     /// The window's title.
     pub title: String,
-    /// In the colours that viewers show.
+    /// In the colours that viewers expect.
     pub gaussians: &'a Gaussians,
-    /// What the page says of itself.
+    /// Provenance, shown on the page.
     pub provenance: Provenance,
-    /// The first is where the page begins.
+    /// The page opens at the first.
     pub bookmarks: Vec<Bookmark>,
-    /// Nothing nearer to a camera is shown, in the coordinates of the Gaussians.
+    /// Near plane, in the coordinates of the Gaussians.
     pub near: f64,
-    /// What is up, a unit vector in the coordinates of the Gaussians.
+    /// The up direction, a unit vector in the coordinates of the Gaussians.
     pub up: DVec3,
 }
 
@@ -49,16 +49,16 @@ impl Page<'_> {
     /// The page as HTML.
     ///
     /// # Errors
-    /// [`Error::Usage`] for a bookmark that is no pinhole.
+    /// [`Error::Usage`] for a bookmark that is not a pinhole camera.
     pub fn html(&self) -> Result<String> {
         let Self { title, gaussians, provenance, bookmarks, near, up } = self;
         let other = bookmarks.iter().find(|own| own.camera.model != CameraModel::Pinhole);
         if let Some(Bookmark { name, .. }) = other {
             return Err(Error::Usage(format!(
-                "view {name} is of a fisheye, and the page shows pinholes; load its dataset with --undistort"
+                "view {name} is a fisheye, and the page renders pinhole cameras; load its dataset with --undistort"
             )));
         }
-        // Coefficients that are all 0 need not travel.
+        // Degrees whose coefficients are all 0 are omitted.
         let gaussians = &gaussians.with_sh_degree(gaussians.sh_degree_in_use());
         let scene = json!({
             "generator": GENERATOR,
@@ -74,7 +74,7 @@ impl Page<'_> {
         let parts = [
             ("@TITLE@", escape(title)),
             ("@STYLE@", include_str!("viewer/style.css").to_owned()),
-            // No text of ours may end the script that holds it.
+            // No `<` in the data may end its script element.
             ("@SCENE@", scene.to_string().replace('<', "\\u003c")),
             ("@VERTEX@", shader(include_str!("viewer/splat.vert"), max_alpha)),
             ("@FRAGMENT@", shader(include_str!("viewer/splat.frag"), max_alpha)),
@@ -96,7 +96,7 @@ impl Page<'_> {
     }
 }
 
-/// The shader with what it has in common with the kernels.
+/// A shader of the page, with the constants and functions that it shares with the kernels.
 fn shader(text: &str, max_alpha: f32) -> String {
     let constants = [
         ("ALPHA_MIN", ALPHA_MIN),
@@ -124,8 +124,8 @@ fn view(bookmark: &Bookmark) -> serde_json::Value {
     })
 }
 
-/// Positions in floats, then everything else in half floats: opacities, logarithms of the scales, rotations and
-/// coefficients, each Gaussian after the other.
+/// Positions as floats, then the other attributes as half floats: opacity, log scales, rotation and coefficients,
+/// Gaussian by Gaussian.
 fn model(gaussians: &Gaussians) -> Vec<u8> {
     let mut bytes: Vec<u8> = bytemuck::cast_slice(gaussians.means()).to_vec();
     let coefficients = crate::splats::scene::rest_coefficients(gaussians.shape.sh_degree);
@@ -149,7 +149,7 @@ mod tests {
     use crate::results::export::tests::drawn;
 
     #[test]
-    fn a_page_is_one_file_in_which_no_name_ends_a_script() {
+    fn a_page_is_one_file_and_no_name_in_it_ends_a_script() {
         let gaussians = drawn(5, 1);
         let camera = Camera {
             width: 40,

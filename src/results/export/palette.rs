@@ -1,11 +1,11 @@
-//! Few values in place of many: 256 numbers for all, and some vectors for all.
+//! Quantisation by codebooks: 256 scalars, or a palette of vectors.
 
 use std::ops::Range;
 
 /// The numbers in a codebook.
 const CODES: usize = 256;
 
-/// 256 numbers that stand for many, ascending: one-dimensional k-means from equal shares.
+/// A codebook of 256 ascending values: one-dimensional k-means, initialised with quantiles.
 pub(super) fn codebook(values: impl Iterator<Item = f32>) -> Vec<f32> {
     const ROUNDS: usize = 24;
     let mut sorted: Vec<f32> = values.collect();
@@ -39,7 +39,7 @@ pub(super) fn codebook(values: impl Iterator<Item = f32>) -> Vec<f32> {
     codes
 }
 
-/// The place of the number nearest to a value.
+/// The index of the nearest code.
 pub(super) fn nearest(codes: &[f32], value: f32) -> u8 {
     let above = codes.partition_point(|&code| code < value).min(codes.len() - 1);
     let below = above.saturating_sub(1);
@@ -50,8 +50,8 @@ pub(super) fn nearest(codes: &[f32], value: f32) -> u8 {
     }
 }
 
-/// At most `size` vectors of `width` that stand for all of `points`, and which one does for each: cells are cut at their
-/// mean, across the axis of their largest variance, the one of the largest error next.
+/// A palette of at most `size` vectors of `width`, and the index into it for each of `points`. The cell of the largest
+/// error is split next, at its mean, across the axis of its largest variance.
 pub(super) fn vectors(points: &[f32], width: usize, size: usize) -> (Vec<f32>, Vec<u32>) {
     let count = points.len() / width;
     let mut order: Vec<u32> = (0..count as u32).collect();
@@ -67,7 +67,7 @@ pub(super) fn vectors(points: &[f32], width: usize, size: usize) -> (Vec<f32>, V
         }
         let part = &mut order[cell.range.clone()];
         let value = |point: u32| points[width * point as usize + cell.axis];
-        // Stable, so that the same points give the same cells everywhere.
+        // A stable sort gives the same cells on every machine.
         part.sort_by_key(|&point| value(point) > cell.mean);
         let middle = cell.range.start + part.partition_point(|&point| value(point) <= cell.mean);
         if middle == cell.range.start || middle == cell.range.end {
@@ -89,10 +89,10 @@ pub(super) fn vectors(points: &[f32], width: usize, size: usize) -> (Vec<f32>, V
     (means, labels)
 }
 
-/// Some of the points.
+/// A subset of the points.
 struct Cell {
     range: Range<usize>,
-    /// That of the largest variance, with the mean along it and the sum of squared distances to that.
+    /// The axis of the largest variance, with the mean along it and the sum of squared distances to the mean.
     axis: usize,
     mean: f32,
     error: f64,
@@ -140,7 +140,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn values_that_are_few_are_kept_and_many_lie_near_their_code() {
+    fn few_values_are_kept_and_many_are_near_their_code() {
         let small = codebook([3.0, -1.0, 3.0, 0.5].into_iter());
         for value in [3.0, -1.0, 0.5] {
             assert_eq!(small[usize::from(nearest(&small, value))], value);
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn a_palette_has_every_point_where_there_is_room_and_clusters_where_there_is_not() {
+    fn a_palette_keeps_every_point_if_it_can_and_clusters_them_otherwise() {
         let point =
             |i: usize| [(i % 4) as f32 * 10.0 + (i / 4) as f32 * 0.01, (i % 3) as f32 * 0.01];
         let points: Vec<f32> = (0..24).flat_map(point).collect();

@@ -1,8 +1,8 @@
-//! SOG, spatially ordered Gaussians: lossless WebP images of quantised attributes in a ZIP, a fifteenth of a PLY. Source: the
-//! format's own description, version 2.
+//! SOG, spatially ordered Gaussians: lossless WebP images of quantised attributes in a ZIP, a fifteenth of a PLY.
+//! Source: the specification of the format, version 2.
 //!
-//! The axes stay those of a PLY. Positions are 16 bits of their signed logarithm, scales and colours codes of 256 numbers,
-//! rotations three bytes, and the higher coefficients one of at most 65 536 sets.
+//! The axes are those of a PLY. Positions are 16 bits of their signed logarithm, scales and colours 8-bit indices of
+//! codebooks, rotations three bytes, and the higher coefficients an index of at most 65 536 vectors.
 
 use std::io::{Cursor, Read as _, Write as _};
 
@@ -18,16 +18,16 @@ use super::{GENERATOR, Provenance, raw_opacity, sigmoid, unit};
 use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE, rest_coefficients};
 use crate::{Error, Result};
 
-/// Sets of coefficients in a row of their image.
+/// Vectors of coefficients per row of their image.
 const SETS_PER_ROW: usize = 64;
 
-/// The file.
+/// Encodes a model.
 ///
 /// # Errors
-/// None but for what no memory is left for.
+/// [`Error::Output`] if an image or the archive cannot be encoded.
 pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>> {
     let (bounds, positions) = positions(gaussians);
-    // Neighbours in space are neighbours in the images, which compress the better for it.
+    // Neighbours in space are neighbours in the images, which compresses better.
     let mut order: Vec<usize> = (0..gaussians.count).collect();
     order.sort_by_key(|&i| morton(positions[i]));
     let size = image_size(gaussians.count);
@@ -99,7 +99,7 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
     archive(&meta.to_string(), &files)
 }
 
-/// Least and largest signed logarithm of each axis, and each position between them in 16 bits.
+/// Minimum and maximum of the signed logarithm per axis, and each position between them in 16 bits.
 fn positions(gaussians: &Gaussians) -> ([[f32; 3]; 2], Vec<[u16; 3]>) {
     let logarithm = |x: f32| (x.abs() + 1.0).ln().copysign(x);
     let logarithms = || gaussians.means().iter().map(|mean| mean.to_array().map(logarithm));
@@ -119,7 +119,7 @@ fn positions(gaussians: &Gaussians) -> ([[f32; 3]; 2], Vec<[u16; 3]>) {
     ([low, high], logarithms().map(fixed).collect())
 }
 
-/// The place along a Z-order curve.
+/// The index along a Z-order curve.
 fn morton(position: [u16; 3]) -> u64 {
     let spread =
         |value: u16| (0..16).fold(0, |bits, bit| bits | u64::from(value >> bit & 1) << (3 * bit));
@@ -127,7 +127,7 @@ fn morton(position: [u16; 3]) -> u64 {
     x | y << 1 | z << 2
 }
 
-/// The three smaller parts of (w, x, y, z) in a byte each, in order, and which was the largest.
+/// The three smaller components of (w, x, y, z) in a byte each, in order, then the index of the largest.
 fn rotation(quat: [f32; 4]) -> [u8; 4] {
     let parts = unit(quat);
     let largest =
@@ -142,12 +142,12 @@ fn rotation(quat: [f32; 4]) -> [u8; 4] {
     [next(), next(), next(), 252 + largest as u8]
 }
 
-/// A quarter of the Gaussians, and what 16 bits count.
+/// The size of the palette: a quarter of the Gaussians, at most 65 536.
 fn sets_of(count: usize) -> usize {
     (count / 4).clamp(1024, 1 << 16)
 }
 
-/// Nearly square.
+/// Width and height, nearly square.
 fn image_size(count: usize) -> [usize; 2] {
     let width = ((count as f64).sqrt().ceil() as usize).next_multiple_of(4).max(4);
     [width, count.div_ceil(width).max(1)]
@@ -155,9 +155,9 @@ fn image_size(count: usize) -> [usize; 2] {
 
 fn archive(meta: &str, files: &[(&str, [usize; 2], Vec<u8>)]) -> Result<Vec<u8>> {
     let failed = |error: &dyn std::fmt::Display| {
-        Error::output("an export", format!("cannot be put together: {error}"))
+        Error::output("an export", format!("cannot be assembled: {error}"))
     };
-    // Stored: the images are compressed.
+    // Stored, since the images are compressed.
     let stored = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
     let mut zip = ZipWriter::new(Cursor::new(vec![]));
     let mut add = |name: &str, bytes: &[u8]| {
@@ -175,7 +175,7 @@ fn archive(meta: &str, files: &[(&str, [usize; 2], Vec<u8>)]) -> Result<Vec<u8>>
     Ok(zip.finish().map_err(|error| failed(&error))?.into_inner())
 }
 
-/// `meta.json`, as far as it is read.
+/// The parts of `meta.json` that are read.
 #[derive(Deserialize)]
 struct Meta {
     count: usize,
@@ -210,16 +210,16 @@ struct Rest {
     files: [String; 2],
 }
 
-/// The most bytes of a file in the archive.
+/// Maximum size of a file in the archive, bytes.
 const MOST: u64 = 1 << 30;
 
-/// The Gaussians of a file of version 2, and what it states of them.
+/// The Gaussians of a file of version 2, and the facts that it states.
 ///
 /// # Errors
-/// The problem: another format or version, cut short, or nonsense in what it states.
+/// The problem: another format or version, a truncated file, or an invalid fact.
 pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     let mut zip =
-        ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is no SOG: {error}"))?;
+        ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is not a SOG: {error}"))?;
     let meta = bytes_of(&mut zip, "meta.json")?;
     let meta: Value =
         serde_json::from_slice(&meta).map_err(|error| format!("meta.json: {error}"))?;
@@ -288,7 +288,7 @@ fn decode_rest(
     for (values, [a, b, ..]) in rows.zip(&labels.0) {
         let first = coefficients * usize::from(u16::from_le_bytes([*a, *b]));
         for (value, place) in values.iter_mut().zip(first..) {
-            let codes = sets.0.get(place).ok_or("names coefficients that it does not hold")?;
+            let codes = sets.0.get(place).ok_or("has a label beyond its coefficients")?;
             *value = decoded(&rest.codebook, *codes)?;
         }
     }
@@ -298,7 +298,7 @@ fn decode_rest(
 type Archive<'a> = ZipArchive<Cursor<&'a [u8]>>;
 
 fn bytes_of(zip: &mut Archive<'_>, name: &str) -> Result<Vec<u8>, String> {
-    let file = zip.by_name(name).map_err(|error| format!("is no SOG: {name}: {error}"))?;
+    let file = zip.by_name(name).map_err(|error| format!("is not a SOG: {name}: {error}"))?;
     let mut bytes = vec![];
     file.take(MOST).read_to_end(&mut bytes).map_err(|error| format!("{name}: {error}"))?;
     Ok(bytes)
@@ -326,11 +326,11 @@ fn image_of(zip: &mut Archive<'_>, name: &str, count: usize) -> Result<Pixels, S
     Ok(Pixels(pixels.to_vec(), image.width() as usize))
 }
 
-/// The three numbers that a pixel stands for.
+/// The three numbers that a pixel encodes.
 fn decoded(codebook: &[f32], [a, b, c, _]: [u8; 4]) -> Result<Vec3, String> {
     let number = |code: u8| codebook.get(usize::from(code)).copied();
     let numbers = number(a).zip(number(b)).zip(number(c));
-    let numbers = numbers.ok_or("names a code that its codebook does not have")?;
+    let numbers = numbers.ok_or("has a code beyond its codebook")?;
     Ok(Vec3::new(numbers.0.0, numbers.0.1, numbers.1))
 }
 
@@ -352,7 +352,7 @@ mod tests {
     use crate::results::export::tests::drawn;
 
     #[test]
-    fn a_model_comes_back_within_its_bits_with_what_is_stated_of_it() {
+    fn a_decoded_model_agrees_within_its_precision_and_has_the_stated_facts() {
         for degree in [0, 2] {
             let mut model = drawn(300, degree);
             model.origin = glam::DVec3::new(4_499_999.6, -519_997.7, 10_001.8);
@@ -383,7 +383,7 @@ mod tests {
             }
             let most = [3e-4, 0.03, 0.02, 1e-4, 0.14];
             assert!(errors.iter().zip(most).all(|(error, most)| *error < most), "{errors:?}");
-            // As many sets as Gaussians: each has its own.
+            // As many vectors in the palette as Gaussians: each has its own.
             let sum = |model: &Gaussians| model.rest().iter().sum::<Vec3>();
             assert!((sum(&back) - sum(&model)).abs().max_element() < 0.5, "{degree}");
         }
@@ -392,7 +392,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_cut_short_or_edited_is_an_error_and_no_panic() {
+    fn a_truncated_or_edited_file_is_an_error_and_not_a_panic() {
         let file = encode(&drawn(40, 1), &Provenance::default()).unwrap();
         for length in (0..file.len()).step_by(7) {
             assert!(decode(&file[..length]).is_err(), "{length} bytes");
@@ -409,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn no_gaussian_and_one_are_files_too() {
+    fn models_of_no_gaussian_and_of_one_are_encoded() {
         for count in [0, 1] {
             let file = encode(&drawn(count, 1), &Provenance::default()).unwrap();
             assert_eq!(decode(&file).unwrap().0.count, count);

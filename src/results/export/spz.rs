@@ -1,8 +1,10 @@
-//! SPZ: fixed-point positions and eight bits of all else, about a tenth of a PLY. Source: the format's own description.
+//! SPZ: fixed-point positions and 8 bits for everything else, about a tenth of a PLY. Source: the specification of the
+//! format.
 //!
-//! Version 4 has a plain header, a table and a Zstandard stream for each attribute; version 3, which more readers know, one
-//! gzip stream of a shorter header and the same bytes. Axes are those of OpenGL. What a renderer must know, and where the
-//! origin lies, is text where readers do not look: the comment of the gzip header, or the end of the file.
+//! Version 4 has a plain header, a table and a Zstandard stream per attribute; version 3, which more readers support,
+//! is one gzip stream of a shorter header and the same bytes. The axes are those of OpenGL. The facts for a renderer,
+//! including the origin, are text where readers do not look: in the comment of the gzip header, or at the end of the
+//! file.
 
 use std::io::Read;
 
@@ -16,25 +18,25 @@ use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE, rest_coefficients};
 use crate::{Error, Result};
 
 const MAGIC: u32 = 0x5053_474e;
-/// Positions are signed integers of so many bits.
+/// Bits of a position, a signed integer.
 const POSITION_BITS: u32 = 24;
-/// A colour's coefficient of degree 0 in a byte: 127.5 + this times 255.
+/// A colour coefficient c of degree 0 is the byte 127.5 + 0.15 * 255 c.
 const COLOR_SCALE: f32 = 0.15;
 
-/// The versions that can be written.
+/// The supported versions.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Version {
-    /// Gzip; read by most.
+    /// Gzip, which most readers support.
     V3,
     /// Zstandard.
     #[default]
     V4,
 }
 
-/// The file.
+/// Encodes a model.
 ///
 /// # Errors
-/// [`Error::Usage`]: a position is farther from the origin than 24 bits of whole units reach.
+/// [`Error::Usage`] if a position is beyond the range of 24 bits in whole units.
 pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) -> Result<Vec<u8>> {
     let gaussians = half_turn(gaussians);
     let fraction = fractional_bits(&gaussians)?;
@@ -77,17 +79,17 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) 
                 file.extend((stream.len() as u64).to_le_bytes());
             }
             compressed.iter().for_each(|stream| file.extend(stream));
-            // Behind all that the table names, where a reader does not look.
+            // After everything that the table lists, where readers do not look.
             file.extend(text.bytes());
             Ok(file)
         }
     }
 }
 
-/// The Gaussians of a file of version 2, 3 or 4, and what it states of them.
+/// The Gaussians of a file of version 2, 3 or 4, and the facts that it states.
 ///
 /// # Errors
-/// The problem: another format or version, cut short, or nonsense in the text.
+/// The problem: another format or version, a truncated file, or an invalid fact.
 pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     let (header, streams, text) = match file {
         [0x1f, 0x8b, ..] => unzipped(file)?,
@@ -121,7 +123,7 @@ pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     Ok((gaussians, facts))
 }
 
-/// The words that all versions begin with.
+/// The words at the start of every version.
 struct Header {
     version: u32,
     count: usize,
@@ -132,13 +134,13 @@ struct Header {
 /// Positions, opacities, colours, scales, rotations, higher coefficients.
 type Streams = [Vec<u8>; 6];
 
-const CUT_SHORT: &str = "is cut short";
+const TRUNCATED: &str = "is truncated";
 
 impl Header {
     fn parse(bytes: &[u8]) -> Result<Self, String> {
         let word = |at| word(bytes, at);
         if word(0)? != MAGIC {
-            return Err("is no SPZ".to_owned());
+            return Err("is not an SPZ".to_owned());
         }
         let [degree, fraction, ..] = word(12)?.to_le_bytes();
         if u32::from(degree) > MAX_SH_DEGREE {
@@ -165,15 +167,15 @@ impl Header {
 
 fn word(bytes: &[u8], at: usize) -> Result<u32, String> {
     let word = bytes.get(at..at + 4).and_then(|word| word.try_into().ok());
-    word.map(u32::from_le_bytes).ok_or_else(|| CUT_SHORT.to_owned())
+    word.map(u32::from_le_bytes).ok_or_else(|| TRUNCATED.to_owned())
 }
 
-/// Exactly `length` bytes of a decoder.
+/// Reads exactly `length` bytes from a decoder.
 fn exactly(decoder: &mut impl Read, length: usize) -> Result<Vec<u8>, String> {
     let mut bytes = vec![];
     let read = decoder.take(length as u64).read_to_end(&mut bytes);
     read.map_err(|error| format!("cannot be unpacked: {error}"))?;
-    if bytes.len() == length { Ok(bytes) } else { Err(CUT_SHORT.to_owned()) }
+    if bytes.len() == length { Ok(bytes) } else { Err(TRUNCATED.to_owned()) }
 }
 
 /// Header, streams and comment of version 2 or 3.
@@ -187,7 +189,7 @@ fn unzipped(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
     for (stream, length) in streams.iter_mut().zip(header.lengths()) {
         *stream = exactly(&mut decoder, length)?;
     }
-    // The end has the checksum.
+    // Reading to the end verifies the checksum.
     match decoder.read(&mut [0]) {
         Ok(0) => {}
         Ok(_) => return Err(format!("holds more than its {} Gaussians", header.count)),
@@ -211,7 +213,7 @@ fn unpacked(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
     for (place, stream) in streams.iter_mut().enumerate().take(stream_count) {
         let length = word(file, table + 16 * place)? as usize;
         let (packed, after) =
-            rest.and_then(|rest| rest.split_at_checked(length)).ok_or(CUT_SHORT)?;
+            rest.and_then(|rest| rest.split_at_checked(length)).ok_or(TRUNCATED)?;
         rest = Some(after);
         let mut decoder = StreamingDecoder::new(packed)
             .map_err(|error| format!("cannot be unpacked: {error}"))?;
@@ -242,13 +244,13 @@ fn of_smallest_three(code: u32) -> [f32; 4] {
     [w, x, y, z]
 }
 
-/// Version 2: x, y and z in a byte each, and w is positive.
+/// Version 2: x, y and z in a byte each; w is positive.
 fn of_first_three(bytes: [f32; 3]) -> [f32; 4] {
     let [x, y, z] = bytes.map(|byte| byte / 127.5 - 1.0);
     [(1.0 - x * x - y * y - z * z).max(0.0).sqrt(), x, y, z]
 }
 
-/// As many as leave room for the farthest position.
+/// The most fractional bits that represent the farthest position.
 fn fractional_bits(gaussians: &Gaussians) -> Result<u8> {
     let farthest =
         floats(gaussians.means()).iter().fold(0.0_f32, |most, value| most.max(value.abs()));
@@ -276,8 +278,8 @@ fn bytes<T>(values: &[T], code: impl Fn(&T) -> f32) -> Vec<u8> {
     values.iter().map(|value| code(value).round().clamp(0.0, 255.0) as u8).collect()
 }
 
-/// The largest part's place among x, y, z, w in two bits, then the others in order: a sign and nine bits each of sqrt(2)
-/// times the part. The largest part is positive and follows from these.
+/// The index of the largest component among x, y, z, w in two bits, then the others in order: a sign and nine bits of
+/// sqrt(2) times the component. The largest is positive and follows from the others.
 fn smallest_three([w, x, y, z]: [f32; 4]) -> u32 {
     let [w, x, y, z] = unit([w, x, y, z]);
     let parts = [x, y, z, w];
@@ -300,7 +302,7 @@ mod tests {
         encode(model, &Provenance::default(), version).unwrap()
     }
 
-    /// What stands behind the header, as one.
+    /// The decompressed body after the header.
     fn body(file: &[u8]) -> Vec<u8> {
         let word = |at: usize| u64::from_le_bytes(file[at..at + 8].try_into().unwrap()) as usize;
         if file.starts_with(&[0x1f, 0x8b]) {
@@ -325,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn both_versions_hold_the_same_bytes_at_the_stated_places() {
+    fn both_versions_have_the_same_bytes_at_the_stated_places() {
         for degree in 0..=3 {
             let model = drawn(37, degree);
             let [v3, v4] = [Version::V3, Version::V4].map(|version| encode_alone(&model, version));
@@ -338,14 +340,14 @@ mod tests {
     }
 
     #[test]
-    fn positions_use_all_of_their_24_bits_and_what_they_cannot_hold_is_refused() {
+    fn positions_use_all_24_bits_and_a_farther_one_is_refused() {
         let mut model = drawn(2, 0);
         model.means_mut()[0] = Vec3::new(3.0, -1.0, 0.25);
         model.means_mut()[1] = Vec3::ZERO;
         assert_eq!(fractional_bits(&model).unwrap(), 21);
         let body = body(&encode_alone(&model, Version::V4));
         let fixed = |at: usize| i32::from_le_bytes([0, body[at], body[at + 1], body[at + 2]]) >> 8;
-        // Turned: y and z change their signs.
+        // The half turn negates y and z.
         let position = [0, 3, 6].map(|at| fixed(at) as f32 / (1 << 21) as f32);
         assert_eq!(position, [3.0, 1.0, -0.25]);
         model.means_mut()[0].x = 1e7;
@@ -354,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rotation_comes_back_within_its_ten_bits() {
+    fn a_rotation_is_decoded_within_the_precision_of_ten_bits() {
         for quat in drawn(200, 0).quats() {
             let own = unit(*quat);
             let back = of_smallest_three(smallest_three(*quat));
@@ -366,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn a_model_comes_back_within_its_bits_with_what_is_stated_of_it() {
+    fn a_decoded_model_agrees_within_its_precision_and_has_the_stated_facts() {
         let mut model = drawn(37, 3);
         model.origin = glam::DVec3::new(4_499_999.6, -519_997.7, 10_001.8);
         let facts = Facts {
@@ -390,7 +392,7 @@ mod tests {
                 (error(model.raw_opacities(), back.raw_opacities()), 0.14),
             ];
             assert!(pairs.iter().all(|(error, most)| error <= most), "{pairs:?}");
-            // What it holds comes back to the bit.
+            // A second round trip is exact.
             let again = decode(&encode(&back, &provenance, version).unwrap()).unwrap().0;
             assert_eq!((again.means(), again.dc()), (back.means(), back.dc()), "{version:?}");
         }
@@ -399,12 +401,12 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_cut_short_or_edited_is_an_error_and_no_panic() {
+    fn a_truncated_or_edited_file_is_an_error_and_not_a_panic() {
         let facts = Facts { near: Some(0.1), ..Facts::default() };
         let provenance = Provenance { facts, ..Provenance::default() };
         for version in [Version::V3, Version::V4] {
             let file = encode(&drawn(5, 1), &provenance, version).unwrap();
-            // The text ends the file of version 4, and no text is a text.
+            // A file of version 4 ends with the text, which is optional.
             let end =
                 file.len() - if version == Version::V4 { "nightsplat near 0.1".len() } else { 0 };
             for length in 0..end {

@@ -1,24 +1,24 @@
 //! The axes of the plots.
 
-/// A range of values and where it lies on the drawing.
+/// A range of values and its place in the drawing.
 pub(super) struct Axis {
     low: f64,
     high: f64,
-    /// Between ticks, a round number; none on a logarithmic axis.
+    /// Distance of ticks, a round number; `None` on a logarithmic axis.
     step: Option<f64>,
     from: f64,
     to: f64,
 }
 
 impl Axis {
-    /// The axis from `from` to `to` that holds all of the values, with round ends.
+    /// The axis from `from` to `to` with round ends that contains all values.
     pub(super) fn around(values: impl Iterator<Item = f64>, from: f64, to: f64) -> Self {
         const TICKS: f64 = 5.0;
         let (low, high) = values
             .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
         let (low, high) = match (low <= high, low < high) {
             (false, _) => (0.0, 1.0),
-            // All values are one; the margin must not vanish in rounding.
+            // All values are equal; the margin must survive rounding.
             (true, false) => (low - 0.5 - 0.01 * low.abs(), high + 0.5 + 0.01 * high.abs()),
             (true, true) => (low, high),
         };
@@ -30,13 +30,13 @@ impl Axis {
         Self { low, high, step: Some(step), from, to }
     }
 
-    /// As [`Self::around`], equal ratios as far apart as each other; of values above 1e-9, 1 to 10 where there are none.
+    /// [`Self::around`] on a logarithmic scale, for values above 1e-9; from 1 to 10 without any.
     pub(super) fn logarithmic(values: impl Iterator<Item = f64>, from: f64, to: f64) -> Self {
         let (low, high) = values
             .filter(|value| *value > 1e-9)
             .fold((f64::INFINITY, 0.0), |(low, high): (f64, f64), v| (low.min(v), high.max(v)));
         let (low, high) = if low <= high { (low, high) } else { (1.0, 10.0) };
-        // The rounding of a tick that is the value itself must not cost a decade.
+        // A value equal to a tick must not add a decade by rounding.
         let below = round_values(low / 10.0).filter(|tick| *tick <= low * (1.0 + 1e-9)).last();
         let above = round_values(low).find(|tick| *tick >= high * (1.0 - 1e-9) && *tick > low);
         let (low, high) = (below.unwrap_or(low), above.unwrap_or(10.0 * high));
@@ -54,7 +54,7 @@ impl Axis {
                 .skip_while(|tick| *tick < self.low * 0.999)
                 .take_while(|tick| *tick <= self.high * 1.001)
                 .collect();
-            // Decades alone where they are many.
+            // Many ticks are reduced to decades.
             let is_shown = |tick: &f64| ticks.len() <= 9 || (tick.log10().fract()).abs() < 1e-6;
             return ticks.iter().copied().filter(is_shown).collect();
         };
@@ -91,7 +91,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_logarithmic_axis_holds_its_values_between_round_ends() {
+    fn a_logarithmic_axis_has_its_values_between_round_ends() {
         let of = |values: &[f64]| {
             let axis = Axis::logarithmic(values.iter().copied(), 0.0, 100.0);
             (axis.low, axis.high)
@@ -108,7 +108,7 @@ mod tests {
         let labels: Vec<String> = axis.ticks().into_iter().map(|tick| axis.label(tick)).collect();
         assert_eq!(labels, ["5", "10", "20", "50", "100"]);
         assert!((axis.place(5.0)).abs() < 1e-9 && (axis.place(100.0) - 100.0).abs() < 1e-9);
-        // Equal ratios, equal distances.
+        // Equal ratios have equal distances.
         assert!(
             (axis.place(20.0) - axis.place(10.0) - axis.place(100.0) + axis.place(50.0)).abs()
                 < 1e-9

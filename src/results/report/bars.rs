@@ -10,22 +10,22 @@ use super::escape;
 pub struct Bar {
     /// Its name, to the left.
     pub name: String,
-    /// Its length; one that is not finite, or beyond 1e30, is left out and its name stays.
+    /// Its length; a value that is not finite or exceeds 1e30 has no bar.
     pub value: f64,
-    /// Its least and greatest, of which the value is the mean.
+    /// Minimum and maximum of the values whose mean this is.
     pub spread: Option<[f64; 2]>,
 }
 
-/// SVG user units: narrow enough for a phone to show it whole.
+/// SVG user units, narrow enough for a phone.
 const WIDTH: f64 = 480.0;
 const ROW: f64 = 22.0;
 const TOP: f64 = 24.0;
 const RIGHT: f64 = 64.0;
 
-/// Draws `bars` from top to bottom, from zero, each with its value in `digits` digits after the point.
+/// Draws `bars` from top to bottom, from zero, each labelled with `digits` decimals.
 pub fn bars(value_name: &str, digits: usize, bars: &[Bar]) -> String {
     let names = bars.iter().map(|bar| bar.name.chars().count()).max().unwrap_or(0);
-    // The names have at most half of the width.
+    // Names take at most half of the width.
     let left = (7.0 * names as f64 + 12.0).min(WIDTH / 2.0);
     let is_drawable = |value: &f64| value.abs() <= 1e30;
     let ends = |bar: &Bar| bar.spread.unwrap_or([bar.value; 2]);
@@ -35,12 +35,13 @@ pub fn bars(value_name: &str, digits: usize, bars: &[Bar]) -> String {
     let zero = axis.place(0.0);
 
     let mut svg = format!(
-        "<svg class=\"half\" viewBox=\"0 0 {WIDTH} {}\" role=\"img\" aria-label=\"{name}\" font-size=\"12\" fill=\"var(--quiet)\">\n\
+        "<svg class=\"half\" viewBox=\"0 0 {WIDTH} {}\" role=\"img\" aria-label=\"{name}\" font-size=\"12\" \
+         fill=\"var(--quiet)\">\n\
          <text x=\"{left}\" y=\"14\">{name}</text>\n",
         TOP + ROW * bars.len() as f64,
         name = escape(value_name)
     );
-    // Writing to a string cannot fail, so the results below hold nothing.
+    // Writing to a string cannot fail, so the results below are ignored.
     for (row, Bar { name, value, spread }) in bars.iter().enumerate() {
         let y = TOP + ROW * row as f64;
         let _ = write!(
@@ -67,7 +68,8 @@ pub fn bars(value_name: &str, digits: usize, bars: &[Bar]) -> String {
                 let (low, high, y) = (axis.place(low), axis.place(high), y + ROW / 2.0 - 0.5);
                 let _ = write!(
                     svg,
-                    "<line class=\"spread\" x1=\"{low:.1}\" x2=\"{high:.1}\" y1=\"{y}\" y2=\"{y}\" stroke=\"var(--text)\" stroke-width=\"2\"/>"
+                    "<line class=\"spread\" x1=\"{low:.1}\" x2=\"{high:.1}\" y1=\"{y}\" y2=\"{y}\" \
+                     stroke=\"var(--text)\" stroke-width=\"2\"/>"
                 );
             }
         }

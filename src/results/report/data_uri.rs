@@ -1,4 +1,4 @@
-//! Images inside a page: PNG in base64 (RFC 4648) in a data URI.
+//! Images within a page: base64 (RFC 4648) in a data URI.
 
 use crate::Result;
 use crate::photographs::image::Image;
@@ -8,7 +8,7 @@ pub(super) fn png(image: &Image) -> String {
     uri("png", image.to_png8())
 }
 
-/// The image as a JPEG of little loss; an empty URI for an image without pixels.
+/// The image as a JPEG of high quality; an empty URI for an image without pixels.
 pub(crate) fn jpeg(image: &Image) -> String {
     const QUALITY: u8 = 90;
     uri("jpeg", image.to_jpeg(QUALITY))
@@ -28,7 +28,7 @@ pub(crate) fn base64(bytes: &[u8]) -> String {
         let byte = |index: usize| u32::from(group.get(index).copied().unwrap_or(0));
         let bits = byte(0) << 16 | byte(1) << 8 | byte(2);
         for digit in 0..4 {
-            // A group of n bytes fills n + 1 digits.
+            // A group of n bytes gives n + 1 digits.
             let symbol = ALPHABET[(bits >> (18 - 6 * digit) & 63) as usize];
             text.push(if digit <= group.len() { char::from(symbol) } else { '=' });
         }
@@ -41,7 +41,7 @@ mod tests {
     use super::base64;
 
     #[test]
-    fn base64_gives_the_vectors_of_rfc_4648() {
+    fn base64_matches_the_vectors_of_rfc_4648() {
         let vectors = ["", "Zg==", "Zm8=", "Zm9v", "Zm9vYg==", "Zm9vYmE=", "Zm9vYmFy"];
         for (length, expected) in vectors.into_iter().enumerate() {
             assert_eq!(base64(&b"foobar"[..length]), expected);

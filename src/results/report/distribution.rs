@@ -1,23 +1,23 @@
-//! How a photograph's luminance is distributed: before a curve, after it, and in the reference image.
+//! Histograms of luminance: of a photograph, its target and the reference image.
 
 use super::plot::{Series, plot};
 use crate::photographs::tone::{luminance, measurable};
 
-/// Bins over [0, 1]; what lies beyond counts in the last.
+/// Bins over [0, 1]; higher values count in the last.
 const BINS: usize = 64;
 
-/// A histogram of luminances, and their moments.
+/// A histogram of luminance, and its moments.
 #[derive(Clone, Debug)]
 pub struct Distribution {
     /// Its name in the legend.
     pub name: String,
     counts: [u64; BINS],
-    /// Sums of the first three powers.
+    /// Sums of the first three powers of the luminance.
     sums: [f64; 3],
 }
 
 impl Distribution {
-    /// One of nothing yet.
+    /// Empty.
     pub fn new(name: impl Into<String>) -> Self {
         Self { name: name.into(), counts: [0; BINS], sums: [0.0; 3] }
     }
@@ -35,17 +35,17 @@ impl Distribution {
         }
     }
 
-    /// Skewness m3 / m2^(3/2) of the luminance; 0 where all pixels are alike or there are none.
+    /// Skewness m3 / m2^(3/2) of the luminance; 0 if all pixels are equal or there are none.
     pub fn skewness(&self) -> f64 {
         let count = self.counts.iter().sum::<u64>().max(1) as f64;
         let [mean, square, cube] = self.sums.map(|sum| sum / count);
         let variance = square - mean * mean;
         let third = cube - 3.0 * mean * square + 2.0 * mean * mean * mean;
-        // Below, the moments of a constant image are rounding errors.
+        // At a lower variance, the image is constant and its moments are rounding errors.
         if variance > 1e-12 * square { third / variance.powf(1.5) } else { 0.0 }
     }
 
-    /// Centres of the bins with their density, whose integral over [0, 1] is 1.
+    /// Centres of the bins with their densities; the integral over [0, 1] is 1.
     fn density(&self) -> Vec<(f64, f64)> {
         let scale = BINS as f64 / self.counts.iter().sum::<u64>().max(1) as f64;
         let centre = |bin: usize| (bin as f64 + 0.5) / BINS as f64;
@@ -54,7 +54,7 @@ impl Distribution {
     }
 }
 
-/// Draws densities over each other, each relative to its own peak, with their skewness in the legend.
+/// Draws the densities in one plot, each relative to its peak, with the skewness in the legend.
 pub fn distributions(of: &[Distribution]) -> String {
     let series = |distribution: &Distribution| {
         let density = distribution.density();

@@ -1,6 +1,6 @@
 //! Line plots as inline SVG.
 //!
-//! A line through many points is a line alone; one through few shows where they are, and which of them is special.
+//! A line of many points is drawn alone; a line of few points has dots, and marks for special ones.
 
 use std::fmt::Write as _;
 
@@ -12,20 +12,20 @@ use super::escape;
 pub struct Series {
     /// Its name in the legend.
     pub name: String,
-    /// (x, y) in the order of x; points that are not finite, or beyond 1e30, are left out.
+    /// (x, y) in the order of x; points that are not finite or exceed 1e30 are omitted.
     pub points: Vec<(f64, f64)>,
-    /// Which line of its page it is: the same number has the same colour and dash in every plot; none: by its place in this.
+    /// The number of its colour and dash, the same in every plot of a page; by default its index in this plot.
     pub line: Option<usize>,
-    /// (x, least, greatest) of what its points are means of; may be empty.
+    /// (x, minimum, maximum) of the values whose means are the points; may be empty.
     pub spreads: Vec<(f64, f64, f64)>,
 }
 
 /// A value of x that a vertical line marks.
 #[derive(Clone, Debug, Default)]
 pub struct VerticalLine {
-    /// Where.
+    /// Its position.
     pub x: f64,
-    /// What it is.
+    /// Its label.
     pub name: String,
 }
 
@@ -39,31 +39,31 @@ const BOTTOM: f64 = 34.0;
 
 /// The colours that the page's style defines.
 const COLORS: usize = 5;
-/// How lines of one colour differ.
+/// Dash patterns that distinguish lines of one colour.
 const DASHES: [&str; 4] =
     ["", " stroke-dasharray=\"7 3\"", " stroke-dasharray=\"2 3\"", " stroke-dasharray=\"9 3 2 3\""];
 
-/// A point apart from the lines, drawn as a star.
+/// A separate point, drawn as a star.
 #[derive(Clone, Debug, Default)]
 pub struct Mark {
-    /// What it is, written beside it.
+    /// Its label.
     pub name: String,
-    /// (x, y); left out where it is not finite.
+    /// (x, y); omitted if not finite.
     pub point: (f64, f64),
 }
 
-/// Draws `y_name` against `x_name` (loss or PSNR against the step, say); the colours are those of the page's style.
+/// Draws `y_name` against `x_name` (for example loss against step); the colours are those of the page's style.
 pub fn plot(x_name: &str, y_name: &str, series: &[Series]) -> String {
     draw(x_name, y_name, series, &Extras::default())
 }
 
-/// As [`plot`], for few points (PSNR against a setting, say): each has a dot, and `marks` are drawn as stars.
+/// [`plot`] for few points (for example PSNR against a setting): each has a dot, and `marks` are stars.
 pub fn plot_points(x_name: &str, y_name: &str, series: &[Series], marks: &[Mark]) -> String {
     draw(x_name, y_name, series, &Extras { dot: 3.5, marks, ..Extras::default() })
 }
 
-/// As [`plot`], with `lines` where they lie within the x axis, and for more series than one plot tells apart: a plot for every
-/// few of them, one below the other, all with the same axes.
+/// [`plot`] with vertical `lines`, if they are within the x axis. Many series are divided into several plots with the
+/// same axes, one below the other.
 pub fn plot_in_groups(
     x_name: &str,
     y_name: &str,
@@ -78,7 +78,8 @@ pub fn plot_in_groups(
         let whole = HEIGHT + above;
         let _ = writeln!(
             panels,
-            "<svg y=\"{height}\" overflow=\"visible\" width=\"{WIDTH}\" height=\"{whole}\" viewBox=\"0 {} {WIDTH} {whole}\">\n{panel}</svg>",
+            "<svg y=\"{height}\" overflow=\"visible\" width=\"{WIDTH}\" height=\"{whole}\" \
+             viewBox=\"0 {} {WIDTH} {whole}\">\n{panel}</svg>",
             0.0 - above
         );
         height += whole + GAP;
@@ -86,19 +87,19 @@ pub fn plot_in_groups(
     framed(x_name, y_name, 0.0, height - GAP, &panels)
 }
 
-/// Series that one plot tells apart.
+/// The maximum number of series in one plot.
 const GROUP: usize = 6;
-/// Between two plots of one drawing.
+/// Space between two plots of one drawing.
 const GAP: f64 = 24.0;
 
-/// What a plot has beside its lines.
+/// What a plot has in addition to its lines.
 #[derive(Default)]
 struct Extras<'a> {
-    /// The radius of the points; 0: none.
+    /// The radius of the points, or 0.
     dot: f64,
     marks: &'a [Mark],
     lines: &'a [VerticalLine],
-    /// What the axes have room for beside what is drawn.
+    /// Series that the axes include without drawing them.
     frame: &'a [Series],
 }
 
@@ -107,7 +108,7 @@ fn draw(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> S
     framed(x_name, y_name, 0.0 - above, HEIGHT + above, &panel)
 }
 
-/// The drawing around what is in it.
+/// The SVG element around a plot.
 fn framed(x_name: &str, y_name: &str, top: f64, height: f64, panel: &str) -> String {
     let (x_name, y_name) = (escape(x_name), escape(y_name));
     format!(
@@ -116,10 +117,10 @@ fn framed(x_name: &str, y_name: &str, top: f64, height: f64, panel: &str) -> Str
     )
 }
 
-/// Axes, lines and legend, and by how much the legend rises above the drawing.
+/// Axes, lines and legend, and the height of the legend above the drawing.
 fn panel(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> (f64, String) {
     let &Extras { dot, marks, lines, frame } = extras;
-    // Positive phrasing: a NaN fails the test too. The bound keeps differences of values finite.
+    // Written so that a NaN fails. The bound keeps differences finite.
     let is_drawable = |&(x, y): &(f64, f64)| x.abs() <= 1e30 && y.abs() <= 1e30;
     let marked = || marks.iter().map(|mark| mark.point);
     let points = || {
@@ -135,7 +136,7 @@ fn panel(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> 
     let y_axis = Axis::around(points().map(|(_, y)| y), HEIGHT - BOTTOM, TOP);
     let (legend, legend_height) = legend_places(series);
     let mut svg = String::new();
-    // Writing to a string cannot fail, so the results below hold nothing.
+    // Writing to a string cannot fail, so the results below are ignored.
     for tick in y_axis.ticks() {
         let y = y_axis.place(tick);
         let _ = writeln!(
@@ -169,7 +170,8 @@ fn panel(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> 
         let (bottom, below) = (HEIGHT - BOTTOM, TOP + 12.0);
         let _ = writeln!(
             svg,
-            "<line x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{TOP}\" y2=\"{bottom}\" stroke=\"var(--quiet)\" stroke-dasharray=\"4 3\"/>\
+            "<line x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{TOP}\" y2=\"{bottom}\" stroke=\"var(--quiet)\" \
+             stroke-dasharray=\"4 3\"/>\
              <text x=\"{:.1}\" y=\"{below}\">{}</text>",
             x + 4.0,
             escape(name)
@@ -187,8 +189,10 @@ fn panel(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> 
         let _ = writeln!(
             svg,
             "<g class=\"series\"><title>{name}</title>\
-             <polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"2\"{dashes} stroke-linejoin=\"round\" points=\"{}\"/>\
-             <line class=\"sample\" x1=\"{sample_x}\" x2=\"{}\" y1=\"{sample_y}\" y2=\"{sample_y}\" stroke=\"{color}\" stroke-width=\"2\"{dashes}/>\
+             <polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"2\"{dashes} stroke-linejoin=\"round\" \
+             points=\"{}\"/>\
+             <line class=\"sample\" x1=\"{sample_x}\" x2=\"{}\" y1=\"{sample_y}\" y2=\"{sample_y}\" stroke=\"{color}\" \
+             stroke-width=\"2\"{dashes}/>\
              <text x=\"{}\" y=\"{text_y}\" fill=\"var(--text)\">{name}</text>",
             points.collect::<Vec<_>>().join(" "),
             sample_x + SAMPLE,
@@ -199,7 +203,8 @@ fn panel(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> 
                 let (x, low, high) = (x_axis.place(x), y_axis.place(low), y_axis.place(high));
                 let _ = writeln!(
                     svg,
-                    "<line class=\"spread\" x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{low:.1}\" y2=\"{high:.1}\" stroke=\"{color}\" stroke-width=\"1.5\"/>"
+                    "<line class=\"spread\" x1=\"{x:.1}\" x2=\"{x:.1}\" y1=\"{low:.1}\" y2=\"{high:.1}\" \
+                     stroke=\"{color}\" stroke-width=\"1.5\"/>"
                 );
             }
         }
@@ -215,7 +220,7 @@ fn panel(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> 
             svg,
             "<path d=\"{}\" fill=\"var(--best)\"/><text x=\"{:.1}\" y=\"{:.1}\" fill=\"var(--best)\">{}</text>",
             star(x, y),
-            // Towards the middle, where there is room.
+            // The label extends towards the middle, where there is space.
             if x > WIDTH / 2.0 { x - 10.0 - 7.0 * name.chars().count() as f64 } else { x + 12.0 },
             y - 8.0,
             escape(name)
@@ -224,10 +229,10 @@ fn panel(x_name: &str, y_name: &str, series: &[Series], extras: &Extras<'_>) -> 
     (legend_height, svg)
 }
 
-/// The length of a line's sample in the legend: a dash shows twice.
+/// The length of a line's sample in the legend: two periods of a dash.
 const SAMPLE: f64 = 28.0;
 
-/// Where each sample of the legend begins, and by how much its rows rise above the drawing.
+/// The position of each sample in the legend, and the height of its rows above the drawing.
 fn legend_places(series: &[Series]) -> (Vec<[f64; 2]>, f64) {
     const ROW: f64 = 16.0;
     let (mut x, mut y) = (LEFT + 60.0, 14.0);
@@ -240,18 +245,19 @@ fn legend_places(series: &[Series]) -> (Vec<[f64; 2]>, f64) {
         places.push([x, y]);
         x += width;
     }
-    // The last row is that of the axis's name.
+    // The last row is that of the axis label.
     let above = y - 14.0;
     places.iter_mut().for_each(|place| place[1] -= above);
     (places, above)
 }
 
-/// A plot as a file of its own, in the colours of the page's style.
+/// A plot as an SVG file, in the colours of the page's style.
 pub fn svg_file(plot: &str) -> String {
     let style = include_str!("style.css");
-    // The custom properties stand before the first rule that is not theirs.
+    // The custom properties come before the first other rule.
     let colors = style.split("* {").next().unwrap_or_default();
-    let begin = "<svg xmlns=\"http://www.w3.org/2000/svg\" style=\"background: var(--ground)\" font-family=\"sans-serif\" ";
+    let begin = "<svg xmlns=\"http://www.w3.org/2000/svg\" style=\"background: var(--ground)\" \
+                 font-family=\"sans-serif\" ";
     let whole = plot.replacen("<svg ", begin, 1);
     whole.replacen(">\n", &format!(">\n<style>\n{colors}</style>\n"), 1)
 }

@@ -4,15 +4,15 @@ use std::fmt::Write as _;
 
 use super::escape;
 
-/// Which value of a column is marked.
+/// The value of a column that is highlighted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Best {
     /// None.
     #[default]
     Unmarked,
-    /// The least.
+    /// The lowest.
     Least,
-    /// The greatest.
+    /// The highest.
     Greatest,
 }
 
@@ -23,7 +23,7 @@ pub struct Column {
     pub name: String,
     /// Digits after the decimal point.
     pub digits: usize,
-    /// Which value is marked.
+    /// The highlighted value.
     pub best: Best,
 }
 
@@ -36,19 +36,19 @@ pub struct Table {
     pub label: String,
     /// The columns after the labels.
     pub columns: Vec<Column>,
-    /// Each row's label and numbers; a number that is missing (or not a number) shows as a dash.
+    /// The label and values of each row; a missing value or NaN is shown as a dash.
     pub rows: Vec<(String, Vec<Option<f64>>)>,
 }
 
 impl Table {
-    /// The table as a section of an HTML page, the best values marked.
+    /// The table as a section of an HTML page, with the best values highlighted.
     pub fn html(&self) -> String {
         let mut html = format!(
             "<div class=\"table\"><table>\n<caption>{}</caption>\n<thead><tr><th scope=\"col\">{}</th>",
             escape(&self.title),
             escape(&self.label)
         );
-        // Writing to a string cannot fail, so the results below hold nothing.
+        // Writing to a string cannot fail, so the results below are ignored.
         for column in &self.columns {
             let _ = write!(html, "<th scope=\"col\">{}</th>", escape(&column.name));
         }
@@ -65,7 +65,7 @@ impl Table {
         html
     }
 
-    /// The table as Markdown (GitHub's), the best values bold; the title is left to the page.
+    /// The table as GitHub's Markdown, without its title, with the best values bold.
     pub fn markdown(&self) -> String {
         let plain = |text: &str| text.replace('|', "\\|").replace(['\n', '\r'], " ");
         let mut markdown = format!("| {} |", plain(&self.label));
@@ -97,7 +97,7 @@ impl Table {
         }
     }
 
-    /// Values that print alike are equally good; a lone value is not marked.
+    /// Values that print the same are equally good; a single value is not highlighted.
     fn is_best(&self, row: usize, column: usize) -> bool {
         let values: Vec<f64> =
             (0..self.rows.len()).filter_map(|row| self.value(row, column)).collect();

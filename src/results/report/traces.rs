@@ -1,24 +1,24 @@
-//! Runs of a batch in one drawing as inline SVG: where each ends up, or how it came there, against what it took.
+//! Runs of a batch in one drawing as inline SVG: final or intermediate results against their cost.
 //!
-//! Half as wide as other plots, so that two stand side by side, and a phone shows one without making its text small.
+//! Half as wide as other plots: two fit side by side, and one is readable on a phone.
 
 use std::fmt::Write as _;
 
 use super::axis::Axis;
 use super::escape;
 
-/// A run of a drawing.
+/// A run in a drawing.
 #[derive(Clone, Debug, Default)]
 pub struct Trace {
-    /// Its name, beside its last point.
+    /// Its label at the last point.
     pub name: String,
-    /// What is said where the pointer rests on it.
+    /// The tooltip.
     pub title: String,
-    /// Which of the colours of the page's style: the same in every drawing of a page.
+    /// The index of its colour, the same in every drawing of a page.
     pub color: usize,
-    /// Whether it is one of the lesser runs, whose dot is a ring and whose line is thin.
+    /// Whether it is a minor run, with a ring as its dot and a thin line.
     pub is_minor: bool,
-    /// (x, y) in the order of x; points that are not finite, not above 0 in x or beyond 1e30 are left out.
+    /// (x, y) in the order of x; points that are not finite, not above 0 in x or beyond 1e30 are omitted.
     pub points: Vec<(f64, f64)>,
 }
 
@@ -33,10 +33,10 @@ const BOTTOM: f64 = 34.0;
 /// The colours that the page's style defines.
 const COLORS: usize = 5;
 
-/// Draws `y_name` against the logarithm of `x_name`: the line and the last point of each run, and dotted behind them the
-/// steps of a front, whose points are in the order of x.
+/// Draws `y_name` against the logarithm of `x_name`: the line and the last point of each run, and below them the dotted
+/// steps of the Pareto front, whose points are in the order of x.
 pub fn traces(x_name: &str, y_name: &str, of: &[Trace], front: &[(f64, f64)]) -> String {
-    // Positive phrasing: a NaN fails the test too. The bound keeps differences of values finite.
+    // Written so that a NaN fails. The bound keeps differences finite.
     let is_drawable = |&(x, y): &(f64, f64)| x > 1e-9 && x <= 1e30 && y.abs() <= 1e30;
     let points = || of.iter().flat_map(|trace| trace.points.iter().copied()).filter(is_drawable);
     let x_axis = Axis::logarithmic(points().map(|(x, _)| x), LEFT, WIDTH - RIGHT);
@@ -65,7 +65,7 @@ pub fn traces(x_name: &str, y_name: &str, of: &[Trace], front: &[(f64, f64)]) ->
     svg
 }
 
-// Writing to a string cannot fail, so the results below hold nothing.
+// Writing to a string cannot fail, so the results below are ignored.
 
 fn grid(svg: &mut String, x_axis: &Axis, y_axis: &Axis) {
     for tick in y_axis.ticks() {
@@ -87,7 +87,7 @@ fn grid(svg: &mut String, x_axis: &Axis, y_axis: &Axis) {
     }
 }
 
-/// What can be had for so much: level up to the next point of the front, and from there on higher.
+/// The best result for a cost: level up to the next point of the front, then higher.
 fn steps(svg: &mut String, front: &[(f64, f64)]) {
     let (Some(first), Some(last)) = (front.first(), front.last()) else { return };
     let mut path = format!("M{:.1} {:.1}V{:.1}", first.0, HEIGHT - BOTTOM, first.1);
@@ -97,7 +97,8 @@ fn steps(svg: &mut String, front: &[(f64, f64)]) {
     let end = (WIDTH - RIGHT).max(last.0);
     let _ = writeln!(
         svg,
-        "<path d=\"{path}H{end:.1}\" fill=\"none\" stroke=\"var(--quiet)\" stroke-width=\"1.5\" stroke-dasharray=\"2 3\"/>"
+        "<path d=\"{path}H{end:.1}\" fill=\"none\" stroke=\"var(--quiet)\" stroke-width=\"1.5\" \
+         stroke-dasharray=\"2 3\"/>"
     );
 }
 
@@ -111,7 +112,8 @@ fn draw(svg: &mut String, trace: &Trace, line: &[(f64, f64)], labels: &mut Label
         let points: Vec<String> = line.iter().map(|(x, y)| format!("{x:.1},{y:.1}")).collect();
         let _ = writeln!(
             svg,
-            "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"{width}\" stroke-linejoin=\"round\" points=\"{}\"/>",
+            "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"{width}\" stroke-linejoin=\"round\" \
+             points=\"{}\"/>",
             points.join(" ")
         );
     }
@@ -125,7 +127,7 @@ fn draw(svg: &mut String, trace: &Trace, line: &[(f64, f64)], labels: &mut Label
     );
 }
 
-/// Where names stand: left, top, right and bottom of what is taken.
+/// The places that are taken by labels: left, top, right and bottom.
 struct Labels(Vec<[f64; 4]>);
 
 impl Labels {
@@ -133,11 +135,11 @@ impl Labels {
         Self(dots.map(|(x, y)| [x - 5.0, y - 5.0, x + 5.0, y + 5.0]).collect())
     }
 
-    /// The left end of the base line of a name beside (x, y), where nothing else stands if there is such a place.
+    /// The left end of the baseline of a label next to (x, y), at a free place if there is one.
     fn place(&mut self, x: f64, y: f64, name: &str, ends_line: bool) -> (f64, f64) {
-        // A semibold letter of the page's font at most.
+        // The maximum width of a semibold letter of the page's font.
         let width = 8.4 * name.chars().count() as f64;
-        // A line comes from the left; a front leaves to the right.
+        // A line comes from the left, a front continues to the right.
         let mut order = [x + 8.0, x - 8.0 - width];
         if !ends_line {
             order.reverse();

@@ -1,19 +1,20 @@
-//! What a run directory held before: kept until the new run has done a step, and what a killed process left behind.
+//! The previous contents of a run directory: kept until the new run has done a step. Also recovers from a killed
+//! process.
 
 use std::path::{Path, PathBuf};
 
 use super::files::{FILES, unwritable};
 use crate::Result;
 
-/// Where the files of a run wait that is being replaced.
+/// The folder of the files of a run that is being replaced.
 const BACKUP: &str = ".replaced";
 
-/// The files of a run that was there before. Dropped, they are back where they were; [`Backup::give_up`] ends them.
+/// The files of the previous run. Dropping it restores them; [`Backup::give_up`] deletes them.
 #[derive(Debug, Default)]
 pub(super) struct Backup(Option<PathBuf>);
 
 impl Backup {
-    /// Moves the files of the run out of the way.
+    /// Moves the files of the run into the backup.
     ///
     /// # Errors
     /// The directory cannot be written.
@@ -32,7 +33,7 @@ impl Backup {
         Ok(guard)
     }
 
-    /// The new run has come to be: the old one goes.
+    /// Deletes the previous run, once the new one has begun.
     ///
     /// # Errors
     /// The directory cannot be written.
@@ -45,14 +46,14 @@ impl Backup {
 impl Drop for Backup {
     fn drop(&mut self) {
         if let Some(run) = self.0.take() {
-            // What failed before this is worth reporting; the next start tries again.
+            // The earlier failure is the one to report; the next start tries again.
             let _ = restore(&run);
         }
     }
 }
 
-/// Puts a directory in order whose last process was killed: a run that was being replaced is back, and what was half
-/// written is gone. For whoever holds its lock.
+/// Cleans up after a killed process: restores a run that was being replaced and deletes partial files. The caller must
+/// hold the lock.
 ///
 /// # Errors
 /// The directory cannot be written.
@@ -66,7 +67,7 @@ pub(super) fn recover(run: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Moves what waits back, over what had begun in its place.
+/// Moves the backup back, over files that have begun in its place.
 fn restore(run: &Path) -> std::io::Result<()> {
     let backup = run.join(BACKUP);
     if !backup.is_dir() {
@@ -83,8 +84,8 @@ fn restore(run: &Path) -> std::io::Result<()> {
     std::fs::remove_dir(backup)
 }
 
-/// Whether a file of this name is what a killed process leaves: a run's own under another name, or that which safetensors
-/// writes first.
+/// Whether a file of this name is left by a killed process: a partial file of a run, or the temporary file of
+/// safetensors.
 fn is_half_written(name: &str) -> bool {
     let of_run = name.strip_suffix(".partial").is_some_and(|file| FILES.contains(&file));
     let drawn = name.strip_prefix(".tmp");
@@ -111,7 +112,7 @@ mod tests {
         content
     }
 
-    /// A finished run, something of its owner's, and nothing else.
+    /// A finished run with a file of the user's.
     fn run() -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
         for name in ["config.toml", "model.ply", "metrics.json", "notes.txt"] {
@@ -121,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn a_replaced_run_is_back_unless_the_new_one_has_come_to_be() {
+    fn a_replaced_run_is_restored_unless_the_new_one_has_begun() {
         let folder = run();
         let before = content(folder.path());
         let backup = Backup::set(folder.path()).unwrap();
@@ -132,7 +133,7 @@ mod tests {
         drop(backup);
         assert_eq!(content(folder.path()), before);
 
-        // A process that is killed drops nothing; the next one finds the old run.
+        // A killed process drops nothing; the next one finds the old run.
         let backup = Backup::set(folder.path()).unwrap();
         std::fs::write(folder.path().join("config.toml"), "new").unwrap();
         std::mem::forget(backup);
@@ -146,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_killed_process_left_half_written_is_gone_and_nothing_else() {
+    fn only_the_partial_files_of_a_killed_process_are_deleted() {
         let folder = run();
         let before = content(folder.path());
         for name in [".tmpAb3xYz", "model.ply.partial", "checkpoint.safetensors.partial"] {

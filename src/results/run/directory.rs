@@ -1,26 +1,26 @@
-//! The run directory: what a run leaves behind.
+//! The run directory.
 //!
 //! ```text
-//! RUN/config.toml    everything the run used
-//!     plan.toml      what was decided for these photographs and why, where a plan was made
-//!     model.ply      the Gaussians, as splat viewers open them
-//!     networks.safetensors    the weights of the networks, where the model has any
+//! RUN/config.toml    every setting
+//!     plan.toml      settings decided from the photographs, with reasons, if a plan was made
+//!     model.ply      the Gaussians, for splat viewers
+//!     networks.safetensors    the weights of the networks, if any
 //!     train.csv      one line per step
-//!     held_out.csv   scores of the views that were kept from training, where there are any
-//!     evals.csv      scores of the test views on the way, with what it took, where they are asked for
-//!     views.csv      every view, what it is for and how large it is
-//!     tensorboard/   the same for `TensorBoard`, where that is asked for
-//!     exposures.csv  gain and bias of the training views, where they are learned
-//!     hashes.csv     checksums of the parameters on the way, where they are asked for
-//!     checkpoint.safetensors  what the run goes on from, overwritten every so many steps
-//!     checkpoint.before.safetensors    the one before, for where that is damaged
+//!     held_out.csv   scores of the held-out views, if any
+//!     evals.csv      intermediate scores of the test views, with time and energy, if requested
+//!     views.csv      name, split and size of every view
+//!     tensorboard/   logs for `TensorBoard`, if requested
+//!     exposures.csv  gain and bias of the training views, if learned
+//!     hashes.csv     checksums of the parameters, if requested
+//!     checkpoint.safetensors  state to resume from, overwritten regularly
+//!     checkpoint.before.safetensors    the previous checkpoint, in case the newest is damaged
 //!     metrics.json   scores of the test views
-//!     done.json      that the run is whole, and of which configuration and dataset it is
+//!     done.json      marks a complete run, with checksums of configuration and dataset
 //! ```
 //!
-//! A file appears under its name only once it is complete, `metrics.json` and `done.json` last: a directory that has them is
-//! whole. The model is written with every checkpoint, too: a run that was stopped can be looked at. While a process trains
-//! in it, it holds `.lock`.
+//! A file appears under its name when it is complete, `metrics.json` and `done.json` last: a directory with them is
+//! complete. The model is written with every checkpoint, so that an interrupted run can be viewed. `.lock` exists while
+//! a process trains in the directory.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -43,29 +43,29 @@ use crate::train::diagnose::Plan;
 use crate::train::{Networks, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result};
 
-/// A run directory and the log that grows in it.
+/// A run directory and its growing log.
 #[derive(Debug)]
 pub struct RunDirectory {
     path: PathBuf,
     log: BufWriter<File>,
     /// The columns of the log between loss and Gaussians.
     terms: Vec<Term>,
-    /// What the steps took that the log held already.
+    /// Seconds of the steps that the log already contained.
     seconds_before: f64,
-    /// Whether what it replaces is still there.
+    /// Whether the run that it replaces still exists.
     is_new: bool,
-    /// The run that was here before; back in its place if this is dropped before [`RunDirectory::settle`].
+    /// The previous run; restored if this is dropped before [`RunDirectory::settle`].
     backup: Backup,
-    /// Behind `backup`: nobody else begins before that is in order.
+    /// Declared after `backup`: the lock is released after the backup is restored.
     _lock: RunLock,
 }
 
 impl RunDirectory {
-    /// Refuses a place where no run can begin, before anything is loaded or written.
+    /// Checks that a run can begin here, before anything is loaded or written.
     ///
     /// # Errors
-    /// Another process trains there; it holds a run already and `overwrite` is false; it holds files of a run's names that
-    /// are no run's; or it lies beneath a file.
+    /// Another process trains there; it contains a run and `overwrite` is false; it contains files with a run's names
+    /// but no run; or a parent is a file.
     pub fn check(path: &Path, overwrite: bool) -> Result<()> {
         let used = FILES.iter().find(|file| path.join(file).exists());
         match used.filter(|_| !overwrite) {
@@ -74,18 +74,17 @@ impl RunDirectory {
         }
     }
 
-    /// Refuses a place where no run can begin or go on.
+    /// Checks that a run can begin or resume here.
     ///
     /// # Errors
-    /// Another process trains there, or it holds files of a run's names that are no run's, or lies beneath a file.
+    /// Another process trains there, it contains files with a run's names but no run, or a parent is a file.
     pub fn check_resumed(path: &Path) -> Result<()> {
         RunLock::check(path)?;
         if let Some(file) = FILES.iter().find(|file| path.join(file).exists())
             && !is_run(path)
         {
-            let problem = format!(
-                "holds {file}, but no config.toml of a run: it is somebody else's; name another folder"
-            );
+            let problem =
+                format!("contains {file}, but no config.toml of a run; name another folder");
             return Err(Error::output(path, problem));
         }
         match path.ancestors().find(|folder| folder.exists()) {
@@ -96,7 +95,7 @@ impl RunDirectory {
         }
     }
 
-    /// Locks the directory, which comes to be where it is not there, and puts it in order.
+    /// Creates the directory if necessary, locks it, and cleans up after a killed process.
     ///
     /// # Errors
     /// Another process trains there, or it cannot be written.
@@ -107,17 +106,17 @@ impl RunDirectory {
         Ok(lock)
     }
 
-    /// Writes the configuration into a directory that is locked. A run that was there before stays until [`RunDirectory::settle`].
+    /// Writes the configuration into a locked directory. A previous run is kept until [`RunDirectory::settle`].
     ///
     /// # Errors
-    /// It holds a run already and `overwrite` is false, or it cannot be written.
+    /// It contains a run and `overwrite` is false, or it cannot be written.
     pub(super) fn create_locked(
         path: &Path,
         lock: RunLock,
         config: &TrainConfig,
         overwrite: bool,
     ) -> Result<Self> {
-        // What was recovered is a run, too.
+        // A recovered run counts, too.
         if let Some(file) = FILES.iter().find(|file| path.join(file).exists() && !overwrite) {
             return Err(held(path, file));
         }
@@ -128,7 +127,7 @@ impl RunDirectory {
         Ok(run)
     }
 
-    /// The run has come to be: what was there before goes.
+    /// Deletes the previous run, once this one has begun.
     ///
     /// # Errors
     /// The directory cannot be written.
@@ -137,7 +136,7 @@ impl RunDirectory {
         if std::mem::take(&mut self.is_new) { remove_events(&self.path) } else { Ok(()) }
     }
 
-    /// Takes up a run again after `step`: its log is cut there, and it is unfinished.
+    /// Resumes a run after `step`: truncates its log there, and marks it as unfinished.
     ///
     /// # Errors
     /// The directory cannot be written, or its log does not reach `step`.
@@ -151,12 +150,12 @@ impl RunDirectory {
         let log_path = path.join(LOG);
         let text = std::fs::read_to_string(&log_path)
             .map_err(|error| Error::input(&log_path, format!("cannot be read ({error})")))?;
-        // The header and a line per step; the last line may be cut short.
+        // The header and a line per step; the last line may be truncated.
         let lines: Vec<&str> = text.split_inclusive('\n').take(step as usize + 1).collect();
         let last = lines.last().filter(|line| line.starts_with(&format!("{step},")));
         if last.is_none_or(|line| !line.ends_with('\n')) {
             let problem =
-                format!("ends before step {step} of the checkpoint; begin anew with --overwrite");
+                format!("ends before step {step} of the checkpoint; start again with --overwrite");
             return Err(Error::input(&log_path, problem));
         }
         let milliseconds = |line: &&str| line.trim_end().rsplit(',').next()?.parse::<f64>().ok();
@@ -165,7 +164,7 @@ impl RunDirectory {
         Self::open(path, config, &lines.concat(), seconds_before, Backup::default(), lock)
     }
 
-    /// Writes the configuration and what the log begins with.
+    /// Writes the configuration and the header of the log.
     fn open(
         path: &Path,
         config: &TrainConfig,
@@ -195,14 +194,14 @@ impl RunDirectory {
         write_whole(&self.path.join(HELD_OUT), text.as_bytes())
     }
 
-    /// How the run came up to a step.
+    /// The intermediate scores up to a step.
     pub(super) fn progress(&self, step: u64) -> Vec<Progress> {
         let mut progress = load_progress(&self.path);
         progress.retain(|one| one.step <= step);
         progress
     }
 
-    /// Writes how the run came so far.
+    /// Writes the intermediate scores.
     ///
     /// # Errors
     /// The disk is full or gone.
@@ -212,7 +211,7 @@ impl RunDirectory {
         write_whole(&self.path.join(PROGRESS), text.as_bytes())
     }
 
-    /// Writes the configuration with who says each value.
+    /// Writes the configuration with the origin of each value.
     ///
     /// # Errors
     /// The disk is full or gone.
@@ -235,7 +234,7 @@ impl RunDirectory {
         write_whole(&self.path.join(PLAN), plan.to_toml()?.as_bytes())
     }
 
-    /// Writes which views there are, for whoever opens the run with another copy of them.
+    /// Writes the list of views, to detect that a dataset has changed.
     ///
     /// # Errors
     /// The disk is full or gone.
@@ -245,18 +244,18 @@ impl RunDirectory {
         write_whole(&self.path.join(VIEWS), text.as_bytes())
     }
 
-    /// Begins event files for `TensorBoard`, behind a step.
+    /// Creates event files for `TensorBoard`, for steps after `step`.
     pub(super) fn events(&self, step: u64) -> Result<EventFile> {
         EventFile::create(&self.path.join(TENSORBOARD), step)
     }
 
-    /// What the steps took that a resumed run had behind it, in seconds.
+    /// Seconds of the steps before a resumed run.
     pub fn seconds_before(&self) -> f64 {
         self.seconds_before
     }
 
-    /// Writes what the run can go on from, behind a log that reaches as far, and the model as it is now. The checkpoint
-    /// before stays; while this is written it is the only one.
+    /// Flushes the log, then writes a checkpoint and the model. The previous checkpoint is kept, the only one until
+    /// this is complete.
     ///
     /// # Errors
     /// The disk is full or gone, the device was lost, or a parameter is not finite.
@@ -267,7 +266,7 @@ impl RunDirectory {
         self.save_trained(trainer)
     }
 
-    /// Writes the model and what belongs to it, as it is now.
+    /// Writes the current model with its networks and exposures.
     ///
     /// # Errors
     /// The disk is full or gone, the device was lost, or a parameter is not finite.
@@ -282,12 +281,12 @@ impl RunDirectory {
         }
     }
 
-    /// Where it is.
+    /// The path of the directory.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Appends the checksum of every plane of the parameters to `hashes.csv`.
+    /// Appends the checksum of every parameter plane to `hashes.csv`.
     ///
     /// # Errors
     /// The disk is full or gone.
@@ -310,7 +309,7 @@ impl RunDirectory {
         self.log_line(&format!("{step},{view},{loss:.6},{terms}{gaussians},{milliseconds:.2}"))
     }
 
-    /// What was logged is in the file, for whoever watches.
+    /// Flushes the log for other readers.
     ///
     /// # Errors
     /// The disk is full or gone.
@@ -318,7 +317,7 @@ impl RunDirectory {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))
     }
 
-    /// Writes `model.ply`, in the colours that viewers show and in the dataset's world.
+    /// Writes `model.ply`, in the colours that viewers expect and in the dataset's world.
     ///
     /// # Errors
     /// The disk is full or gone, or a parameter is not finite.
@@ -347,7 +346,7 @@ impl RunDirectory {
         table::save(&self.path.join(EXPOSURES), exposures)
     }
 
-    /// Writes `metrics.json`, the sign that the run is whole.
+    /// Writes `metrics.json`, which marks a complete run.
     ///
     /// # Errors
     /// The disk is full or gone.
@@ -360,7 +359,7 @@ impl RunDirectory {
     }
 }
 
-/// How a run came to where it is; nothing where its test views were scored at the end alone.
+/// The intermediate scores of a run; empty if the test views were scored at the end only.
 pub fn load_progress(run: &Path) -> Vec<Progress> {
     let text = std::fs::read_to_string(run.join(PROGRESS)).unwrap_or_default();
     text.lines().filter_map(Progress::parse).collect()
@@ -379,7 +378,7 @@ pub(super) fn view_lines(dataset: &Dataset) -> Vec<String> {
     dataset.views.iter().map(line).collect()
 }
 
-/// Whether a directory holds a run, be it of another version: a configuration with what every one has.
+/// Whether a directory contains a run of any version: a configuration with the keys that all have.
 fn is_run(path: &Path) -> bool {
     let text = std::fs::read_to_string(path.join("config.toml")).unwrap_or_default();
     let table = text.parse::<toml::Table>().unwrap_or_default();
@@ -387,7 +386,7 @@ fn is_run(path: &Path) -> bool {
 }
 
 fn held(path: &Path, file: &str) -> Error {
-    let problem = format!("already holds a run ({file}); --overwrite replaces it");
+    let problem = format!("already contains a run ({file}); --overwrite replaces it");
     Error::output(path, problem)
 }
 
@@ -421,7 +420,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_is_only_replaced_when_asked() {
+    fn a_run_is_only_replaced_on_request() {
         let folder = tempfile::tempdir().unwrap();
         let config = TrainConfig::default();
         drop(create(folder.path(), &config, false).unwrap());
@@ -439,11 +438,11 @@ mod tests {
         assert!(load_config(folder.path()).unwrap_err().to_string().contains("config.toml"));
         drop(create(folder.path(), &TrainConfig::default(), false).unwrap());
         let refused = load_gaussians(folder.path()).unwrap_err().to_string();
-        assert!(refused.contains("did not finish"), "{refused}");
+        assert!(refused.contains("neither finished"), "{refused}");
     }
 
     #[test]
-    fn a_run_that_goes_on_keeps_its_progress_up_to_there() {
+    fn a_resumed_run_keeps_its_scores_up_to_the_checkpoint() {
         let folder = tempfile::tempdir().unwrap();
         let run = create(folder.path(), &TrainConfig::default(), false).unwrap();
         assert!(run.progress(9).is_empty());
@@ -465,7 +464,7 @@ mod tests {
     }
 
     #[test]
-    fn a_directory_that_cannot_be_made_is_named() {
+    fn the_error_names_a_directory_that_cannot_be_created() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("file");
         std::fs::write(&file, "").unwrap();

@@ -1,5 +1,5 @@
-//! `done.json`: that a run is whole, and of which configuration and dataset it is. Whoever schedules runs asks for it, and
-//! a run that is asked for again finds itself done.
+//! `done.json` marks a complete run, with checksums of its configuration and dataset, for schedulers and for repeated
+//! commands.
 
 use std::path::Path;
 
@@ -14,16 +14,16 @@ use crate::{Error, Result};
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Done {
-    /// Checksum of what a result depends on.
+    /// Checksum of the settings that affect the result.
     configuration: String,
-    /// Checksum of what was trained on.
+    /// Checksum of the training data.
     dataset: String,
-    /// [`Dataset::stamp`]; none where the dataset is in no folder. Older files have none.
+    /// [`Dataset::stamp`]; `None` if the dataset is not in a folder. Older files have none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     stamp: Option<String>,
     /// The last step.
     steps: u64,
-    /// How it ended; older files do not say.
+    /// How it ended; missing in older files.
     #[serde(default)]
     ended: Option<Ended>,
     /// Version and device; older files have none.
@@ -31,7 +31,7 @@ struct Done {
     trained_with: Option<serde_json::Value>,
 }
 
-/// Writes the sign, after everything else.
+/// Writes the file, after all others.
 pub(super) fn save(
     run: &Path,
     config: &TrainConfig,
@@ -52,14 +52,14 @@ pub(super) fn save(
     write_whole(&run.join(DONE), (text + "\n").as_bytes())
 }
 
-/// What the sign says, if it is there and the files of the run are.
+/// The file, if it exists and those of the run do.
 fn load(run: &Path) -> Option<Done> {
     let text = std::fs::read_to_string(run.join(DONE)).unwrap_or_default();
     let is_whole = ["model.ply", "metrics.json"].iter().all(|file| run.join(file).is_file());
     serde_json::from_str::<Done>(&text).ok().filter(|_| is_whole)
 }
 
-/// The step that ended the run in a directory, if it is the whole of one of this configuration on this dataset.
+/// The last step of the run in a directory, if it is complete and of this configuration and dataset.
 ///
 /// # Errors
 /// None for a configuration that [`TrainConfig::check`] accepts.
@@ -70,8 +70,8 @@ pub fn done_steps(run: &Path, config: &TrainConfig, dataset: &Dataset) -> Result
     Ok(is_same.then_some(done.steps))
 }
 
-/// The same without a look at a photograph: none where the files of the dataset are others than the run was trained on, by
-/// their times of change, whatever they hold.
+/// [`done_steps`] without reading a photograph: `None` if the modification times of the dataset's files have changed,
+/// whatever their contents.
 ///
 /// # Errors
 /// None for a configuration that [`TrainConfig::check`] accepts.

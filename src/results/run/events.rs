@@ -1,27 +1,27 @@
-//! What a run tells its observer.
+//! Events of a run, for its observer.
 
 use super::meter::ResourceUsage;
 use crate::results::eval::ViewScore;
 use crate::train::{Ended, MemoryEstimate, StepReport, Trainer};
 
-/// A moment of a run, in the order in which they come.
+/// An event of a run, in order of occurrence.
 #[derive(Clone, Copy, Debug)]
 #[non_exhaustive]
 pub enum Event<'a> {
     /// The model is on the device.
     Started {
-        /// Steps that a resumed run has behind it; otherwise 0.
+        /// Steps before a resumed run, else 0.
         step: u64,
-        /// The step that ends the run.
+        /// The last step.
         steps: u64,
-        /// The run may end before it, once the held-out views have converged.
+        /// Whether the run may end earlier, once the held-out views have converged.
         may_end_early: bool,
-        /// What it is going to take.
+        /// The memory estimate.
         memory: &'a MemoryEstimate,
     },
-    /// A step is done and in the log. Steps are submitted several at a time and arrive so.
+    /// A step is done and logged. Steps are submitted and reported in batches.
     Step(&'a StepReport),
-    /// What the run can go on from is on disk.
+    /// A checkpoint is on disk.
     Checkpointed {
         /// Steps done.
         step: u64,
@@ -33,27 +33,27 @@ pub enum Event<'a> {
         /// Their mean PSNR, dB.
         psnr: f64,
     },
-    /// The run no longer ends early, or it has converged: what its last step is, is certain.
+    /// The last step is certain: the held-out views have converged, or the run can no longer end early.
     LastStep {
         /// Steps done.
         step: u64,
         /// The last step.
         last: u64,
     },
-    /// The last step is done, and the model of the best step is in place.
+    /// The last step is done, and the model of the best step is restored.
     Ended(&'a Ended),
-    /// The test views were scored, on the way or behind the last step.
+    /// The test views were scored, during the run or after its last step.
     Evaluated {
         /// Steps done.
         step: u64,
         /// The views that have a reference image.
         scored: &'a [ViewScore],
     },
-    /// The run directory is whole.
+    /// The run directory is complete.
     Finished(&'a RunSummary),
 }
 
-/// What a run made.
+/// The result of a run.
 #[derive(Debug)]
 pub struct RunSummary {
     /// The model and its networks, on the device.
@@ -64,6 +64,6 @@ pub struct RunSummary {
     pub scored: Vec<ViewScore>,
     /// The loss of every step of this call.
     pub losses: Vec<f64>,
-    /// What the steps took, without loading and scoring; the seconds before a resumed run included.
+    /// Resources of the steps, without loading and scoring, including the seconds before a resumed run.
     pub spent: ResourceUsage,
 }

@@ -1,4 +1,4 @@
-//! The names of the files of a run directory, and what is said where one cannot be written.
+//! Names of the files of a run directory, and the error if one cannot be written.
 
 use std::path::Path;
 
@@ -26,10 +26,10 @@ pub(super) const FILES: [&str; 14] = [
 /// A line per step.
 pub(super) const LOG: &str = "train.csv";
 
-/// PSNR of the views that were kept from training, against their targets.
+/// PSNR of the held-out views against their targets.
 pub(super) const HELD_OUT: &str = "held_out.csv";
 
-/// Scores of the test views on the way, and what it took.
+/// Intermediate scores of the test views, with time and energy.
 pub(super) const PROGRESS: &str = "evals.csv";
 
 /// Name, split and size of every view.
@@ -38,16 +38,16 @@ pub(super) const VIEWS: &str = "views.csv";
 /// The folder of event files.
 pub(super) const TENSORBOARD: &str = "tensorboard";
 
-/// Checksums of the parameters on the way.
+/// Checksums of the parameters.
 pub(super) const HASHES: &str = "hashes.csv";
 
-/// What was decided for the photographs, and why.
+/// Settings decided from the photographs, with reasons.
 pub(super) const PLAN: &str = "plan.toml";
 
-/// Where `metrics.json` holds the [`crate::train::TargetExposure`].
+/// Key of the [`crate::train::TargetExposure`] in `metrics.json`.
 pub(crate) const TARGET_EXPOSURE: &str = "target_exposure";
 
-/// Where `metrics.json` holds what the steps took beside seconds.
+/// Key of the resources of the steps, other than seconds, in `metrics.json`.
 pub(crate) const SPENT: &str = "spent";
 
 /// How the run ended, in `metrics.json`.
@@ -65,13 +65,13 @@ pub(super) const EXPOSURES: &str = "exposures.csv";
 /// The weights of the networks.
 pub(super) const NETWORKS: &str = "networks.safetensors";
 
-/// The sign that the run is whole, and what it is of.
+/// Marks a complete run.
 pub(super) const DONE: &str = "done.json";
 
-/// The state of an unfinished run, or of a finished one that may be made longer.
+/// The state of an unfinished run, or of a finished one that may be extended.
 pub(super) const CHECKPOINT: &str = "checkpoint.safetensors";
 
-/// The one before.
+/// The previous checkpoint.
 pub(super) const CHECKPOINT_BEFORE: &str = "checkpoint.before.safetensors";
 
 /// The value of [`TRAINED_WITH`].
@@ -84,7 +84,7 @@ pub(super) fn trained_with(gpu: &Gpu) -> serde_json::Value {
     })
 }
 
-/// The error of a file of the run that cannot be written.
+/// The error for a file of the run that cannot be written.
 pub(super) fn unwritable(path: &Path, error: &std::io::Error) -> Error {
     Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
 }

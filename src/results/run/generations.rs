@@ -1,4 +1,4 @@
-//! The two checkpoints of a run: the newest, and the one before for where that is damaged.
+//! The two checkpoints of a run: the newest, and the previous one in case the newest is damaged.
 
 use std::path::{Path, PathBuf};
 
@@ -10,8 +10,8 @@ fn both(run: &Path) -> [PathBuf; 2] {
     [CHECKPOINT, CHECKPOINT_BEFORE].map(|file| run.join(file))
 }
 
-/// The checkpoint that a run goes on from: the newest that is whole, else the newest, to say what is wrong with it; none
-/// where there is none.
+/// The checkpoint to resume from: the newest that is intact, else the newest, so that its problem is reported; `None`
+/// if there is none.
 pub(super) fn newest(run: &Path) -> Option<PathBuf> {
     let [newest, before] = both(run);
     let problem = match newest.is_file().then(|| check_checkpoint(&newest)) {
@@ -21,14 +21,14 @@ pub(super) fn newest(run: &Path) -> Option<PathBuf> {
     };
     if before.is_file() && check_checkpoint(&before).is_ok() {
         if let Some(problem) = problem {
-            tracing::warn!("{problem}: the run goes on from the checkpoint before");
+            tracing::warn!("{problem}: resuming from the previous checkpoint");
         }
         return Some(before);
     }
     [newest, before].into_iter().find(|path| path.is_file())
 }
 
-/// Removes a newest checkpoint that is damaged, once the run goes on from the one before: it would take that one's place.
+/// Removes a damaged newest checkpoint, once the run has resumed from the previous one, which it would replace.
 pub(super) fn keep_whole(run: &Path) -> Result<()> {
     let [newest, _] = both(run);
     if newest.is_file() && check_checkpoint(&newest).is_err() {
@@ -37,7 +37,7 @@ pub(super) fn keep_whole(run: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Where the next one is to be written: the newest becomes the one before, and stays if that fails.
+/// The path of the next checkpoint. The newest becomes the previous one, and stays if writing fails.
 pub(super) fn rotate(run: &Path) -> Result<PathBuf> {
     let [newest, before] = both(run);
     if newest.exists() {

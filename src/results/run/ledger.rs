@@ -1,4 +1,4 @@
-//! `hashes.csv`: a checksum of every plane of the parameters on the way, which two machines compare line by line.
+//! `hashes.csv`: checksums of every parameter plane, to compare two machines line by line.
 //!
 //! ```text
 //! step,gaussians,means,quats,log_scales,raw_opacities,dc,features,rest
@@ -8,8 +8,7 @@
 use crate::base::hash;
 use crate::splats::scene::{ATTRIBUTES, Gaussians};
 
-/// The table with the line of one step more. Lines of that step and later ones, which a run leaves behind that goes on from
-/// before them, are gone.
+/// The table with a line for `step`. Lines of this and later steps are removed: a resumed run repeats them.
 pub(super) fn extended(known: &str, step: u64, gaussians: &Gaussians) -> String {
     let names = ATTRIBUTES.each_ref().map(|spec| spec.name).join(",");
     let is_before = |line: &&str| {
@@ -34,7 +33,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_ledger_names_the_plane_that_differs_and_forgets_what_is_done_again() {
+    fn a_ledger_names_the_plane_that_differs_and_drops_repeated_steps() {
         let gaussians = Gaussians::zeros(3, 1);
         let mut other = gaussians.clone();
         other.dc_mut()[1].y = 1e-6;

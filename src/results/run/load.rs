@@ -1,4 +1,4 @@
-//! What a run directory holds, read back.
+//! Reads a run directory.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -15,12 +15,12 @@ use crate::splats::scene::{Features, Gaussians, ply};
 use crate::train::{ModelConfig, Networks, TrainConfig};
 use crate::{Error, Result};
 
-/// Whether a directory holds a run that reached its end.
+/// Whether a directory contains a finished run.
 pub fn is_finished(run: &Path) -> bool {
     run.join("metrics.json").exists()
 }
 
-/// What `metrics.json` says; null where it does not exist.
+/// The contents of `metrics.json`; null if there is none.
 pub fn load_metrics(run: &Path) -> serde_json::Value {
     let text = std::fs::read(run.join("metrics.json")).ok();
     text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
@@ -29,28 +29,27 @@ pub fn load_metrics(run: &Path) -> serde_json::Value {
 /// The configuration of a finished or unfinished run.
 ///
 /// # Errors
-/// The directory holds none.
+/// The directory contains none.
 pub fn load_config(run: &Path) -> Result<TrainConfig> {
     let path = run.join("config.toml");
     if !path.is_file() {
-        let problem =
-            "is no run directory: it has no config.toml; name what `nightsplat train` wrote";
+        let problem = "is no run directory: it has no config.toml; name the folder that `nightsplat train` wrote";
         return Err(Error::input(run, problem));
     }
     Ok(TrainConfig::load(&path)?.with_paths_from(run))
 }
 
-/// The plan that a run keeps to; none where it keeps to none.
+/// The plan of a run, if it has one.
 pub fn plan_of(run: &Path) -> Option<PathBuf> {
     Some(run.join(PLAN)).filter(|path| path.is_file())
 }
 
-/// The step of the model of a run that did not come to its end; none of a finished one, and where none is known.
+/// The step of the model of an unfinished run; `None` if it is finished or the step is unknown.
 pub fn stopped_at(run: &Path) -> Option<u64> {
     if is_finished(run) {
         return None;
     }
-    // The header of a safetensors file, length first, is JSON with a note in which the checkpoint says what it is.
+    // A safetensors file begins with the length of its header, JSON with the checkpoint's description.
     let mut file = File::open(generations::newest(run)?).ok()?;
     let mut length = [0; 8];
     file.read_exact(&mut length).ok()?;
@@ -64,22 +63,22 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
 /// The trained Gaussians of a run, in the colours that viewers show.
 ///
 /// # Errors
-/// The run has not been trained to its end or a checkpoint, or the file is cut short.
+/// The run neither finished nor reached a checkpoint, or the file is truncated.
 pub fn load_gaussians(run: &Path) -> Result<Gaussians> {
     let path = run.join("model.ply");
     if !path.is_file() {
-        let problem = "has no model.ply: the run did not finish, nor come to a checkpoint; train it again, or go on with \
-                       --resume";
+        let problem = "has no model.ply: the run neither finished nor reached a checkpoint; train it again, or \
+                       continue with --resume";
         return Err(Error::input(run, problem));
     }
     ply::load(path)
 }
 
-/// The trained networks of a run; none where its model has none. `features` are those that its Gaussians came to have:
-/// a part that found nothing to learn from has none, whatever the configuration asks for.
+/// The trained networks of a run; `None` if its model has none. `features` are those of its Gaussians: a part without
+/// anything to learn from has none, whatever the configuration says.
 ///
 /// # Errors
-/// Their file is missing or damaged, or holds networks of another configuration.
+/// Their file is missing, damaged, or of another configuration.
 pub fn load_networks(
     gpu: &Gpu,
     run: &Path,
@@ -94,7 +93,7 @@ pub fn load_networks(
     Ok(Some(networks))
 }
 
-/// What the exposures of a run's training views make of its model, by name; none where it has learned none.
+/// The learned exposures of a run's training views relative to its model, by name; empty if none were learned.
 ///
 /// # Errors
 /// The file is damaged.
@@ -104,8 +103,8 @@ pub fn load_exposures(run: &Path) -> Result<BTreeMap<String, Affine>> {
     Ok(known.into_iter().filter_map(|known| Some((known.name, known.affine?))).collect())
 }
 
-/// How the views of a dataset differ from those that a run was trained and scored on, in words; none where they are the
-/// same, or the run does not say which those were.
+/// The difference between the views of a dataset and those of a run, in words; `None` if they are equal, or the run has
+/// no list of views.
 pub fn other_views(run: &Path, dataset: &Dataset) -> Option<String> {
     let text = std::fs::read_to_string(run.join(VIEWS)).ok()?;
     let own: BTreeSet<&str> = text.lines().skip(1).collect();

@@ -1,7 +1,7 @@
 //! One training at a time in a run directory.
 //!
-//! The lock is advisory and belongs to the open file: it goes with the process, however that ends. The file holds the
-//! process's number for whoever comes second, and is removed at the end.
+//! The lock is advisory and belongs to the open file: it is released when the process ends. The file contains the
+//! process id, for the error message of a second process, and is removed at the end.
 
 use std::fs::{File, TryLockError};
 use std::io::Write;
@@ -9,11 +9,11 @@ use std::path::{Path, PathBuf};
 
 use crate::{Error, Result};
 
-/// A run directory that nobody else trains in while this lives.
+/// An exclusive lock on a run directory.
 #[derive(Debug)]
 pub(super) struct RunLock {
     path: PathBuf,
-    /// What holds the lock.
+    /// The open file that has the lock.
     _file: File,
 }
 
@@ -33,10 +33,10 @@ impl RunLock {
             let mut file = options.open(&path).map_err(unusable)?;
             match file.try_lock() {
                 Err(TryLockError::WouldBlock) => return Err(taken(run, &path)),
-                // A file system without locks: one training at a time is up to its user.
+                // The file system has no locks; users must not train twice at a time.
                 Err(TryLockError::Error(_)) | Ok(()) => {}
             }
-            // Whoever had it before may have removed the file in between.
+            // The previous owner may have removed the file in between.
             if is_at(&file, &path) {
                 let process = format!("{}\n", std::process::id());
                 file.set_len(0)
@@ -47,10 +47,10 @@ impl RunLock {
         }
     }
 
-    /// Whether [`RunLock::take`] would find nobody there.
+    /// Checks that [`RunLock::take`] would succeed.
     ///
     /// # Errors
-    /// As there.
+    /// Those of [`RunLock::take`].
     pub(super) fn check(run: &Path) -> Result<()> {
         let path = run.join(LOCK);
         match File::open(&path).map(|file| file.try_lock_shared()) {
@@ -62,7 +62,7 @@ impl RunLock {
 
 impl Drop for RunLock {
     fn drop(&mut self) {
-        // Behind the removal the file is nobody's, and the lock ends with it.
+        // After the removal no other process opens the file, and the lock ends with it.
         let _ = std::fs::remove_file(&self.path);
     }
 }
@@ -86,7 +86,7 @@ fn is_at(file: &File, path: &Path) -> bool {
     both.is_some_and(|(own, there)| (own.dev(), own.ino()) == (there.dev(), there.ino()))
 }
 
-/// A file that is open cannot be removed.
+/// An open file cannot be removed.
 #[cfg(not(unix))]
 fn is_at(_: &File, _: &Path) -> bool {
     true
@@ -97,7 +97,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_second_training_in_a_directory_is_refused_with_the_process_that_has_it() {
+    fn a_second_training_in_a_directory_is_refused_and_the_first_process_named() {
         let folder = tempfile::tempdir().unwrap();
         let held = RunLock::take(folder.path()).unwrap();
         for error in
@@ -112,12 +112,8 @@ mod tests {
         }
         drop(held);
         RunLock::check(folder.path()).unwrap();
-        assert_eq!(
-            std::fs::read_dir(folder.path()).unwrap().count(),
-            0,
-            "it leaves nothing behind"
-        );
-        // What a killed process leaves is no lock.
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "it leaves no file");
+        // The file of a killed process is no lock.
         std::fs::write(folder.path().join(LOCK), "1\n").unwrap();
         drop(RunLock::take(folder.path()).unwrap());
     }

@@ -1,31 +1,31 @@
-//! What a run takes of the machine: time on the wall and on the processors, energy, memory; as far as the system says.
+//! Resources of a run: wall-clock time, processor time, energy and memory, as far as the system reports them.
 //!
-//! Processor time and memory are the process's own (`/proc/self`, Linux). Energy is that of the whole machine while the
-//! run is at work, idling included: the packages and memory of `/sys/class/powercap` (RAPL), and graphics cards whose
-//! driver counts microjoules.
+//! Processor time and memory are those of the process (`/proc/self`, Linux). Energy is that of the whole machine during
+//! the run, including idle power: the packages and memory of `/sys/class/powercap` (RAPL), and GPUs whose driver counts
+//! microjoules.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use serde::Serialize;
 
-/// What the steps of a run took; none where the system does not say, or a part was taken by a process before this one.
+/// Resources of the steps of a run; `None` if the system does not report them, or an earlier process did a part.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct ResourceUsage {
-    /// On the wall.
+    /// Wall-clock time.
     #[serde(skip)]
     pub seconds: f64,
-    /// On all processors together, of the system included.
+    /// Time on all processors, user and system.
     pub processor_seconds: Option<f64>,
-    /// Of the whole machine.
+    /// Energy of the whole machine.
     pub joules: Option<f64>,
-    /// The most that buffers took on the device.
+    /// Peak device memory of buffers.
     pub device_bytes: u64,
-    /// The most that the process had in memory; on a software device, the device's buffers too.
+    /// Peak memory of the process; on a software device, this includes the device's buffers.
     pub host_bytes: Option<u64>,
 }
 
-/// Adds up what pieces of work take.
+/// Sums the resources of pieces of work.
 #[derive(Debug)]
 pub(super) struct ResourceMeter {
     counters: Vec<Counter>,
@@ -33,7 +33,7 @@ pub(super) struct ResourceMeter {
 }
 
 impl ResourceMeter {
-    /// One that goes on after `seconds_before` of another process, whose other figures nobody knows.
+    /// Begins after `seconds_before` of an earlier process, whose other figures are unknown.
     pub(super) fn new(seconds_before: f64) -> Self {
         let is_whole = seconds_before == 0.0;
         let counters = Counter::all(Path::new("/sys"));
@@ -48,7 +48,7 @@ impl ResourceMeter {
         Self { counters, spent }
     }
 
-    /// Does `work` and adds what it takes.
+    /// Runs `work` and adds its resources.
     pub(super) fn of<T>(&mut self, work: impl FnOnce() -> T) -> T {
         let energy = |meter: &Self| meter.counters.iter().map(Counter::read).collect::<Vec<_>>();
         let (joules, processor, begin) = (energy(self), processor_seconds(), Instant::now());
@@ -63,13 +63,13 @@ impl ResourceMeter {
         done
     }
 
-    /// What the work so far took, and what the process had in memory at most.
+    /// The resources so far, and the peak memory of the process.
     pub(super) fn spent(&self, device_bytes: u64) -> ResourceUsage {
         ResourceUsage { device_bytes, host_bytes: host_bytes(), ..self.spent }
     }
 }
 
-/// What the energy of runs is measured by on this machine; empty where nothing counts it, or only for administrators.
+/// The energy counters of this machine; empty if there are none or only administrators may read them.
 pub fn energy_counters() -> Vec<String> {
     Counter::all(Path::new("/sys")).into_iter().map(|counter| counter.name).collect()
 }
@@ -79,17 +79,17 @@ pub fn energy_counters() -> Vec<String> {
 struct Counter {
     name: String,
     file: PathBuf,
-    /// Where it begins anew, microjoules; none where it never does.
+    /// The value at which it wraps around, microjoules; `None` if it never does.
     range: Option<f64>,
 }
 
 impl Counter {
-    /// Those below `sys` that can be read, each domain once.
+    /// The readable counters below `sys`, each domain once.
     fn all(sys: &Path) -> Vec<Self> {
         let mut counters: Vec<Self> = vec![];
         for zone in folders(&sys.join("class/powercap")) {
             let name = text(&zone.join("name")).unwrap_or_default();
-            // Cores are a part of their package, and psys has the packages in it.
+            // Cores are a part of their package, and psys contains the packages.
             let is_counted = name.starts_with("package") || name == "dram";
             let parent = zone.file_name().unwrap_or_default().to_string_lossy();
             let package = parent.split(':').nth(1).unwrap_or_default();
@@ -115,7 +115,7 @@ impl Counter {
         number(&self.file)
     }
 
-    /// Joules from one reading to a later one, at most one round of the counter away.
+    /// Joules between two readings, with at most one wrap-around of the counter.
     fn between(&self, then: f64, now: f64) -> f64 {
         let wraps = if now < then { self.range.unwrap_or(0.0) } else { 0.0 };
         1e-6 * (now + wraps - then).max(0.0)
@@ -124,10 +124,10 @@ impl Counter {
 
 /// Processor time of this process so far.
 fn processor_seconds() -> Option<f64> {
-    // Linux promises its users hundredths of a second, whatever the kernel counts in.
+    // Linux reports hundredths of a second, whatever the kernel's tick rate.
     const TICKS: f64 = 100.0;
     let text = text(Path::new("/proc/self/stat"))?;
-    // The name of the program stands in parentheses and may hold anything; behind it, times are fields 12 and 13.
+    // The program's name is in parentheses and may contain anything; after it, the times are fields 12 and 13.
     let fields: Vec<&str> = text.rsplit_once(')')?.1.split_whitespace().collect();
     let ticks = |field: usize| fields.get(field)?.parse::<f64>().ok();
     Some((ticks(11)? + ticks(12)?) / TICKS)

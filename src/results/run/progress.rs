@@ -1,14 +1,14 @@
-//! The rows of `evals.csv`: how a run came to where it is.
+//! The rows of `evals.csv`: intermediate scores of a run.
 
 use super::meter::ResourceUsage;
 use crate::photographs::metrics::Scores;
 
-/// The scores of the test views at one step of a run, and what the steps up to it took.
+/// The mean scores of the test views at one step, and the resources up to it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Progress {
     /// Counted from 1.
     pub step: u64,
-    /// How many were scored.
+    /// The number of scored views.
     pub views: usize,
     /// The mean over the test views, dB.
     pub psnr: f64,
@@ -16,11 +16,11 @@ pub struct Progress {
     pub psnr_channel_mean: f64,
     /// The mean over the test views.
     pub ssim: f64,
-    /// On the wall, without scoring.
+    /// Wall-clock time, without scoring.
     pub seconds: f64,
-    /// On all processors together, without scoring; none where the system does not say.
+    /// Time on all processors, without scoring; `None` if the system does not report it.
     pub processor_seconds: Option<f64>,
-    /// Of the whole machine; none where it has no counter.
+    /// Energy of the whole machine; `None` if it has no counter.
     pub joules: Option<f64>,
     /// The number of Gaussians.
     pub gaussians: u64,
@@ -59,7 +59,7 @@ impl Progress {
         )
     }
 
-    /// None of a line that is no row.
+    /// Parses a line; `None` if it is not a row.
     pub(super) fn parse(line: &str) -> Option<Self> {
         let fields: Vec<&str> = line.split(',').collect();
         let [step, views, psnr, channel_mean, ssim, seconds, processor, joules, gaussians] =

@@ -1,14 +1,14 @@
-//! What is asked of a run while it trains: by signals, or from another thread.
+//! Requests to a running training, by signals or from another thread.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use crate::Stop;
 
-/// Wishes that a run fulfils at the end of the steps under way. Clones are the same wishes.
+/// Requests that a run fulfils after the steps under way. Clones share their state.
 #[derive(Clone, Debug, Default)]
 pub struct Requests {
-    /// 0, or 1 more than the place in [`STOPS`].
+    /// 0, or 1 + the index in [`STOPS`].
     stop: Arc<AtomicUsize>,
     save: Arc<AtomicBool>,
 }
@@ -16,40 +16,40 @@ pub struct Requests {
 const STOPS: [Stop; 3] = [Stop::Interrupted, Stop::Terminated, Stop::TimeUp];
 
 impl Requests {
-    /// Asks to save and stop.
+    /// Requests to save and stop.
     #[cfg(feature = "testing")]
     pub fn stop(&self, cause: Stop) {
         self.stop.store(Self::code(cause), Ordering::Relaxed);
     }
 
-    /// Asks to save and go on.
+    /// Requests to save and continue.
     #[cfg(feature = "testing")]
     pub fn save(&self) {
         self.save.store(true, Ordering::Relaxed);
     }
 
-    /// What asked to stop, if anything did.
+    /// The cause of a request to stop, if there is one.
     pub(crate) fn stops(&self) -> Option<Stop> {
         let place = self.stop.load(Ordering::Relaxed).checked_sub(1)?;
         STOPS.get(place).copied()
     }
 
-    /// Whether somebody asked to save since this was asked last.
+    /// Whether a save was requested since the last call.
     pub(super) fn takes_save(&self) -> bool {
         self.save.swap(false, Ordering::Relaxed)
     }
 
-    /// For signal handlers, which may store a number and nothing more: where, and the number of a cause.
+    /// For signal handlers, which may only store a number: the flag for [`Requests::code`].
     pub(crate) fn stop_flag(&self) -> &Arc<AtomicUsize> {
         &self.stop
     }
 
-    /// The number that stands for a cause in [`Requests::stop_flag`].
+    /// The number of a cause in [`Requests::stop_flag`].
     pub(crate) fn code(cause: Stop) -> usize {
         STOPS.iter().position(|&stop| stop == cause).map_or(0, |place| place + 1)
     }
 
-    /// As [`Requests::stop_flag`], of [`Requests::save`].
+    /// The flag of [`Requests::save`], for signal handlers.
     pub(crate) fn save_flag(&self) -> &Arc<AtomicBool> {
         &self.save
     }

@@ -1,7 +1,7 @@
-//! Event files as `TensorBoard` reads them: numbers and pictures over the steps of a run.
+//! Event files for `TensorBoard`: scalars and images over the steps of a run.
 //!
-//! A file is records of (length u64, masked CRC-32C of that, bytes, masked CRC-32C of those), little-endian, as TensorFlow's
-//! `TFRecord` has them; the bytes are a protocol buffer `tensorflow.Event`, of which a few fields are written.
+//! A file is records of (length u64, masked CRC-32C of that, bytes, masked CRC-32C of those), little-endian, as in
+//! TensorFlow's `TFRecord`; the bytes are a protocol buffer `tensorflow.Event` with a few of its fields.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -10,7 +10,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use crate::{Error, Result};
 
-/// A file that grows.
+/// A growing event file.
 #[derive(Debug)]
 pub(super) struct EventFile {
     path: PathBuf,
@@ -18,15 +18,15 @@ pub(super) struct EventFile {
 }
 
 impl EventFile {
-    /// Begins another file in `folder`, whose events are to hold behind `step`: what earlier files say of later steps, of a
-    /// run that was cut off, is forgotten.
+    /// Creates a new file in `folder` for events after `step`. It invalidates later events of earlier files, from an
+    /// interrupted run.
     ///
     /// # Errors
     /// The folder cannot be written.
     pub(super) fn create(folder: &Path, step: u64) -> Result<Self> {
         let failed = |error: std::io::Error| unwritable(folder, &error);
         std::fs::create_dir_all(folder).map_err(failed)?;
-        // Readers take the files of a run in the order of their names.
+        // Readers order the files of a run by name.
         let (now, mut number) = (seconds() as u64, 0);
         let (path, file) = loop {
             let path = folder.join(format!("events.out.tfevents.{now:010}.{number:04}.nightsplat"));
@@ -43,7 +43,7 @@ impl EventFile {
         Ok(events)
     }
 
-    /// Numbers at a step, each under its name; a slash in it parts a group from a name.
+    /// Writes scalars of a step by name; a slash separates group and name.
     ///
     /// # Errors
     /// The disk is full or gone.
@@ -56,7 +56,7 @@ impl EventFile {
         self.write(step, &Message::default().message(5, &summary))
     }
 
-    /// A picture at a step, as a PNG file has it.
+    /// Writes an image of a step, a PNG file.
     ///
     /// # Errors
     /// The disk is full or gone.
@@ -74,7 +74,7 @@ impl EventFile {
         self.write(step, &Message::default().message(5, &Message::default().message(1, &value)))
     }
 
-    /// A line of text at a step.
+    /// Writes a line of text of a step.
     ///
     /// # Errors
     /// The disk is full or gone.
@@ -89,7 +89,7 @@ impl EventFile {
         self.write(step, &Message::default().message(5, &Message::default().message(1, &value)))
     }
 
-    /// What was written is in the file, for whoever watches.
+    /// Flushes the file for other readers.
     ///
     /// # Errors
     /// The disk is full or gone.
@@ -97,7 +97,7 @@ impl EventFile {
         self.file.flush().map_err(|error| unwritable(&self.path, &error))
     }
 
-    /// Writes what an event says as one record.
+    /// Writes the fields of an event as one record.
     fn write(&mut self, step: u64, what: &Message) -> Result<()> {
         let mut event = Message::default().double(1, seconds()).varint(2, step);
         event.0.extend(&what.0);
@@ -113,7 +113,7 @@ impl EventFile {
     }
 }
 
-/// The clock on the wall.
+/// Seconds since the Unix epoch.
 fn seconds() -> f64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
 }
@@ -122,7 +122,7 @@ fn unwritable(path: &Path, error: &std::io::Error) -> Error {
     Error::output(path, format!("cannot be written ({error}); check the folder and the disk"))
 }
 
-/// The fields of a protocol buffer, one behind the other.
+/// The fields of a protocol buffer, concatenated.
 #[derive(Default)]
 struct Message(Vec<u8>);
 
@@ -132,7 +132,7 @@ impl Message {
         self
     }
 
-    /// Seven bits a byte, the least first; the highest bit says that more follow.
+    /// A varint: seven bits per byte, least significant first; the high bit marks that more follow.
     fn number(&mut self, mut value: u64) {
         while value >= 0x80 {
             self.0.push(value as u8 | 0x80);
@@ -171,7 +171,7 @@ impl Message {
     }
 }
 
-/// The cyclic redundancy check of Castagnoli, reflected.
+/// CRC-32C (Castagnoli), reflected.
 fn crc32c(bytes: &[u8]) -> u32 {
     const TABLE: [u32; 256] = table();
     let step = |crc: u32, byte: &u8| TABLE[((crc ^ u32::from(*byte)) & 0xff) as usize] ^ (crc >> 8);
@@ -193,7 +193,7 @@ const fn table() -> [u32; 256] {
     table
 }
 
-/// A check of data that holds checks is masked, says the format.
+/// The format masks checksums of data that contain checksums.
 fn masked(crc: u32) -> u32 {
     crc.rotate_right(15).wrapping_add(0xa282_ead8)
 }
@@ -203,14 +203,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_check_is_castagnolis() {
+    fn the_checksum_matches_a_vector_of_rfc_3720() {
         // RFC 3720, B.4.
         assert_eq!(crc32c(b"123456789"), 0xe306_9283);
         assert_eq!(crc32c(&[0; 32]), 0x8a91_36aa);
         assert_eq!(crc32c(&[0xff; 32]), 0x62a8_ab43);
     }
 
-    /// The fields of a message: number and bytes, numbers as eight of them.
+    /// The fields of a message: number and bytes, with numbers as eight bytes.
     fn fields(mut bytes: &[u8]) -> Vec<(u64, Vec<u8>)> {
         fn number(bytes: &mut &[u8]) -> u64 {
             let (mut value, mut shift) = (0, 0);
@@ -243,7 +243,7 @@ mod tests {
         fields
     }
 
-    /// The events of a file, every check verified.
+    /// The events of a file, with every checksum verified.
     fn events(path: &Path) -> Vec<Vec<(u64, Vec<u8>)>> {
         let bytes = std::fs::read(path).unwrap();
         let (mut rest, mut events) = (&bytes[..], vec![]);
@@ -260,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_back() {
+    fn written_events_are_read_back() {
         let folder = tempfile::tempdir().unwrap();
         let mut file = EventFile::create(folder.path(), 7).unwrap();
         let values = [("loss/l1".to_owned(), 0.25), ("Gaussians".to_owned(), 70_000.0)];
@@ -286,7 +286,7 @@ mod tests {
         let number = |bytes: &Vec<u8>| u64::from_le_bytes(bytes.clone().try_into().unwrap());
         assert_eq!([0, 1, 2].map(|place| number(&image[place].1)), [480, 640, 3]);
         assert_eq!(image[3], (4, b"pixels".to_vec()));
-        // Another file of the same second is another file.
+        // A second file of the same second gets another name.
         let again = EventFile::create(folder.path(), 0).unwrap();
         assert_ne!(again.path, file.path);
     }

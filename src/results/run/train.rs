@@ -1,4 +1,4 @@
-//! Trains into a run directory and tells an observer.
+//! Trains into a run directory and reports events.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -16,38 +16,40 @@ use crate::train::diagnose::Plan;
 use crate::train::{Ended, MemoryEstimate, OnOff, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
-/// What becomes of a run that the directory already holds.
+/// What to do with an existing run in the directory.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum IfExists {
-    /// It stays: nothing is trained.
+    /// Keep it and train nothing.
     #[default]
     Refuse,
-    /// It is deleted.
+    /// Delete it.
     Replace,
-    /// It goes on from its checkpoint, to the bits that it would have had in one go; without one it begins anew.
+    /// Resume it from its checkpoint, with the same bits as an uninterrupted run; start again if there is no
+    /// checkpoint.
     Resume,
 }
 
-/// How a run comes to be, and what may be asked of it.
+/// Options of a run.
 #[derive(Clone, Debug, Default)]
 pub struct Session<'a> {
-    /// The plan that its configuration and dataset follow already; it is kept in the run directory.
+    /// The plan that the configuration and dataset already follow; it is saved in the run directory.
     pub plan: Option<&'a Plan>,
-    /// Where the configuration's values come from; config.toml says so.
+    /// The origins of the configuration's values, for config.toml.
     pub settings: Option<&'a Settings>,
-    /// What becomes of a run that is there.
+    /// What to do with an existing run.
     pub if_exists: IfExists,
-    /// What is asked of it on the way.
+    /// Requests while it trains.
     pub requests: Requests,
 }
 
 /// Trains `config` on `dataset`, scores the test views and writes the run directory `out`.
 ///
-/// `observe` is told every [`Event`] on the calling thread. `dataset` is what [`TrainConfig::load_options`] loads.
+/// `observe` is called with every [`Event`] on the calling thread. `dataset` must be loaded with
+/// [`TrainConfig::load_options`].
 ///
 /// # Errors
-/// The directory holds a run that `if_exists` keeps, or cannot be written; the configuration makes no sense or is not that of
-/// the run that is to go on; a loss is not finite; the device is out of memory or lost.
+/// The directory contains a run that `if_exists` keeps, or cannot be written; the configuration is invalid or not that
+/// of the run to resume; a loss is not finite; the device is out of memory or lost.
 ///
 /// ```no_run
 /// use std::path::Path;
@@ -77,10 +79,10 @@ pub fn train(
     train_in(gpu, config, dataset, out, &Session { if_exists, ..Session::default() }, observe)
 }
 
-/// As [`train`], in a [`Session`].
+/// [`train`] with the options of a [`Session`].
 ///
 /// # Errors
-/// As there, and [`Error::Stopped`] where the run was asked to stop or has taken `TrainConfig::max_minutes`.
+/// Those of [`train`], and [`Error::Stopped`] on request or after `TrainConfig::max_minutes`.
 pub fn train_in(
     gpu: &Gpu,
     config: &TrainConfig,
@@ -134,14 +136,15 @@ pub fn train_in(
     Ok(trained)
 }
 
-/// Warns where the driver has less memory for us than the run may come to need.
+/// Warns if the driver has less free memory than the run may need.
 fn warn_of_memory(gpu: &Gpu, memory: &MemoryEstimate) {
     let Some(budget) = gpu.memory_budget() else { return };
     let left = budget.budget.saturating_sub(budget.usage) + gpu.memory_in_use();
     if memory.peak_device > left {
         let mebibytes = |bytes: u64| bytes >> 20;
         tracing::warn!(
-            "{} Gaussians may take {} MiB of the device, {} MiB are free: max_vram or max_gaussians stops growth in time",
+            "{} Gaussians may take {} MiB of the device, {} MiB are free: max_vram or max_gaussians stops growth \
+             in time",
             memory.peak_gaussians,
             mebibytes(memory.peak_device),
             mebibytes(left)
@@ -149,7 +152,7 @@ fn warn_of_memory(gpu: &Gpu, memory: &MemoryEstimate) {
     }
 }
 
-/// A new run, or one that is taken up again.
+/// Begins a new run, or resumes one.
 fn begin(
     gpu: &Gpu,
     config: &TrainConfig,
@@ -158,7 +161,7 @@ fn begin(
     session: &Session<'_>,
 ) -> Result<(RunDirectory, Trainer)> {
     let if_exists = session.if_exists;
-    // A tile that does not suit the device is said before there is a directory.
+    // A tile size that the device does not support is refused before a directory is created.
     config.render_settings().tile_on(gpu)?;
     match if_exists {
         IfExists::Refuse => RunDirectory::check(out, false)?,
@@ -169,7 +172,7 @@ fn begin(
     let resumes = if_exists == IfExists::Resume;
     let checkpoint = if resumes { generations::newest(out) } else { None };
     let mut config = with_what_is_found(gpu, config, dataset, checkpoint.is_some().then_some(out))?;
-    // A disk that has room for the run has it for photographs.
+    // The disk of the run has space for the photographs, too.
     config.spool.get_or_insert_with(|| out.to_owned());
     let config = &config;
     let explain = |directory: &RunDirectory| match session.settings {
@@ -185,12 +188,12 @@ fn begin(
         let step = trainer.steps_done();
         tracing::info!("{} goes on after step {step}", out.display());
         let mut directory = RunDirectory::resume(out, lock, config, step)?;
-        // What it had of a later step is gone: the model is that of the checkpoint again.
+        // Restores the model of the checkpoint, as later steps are lost.
         directory.save_trained(&mut trainer)?;
         explain(&directory)?;
         return Ok((directory, trainer));
     }
-    // Without a checkpoint, an unfinished run is nothing to lose.
+    // Without a checkpoint, nothing of an unfinished run is lost.
     let replaces = match if_exists {
         IfExists::Refuse => false,
         IfExists::Replace => true,
@@ -201,9 +204,9 @@ fn begin(
     Ok((directory, trainer))
 }
 
-/// The configuration with the tile, the frame and the direction of up that are to be recorded: the same ones give the same
-/// bits, whatever is measured later. Each is the configuration's own, else that of the run that is `resumed`, else the
-/// fastest known on the device and that of the dataset. A run that records no frame was trained in the world.
+/// The configuration with the tile size, training frame and up direction to record: with these, the bits do not depend
+/// on later measurements. Each is from the configuration, else from the `resumed` run, else the fastest known on the
+/// device or the dataset's. A run without a recorded frame was trained in the dataset's world.
 fn with_what_is_found(
     gpu: &Gpu,
     config: &TrainConfig,
@@ -226,24 +229,24 @@ fn with_what_is_found(
     Ok(config)
 }
 
-/// How far a run has come, and what that took.
+/// The progress of a run and its resources.
 struct TrainLoop<'a> {
     gpu: &'a Gpu,
     config: &'a TrainConfig,
     dataset: &'a Dataset,
     meter: ResourceMeter,
-    /// Steps that were done before.
+    /// Steps before this call.
     begin: u64,
-    /// Steps that are in a checkpoint.
+    /// Steps in a checkpoint.
     saved: u64,
     progress: Vec<Progress>,
-    /// Once something was scored.
+    /// Created at the first scoring.
     score_reference: Option<ScoreReference>,
-    /// For `TensorBoard`, once there is something to tell.
+    /// For `TensorBoard`; created at the first event.
     events: Option<EventFile>,
-    /// Scores of the held-out views that are told.
+    /// Number of reported scores of the held-out views.
     told: usize,
-    /// Whether the run may end early, as far as that is told.
+    /// The reported value of whether the run may end early.
     may_end_early: bool,
 }
 
@@ -272,7 +275,7 @@ impl<'a> TrainLoop<'a> {
         }
     }
 
-    /// Logs every step, writes checkpoints and ends early where that is asked for; gives the losses.
+    /// Logs every step, writes checkpoints, and ends early if configured; returns the losses.
     fn train_to_end(
         &mut self,
         trainer: &mut Trainer,
@@ -328,7 +331,7 @@ impl<'a> TrainLoop<'a> {
         Ok(losses)
     }
 
-    /// Restores the best model where the last is worse, scores the test views and writes the model.
+    /// Restores the best model if the last is worse, scores the test views and writes the model.
     fn finish(
         &mut self,
         trainer: &mut Trainer,
@@ -349,7 +352,7 @@ impl<'a> TrainLoop<'a> {
         Ok((ended, scored, spent))
     }
 
-    /// Saves what was trained before an error that leaves it as it was: nothing but memory, a file or the like was missing.
+    /// Saves the state before an error that does not damage it, such as a lack of memory or a missing file.
     fn save_on_error(&self, error: &Error, trainer: &mut Trainer, directory: &mut RunDirectory) {
         let is_lost = matches!(
             error,
@@ -371,7 +374,7 @@ impl<'a> TrainLoop<'a> {
         }
     }
 
-    /// Scores the test views, which takes none of the run's time.
+    /// Scores the test views; its time is not that of the run.
     fn evaluate(
         &mut self,
         trainer: &mut Trainer,
@@ -404,7 +407,7 @@ impl<'a> TrainLoop<'a> {
         self.write_event_scores(step, &scored)?;
         if let Some(scores) = eval::means(&scored).0.filter(|_| self.config.eval_every > 0) {
             let (gaussians, spent) = (trainer.gaussian_count(), self.meter.spent(0));
-            // A finished run that goes on begins where it was scored last.
+            // An extended run begins at a step that was scored before.
             self.progress.retain(|earlier| earlier.step < step);
             self.progress.push(Progress::new(step, gaussians, scored.len(), &scores, &spent));
             directory.save_progress(&self.progress)?;
@@ -414,7 +417,7 @@ impl<'a> TrainLoop<'a> {
 }
 
 impl TrainLoop<'_> {
-    /// Writes what `TensorBoard` draws over the steps, of every tenth.
+    /// Writes every tenth step for `TensorBoard`.
     fn write_events(
         &mut self,
         trainer: &Trainer,
@@ -443,7 +446,7 @@ impl TrainLoop<'_> {
         events.flush()
     }
 
-    /// Writes and tells every score of the held-out views since the last call, and the last step once that is certain.
+    /// Writes and reports the scores of the held-out views since the last call, and the last step once it is certain.
     fn log_scores(
         &mut self,
         trainer: &Trainer,
@@ -468,7 +471,7 @@ impl TrainLoop<'_> {
         Ok(())
     }
 
-    /// Writes how a test view looks, and what it should be.
+    /// Writes the render of a test view, and the image that it is compared with.
     fn write_event_images(
         &mut self,
         step: u64,
@@ -501,7 +504,7 @@ impl TrainLoop<'_> {
     }
 }
 
-/// How the held-out views' scores came to their end, for `metrics.json`: the last, and how far the last ten lie apart.
+/// The convergence of the held-out views for `metrics.json`: the last score, and the range of the last ten.
 fn held_out_curve(trainer: &Trainer) -> Option<serde_json::Value> {
     const LAST: usize = 10;
     let scores: Vec<f64> =

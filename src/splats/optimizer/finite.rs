@@ -27,7 +27,7 @@ impl FiniteCheck {
     /// The index of the first of `count` values that is not finite.
     ///
     /// # Errors
-    /// The buffer holds fewer, or the device was lost.
+    /// The buffer has fewer, or the device was lost.
     pub fn first<'a>(
         &mut self,
         gpu: &Gpu,

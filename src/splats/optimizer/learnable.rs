@@ -1,4 +1,4 @@
-//! Parameters beside the Gaussians.
+//! Learned parameters other than the Gaussians.
 
 use super::{Adam, AdamBuffers, LearningRates};
 use crate::Result;
@@ -22,7 +22,7 @@ impl Adam {
     /// while `status` is nonzero.
     ///
     /// # Errors
-    /// As [`Adam::record`].
+    /// Those of [`Adam::record`].
     pub fn update(
         &self,
         pass: &mut Recorder<'_>,

@@ -106,7 +106,7 @@ sections {
 }
 }
 
-/// No useful rate is near it, and a step with it cannot overflow.
+/// Far above any useful rate, and a step with it cannot overflow.
 const MAX_RATE: f64 = 100.0;
 
 impl LearningRates {
@@ -128,7 +128,7 @@ impl LearningRates {
 }
 
 impl Schedule {
-    /// Refuses values that make no sense.
+    /// Checks the values.
     ///
     /// # Errors
     /// [`Error::Setting`](crate::Error::Setting).
@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn a_boost_fades_and_leaves_the_rates_as_they_are() {
+    fn the_initial_rate_factor_decays_to_one() {
         let schedule =
             Schedule { initial_rate_factor: 4.0, initial_rate_steps: 100, ..Schedule::paper() };
         let rate = |step| schedule.learning_rates(step, 1.0)[Attribute::Quats];
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn damping_fades_in_two_steps() {
+    fn damping_decreases_in_two_steps() {
         let schedule = Schedule::default();
         let weights = [1, 3_999, 4_000, 6_999, 7_000].map(|step| schedule.damping_weight(step));
         assert_eq!(weights, [1.0, 1.0, 0.5, 0.5, 0.0]);

@@ -110,7 +110,7 @@ impl Renderer {
         let (count, most) = (self.tiles(size).element_product(), max_tiles(&self.gpu));
         let device = &self.gpu.properties().name;
         Error::Usage(format!(
-            "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}; \
+            "a {width}x{height} view has {count} tiles of {tile_width}x{tile_height} pixels, {device} allows {most}; \
              lower patch_pixels or take a larger tile"
         ))
     }

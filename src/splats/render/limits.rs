@@ -85,7 +85,7 @@ impl RenderSettings {
             (bytes as f64 / *bindable as f64, what)
         } else if tiles > most {
             let what = format!(
-                "it has {tiles} tiles of {tile_width}x{tile_height} pixels, {device} follows {most}"
+                "it has {tiles} tiles of {tile_width}x{tile_height} pixels, {device} allows {most}"
             );
             (tiles as f64 / most as f64, what)
         } else {

@@ -9,7 +9,7 @@ use crate::splats::attributes::PlaneCounts;
 use crate::splats::batches::Batches;
 use crate::splats::packed_sh::{PackedSh, StorageFormat};
 
-/// The layout of Gaussians on the device: planes (include/gaussian.glsl), in batches where they exceed one binding.
+/// The layout of Gaussians on the device: planes (include/gaussian.glsl), in batches if they exceed one binding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Layout {
     /// The number of Gaussians.
@@ -53,7 +53,7 @@ impl Layout {
     }
 }
 
-/// Gaussians that own their parameters on the device: what a [`Renderer`](crate::splats::render::Renderer) renders.
+/// Gaussians with their parameters on the device, for a [`Renderer`](crate::splats::render::Renderer).
 #[derive(Debug)]
 pub struct DeviceGaussians {
     /// The layout of the parameters.

@@ -1,4 +1,4 @@
-//! What the file of a model states beside its Gaussians.
+//! Facts that a model file states in addition to its Gaussians.
 
 use std::fmt::Display;
 use std::str::FromStr;
@@ -6,24 +6,24 @@ use std::str::FromStr;
 use glam::DVec3;
 use serde_json::{Map, Value};
 
-/// What a file states of its model beside the Gaussians: a key and a value each, such as `near 0.1`.
+/// Facts that a file states about its model, each with a key and a value, such as `near 0.1`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Facts {
     /// The near plane, in world units.
     pub near: Option<f32>,
     /// The largest alpha of a splat on a pixel.
     pub max_alpha: Option<f32>,
-    /// Whether colours are the raw SH sum. Files hold the colours that viewers show, 0.5 below.
+    /// Whether colours are the raw SH sum. Files contain the colours that viewers show, which are 0.5 lower.
     pub raw_colors: Option<bool>,
     /// The world position that positions are relative to.
     pub origin: DVec3,
 }
 
 impl Facts {
-    /// What a line of text begins with that states a fact.
+    /// Prefix of a line of text that states a fact.
     pub(crate) const PREFIX: &str = "nightsplat ";
 
-    /// Keys and values; without the origin where it is the world's.
+    /// Keys and values; without the origin if it is the world's.
     fn entries(&self) -> Vec<(&'static str, String)> {
         let Self { near, max_alpha, raw_colors, origin: DVec3 { x, y, z } } = self;
         let entry = |key, value: Option<&dyn Display>| Some((key, value?.to_string()));
@@ -60,7 +60,7 @@ impl Facts {
         entries.map(|(key, text)| (key.to_owned(), value(&text))).collect::<Map<_, _>>().into()
     }
 
-    /// The facts of an object of JSON; of anything else, none.
+    /// The facts of a JSON object; empty for any other value.
     ///
     /// # Errors
     /// As [`Facts::set`].
@@ -74,10 +74,10 @@ impl Facts {
         Ok(facts)
     }
 
-    /// Takes what a file states; a key of a later version is skipped.
+    /// Sets a fact; keys of later versions are skipped.
     ///
     /// # Errors
-    /// The value is none of the key's.
+    /// The value is invalid for the key.
     pub(crate) fn set(&mut self, key: &str, value: &str) -> Result<(), String> {
         match key {
             "near" => self.near = Some(number(key, value, "above 0", |near| near > 0.0)?),
@@ -96,7 +96,7 @@ impl Facts {
         Ok(())
     }
 
-    /// Takes a line of text, if it states a fact.
+    /// Sets the fact of a line of text, if it states one.
     ///
     /// # Errors
     /// As [`Facts::set`].
@@ -107,7 +107,7 @@ impl Facts {
     }
 }
 
-/// A finite number for which the rule holds.
+/// A finite number that satisfies the rule.
 fn number(key: &str, text: &str, rule: &str, holds: impl Fn(f32) -> bool) -> Result<f32, String> {
     let number = f32::from_str(text.trim()).ok();
     number.filter(|number| number.is_finite() && holds(*number)).ok_or_else(|| {

@@ -1,4 +1,4 @@
-//! Features: values beside colour that the rasteriser blends as it blends colour.
+//! Features: values that the rasteriser blends in addition to colour.
 
 use std::ops::Range;
 
@@ -9,7 +9,7 @@ pub const COLOR_CHANNELS: usize = 3;
 /// activation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Feature {
-    /// A free scalar that the depth loss shapes; not the distance to the camera.
+    /// A free scalar that the depth loss determines; not the distance to the camera.
     Depth,
     /// Edge strength, compared with the colour invariant of the target.
     Structure,
@@ -28,7 +28,7 @@ pub struct FeatureSpec {
     pub name: &'static str,
     /// Channels.
     pub width: usize,
-    /// The prefix of its PLY properties (`f_NAME_0` and on, as LITA-GS writes them).
+    /// The prefix of its PLY properties (`f_NAME_0` and so on, as LITA-GS writes them).
     pub ply_name: &'static str,
 }
 
@@ -48,7 +48,7 @@ pub const FEATURES: [FeatureSpec; 4] = [
 /// The features of a scene's Gaussians.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Features {
-    /// A free scalar that the depth loss shapes; not the distance to the camera.
+    /// A free scalar that the depth loss determines; not the distance to the camera.
     pub depth: bool,
     /// Edge strength, compared with the colour invariant of the target.
     pub structure: bool,
@@ -92,7 +92,7 @@ impl Features {
         COLOR_CHANNELS + self.width()
     }
 
-    /// The channels of a render with the feature; `None` where the scene does not have it.
+    /// The channels of a render with the feature; `None` if the scene does not have it.
     pub(crate) fn channels_of(self, feature: Feature) -> Option<Range<usize>> {
         let mut begin = COLOR_CHANNELS;
         for spec in self.specs() {
@@ -104,7 +104,7 @@ impl Features {
         None
     }
 
-    /// The name of the PLY property that holds component `position` of the features.
+    /// The name of the PLY property for component `position` of the features.
     pub(super) fn ply_property(self, position: usize) -> String {
         let names = self.specs().flat_map(|spec| (0..spec.width).map(move |i| (spec.ply_name, i)));
         names.map(|(name, i)| format!("f_{name}_{i}")).nth(position).unwrap_or_default()

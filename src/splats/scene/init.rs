@@ -1,4 +1,4 @@
-//! Initialization of the Gaussians.
+//! Initialization of Gaussians.
 
 use std::borrow::Borrow;
 use std::ops::Bound::Excluded;
@@ -20,16 +20,16 @@ settings! {
 "start."
 /// The initialization of the Gaussians; points give positions and colours.
 ///
-/// The defaults are denser and smaller than those of 3DGS. They score higher after the same steps in less time, since
-/// opaque Gaussians hide those behind a surface (docs/benchmarks.md). Even denser ones score higher yet, but lose more
-/// when they are split. Discs score as round ones do, with more Gaussians.
+/// The defaults are more opaque and smaller than those of 3DGS. They score higher after the same steps in less time,
+/// since opaque Gaussians hide those behind a surface (docs/benchmarks.md). Even more opaque ones score higher still,
+/// but lose more when they are split. Discs score like round ones, with more Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Initialization {
     /// Initial opacity.
     opacity: f64 = 0.2 => Rule::Number(Excluded(0.0), Excluded(1.0));
     /// Standard deviation in units of the root mean squared distance to the three nearest points.
     scale: f64 = 0.8 => Rule::from_to(1e-3, 1e3);
-    /// The least axis of a disc in units of its longest: where neighbouring points lie on a surface, Gaussians are
+    /// The shortest axis of a disc in units of its longest: if neighbouring points are on a surface, Gaussians are
     /// discs along it. 1: all are isotropic.
     min_axis_ratio: f64 = 1.0 => Rule::from_to(1e-3, 1.0);
 }
@@ -40,7 +40,7 @@ impl Initialization {
     #[cfg(feature = "testing")]
     pub const PAPER: Self = Self { opacity: 0.1, scale: 1.0, min_axis_ratio: 1.0 };
 
-    /// Refuses invalid values, naming the field.
+    /// Checks the values.
     ///
     /// # Errors
     /// [`Error::Usage`].
@@ -49,7 +49,7 @@ impl Initialization {
     }
 }
 
-/// The least mean squared distance to the neighbours, world units squared (3DGS).
+/// The minimum of the mean squared distance to the neighbours, world units squared (3DGS).
 const MIN_SQUARED_DISTANCE: f64 = 1e-7;
 
 /// The most views that are searched for a point without a track.
@@ -68,8 +68,8 @@ impl Gaussians {
     /// uniform in [0, 1), drawn from `seed` (LITA-GS).
     ///
     /// # Errors
-    /// [`Error::Usage`] where a position or colour is not finite or their numbers differ, or `Initialization::check`
-    /// refuses.
+    /// [`Error::Usage`] if a position or colour is not finite or their numbers differ, and those of
+    /// `Initialization::check`.
     pub fn from_points(
         positions: &[DVec3],
         colors: &[Vec3],
@@ -161,8 +161,8 @@ fn ellipsoids(positions: &[DVec3], start: &Initialization) -> Vec<Ellipsoid> {
     positions.par_iter().map(ellipsoid).collect()
 }
 
-/// The principal axes of directions, and the spread along each, relative to the largest. All directions weigh the same,
-/// whatever their length.
+/// The principal axes of directions, and the spread along each, relative to the largest. All directions have the same
+/// weight, whatever their length.
 fn spread(directions: impl Iterator<Item = DVec3>) -> (DQuat, DVec3) {
     let mut moments = Matrix3::zeros();
     for direction in directions.filter_map(DVec3::try_normalize) {
@@ -180,7 +180,7 @@ fn spread(directions: impl Iterator<Item = DVec3>) -> (DQuat, DVec3) {
 /// `count` random positions within the views of the cameras, for captures without points; empty without cameras.
 ///
 /// Each is at a uniform position of a random camera's image, at a depth that is log-uniform between half the capture's
-/// radius and five times it (radius: the greatest distance of a camera from the cameras' mean; 1 where all cameras
+/// radius and five times it (radius: the greatest distance of a camera from the cameras' mean; 1 if all cameras
 /// coincide). Positions that a second camera sees are preferred, since their depth can be learned. At most
 /// [`MAX_VIEWS`] cameras are tried, so that the time is proportional to `count`.
 pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
@@ -206,7 +206,7 @@ pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
             let in_view = camera.in_view(pixel, depth).unwrap_or(DVec3::Z * depth);
             (place, camera.view_from_world.inverse().transform_point3(in_view))
         };
-        // Consecutive views overlap: the second camera is most often found among the first ones tried.
+        // Consecutive views overlap: the second camera is usually among the first ones tried.
         let seen_twice = |(place, position): &(usize, DVec3)| {
             let (before, from) = cameras.split_at(*place);
             let seen = from.iter().chain(before.iter().rev()).take(MAX_VIEWS);
@@ -219,12 +219,12 @@ pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
     (0..count as u64).into_par_iter().map(draw).collect()
 }
 
-/// The greatest distance of a camera from the cameras' mean, world units; 1 where that is zero.
+/// The greatest distance of a camera from the cameras' mean, world units; 1 if that is zero.
 fn radius(cameras: &[Camera]) -> f64 {
     let centers: Vec<DVec3> = cameras.iter().map(Camera::center).collect();
     let mean = centers.iter().sum::<DVec3>() / centers.len() as f64;
     let radius = centers.iter().map(|center| center.distance(mean)).fold(0.0, f64::max);
-    // Below this the spread is rounding error of one position's coordinates.
+    // A smaller spread is rounding error of a single position's coordinates.
     let least = 1e-9 * mean.length().max(1.0);
     if radius > least { radius } else { 1.0 }
 }
@@ -267,18 +267,18 @@ pub fn colors_from_views<I: Borrow<Image>>(
     Ok(colors.into_iter().map(|color| color.value().unwrap_or(grey)).collect())
 }
 
-/// The pixel of a view that shows a point; `None` where the point is outside of it or its pixel is masked.
+/// The pixel of a view that shows a point; `None` if the point is outside the view or its pixel is masked.
 fn shown(view: &View, point: &Point) -> Option<DVec2> {
     let pixel = view.camera.sees(point.position)?;
     let is_hidden = view.mask.as_ref().is_some_and(|mask| mask.hides_around(pixel));
     (!is_hidden).then_some(pixel)
 }
 
-/// The points that a view may colour.
+/// The candidate points of each view.
 struct Candidates {
-    /// For each view the points whose track has it, ascending.
+    /// For each view, the points whose track includes it, ascending.
     of_view: Vec<Vec<u32>>,
-    /// The points that no training view of their track shows.
+    /// The points without a training view in their track.
     untracked: Vec<u32>,
     /// Whether each view is searched for these.
     covers: Vec<bool>,
@@ -376,7 +376,7 @@ mod tests {
     use super::*;
     use crate::camera::CameraModel;
 
-    /// Views side by side that look along z, 10 wide where they are 1 away.
+    /// Views side by side that look along z, 10 wide at a distance of 1.
     fn views(count: usize) -> Vec<View> {
         let view = |i: usize| {
             let camera = Camera {
@@ -394,7 +394,7 @@ mod tests {
     }
 
     #[test]
-    fn a_point_is_looked_for_in_its_track_or_in_no_more_views_than_there_is_a_bound_for() {
+    fn a_point_is_searched_in_its_track_or_in_a_limited_number_of_views() {
         let point = |views: Vec<u32>| Point { position: DVec3::Z, views };
         let points: Vec<Point> =
             (0..30).map(|i| point(if i % 3 == 0 { vec![0, 7] } else { vec![] })).collect();

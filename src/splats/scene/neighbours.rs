@@ -44,7 +44,7 @@ impl Neighbours {
         let (below, above) = (range.start..middle, middle + 1..range.end);
         let (near, far) = if beyond < 0.0 { (below, above) } else { (above, below) };
         self.search(near, place, found);
-        // Rounding is monotone: no squared distance comes out below that of its part along one axis.
+        // Rounding is monotone: no squared distance is below that of its component along one axis.
         if found.last().is_some_and(|(farthest, _)| beyond * beyond < *farthest) {
             self.search(far, place, found);
         }
@@ -71,10 +71,10 @@ mod tests {
     use crate::base::random::Stream;
 
     #[test]
-    fn the_nearest_are_those_that_a_search_through_all_finds() {
+    fn the_nearest_are_those_of_an_exhaustive_search() {
         let draws = Stream::new(7, 0);
         for count in [0, 1, 2, 3, 7, 64, 1000] {
-            // On a grid many are equidistant, and many share a coordinate with the one that splits them.
+            // On a grid, many are equidistant, and many share a coordinate with their splitting position.
             for grid in [1e-9, 0.25] {
                 let axis = |draw: u64| (4.0 * draws.uniform(draw) / grid).round() * grid;
                 let position = |i: u64| DVec3::from_array([0, 1, 2].map(|k| axis(3 * i + k)));

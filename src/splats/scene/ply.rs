@@ -1,8 +1,8 @@
 //! Gaussians as a PLY file in the INRIA layout, which splat viewers open.
 //!
 //! Binary little-endian, one vertex per Gaussian: `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`.
-//! Positions far from the world's origin are relative to another one, which a comment gives: `world = position + X Y
-//! Z`. Others state what a renderer must know, `nightsplat near 0.1`: [`Facts`]. Features, where the scene has any, are
+//! Positions far from the world's origin are relative to another origin, given in a comment: `world = position + X Y
+//! Z`. Other comments state the settings of a renderer, such as `nightsplat near 0.1`: [`Facts`]. Features, if any, are
 //! between `f_rest_*` and `opacity`: `f_depth_0 f_prior_0 f_noise_0..2 f_illu_0..2`, which viewers skip. Normals are
 //! zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid, scales are
 //! logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
@@ -23,7 +23,7 @@ use crate::{Error, Result};
 /// The prefix of the comment with the origin of the positions.
 const ORIGIN: &str = "world = position + ";
 
-/// A property of the file: its name, and the attribute and component that it holds.
+/// A property of the file: its name, and its attribute and component.
 struct Property {
     name: String,
     attribute: Attribute,
@@ -38,14 +38,14 @@ impl Property {
     }
 }
 
-/// All properties but the normals, which follow the means, in file order.
+/// All properties except the normals, which follow the means, in file order.
 fn properties(shape: Shape) -> Vec<Property> {
     let mut specs: Vec<&AttributeSpec> = ATTRIBUTES.iter().collect();
     specs.sort_by_key(|spec| spec.ply_place);
     let planes = planes(shape.features.width(), width(shape));
     let of_attribute = |spec: &'static AttributeSpec| {
         (0..planes[spec.attribute as usize].1).map(move |position| {
-            // The file is channel-major where the scene is coefficient-major.
+            // The file is channel-major, the scene coefficient-major.
             let component = match spec.attribute {
                 Attribute::Rest => {
                     let coefficients = rest_coefficients(shape.sh_degree);
@@ -68,8 +68,8 @@ impl Gaussians {
     /// Reads a model: a PLY in the INRIA layout, of any trainer, recognised by its content, not by its name.
     ///
     /// # Errors
-    /// [`Error::Input`] where the file is missing, of another format, truncated, longer than its header says, or where
-    /// a required property is missing or not finite.
+    /// [`Error::Input`] if the file is missing, of another format, truncated or longer than its header states, or if a
+    /// required property is missing or not finite.
     pub fn open(path: impl AsRef<Path>) -> Result<Self> {
         load(path)
     }
@@ -78,15 +78,15 @@ impl Gaussians {
 /// Writes `gaussians` to `path` atomically.
 ///
 /// # Errors
-/// [`Error::Output`] where the file cannot be written.
+/// [`Error::Output`] if the file cannot be written.
 pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
     save_with_comments(gaussians, path, &[""; 0])
 }
 
-/// As [`save`], with comments in the header.
+/// [`save`] with comments in the header.
 ///
 /// # Errors
-/// As there.
+/// Those of [`save`].
 pub fn save_with_comments(
     gaussians: &Gaussians,
     path: impl AsRef<Path>,
@@ -132,14 +132,14 @@ fn write(gaussians: &Gaussians, path: &Path, comments: &[impl AsRef<str>]) -> st
         }
     }
     let file = file.into_inner().map_err(std::io::IntoInnerError::into_error)?;
-    // A pipe has no disk to wait for.
+    // A pipe cannot be synchronised.
     if file.metadata()?.is_file() { file.sync_all() } else { Ok(()) }
 }
 
 /// Reads Gaussians from a binary little-endian PLY; unknown properties are skipped.
 ///
 /// # Errors
-/// [`Error::Input`] where the file is missing, of another format, truncated, longer than its header says, or where a
+/// [`Error::Input`] if the file is missing, of another format, truncated or longer than its header states, or if a
 /// required property is missing or not finite.
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
@@ -148,10 +148,10 @@ pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     Ok(gaussians)
 }
 
-/// The Gaussians of a file, and what it states of them.
+/// The Gaussians of a file, and the facts that it states.
 ///
 /// # Errors
-/// The problem, as [`load`] has it.
+/// The problem, as in [`load`].
 pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
     let header = Header::parse(bytes)?;
     if header.encoding != Encoding::Little {
@@ -162,7 +162,7 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
     let expected = header.count.checked_mul(header.stride).ok_or("the vertex count is absurd")?;
     if body.len() < expected {
         return Err(format!(
-            "is cut short: {} vertices of {} bytes need {expected} bytes, the file holds {}",
+            "is truncated: {} vertices of {} bytes need {expected} bytes, the file has {}",
             header.count,
             header.stride,
             body.len()
@@ -170,7 +170,7 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
     }
     if body.len() > expected && !header.has_more {
         return Err(format!(
-            "holds {} bytes more than its {} vertices need",
+            "has {} bytes more than its {} vertices need",
             body.len() - expected,
             header.count
         ));

@@ -14,7 +14,7 @@ pub struct RadixSort {
     gpu: Gpu,
     kernels: Arc<Kernels>,
     partition_size: u32,
-    /// With more partitions, the spine is a pass of its own.
+    /// With more partitions, the spine is a separate pass.
     folded_partitions: u32,
     /// Workgroups of an upsweep that are done; 0 between upsweeps.
     arrivals: Buffer<u32>,

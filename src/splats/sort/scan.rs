@@ -36,7 +36,7 @@ impl Scan {
     }
 
     /// Records `offsets[i] = values[0] + .. + values[i - 1]` for each i below `count`, and `total[0]`, the sum of all
-    /// values. Offsets beyond the count stay as they are; a count beyond the buffers' common length is clamped to it.
+    /// values. Offsets beyond the count are unchanged; a count beyond the buffers' common length is clamped to it.
     ///
     /// # Errors
     /// The buffers' lengths differ, `total` is empty, the count's index is outside its buffer, or the device is out of

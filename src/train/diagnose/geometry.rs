@@ -1,4 +1,4 @@
-//! What the cameras share: points, overlap, and relative exposures.
+//! Measurements across cameras: points, overlap, and relative exposures.
 
 use glam::DVec2;
 use rayon::prelude::*;
@@ -19,12 +19,12 @@ const REACH: i64 = 2;
 /// The fewest shared points for an exposure.
 const MIN_SHARED: usize = 12;
 
-/// What the cameras of the training views share.
+/// Measurements across the cameras of the training views.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Shared {
-    /// The number of points of each view: those it helped to triangulate, if the dataset tells.
+    /// The number of points of each view: those that it helped to triangulate, if the dataset lists them.
     pub(super) points: Vec<usize>,
-    /// For each view, the mean fraction of the other views that see the points it shows.
+    /// For each view, the mean fraction of the other views that see its points.
     pub(super) overlaps: Vec<f64>,
     /// The mean number of views of a point.
     pub(super) views_per_point: f64,
@@ -33,7 +33,7 @@ pub(super) struct Shared {
 }
 
 impl Shared {
-    /// For training views, in their order.
+    /// Measures training views, in order.
     ///
     /// # Errors
     /// A photograph can no longer be read.
@@ -99,7 +99,7 @@ fn pixel(camera: &Camera, point: &Point) -> Option<DVec2> {
     (pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all()).then_some(pixel)
 }
 
-/// For each point, (view, log2 of the linear luminance around it) where it is neither black nor white.
+/// For each point, (view, log2 of the linear luminance around it) if it is neither black nor white.
 fn brightness(
     points: &[&Point],
     seen: &[Vec<usize>],
@@ -153,7 +153,7 @@ fn exposures(points: &[Vec<(usize, f64)>], view_count: usize) -> Vec<Option<f64>
             let own = point.iter().filter_map(|&(view, light)| Some(light - exposures[view]?));
             median(own.collect())
         };
-        // Approximate exposures tell which points are bright.
+        // Approximate exposures determine which points are bright.
         if round == ROUNDS / 2 {
             let typical = median(points.iter().filter_map(|point| level(point)).collect());
             kept.retain(|point| level(point) >= typical);
@@ -186,7 +186,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn medians_lie_in_the_middle() {
+    fn the_median_is_the_middle_value() {
         assert_eq!(median(vec![]), None);
         assert_eq!(median(vec![3.0]), Some(3.0));
         assert_eq!(median(vec![3.0, 1.0]), Some(2.0));
@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn exposures_are_found_whatever_the_points_show() {
+    fn exposures_are_found_for_any_brightness_of_the_points() {
         let truth = [0.5, -1.0, 0.25, 0.25];
         let point = |index: usize| -> Vec<(usize, f64)> {
             let level = -3.0 - 0.1 * (index % 17) as f64;

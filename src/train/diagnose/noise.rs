@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn gain_and_read_noise_are_found_beside_texture() {
+    fn gain_and_read_noise_are_found_in_textured_photographs() {
         let injected = Noise { gain: 2e-4, read: 3e-3 };
         for textured in [false, true] {
             let found = fit(patches(&plane(injected, textured), WIDTH, 0.0)).unwrap();
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plane_without_noise_has_none_and_one_without_patches_tells_none() {
+    fn a_clean_plane_has_no_noise_and_one_without_patches_no_estimate() {
         let found = fit(patches(&plane(Noise::default(), true), WIDTH, 0.0)).unwrap();
         assert!(found.deviation(0.3) < 1e-4, "{found:?}");
         assert_eq!(fit(patches(&[0.5; 30], 6, 0.0)), None);
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn the_slope_is_that_of_the_transfer_function() {
+    fn the_slope_is_the_derivative_of_the_transfer_function() {
         for linear in [0.001, 0.02, 0.4] {
             let encoded =
                 |linear: f64| f64::from(crate::photographs::image::srgb_from_linear(linear as f32));

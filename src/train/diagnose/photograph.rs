@@ -45,7 +45,7 @@ impl PhotographStatistics {
         Self {
             statistics: Statistics::of(counted),
             light: mean(&luminance),
-            // Positive phrasing: a NaN is neither.
+            // Written so that a NaN is neither.
             clipped_fraction: fraction(|value| value >= 1.0),
             zero_fraction: fraction(|value| value <= 0.0),
             code_values: code_values(counted),

@@ -1,4 +1,4 @@
-//! The plan of a capture's model with its reasons, which `diagnose` prints, `train` follows and `plan.toml` holds.
+//! The plan of a model with its reasons: `diagnose` prints it, `train` follows it and `plan.toml` stores it.
 
 use std::path::Path;
 
@@ -17,18 +17,19 @@ use crate::{Error, Result};
 /// Below this brightening, targets are the photographs themselves, as in `--curve auto`.
 const MIN_BRIGHTENING: f64 = 1.5;
 /// Exposures are learned from this spread of the targets, in stops. On a set with 1.2 stops between its photographs and
-/// .02 between its targets, learning lost .4 dB.
+/// 0.02 between its targets, learning lost 0.4 dB.
 const MIN_SPREAD: f64 = 0.3;
-/// A denoiser pays from this noise in the average over the views, in encoded values (docs/benchmarks.md).
+/// A denoiser is worth its time from this noise in the average over the views, in encoded values (docs/benchmarks.md).
 const MIN_NOISE: f64 = 0.01;
 /// An illumination is learned from this variation of light between large regions, in stops. A hall with one bright
-/// window has 2.6; up to 1, the network gained .2 dB at most for two to four times the time.
+/// window has 2.6; up to 1, the network gained at most 0.2 dB for two to four times the time.
 const MIN_UNEVENNESS: f64 = 3.0;
-/// Views wanted for each SH coefficient of a channel.
+/// Views required for each SH coefficient of a channel.
 const VIEWS_PER_COEFFICIENT: f64 = 2.0;
 /// A degree that is reached after this fraction of the steps is not worth its memory.
 const LATEST_DEGREE: f64 = 0.8;
-/// The fewest pixels of the training views for each Gaussian. With free growth, moving leaves had 9, a chair 80.
+/// The fewest pixels of the training views for each Gaussian. With unlimited growth, a scene of moving leaves had 9 and
+/// a chair 80.
 const PIXELS_PER_GAUSSIAN: f64 = 8.0;
 /// The fraction of the device's memory that Gaussians may take.
 const MEMORY_SHARE: f64 = 0.5;
@@ -52,12 +53,12 @@ pub struct PlannedPart {
 pub struct PlannedNumber {
     /// The number.
     pub value: u64,
-    /// The reason with its figure, a sentence.
+    /// The reason with its figure, as a sentence.
     #[serde(default)]
     pub why: String,
 }
 
-/// The dataset that a plan is for: its training views by name and loaded size.
+/// Identifies the dataset of a plan by the names and loaded sizes of its training views.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlannedViews {
@@ -96,7 +97,7 @@ pub struct Plan {
     pub left_out: Vec<String>,
     /// The dataset that it is for.
     pub dataset: PlannedViews,
-    /// Whether a tone curve makes the targets; else they are the photographs.
+    /// Whether a tone curve makes the targets; otherwise they are the photographs.
     pub curve: PlannedPart,
     /// Whether each view's exposure is learned.
     pub exposure: PlannedPart,
@@ -197,7 +198,7 @@ impl Plan {
     /// Reads the plan of a dataset.
     ///
     /// # Errors
-    /// [`Error::Input`]: the file cannot be read, holds no plan, or one of another dataset.
+    /// [`Error::Input`]: the file cannot be read, is not a plan, or is the plan of another dataset.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
         let plan = Self::read(path)?;
@@ -216,7 +217,7 @@ impl Plan {
     /// Reads a plan of any dataset.
     ///
     /// # Errors
-    /// [`Error::Input`]: the file cannot be read or holds no plan.
+    /// [`Error::Input`]: the file cannot be read or is not a plan.
     pub(crate) fn read(path: &Path) -> Result<Self> {
         let text = input::text(path)?;
         toml::from_str(&text).map_err(|error| {
@@ -284,7 +285,7 @@ fn denoiser(scene: &SceneDiagnosis) -> PlannedPart {
 
 fn tonemapper(scene: &SceneDiagnosis, learns_exposures: bool) -> PlannedPart {
     let unevenness = scene.unevenness;
-    // The tonemapper models the dark photographs, which a learned exposure of targets does not describe.
+    // The tonemapper models the dark photographs, to which a learned exposure of targets does not apply.
     let on =
         unevenness >= MIN_UNEVENNESS && scene.brightening >= MIN_BRIGHTENING && !learns_exposures;
     let why = format!(

@@ -76,7 +76,7 @@ mod tests {
     use crate::base::random::Stream;
 
     #[test]
-    fn the_blur_of_an_edge_is_found_beside_noise() {
+    fn the_blur_of_an_edge_is_found_despite_noise() {
         let (width, height) = (96, 64);
         let stream = Stream::new(1, 0);
         for sigma in [1.0, 2.0, 4.0] {
@@ -92,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sharp_edge_is_sharp_and_a_flat_plane_has_none() {
+    fn a_sharp_edge_has_half_a_pixel_of_blur_and_a_flat_plane_no_estimate() {
         let step: Vec<f32> = (0..96 * 64).map(|i| if i % 96 < 48 { 0.2 } else { 0.8 }).collect();
         assert!(blur(&step, 96).unwrap() < 0.7);
         assert_eq!(blur(&[0.5; 96 * 64], 96), None);

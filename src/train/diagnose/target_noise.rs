@@ -1,10 +1,10 @@
-//! Noise as it appears in a target: of the sensor, of whole codes and of JPEG together, under the tone curve.
+//! Noise in a target: sensor noise, quantisation and JPEG artefacts together, under the tone curve.
 //!
-//! What JPEG and whole codes leave of dark photographs is flat to the code or blotched: second differences see nothing
-//! of it, and the tone curve multiplies it. So a part of the photograph is tone-mapped, and what a patch deviates from
-//! the plane through it by is taken, of the luminance Y and of the colour differences R - Y and B - Y. A patch is wider
-//! than the 16 pixels that one chroma block of JPEG covers. Of the patches of middle brightness, half show texture,
-//! which is mostly grey: the luminance is that of the first quartile, the chroma that of the median.
+//! Quantisation and JPEG leave dark photographs flat or blotchy: second differences do not see the blotches, and the
+//! tone curve amplifies them. So a part of the photograph is tone-mapped, and each patch is compared with a plane
+//! fitted to it, in luminance Y and in the colour differences R - Y and B - Y. A patch is wider than the 16 pixels of a
+//! JPEG chroma block. Among the patches of medium brightness, half show texture, which is mostly grey: luma is the
+//! first quartile of the patches, chroma their median.
 
 use serde::Serialize;
 
@@ -14,14 +14,14 @@ use crate::photographs::tone::{Exposure, luminance, measurable, soft};
 
 /// Side of a patch, pixels.
 const SIDE: u32 = 32;
-/// Every second pixel of a patch is looked at.
+/// The stride of sampled pixels in a patch.
 const STRIDE: u32 = 2;
-/// Patches of a photograph, an even choice of them.
+/// The most patches of a photograph, evenly spread.
 const MOST: u32 = 400;
-/// Of the patches by their variances, the part that is below the noise of luma and of chroma.
+/// The quantiles of the patches' variances that give the noise of luma and of chroma.
 const QUANTILES: [f64; 2] = [0.25, 0.5];
 
-/// The standard deviation of the noise in the target of one photograph, of encoded values.
+/// The noise in the target of one photograph, as standard deviations of encoded values.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct TargetNoise {
     /// Of the luminance.
@@ -38,8 +38,8 @@ impl TargetNoise {
     }
 }
 
-/// The noise in the target of a photograph under the automatic curve that its own exposure asks for; `None` of one that
-/// is smaller than a patch.
+/// The noise in the target of a photograph under the automatic curve for its own exposure; `None` if it is smaller than
+/// a patch.
 pub(super) fn target_noise(image: &Image, exposure: &Exposure) -> Option<TargetNoise> {
     let (columns, rows) = (image.width / SIDE, image.height / SIDE);
     let step = (columns * rows).div_ceil(MOST).max(1) as usize;
@@ -65,7 +65,7 @@ pub(super) fn target_noise(image: &Image, exposure: &Exposure) -> Option<TargetN
 /// A square of a target.
 struct Patch {
     brightness: f64,
-    /// Variances about the planes through it.
+    /// Variances about the fitted planes.
     luma: f64,
     chroma: f64,
 }
@@ -92,7 +92,7 @@ impl Patch {
     }
 }
 
-/// A pixel under the automatic curve, a third of it keeping the ratios of the channels.
+/// Applies the automatic curve to a pixel; a third of the result keeps the ratios of the channels.
 fn tone_mapped(rgb: [f32; 3], exposure: &Exposure) -> [f32; 3] {
     const KEPT: f64 = 1.0 / 3.0;
     let (gain, weight) = (exposure.gain, exposure.weight());
@@ -106,7 +106,7 @@ fn tone_mapped(rgb: [f32; 3], exposure: &Exposure) -> [f32; 3] {
     })
 }
 
-/// The variance of a square of values about the plane that fits them best.
+/// The variance of a square of values about the plane fitted to it.
 fn variance_about_plane(values: &[f64], side: usize) -> f64 {
     let middle = (side as f64 - 1.0) / 2.0;
     let mean = values.iter().sum::<f64>() / values.len() as f64;
@@ -118,7 +118,7 @@ fn variance_about_plane(values: &[f64], side: usize) -> f64 {
         along += y * value;
         spread += x * x;
     }
-    // Three degrees of freedom are the plane's.
+    // The plane has three degrees of freedom.
     let rest = squares - (across * across + along * along) / spread;
     rest.max(0.0) / (values.len() - 3) as f64
 }
@@ -156,10 +156,10 @@ mod tests {
     }
 
     #[test]
-    fn noise_of_each_channel_is_found_as_the_curve_leaves_it() {
+    fn noise_of_each_channel_is_found_as_the_curve_amplifies_it() {
         let image = dark([0.002; 3]);
         let gain = exposure(&image).gain;
-        // Of the middle of the flat half; the curve is next to linear in the noise.
+        // In the middle of the flat half; the curve is nearly linear over the noise.
         let slope = (soft(0.051, gain) - soft(0.049, gain)) / 0.002;
         let kept = (soft(0.05, gain) - soft(0.0, gain)) / 0.05;
         let own = 2.0 / 3.0 * slope + kept / 3.0;
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clean_photograph_has_none_and_a_small_one_tells_none() {
+    fn a_clean_photograph_has_no_noise_and_a_small_one_no_estimate() {
         let found = found(&dark([0.0; 3]));
         assert!(found.luma < 3e-3 && found.chroma < 3e-3, "{found:?}");
         let small = Image::filled(31, 200, [0.1; 3]);
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn jpeg_of_a_dark_photograph_shows_where_the_sensor_seems_quiet() {
+    fn jpeg_artefacts_are_found_where_sensor_noise_is_not() {
         let stored = dark([0.004, 0.004, 0.006]).to_jpeg(90).unwrap();
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.jpg");
@@ -200,12 +200,12 @@ mod tests {
     }
 
     #[test]
-    fn whole_codes_show_too() {
+    fn quantisation_counts_as_noise() {
         let plain = dark([0.002; 3]);
         let data = plain.data.iter().map(|x| (x * 255.0).round() / 255.0).collect();
         let [plain, coded] =
             [plain.clone(), Image { data, ..plain }].map(|image| found(&image).luma);
-        // A step of a code adds its square over 12 to the variance of half a code in each channel.
+        // Quantisation adds 1/12 of a squared step to the variance of half a step in each channel.
         assert!((coded / plain - 1.155).abs() < 0.08, "{coded} {plain}");
     }
 }

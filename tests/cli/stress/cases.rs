@@ -17,35 +17,35 @@ pub(super) struct Case {
     pub(super) name: &'static str,
     /// Expected outcome in words.
     pub(super) outcome: &'static str,
-    /// What it takes.
+    /// Its cost.
     pub(super) effort: Effort,
     pub(super) expect: Expect,
     pub(super) build: fn(&Gpu) -> Result<Hostile>,
 }
 
-/// What a case takes.
+/// The cost of a case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Effort {
-    /// Seconds, and one of those that stand for all in the tests.
+    /// Seconds; run by the tests.
     Quick,
     /// Seconds.
     Small,
-    /// Seconds to minutes: the references go through every pixel and splat.
+    /// Seconds to minutes: the references process every pixel and splat.
     Large,
-    /// As large as the device takes it: too much for the references.
+    /// As large as the device allows, which is too much for the references.
     Unchecked,
 }
 
 /// Expected outcome of a case. In every case, loss, gradients and parameters are finite.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Expect {
-    /// The Gaussians that it is about learn.
+    /// The hostile Gaussians learn.
     Learns,
-    /// They have no gradient and stay as they are.
+    /// They have no gradient and do not change.
     NoTrace,
     /// The steps are done.
     Trains,
-    /// An error that says this.
+    /// An error that contains this.
     Refusal(&'static str),
 }
 
@@ -68,17 +68,17 @@ fn mean(x: f32, y: f32, z: f32) -> Result<Hostile> {
     Ok(Hostile::gaussians(1, SIZE, |gaussians, i| gaussians.means_mut()[i] = Vec3::new(x, y, z)))
 }
 
-/// One step, where Adam moves the Gaussian out of the view in it.
+/// Trains one step, in which Adam moves the Gaussian out of the view.
 fn at_once(mut own: Hostile) -> Hostile {
     own.config.steps = 1;
     own
 }
 
-/// Every hostile Gaussian of the table before one camera.
+/// Every hostile Gaussian of the table in front of one camera.
 fn all_at_once() -> Result<Hostile> {
     let log = |power: f32| power * std::f32::consts::LN_10;
     Ok(Hostile::gaussians(24, SIZE, |gaussians, i| {
-        // Apart, so that their order is not a matter of rounding.
+        // At different depths, so that their order does not depend on rounding.
         gaussians.means_mut()[i].z = 3.0 + 0.1 * i as f32;
         match i {
             0..4 => gaussians.log_scales_mut()[i] = Vec3::splat(log([-20.0, 3.0, 10.0, 20.0][i])),
@@ -114,7 +114,7 @@ fn coincident(count: usize) -> Result<Hostile> {
     }))
 }
 
-/// Many faint Gaussians on a pixel of an image of one tile, in a row along the axis.
+/// Many faint Gaussians on one pixel of an image of one tile, in a row along the axis.
 fn splats_per_tile(count: usize) -> Result<Hostile> {
     let mut own = Hostile::gaussians(count, [16, 8], |gaussians, i| {
         let depth = 1.0 + 4.0 * i as f32 / 100_000.0;
@@ -145,7 +145,7 @@ fn wide() -> Result<Hostile> {
     Ok(own)
 }
 
-/// A square view of 8192 pixels, or the largest that the device takes.
+/// A square view of 8192 pixels, or the largest that the device can train on.
 fn largest(gpu: &Gpu) -> Result<Hostile> {
     let settings = RenderSettings::default();
     let fits = |side: u32| settings.check_size(gpu, "of stress", [side; 2]).is_ok();
@@ -160,7 +160,7 @@ fn largest(gpu: &Gpu) -> Result<Hostile> {
     Ok(own)
 }
 
-/// Refused, or else the step would be done.
+/// A refusal, or else the step is done.
 fn beyond(gpu: &Gpu) -> Result<Hostile> {
     RenderSettings::default().check_size(gpu, "of stress", [65_535; 2])?;
     size(16, 16)
@@ -308,7 +308,7 @@ pub(super) const CASES: &[Case] = &[
     quick(case("photograph black: p90 = 0", "trains towards a target of black", Trains, |_| {
         Ok(Hostile::photograph(|_, _| [0.0; 3]))
     })),
-    case("photograph black, curve auto", "refused: all black", Refusal("as good as black"), |_| {
+    case("photograph black, curve auto", "refused: all black", Refusal("almost black"), |_| {
         let mut own = Hostile::photograph(|_, _| [0.0; 3]);
         own.config.tone = ToneSettings::new(ToneCurve::Auto);
         Ok(own)

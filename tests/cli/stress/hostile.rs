@@ -1,4 +1,4 @@
-//! What a case trains on: an ordinary small scene, of which something is made hostile.
+//! The scene of a case: a small ordinary one, parts of which are made hostile.
 
 use std::ops::Range;
 use std::path::PathBuf;
@@ -17,23 +17,23 @@ use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{OnOff, TrainConfig};
 use nightsplat::{Error, Result};
 
-/// A dataset, the first Gaussians where it does not say them, and which of these the case is about.
+/// A dataset, its first Gaussians unless they come from its points, and the indices of the hostile ones.
 pub(super) struct Hostile {
     pub(super) dataset: Dataset,
     pub(super) gaussians: Option<Gaussians>,
     pub(super) config: TrainConfig,
     pub(super) concerned: Range<usize>,
-    /// Files that the configuration names.
+    /// Files named by the configuration.
     pub(super) files: Option<tempfile::TempDir>,
 }
 
-/// Enough for every SH degree to come into use.
+/// Enough for every SH degree to be used.
 const STEPS: u64 = 3;
 
 /// Neighbours of the hostile Gaussians.
 const NEIGHBOURS: usize = 12;
 
-/// Steps that do the same work, in the world, without density control.
+/// Steps that do the same work, in the dataset's world, without density control.
 fn config() -> TrainConfig {
     let mut config =
         TrainConfig { steps: STEPS, frame: Some(TrainingFrame::WORLD), ..TrainConfig::bare() };
@@ -46,8 +46,7 @@ fn config() -> TrainConfig {
 }
 
 impl Hostile {
-    /// `count` Gaussians in the middle of a view of this size, at depth 3 and some pixels wide, and farther
-    /// neighbours.
+    /// `count` Gaussians in the middle of a view of this size, at depth 3 and some pixels wide, and farther neighbours.
     pub(super) fn gaussians(
         count: usize,
         size: [u32; 2],
@@ -56,7 +55,7 @@ impl Hostile {
         Self::seen_by(scene::camera(size[0], size[1]), count, made)
     }
 
-    /// The same before another camera.
+    /// [`gaussians`] in front of another camera.
     pub(super) fn seen_by(
         camera: Camera,
         count: usize,
@@ -65,7 +64,7 @@ impl Hostile {
         Self::beside(NEIGHBOURS, camera, count, made)
     }
 
-    /// One without neighbours.
+    /// A single Gaussian without neighbours.
     pub(super) fn alone([width, height]: [u32; 2]) -> Self {
         Self::beside(0, scene::camera(width, height), 1, |_, _| ())
     }
@@ -112,8 +111,8 @@ impl Hostile {
         own
     }
 
-    /// Photographs in EXR files, as the loader takes them; `value` of linear light, column and row. The first
-    /// Gaussians are the dataset's own.
+    /// Photographs in EXR files, read by the loader; `value` of linear light, column and row. The first Gaussians are
+    /// the dataset's own.
     pub(super) fn exr(value: impl Fn(f32, u32, u32) -> f32) -> Result<Self> {
         let config = config();
         let files = tempfile::tempdir()
@@ -135,20 +134,20 @@ impl Hostile {
                 let (x, y) = (at % pixels % width, at % pixels / width);
                 *linear = value(linear_from_srgb(*linear), x as u32, y as u32);
             }
-            // The content decides, not the file's name.
+            // The content determines the format, not the file's name.
             image.save_exr_as_stored(&png)?;
         }
         let dataset = Dataset::load(files.path(), &config.load_options())?;
         Ok(Self { dataset, gaussians: None, config, concerned: 0..0, files: Some(files) })
     }
 
-    /// With learned exposures, of which the one of the first view begins at a gain.
+    /// With learned exposures, where that of the first view starts with a gain.
     pub(super) fn exposed(mut self, gain: f32) -> Result<Self> {
         let files = tempfile::tempdir()
             .map_err(|error| Error::output(std::env::temp_dir(), error.to_string()))?;
         let path = files.path().join("exposures.csv");
         let affine = Affine { gain: [gain.into(); 3], bias: [0.0; 3] };
-        // Exposures are told apart by their mean: another view begins at none.
+        // Exposures are relative to their mean, so another view starts without one.
         let mut other = self.dataset.views[0].clone();
         other.name = "view without gain".to_owned();
         table::save(&path, &[(self.dataset.views[0].name.clone(), affine)])?;

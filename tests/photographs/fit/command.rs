@@ -44,7 +44,7 @@ fn scene(folder: &Path, count: u64) {
 }
 
 #[test]
-fn what_is_written_is_a_curve_that_others_take() {
+fn a_written_curve_is_accepted_by_other_commands() {
     let dir = tempfile::tempdir().unwrap();
     let folders = [dir.path().join("a"), dir.path().join("b")];
     folders.iter().for_each(|folder| scene(folder, 3));
@@ -90,7 +90,7 @@ fn pairs_that_cannot_be_used_are_named_in_one_line() {
     };
     scene(&path("good"), 2);
     assert!(apply(&args(&[path("good")])).is_ok());
-    // Two folders by name say the same as one.
+    // Two folders by name are the same as one.
     let two = FitArgs { normal: Some(path("good/high")), ..args(&[path("good/low")]) };
     assert_eq!(apply(&two).unwrap()[0].fit, apply(&args(&[path("good")])).unwrap()[0].fit);
 
@@ -116,7 +116,7 @@ fn pairs_that_cannot_be_used_are_named_in_one_line() {
         "table".parse::<FamilyChoice>().is_err() && "nonsense".parse::<FamilyChoice>().is_err()
     );
 
-    // A photograph without a partner is left out; of none with one nothing is left.
+    // A photograph without a partner is left out; without any pair, nothing is left.
     std::fs::remove_file(path("good/high/1.png")).unwrap();
     assert_eq!(apply(&args(&[path("good")])).unwrap()[0].fit.values, 4800.0);
     fails(FitArgs { cross_validate: true, ..args(&[path("good")]) }, "1 pairs in 5 folds", 2);

@@ -1,4 +1,4 @@
-//! Camera profiles: what made the references comes back, whatever the exposure, and bad pairs are named.
+//! Camera profiles: the true profile is recovered for any exposure, and bad pairs are named.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use nightsplat::photographs::tone::Profile;
 
 use super::*;
 
-/// Mixes channels, and bends each in its own way.
+/// Mixes channels, and bends each differently.
 fn truth() -> Profile {
     let bent = |power: f64| (0..=16).map(move |i| 0.05 + 0.9 * (f64::from(i) / 16.0).powf(power));
     Profile {
@@ -22,14 +22,14 @@ fn truth() -> Profile {
     }
 }
 
-/// A scene of pairs on disk: dark colours, each photograph `exposures` times as bright as the first, and what the truth
-/// makes of the colours at the gain of the first, with noise.
+/// A scene of pairs on disk: dark colours, each photograph with one of `exposures` relative to the first, and the true
+/// profile of the colours at the gain of the first, with noise.
 fn scene(folder: &Path, exposures: &[f64], noise: f64) {
     for name in ["low", "high"] {
         std::fs::create_dir_all(folder.join(name)).unwrap();
     }
     let (first, stream) = (dark(120, 0.04, 0.0, 5), Stream::new(5, 9));
-    // The gain at which the rule brings the first photograph, alone, to its brightness.
+    // The gain at which the rule gives the first photograph, by itself, its brightness.
     let luminance = nightsplat::photographs::tone::LuminanceHistogram::of(&first.data);
     let gain = nightsplat::photographs::tone::Exposure::of([&luminance], None).unwrap().gain;
     for (index, exposure) in exposures.iter().enumerate() {
@@ -60,7 +60,7 @@ fn fitted(scene: &ColourScene) -> Profile {
 }
 
 #[test]
-fn a_profile_finds_what_made_the_references_whatever_the_exposure() {
+fn a_profile_recovers_the_references_for_any_exposure() {
     let dir = tempfile::tempdir().unwrap();
     scene(&dir.path().join("a"), &[1.0], 0.0);
     scene(&dir.path().join("b"), &[0.5, 1.0, 2.0], 0.02);
@@ -70,7 +70,7 @@ fn a_profile_finds_what_made_the_references_whatever_the_exposure() {
     assert_eq!((profile.reference.as_str(), profile.pairs), ("a", 1));
     let scores = profile_scores(&profile, &a.pairs.iter().collect::<Vec<_>>());
     assert!(scores.profile > 38.0 && scores.auto < scores.profile - 10.0, "{scores:?}");
-    // Noise of .02 leaves 34 dB; the other exposures are the same after the rule.
+    // Noise of 0.02 gives 34 dB; the other exposures are the same after the rule.
     let scores = profile_scores(&profile, &b.pairs.iter().collect::<Vec<_>>());
     assert!((32.5..34.2).contains(&scores.profile), "{scores:?}");
     for (row, truth) in profile.matrix.iter().zip(truth().matrix) {
@@ -78,7 +78,7 @@ fn a_profile_finds_what_made_the_references_whatever_the_exposure() {
             assert!((weight - truth).abs() < 0.05, "{row:?}");
         }
     }
-    // Twice the same fit is the same file.
+    // The same fit gives the same file twice.
     assert_eq!(fitted(&a), profile);
     let folds = cross_validate_profile(&[a, b], 5, 1.345).unwrap();
     assert_eq!(folds.iter().map(|fold| fold.name.as_str()).collect::<Vec<_>>(), ["a", "b"]);
@@ -86,12 +86,12 @@ fn a_profile_finds_what_made_the_references_whatever_the_exposure() {
 }
 
 #[test]
-fn outliers_do_not_pull_a_profile() {
+fn outliers_do_not_affect_a_profile() {
     let dir = tempfile::tempdir().unwrap();
     scene(dir.path(), &[1.0], 0.005);
     let clean = load(dir.path());
     let mut spoilt = clean.clone();
-    // A twentieth of the colours shows something else.
+    // A twentieth of the colours is different.
     for (index, [_, light]) in spoilt.pairs[0].colours.iter_mut().enumerate() {
         if index % 20 == 0 {
             *light = [1.0, 0.0, 1.0];
@@ -103,8 +103,8 @@ fn outliers_do_not_pull_a_profile() {
 }
 
 #[test]
-fn pairs_that_make_no_profile_are_named() {
-    assert!(fit_profile(&[], 1.345).unwrap_err().to_string().contains("one at least"));
+fn pairs_that_determine_no_profile_are_refused() {
+    assert!(fit_profile(&[], 1.345).unwrap_err().to_string().contains("at least one"));
     let dir = tempfile::tempdir().unwrap();
     scene(dir.path(), &[1.0], 0.0);
     let mut grey = load(dir.path());
@@ -114,10 +114,10 @@ fn pairs_that_make_no_profile_are_named() {
     grey.pairs[0].colours.iter_mut().for_each(|[dark, _]| *dark = [0.5; 3]);
     let problem =
         fit_profile(&[("a", grey.pairs.iter().collect())], 1.345).unwrap_err().to_string();
-    assert!(problem.contains("one colour"), "{problem}");
+    assert!(problem.contains("a single colour"), "{problem}");
     for name in ["low/0.png", "high/0.png"] {
         Image::filled(40, 40, [0.0; 3]).save_png8(dir.path().join(name)).unwrap();
     }
     let problem = ColourScene::load(dir.path(), None).unwrap_err().to_string();
-    assert!(problem.contains("as good as black"), "{problem}");
+    assert!(problem.contains("almost black"), "{problem}");
 }

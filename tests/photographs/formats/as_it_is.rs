@@ -1,4 +1,4 @@
-//! What COLMAP and its users leave: several models, photographs without a pose, rigs, marks of editors, real lenses.
+//! Output of COLMAP and other tools: several models, photographs without a pose, rigs, byte-order marks, real lenses.
 
 use std::fs;
 use std::path::Path;
@@ -12,19 +12,19 @@ use super::synthetic::*;
 use super::{load, names, view};
 use crate::common::command::run;
 
-/// What `tone apply` says on standard error of a dataset; one line for each remark.
+/// The standard error of `tone apply` for a dataset; one line for each remark.
 fn message_of(root: &Path) -> String {
     run(&format!("tone apply {} --json", root.display()), 0).1
 }
 
 #[test]
-fn of_several_models_the_one_that_places_the_most_photographs_is_taken_and_said() {
+fn of_several_models_the_one_with_the_most_photographs_is_used_and_named() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     photographs(root, "images", 0..9, 1.0);
     model(2).write_binary(&root.join("sparse/0"));
     model(9).write_binary(&root.join("sparse/1"));
-    // More poses, of photographs that are not there.
+    // More poses, of missing photographs.
     let mut absent = model(20);
     absent.images.iter_mut().for_each(|image| image.3 = format!("absent/{}", image.3));
     absent.write_text(&root.join("sparse/2"));
@@ -40,7 +40,7 @@ fn of_several_models_the_one_that_places_the_most_photographs_is_taken_and_said(
 }
 
 #[test]
-fn photographs_without_a_pose_and_pictures_that_are_not_read_are_counted() {
+fn photographs_without_a_pose_and_files_that_are_not_read_are_counted() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     photographs(root, "images", 0..9, 1.0);
@@ -60,7 +60,7 @@ fn photographs_without_a_pose_and_pictures_that_are_not_read_are_counted() {
         parts.iter().all(|part| message.contains(part)) && !message.contains("txt"),
         "{message}"
     );
-    // Where all have one, there is nothing to say.
+    // If all have one, there is no remark.
     model(9).write_text(&root.join("sparse/0"));
     fs::remove_file(root.join("images/IMG_1.HEIC")).unwrap();
     fs::remove_file(root.join("images/clip.mp4")).unwrap();
@@ -68,7 +68,7 @@ fn photographs_without_a_pose_and_pictures_that_are_not_read_are_counted() {
 }
 
 #[test]
-fn the_cameras_of_a_rig_may_have_photographs_of_one_name() {
+fn the_cameras_of_a_rig_may_have_equal_file_names() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let mut rig = model(8);
@@ -128,7 +128,7 @@ fn a_byte_order_mark_changes_nothing() {
 }
 
 #[test]
-fn a_rational_lens_is_undistorted_on_load_and_so_is_a_fisheye_where_that_is_asked_for() {
+fn a_rational_lens_is_undistorted_on_load_and_a_fisheye_on_request() {
     let center = [20.0, 15.0];
     let lenses = [
         ("FULL_OPENCV", 6, vec![0.1, 0.01, 0.001, 0.0, 0.003, 0.02, 0.0, 0.0]),
@@ -147,7 +147,7 @@ fn a_rational_lens_is_undistorted_on_load_and_so_is_a_fisheye_where_that_is_aske
         let camera = binary.views[0].camera;
         assert_eq!(camera.model, CameraModel::Pinhole, "{name}");
         assert!(camera.focal.is_finite() && camera.focal.x != 22.0, "{name}: {camera:?}");
-        // No blank pixel: every photograph is of one colour.
+        // No blank pixel: every photograph has a single colour.
         assert_eq!(super::level(view(&binary, "v04").image.as_ref()), Some(14.0), "{name}");
         fs::remove_dir_all(folder.path().join("sparse")).unwrap();
         lens.write_text(&folder.path().join("sparse/0"));
@@ -160,7 +160,7 @@ fn undistorted(root: &Path) -> Dataset {
 }
 
 #[test]
-fn a_fisheye_is_loaded_as_it_is_from_every_listing_and_what_lies_outside_its_circle_is_hidden() {
+fn a_fisheye_is_loaded_natively_from_every_listing_and_masked_outside_its_circle() {
     let [fx, fy, cx, cy, k1, k2, k3, k4] = [15.0, 15.5, 21.0, 14.0, 0.03, -0.01, 0.002, -0.0005];
     let coefficients = [k1, k2, k3, k4];
     let folder = tempfile::tempdir().unwrap();
@@ -203,13 +203,13 @@ fn a_fisheye_is_loaded_as_it_is_from_every_listing_and_what_lies_outside_its_cir
             assert_eq!(weight, f32::from(is_seen), "pixel {corner}");
         }
     }
-    // Of photographs that shrink the mask is that of the pixels there.
+    // For resized photographs, the mask is that of the resized pixels.
     let shrunk = LoadOptions { downscale: 1.25, ..LoadOptions::default() };
     let shrunk = Dataset::load(root, &shrunk).unwrap();
     let (camera, mask) = (shrunk.views[0].camera, shrunk.views[0].mask.as_ref().unwrap());
     assert_eq!((camera.focal.x, mask.width, mask.height), (0.8 * fx, 32, 24));
     assert_eq!(mask.hidden(), camera.unseen());
-    // A polynomial that falls from 5 degrees on is no lens.
+    // A polynomial that falls from 5 degrees on is not a lens.
     listing["k1"] = json!(-40.0);
     write_json(root.join("transforms.json"), &listing);
     let refused = Dataset::load(root, &LoadOptions::default()).unwrap_err().to_string();
@@ -217,7 +217,7 @@ fn a_fisheye_is_loaded_as_it_is_from_every_listing_and_what_lies_outside_its_cir
 }
 
 #[test]
-fn what_a_pinhole_cannot_show_of_a_fisheye_is_cropped_and_said() {
+fn the_part_of_a_fisheye_beyond_a_pinhole_is_cropped_with_a_remark() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     photographs(root, "images", 0..9, 1.0);

@@ -1,4 +1,4 @@
-//! Bad input: one line that names the object, never a panic, never a huge allocation.
+//! Bad input: one line that names the object, no panic, no huge allocation.
 
 use std::fs;
 use std::path::Path;
@@ -10,7 +10,7 @@ use serde_json::json;
 use super::synthetic::*;
 use super::{load, names, view};
 
-/// The one-line error of loading `root`, which must say all of `parts`.
+/// The one-line error of loading `root`, which must contain all of `parts`.
 fn refused(root: &Path, parts: &[&str]) {
     refused_with(root, &LoadOptions::default(), 3, parts);
 }
@@ -65,7 +65,7 @@ fn a_set_without_photographs_is_refused() {
 }
 
 #[test]
-fn a_listing_cut_short_anywhere_is_named() {
+fn a_truncated_listing_is_named() {
     let folder = tempfile::tempdir().unwrap();
     single(folder.path(), 2);
     let path = folder.path().join("transforms.json");
@@ -81,7 +81,7 @@ fn a_listing_cut_short_anywhere_is_named() {
 }
 
 #[test]
-fn frames_whose_file_is_absent_are_counted_and_left_out() {
+fn frames_with_a_missing_file_are_counted_and_left_out() {
     let folder = tempfile::tempdir().unwrap();
     lom(folder.path(), 10, &[2, 5]);
     for index in [1, 2, 7] {
@@ -98,7 +98,7 @@ fn frames_whose_file_is_absent_are_counted_and_left_out() {
 }
 
 #[test]
-fn a_photograph_that_does_not_decode_is_named_and_the_rest_goes_on() {
+fn a_photograph_that_does_not_decode_is_named_and_the_others_are_used() {
     let folder = tempfile::tempdir().unwrap();
     lom(folder.path(), 10, &[2, 5]);
     let whole = fs::read(folder.path().join("low/v03.png")).unwrap();
@@ -122,7 +122,7 @@ fn a_photograph_that_does_not_decode_is_named_and_the_rest_goes_on() {
 }
 
 #[test]
-fn two_views_of_one_name_are_refused() {
+fn two_views_with_one_name_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     lom(folder.path(), 10, &[2, 5]);
     let train = folder.path().join("transforms_train.json");
@@ -172,7 +172,7 @@ fn an_unsupported_camera_model_is_named() {
 }
 
 #[test]
-fn a_model_cut_short_anywhere_is_named_and_a_corrupt_count_allocates_nothing() {
+fn a_truncated_model_is_named_and_a_corrupt_count_allocates_nothing() {
     let folder = tempfile::tempdir().unwrap();
     photographs(folder.path(), "images", 0..2, 1.0);
     let mut small = model(2);
@@ -192,7 +192,7 @@ fn a_model_cut_short_anywhere_is_named_and_a_corrupt_count_allocates_nothing() {
         refused(folder.path(), &[file]);
         fs::write(&path, &whole).unwrap();
     }
-    // The count of keypoints and the length of a track, too.
+    // Also the number of keypoints and the length of a track.
     let images = folder.path().join("sparse/0/images.bin");
     let mut corrupt = fs::read(&images).unwrap();
     let keypoints = 8 + 64 + "v01.png".len() + 1;
@@ -236,7 +236,7 @@ fn an_image_of_an_unlisted_camera_is_named() {
 }
 
 #[test]
-fn a_pose_that_is_not_finite_or_no_rotation_is_named_and_left_out() {
+fn an_invalid_pose_is_named_and_left_out() {
     let folder = tempfile::tempdir().unwrap();
     single(folder.path(), 10);
     let path = folder.path().join("transforms.json");
@@ -245,7 +245,7 @@ fn a_pose_that_is_not_finite_or_no_rotation_is_named_and_left_out() {
         json["frames"][5]["transform_matrix"][1][1] = json!(7.0);
         json["frames"][6]["transform_matrix"] = json!([[1.0], [0.0]]);
     });
-    // As Python writes them.
+    // In Python's notation.
     let text = fs::read_to_string(&path).unwrap().replace("\"HERE\"", "-Infinity");
     fs::write(
         &path,
@@ -272,7 +272,7 @@ fn a_pose_that_is_not_finite_or_no_rotation_is_named_and_left_out() {
 }
 
 #[test]
-fn a_focal_length_that_is_no_number_is_not_taken_for_one_left_out() {
+fn an_invalid_focal_length_is_not_a_missing_one() {
     for key in ["fl_x", "cx", "k1"] {
         let folder = tempfile::tempdir().unwrap();
         single(folder.path(), 4);
@@ -288,7 +288,7 @@ fn a_focal_length_that_is_no_number_is_not_taken_for_one_left_out() {
 }
 
 #[test]
-fn a_photograph_whose_size_contradicts_its_camera_is_refused() {
+fn a_photograph_with_another_size_than_its_camera_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     single(folder.path(), 4);
     photograph(&folder.path().join("images/v02.png"), (30, 40), 0.1);
@@ -301,7 +301,7 @@ fn a_photograph_whose_size_contradicts_its_camera_is_refused() {
 }
 
 #[test]
-fn intrinsics_that_make_no_camera_are_refused() {
+fn invalid_intrinsics_are_refused() {
     for (key, value) in
         [("fl_x", json!(-3.0)), ("w", json!(0.0)), ("h", json!(1e12)), ("k1", json!(-90.0))]
     {
@@ -325,7 +325,7 @@ fn intrinsics_that_make_no_camera_are_refused() {
 }
 
 #[test]
-fn a_photograph_of_one_pixel_is_named_and_no_option_blamed() {
+fn a_photograph_of_one_pixel_is_named_rather_than_an_option() {
     let folder = tempfile::tempdir().unwrap();
     single(folder.path(), 3);
     for index in 0..3 {

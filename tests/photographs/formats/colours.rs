@@ -12,7 +12,7 @@ use super::{load, view};
 use crate::common::command::{refused, run};
 use crate::common::png::put_chunk;
 
-/// Says that every picture of a folder is linear light.
+/// Marks every image of a folder as linear light.
 fn mark_linear(folder: &Path) {
     for entry in fs::read_dir(folder).unwrap() {
         put_chunk(&entry.unwrap().path(), b"gAMA", &100_000_u32.to_be_bytes());
@@ -31,7 +31,7 @@ fn photographs_and_references_become_srgb_and_masks_do_not() {
     let before = load(root);
     mark_linear(&root.join("low"));
     mark_linear(&root.join("high"));
-    // A mask of 0.4 hides; as linear light it would be 0.66 and show.
+    // A mask of 0.4 masks; as linear light it would be 0.66 and count.
     fs::create_dir(root.join("masks")).unwrap();
     let mask = root.join("masks/v03.png");
     Image::from_fn(SIZE.0, SIZE.1, |x, _| [if x < 4 { 0.4 } else { 1.0 }; 3])
@@ -70,7 +70,7 @@ fn a_profile_that_cannot_be_used_is_named_once_for_the_dataset() {
     assert_eq!(lines.len(), 1, "{message}");
 }
 
-/// The photographs of a dataset under the light of a lamp.
+/// The photographs of a dataset under a lamp.
 fn lamp_lit(root: &Path) {
     lom(root, 10, &[2, 5]);
     for entry in fs::read_dir(root.join("low")).unwrap() {
@@ -82,7 +82,7 @@ fn lamp_lit(root: &Path) {
 }
 
 #[test]
-fn one_grey_card_balances_every_photograph_kept_or_read_anew() {
+fn one_grey_card_balances_every_photograph_cached_or_not() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     lamp_lit(root);
@@ -106,7 +106,7 @@ fn one_grey_card_balances_every_photograph_kept_or_read_anew() {
 }
 
 #[test]
-fn a_white_balance_that_cannot_be_is_refused_in_a_line() {
+fn an_invalid_white_balance_is_refused_in_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     lamp_lit(root);
@@ -115,7 +115,7 @@ fn a_white_balance_that_cannot_be_is_refused_in_a_line() {
         ("0,1,1", 2, "white_balance (--white-balance) is \"0,1,1\"; it must be R,G,B"),
         ("warm", 2, "(--white-balance) is \"warm\""),
         ("v99,2,2,5,5", 3, "no photograph is called `v99`"),
-        ("v03,39,2,5,5", 2, "it leaves the photograph, which is 40x30"),
+        ("v03,39,2,5,5", 2, "it exceeds the photograph, which is 40x30"),
     ] {
         let arguments =
             format!("train {} --out {} --white-balance {white}", root.display(), out.display());

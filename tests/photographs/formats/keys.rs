@@ -1,4 +1,5 @@
-//! What stands in a listing beside names and poses: points, masks, depth, splits, marks; and matrices as exporters write them.
+//! Keys of a listing other than names and poses: points, masks, depth, splits, bad frames; and matrices as written by
+//! exporters.
 
 use std::fs;
 use std::path::Path;
@@ -16,7 +17,7 @@ fn frames(count: usize) -> Vec<Value> {
     (0..count).map(|index| frame(index, &format!("images/{}.png", name(index)))).collect()
 }
 
-/// A single listing of nine views and what `edit` makes of it.
+/// A single listing of nine views, changed by `edit`.
 fn single(root: &Path, edit: impl FnOnce(&mut Value)) {
     photographs(root, "images", 0..9, 1.0);
     let mut listing = transforms(frames(9));
@@ -46,7 +47,7 @@ fn expected() -> Vec<DVec3> {
 }
 
 #[test]
-fn points_of_a_ply_are_read_where_the_listing_or_a_tool_puts_them() {
+fn points_of_a_ply_are_read_from_the_listed_or_usual_place() {
     for (place, key) in [
         ("clouds/mine.ply", Some("./clouds/mine.ply")),
         ("mine.ply", Some("C:\\scan\\mine.ply")),
@@ -71,7 +72,7 @@ fn points_of_a_ply_are_read_where_the_listing_or_a_tool_puts_them() {
 }
 
 #[test]
-fn the_transform_that_a_listing_applied_is_applied_to_points_where_they_lack_it() {
+fn the_applied_transform_of_a_listing_is_applied_to_points_that_lack_it() {
     let away = [[100.0, 0.0, 0.0], [101.0, 0.25, 0.0], [100.5, 0.5, 0.0], [100.0, 0.0, 0.5]];
     let applied = json!([[1.0, 0.0, 0.0, -100.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]);
     for (points, shift) in [(away, -100.0), (POINTS, 0.0)] {
@@ -87,7 +88,7 @@ fn the_transform_that_a_listing_applied_is_applied_to_points_where_they_lack_it(
 }
 
 #[test]
-fn a_file_of_points_that_is_not_read_is_named() {
+fn an_unsupported_file_of_points_is_named() {
     let folder = tempfile::tempdir().unwrap();
     single(folder.path(), |listing| listing["ply_file_path"] = json!("absent.ply"));
     fs::write(folder.path().join("scan.las"), "LASF").unwrap();
@@ -102,7 +103,7 @@ fn a_file_of_points_that_is_not_read_is_named() {
     }
 }
 
-/// A mask whose left half counts.
+/// A mask that keeps the left half.
 fn left_half(path: &Path, is_inverted: bool) {
     fs::create_dir_all(path.parent().unwrap()).unwrap();
     let shown = |x: u32| if (x < SIZE.0 / 2) == is_inverted { 0.0 } else { 1.0 };
@@ -110,7 +111,7 @@ fn left_half(path: &Path, is_inverted: bool) {
 }
 
 #[test]
-fn masks_that_the_listing_names_hide_and_those_of_what_moves_do_so_inverted() {
+fn listed_masks_are_applied_and_dynamic_masks_inverted() {
     let hidden = |dataset: &Dataset, name: &str| {
         view(dataset, name).mask.as_ref().map(|mask| (mask.weights[0], mask.weights[39]))
     };
@@ -141,7 +142,7 @@ fn masks_that_the_listing_names_hide_and_those_of_what_moves_do_so_inverted() {
 }
 
 #[test]
-fn depth_that_the_listing_names_is_the_views() {
+fn listed_depth_maps_belong_to_their_views() {
     for key in ["depth_file_path", "depth_path"] {
         let folder = tempfile::tempdir().unwrap();
         single(folder.path(), |listing| listing["frames"][1][key] = json!("range/d1.png"));
@@ -157,7 +158,7 @@ fn depth_that_the_listing_names_is_the_views() {
 }
 
 #[test]
-fn stated_splits_are_kept_and_frames_marked_bad_or_in_no_list_are_left_out() {
+fn stated_splits_are_kept_and_bad_or_unlisted_frames_left_out() {
     let names_of = |views: std::ops::Range<usize>| -> Vec<String> {
         views.map(|index| format!("./images/{}.png", name(index))).collect()
     };
@@ -230,8 +231,8 @@ fn with_matrices(root: &Path, change: impl Fn([[f64; 4]; 4]) -> [[f64; 4]; 4]) {
 }
 
 #[test]
-fn scaled_rounded_and_transposed_matrices_are_read_and_told() {
-    // The numbers of a matrix may stand one after the other.
+fn scaled_rounded_and_transposed_matrices_are_read_with_a_remark() {
+    // The values of a matrix may be a flat list.
     let folder = tempfile::tempdir().unwrap();
     single(folder.path(), |listing| {
         for frame in listing["frames"].as_array_mut().unwrap() {
@@ -289,7 +290,7 @@ fn left_handed_matrices_are_refused_by_that_name() {
 }
 
 #[test]
-fn a_frames_own_camera_model_counts() {
+fn a_frames_own_camera_model_overrides() {
     let folder = tempfile::tempdir().unwrap();
     single(folder.path(), |listing| {
         listing["frames"][1]["camera_model"] = json!("OPENCV_FISHEYE");

@@ -1,4 +1,4 @@
-//! Folders as tools leave them, and listings of another machine.
+//! Folders as left by tools, and listings from another machine.
 
 use std::fs;
 use std::fs::File;
@@ -28,7 +28,7 @@ fn assert_whole(dataset: &Dataset, what: &str) {
 }
 
 #[test]
-fn a_model_and_its_photographs_are_found_where_tools_leave_them() {
+fn a_model_and_its_photographs_are_found_in_the_folders_of_tools() {
     for (images, model_folder) in [
         ("images", ""),
         ("", ""),
@@ -47,13 +47,13 @@ fn a_model_and_its_photographs_are_found_where_tools_leave_them() {
 }
 
 #[test]
-fn a_model_or_listing_that_is_named_itself_is_the_dataset_around_it() {
+fn a_path_of_a_model_or_listing_names_its_dataset() {
     let folder = tempfile::tempdir().unwrap();
     photographs(folder.path(), "images", 0..9, 1.0);
     for place in ["sparse/0", "sparse/1"] {
         model(9).write_binary(&folder.path().join(place));
     }
-    // Of the other model one camera is elsewhere.
+    // One camera of the other model is elsewhere.
     let mut other = model(9);
     other.points.truncate(7);
     other.write_text(&folder.path().join("sparse/1"));
@@ -70,7 +70,7 @@ fn a_model_or_listing_that_is_named_itself_is_the_dataset_around_it() {
 }
 
 #[test]
-fn shrunk_copies_scale_the_camera_and_the_largest_is_taken() {
+fn downscaled_copies_scale_the_camera_and_the_largest_is_used() {
     let folder = tempfile::tempdir().unwrap();
     for (name, size) in [("images_4", (24, 18)), ("images_2", (32, 24))] {
         (0..9).for_each(|index| {
@@ -94,7 +94,7 @@ fn shrunk_copies_scale_the_camera_and_the_largest_is_taken() {
 }
 
 #[test]
-fn a_folder_that_the_user_names_holds_the_photographs() {
+fn the_photographs_are_read_from_a_given_folder() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path().join("set");
     photographs(&root, "images", 0..9, 4.0);
@@ -109,7 +109,7 @@ fn a_folder_that_the_user_names_holds_the_photographs() {
 }
 
 #[test]
-fn where_two_folders_hold_the_names_none_is_guessed() {
+fn of_two_folders_with_the_names_none_is_guessed() {
     let folder = tempfile::tempdir().unwrap();
     photographs(folder.path(), "monday", 0..9, 1.0);
     photographs(folder.path(), "tuesday", 0..9, 1.0);
@@ -120,7 +120,7 @@ fn where_two_folders_hold_the_names_none_is_guessed() {
 }
 
 #[test]
-fn paths_of_another_machine_lead_to_the_files_of_their_names_and_that_is_said_once() {
+fn paths_of_another_machine_are_resolved_by_name_with_one_remark() {
     for before in [
         "/home/user/scan/images/",
         "C:\\Users\\user\\scan\\images\\",
@@ -150,7 +150,7 @@ fn paths_of_another_machine_lead_to_the_files_of_their_names_and_that_is_said_on
 }
 
 #[test]
-fn of_a_rig_on_another_machine_folders_are_kept() {
+fn paths_of_a_rig_on_another_machine_keep_their_folders() {
     let folder = tempfile::tempdir().unwrap();
     for camera in ["left", "right"] {
         photographs(folder.path(), &format!("images/{camera}"), 0..4, 1.0);
@@ -165,7 +165,7 @@ fn of_a_rig_on_another_machine_folders_are_kept() {
 }
 
 #[test]
-fn test_photographs_that_are_kept_back_are_looked_for_nowhere_else() {
+fn withheld_test_photographs_are_not_searched_elsewhere() {
     let folder = tempfile::tempdir().unwrap();
     photographs(folder.path(), "train", 0..8, 1.0);
     photographs(folder.path(), "elsewhere", 0..8, 1.0);
@@ -179,7 +179,7 @@ fn test_photographs_that_are_kept_back_are_looked_for_nowhere_else() {
 }
 
 #[test]
-fn splits_may_hold_equal_names() {
+fn splits_may_contain_equal_names() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     for (split, views) in [("train", 0..5), ("val", 5..7), ("test", 7..9)] {
@@ -197,7 +197,7 @@ fn splits_may_hold_equal_names() {
 }
 
 #[test]
-fn names_are_compared_however_unicode_writes_them() {
+fn names_are_compared_in_normalised_unicode() {
     let (composed, decomposed) = ("K\u{fc}che", "Ku\u{308}che");
     for (on_disk, listed) in [(composed, decomposed), (decomposed, composed)] {
         let folder = tempfile::tempdir().unwrap();
@@ -220,7 +220,7 @@ fn names_are_compared_however_unicode_writes_them() {
 }
 
 #[test]
-fn files_that_begin_with_a_dot_are_no_photographs() {
+fn hidden_files_are_not_photographs() {
     let folder = tempfile::tempdir().unwrap();
     photographs(folder.path(), "images", 0..9, 1.0);
     for index in 0..9 {
@@ -265,13 +265,13 @@ fn an_archive_is_read_in_place() {
         pack(&root, &zip, prefix);
         assert_whole(&load(&zip), prefix);
     }
-    // Photographs that are read anew as well.
+    // Also photographs that are read again.
     let options = LoadOptions { keep: Some(0), ..LoadOptions::default() };
     let dataset = Dataset::load(&zip, &options).unwrap();
     let image = dataset.views[3].loaded().unwrap();
     assert_eq!(super::level(image.as_deref()), Some(13.0));
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2, "something was unpacked");
-    // What its listing names outside it is not read.
+    // Listed files outside the archive are not read.
     let outside = folder.path().join("outside.png");
     Image::filled(SIZE.0, SIZE.1, [0.1; 3]).save_png8(&outside).unwrap();
     let listing = transforms(vec![
@@ -305,7 +305,7 @@ fn a_dataset_below_or_above_is_named() {
 }
 
 #[test]
-fn black_borders_of_undistorted_photographs_are_masked_and_those_of_a_dark_scene_are_not() {
+fn black_borders_of_undistorted_photographs_are_masked_but_not_those_of_a_dark_scene() {
     let folder = tempfile::tempdir().unwrap();
     let paint = |corner: f64, shift: u32| {
         for index in 0..9 {
@@ -356,7 +356,7 @@ fn black_borders_of_undistorted_photographs_are_masked_and_those_of_a_dark_scene
 }
 
 #[test]
-fn references_as_dark_as_the_photographs_are_photographs() {
+fn references_as_dark_as_the_photographs_are_not_references() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     for (split, views) in [("train", 0..7), ("test", 7..9)] {

@@ -1,4 +1,4 @@
-//! COLMAP's models as scripts and newer versions write them.
+//! COLMAP models written by scripts and newer versions.
 
 use std::fs;
 
@@ -10,7 +10,7 @@ use super::load;
 use super::synthetic::*;
 
 #[test]
-fn images_of_one_line_each_are_all_read() {
+fn images_with_one_line_each_are_all_read() {
     let folder = tempfile::tempdir().unwrap();
     photographs(folder.path(), "images", 0..9, 1.0);
     let place = folder.path().join("sparse/0");
@@ -49,7 +49,7 @@ fn sizes_may_be_written_as_floats_and_must_be_whole() {
 }
 
 #[test]
-fn fisheyes_without_distortion_are_fisheyes() {
+fn fisheyes_without_distortion_stay_fisheyes() {
     let zeros = CameraModel::Fisheye(KannalaBrandt { coefficients: [0.0; 4] });
     for (name, number, parameters) in [
         ("SIMPLE_FISHEYE", 14, vec![35.0, 18.0, 16.0]),
@@ -59,7 +59,7 @@ fn fisheyes_without_distortion_are_fisheyes() {
         photographs(folder.path(), "images", 0..9, 1.0);
         let written = Model { cameras: vec![(3, name, number, parameters)], ..model(9) };
         written.write_binary(&folder.path().join("sparse/0"));
-        // What newer versions add says no more than images.bin.
+        // Additional files of newer versions are not needed.
         fs::write(folder.path().join("sparse/0/rigs.bin"), [0; 8]).unwrap();
         fs::write(folder.path().join("sparse/0/frames.bin"), [0; 8]).unwrap();
         assert_eq!(load(folder.path()).views[0].camera.model, zeros, "{name}");

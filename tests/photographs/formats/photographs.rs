@@ -1,4 +1,4 @@
-//! Photographs as they come: formats, orientation, alpha and masks.
+//! Photograph files: formats, orientation, alpha and masks.
 
 use std::fs;
 use std::path::Path;
@@ -24,7 +24,7 @@ fn close(values: &[f32], expected: &[f32]) {
 }
 
 #[test]
-fn tiff_and_webp_are_read_in_the_bits_that_they_have() {
+fn tiff_and_webp_are_read_at_full_precision() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     let grey = [0_u8, 7, 100, 255];
@@ -49,7 +49,7 @@ fn tiff_and_webp_are_read_in_the_bits_that_they_have() {
         &row(&Image::load(path("16.tif")).unwrap()),
         &deep.map(|value| f32::from(value) / 65_535.0),
     );
-    // Of floats, EXR is what is read.
+    // Float images are only read from EXR.
     fs::write(path("float.tif"), float_tiff(&[[0.0; 3], [0.5; 3]])).unwrap();
     let error = Image::load(path("float.tif")).unwrap_err().to_string();
     assert!(error.contains("float.tif: is not read") && error.contains("EXR"), "{error}");
@@ -59,7 +59,7 @@ fn tiff_and_webp_are_read_in_the_bits_that_they_have() {
 fn float_tiff(pixels: &[[f32; 3]]) -> Vec<u8> {
     let bytes: Vec<u8> = pixels.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
     let (count, length) = (pixels.len() as u32, bytes.len() as u32);
-    // Behind the pixels, for each of the three samples: 32 bits, and that they are floats.
+    // After the pixels, for each of the three samples: 32 bits, and the float format.
     let of_samples = [32_u16, 32, 32, 3, 3, 3];
     let (bits, formats) = (8 + length, 8 + length + 6);
     // Tag, number, value: size, bits, no compression, RGB, offset, samples, rows, bytes, float.
@@ -79,7 +79,7 @@ fn float_tiff(pixels: &[[f32; 3]]) -> Vec<u8> {
     file.extend(of_samples.iter().flat_map(|value| value.to_le_bytes()));
     file.extend((entries.len() as u16).to_le_bytes());
     for (tag, number, value) in entries {
-        // Several values are shorts; one is a long.
+        // Several values are shorts; a single one is a long.
         let kind: u16 = if number > 1 { 3 } else { 4 };
         file.extend([tag, kind, number, 0].iter().flat_map(|half| half.to_le_bytes()));
         file.extend(value.to_le_bytes());
@@ -89,7 +89,7 @@ fn float_tiff(pixels: &[[f32; 3]]) -> Vec<u8> {
 }
 
 #[test]
-fn pixels_of_an_exr_that_are_no_numbers_are_hidden() {
+fn pixels_of_an_exr_that_are_not_finite_are_masked() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     fs::create_dir(root.join("images")).unwrap();
@@ -112,7 +112,7 @@ fn pixels_of_an_exr_that_are_no_numbers_are_hidden() {
 }
 
 #[test]
-fn heic_is_refused_with_what_converts_it_and_listed_where_it_is_not_read() {
+fn heic_is_refused_with_its_converter_and_listed_as_unread() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     fs::write(root.join("a.heic"), b"\0\0\0\x18ftypheic\0\0\0\0mif1heic").unwrap();
@@ -149,8 +149,8 @@ pub(crate) fn orient(path: &Path, orientation: u8) {
 }
 
 #[test]
-fn a_photograph_is_turned_where_its_camera_saw_it_upright_and_stays_where_it_did_not() {
-    // Of each way of holding a camera: the size as stored where the cameras' is 40 x 30.
+fn a_photograph_is_rotated_if_its_camera_is_upright_and_else_kept_as_stored() {
+    // For each orientation: as stored if the cameras' size is 40 x 30.
     for orientation in 1..=8 {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path();
@@ -169,7 +169,7 @@ fn a_photograph_is_turned_where_its_camera_saw_it_upright_and_stays_where_it_did
             let dataset = load(root);
             let image = view(&dataset, "v03").image.as_ref().unwrap();
             assert_eq!((image.width, image.height), SIZE);
-            // The bright half is that of the columns as they are stored.
+            // The bright half is that of the stored columns.
             let is_bright = |x: u32, y: u32| image.pixel(x, y)[0] > 0.12;
             let (columns, rows) =
                 ([5, 35].map(|x| is_bright(x, 15)), [5, 25].map(|y| is_bright(20, y)));
@@ -194,8 +194,8 @@ fn a_photograph_is_turned_where_its_camera_saw_it_upright_and_stays_where_it_did
 }
 
 #[test]
-fn up_is_that_of_the_photographs_as_people_see_them() {
-    // A phone held upright stores its pictures lying on a side: orientation 6, cameras of what is stored.
+fn up_is_that_of_the_upright_photographs() {
+    // A phone held upright stores its photographs sideways: orientation 6, with cameras of the stored images.
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let backup = DAffine3::from_mat3(DMat3::from_cols(DVec3::NEG_Y, DVec3::X, DVec3::Z));
@@ -221,7 +221,7 @@ fn up_is_that_of_the_photographs_as_people_see_them() {
     }
 }
 
-/// Half of a picture is white, the left one.
+/// The left half of the image is white.
 fn half_mask(path: &Path, size: (u32, u32)) {
     fs::create_dir_all(path.parent().unwrap()).unwrap();
     let half = |x: u32, _| [f32::from(2 * x < size.0); 3];
@@ -235,7 +235,7 @@ fn hides_the_right(mask: &Mask) {
 }
 
 #[test]
-fn masks_are_found_by_both_names_may_be_inverted_and_alpha_is_one() {
+fn masks_are_found_by_both_names_and_may_be_inverted_and_alpha_is_a_mask() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     lom(root, 10, &[2, 5]);
@@ -256,18 +256,18 @@ fn masks_are_found_by_both_names_may_be_inverted_and_alpha_is_one() {
     let dataset = Dataset::load(root, &inverted).unwrap();
     let mask = view(&dataset, "v00").mask.as_ref().unwrap();
     assert_eq!((mask.weights[0], mask.weights[39]), (0.0, 1.0));
-    // Alpha says what is there, and is not inverted.
+    // Alpha is not inverted.
     hides_the_right(view(&dataset, "v03").mask.as_ref().unwrap());
 
-    // Shrunk with the photograph.
+    // Resized with the photograph.
     let shrunk = LoadOptions { downscale: 1.6, ..LoadOptions::default() };
     let mask = view(&Dataset::load(root, &shrunk).unwrap(), "v00").mask.clone().unwrap();
-    // The thirteenth column shows half a column of what is hidden.
+    // The thirteenth column contains half a masked column.
     assert_eq!((mask.width, mask.weights[11], mask.weights[12]), (25, 1.0, 0.0));
 }
 
 #[test]
-fn a_mask_of_another_shape_is_refused_and_one_that_hides_all_leaves_the_view_out() {
+fn a_mask_of_another_aspect_ratio_is_refused_and_a_full_mask_excludes_its_view() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     lom(root, 10, &[2, 5]);
@@ -286,7 +286,7 @@ fn a_mask_of_another_shape_is_refused_and_one_that_hides_all_leaves_the_view_out
 }
 
 #[test]
-fn what_is_hidden_is_in_no_measure_of_tone() {
+fn masked_pixels_are_not_in_the_statistics_of_tone() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let measured = |more: &str| -> serde_json::Value {

@@ -1,4 +1,4 @@
-//! `nightsplat pose`: what becomes of the user's programs, and what is written; COLMAP itself where it is installed.
+//! `nightsplat pose`: external programs, their failures, and the written dataset; COLMAP itself if it is installed.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,18 +13,34 @@ use super::synthetic::*;
 use crate::common::command::{command, refused, run, succeed};
 use crate::common::{not_run, shared};
 
-/// A program that does as the real one's command line asks, by a few lines of shell for each of its commands.
+/// A program with the command line of COLMAP, and a few lines of shell for each of its commands.
 #[cfg(unix)]
 pub(super) fn stub(folder: &Path, cases: &str) -> PathBuf {
     let path = folder.join("colmap-stub");
     let lines = format!(
-        "command=$1; shift\nif [ \"$1\" = -h ]; then\n [ $command = mapper ] && echo '  --Mapper.init_min_tri_angle arg (=16)'\n exit 0\nfi\nwhile [ $# -gt 0 ]; do\n case $1 in\n  --image_path) images=$2;;\n  --output_path) output=$2;;\n  --image_list_path) list=$2;;\n  --Mapper.init_min_tri_angle) angle=$2;;\n esac\n shift\ndone\ncase $command in\n{cases}\nesac\n"
+        "command=$1; shift\n\
+         if [ \"$1\" = -h ]; then\n\
+         [ $command = mapper ] && echo '  --Mapper.init_min_tri_angle arg (=16)'\n\
+         exit 0\n\
+         fi\n\
+         while [ $# -gt 0 ]; do\n\
+         case $1 in\n\
+         --image_path) images=$2;;\n\
+         --output_path) output=$2;;\n\
+         --image_list_path) list=$2;;\n\
+         --Mapper.init_min_tri_angle) angle=$2;;\n\
+         esac\n\
+         shift\n\
+         done\n\
+         case $command in\n\
+         {cases}\n\
+         esac\n"
     );
     script(&path, &lines);
     path
 }
 
-/// A program of these lines of shell.
+/// A shell script with these lines.
 #[cfg(unix)]
 fn script(path: &Path, lines: &str) {
     use std::os::unix::fs::PermissionsExt;
@@ -32,7 +48,7 @@ fn script(path: &Path, lines: &str) {
     fs::set_permissions(path, fs::Permissions::from_mode(0o755)).unwrap();
 }
 
-/// Photographs with some detail, dark, `photos/v00.png` to `v08.png`.
+/// Dark photographs with some detail, `photos/v00.png` to `v08.png`.
 pub(super) fn photographed(root: &Path) -> PathBuf {
     let photos = root.join("photos");
     fs::create_dir_all(&photos).unwrap();
@@ -49,7 +65,7 @@ fn dark_picture(index: usize) -> Image {
     })
 }
 
-/// Nothing of a dataset that failed is left but its log.
+/// A failed dataset leaves only its log.
 fn nothing_is_left(out: &Path) {
     let beside: Vec<String> = fs::read_dir(out.parent().unwrap())
         .unwrap()
@@ -98,7 +114,7 @@ fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
     assert!(fs::read_to_string(out.join("colmap.log")).unwrap().contains("$ "));
     let dataset = load(&out);
     assert_eq!((dataset.views.len(), dataset.points.len()), (8, 20));
-    // What is there stays, unless it was made here and is to go.
+    // An existing folder is kept, unless `pose` wrote it and may replace it.
     refused(&arguments, 1, &["scene", "exists already", "--overwrite"]);
     succeed(&format!("{arguments} --overwrite"));
     fs::remove_file(out.join("colmap.log")).unwrap();
@@ -108,7 +124,7 @@ fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
 /// One photograph in nine has no camera, so all are matched again.
 #[cfg(unix)]
 #[test]
-fn a_second_comparison_that_fails_costs_nothing_of_the_first() {
+fn a_failed_second_matching_keeps_the_cameras_of_the_first() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let (photos, out) = (photographed(root), root.join("scene"));
@@ -125,7 +141,7 @@ fn a_second_comparison_that_fails_costs_nothing_of_the_first() {
 
 #[cfg(unix)]
 #[test]
-fn cameras_are_placed_all_at_once_by_colmap_where_it_can_or_by_glomap() {
+fn cameras_are_registered_globally_by_colmap_or_else_by_glomap() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let photos = photographed(root);
@@ -139,7 +155,7 @@ fn cameras_are_placed_all_at_once_by_colmap_where_it_can_or_by_glomap() {
             colmap.display()
         )
     };
-    // COLMAP from 4.0 on has it among its commands.
+    // COLMAP has this command from 4.0 on.
     let new = stub(root, &format!("help) echo global_mapper;;\nglobal_mapper) {models};;"));
     let (stdout, _) = run(&pose("new", &new, "/nowhere/glomap"), 0);
     assert!(stdout.contains("8 of 9 photographs"), "{stdout}");
@@ -168,7 +184,7 @@ fn cameras_are_placed_all_at_once_by_colmap_where_it_can_or_by_glomap() {
 
 #[cfg(unix)]
 #[test]
-fn colmap_that_fails_or_finds_too_little_is_told_in_a_line_and_leaves_nothing() {
+fn a_failure_of_colmap_is_reported_in_a_line_and_leaves_no_dataset() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let (photos, out) = (photographed(root), root.join("scene"));
@@ -207,12 +223,12 @@ fn colmap_that_fails_or_finds_too_little_is_told_in_a_line_and_leaves_nothing() 
 
 #[cfg(unix)]
 #[test]
-fn the_focal_length_that_a_camera_wrote_is_what_colmap_begins_with() {
+fn colmap_gets_the_focal_length_of_the_exif() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let photos = root.join("photos");
     fs::create_dir_all(&photos).unwrap();
-    // Orientation 6 and 28 mm as of 35 mm film, big-endian as some cameras have it.
+    // Orientation 6 and a focal length of 28 mm equivalent, big-endian as in some cameras.
     let exif = b"MM\0*\0\0\0\x08\0\x02\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\x87\x69\0\x04\0\0\0\x01\0\0\0\x26\0\0\0\0\
         \0\x01\xa4\x05\0\x03\0\0\0\x01\0\x1c\0\0\0\0\0\0";
     for index in 0..3 {
@@ -229,7 +245,8 @@ fn the_focal_length_that_a_camera_wrote_is_what_colmap_begins_with() {
         let seen = fs::read(root.join(format!("seen/{index}.JPG"))).unwrap();
         let focal = b"\xa4\x05\0\x03\0\0\0\x01\0\x1c";
         assert!(seen.windows(focal.len()).any(|bytes| bytes == focal));
-        // What is lifted is as stored, and says so: cameras are of the stored photograph.
+        // The tone-mapped copy is in the stored orientation and marked as upright: cameras are those of the stored
+        // photograph.
         let upright = b"\x01\x12\0\x03\0\0\0\x01\0\x01";
         assert!(seen.windows(upright.len()).any(|bytes| bytes == upright));
         assert_eq!(Image::size_of(root.join(format!("seen/{index}.JPG"))).unwrap(), (37, 29));
@@ -237,7 +254,7 @@ fn the_focal_length_that_a_camera_wrote_is_what_colmap_begins_with() {
 }
 
 #[test]
-fn what_keeps_pose_from_beginning_is_told_in_a_line() {
+fn problems_before_the_start_are_reported_in_a_line() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let (photos, out) = (photographed(root), root.join("scene"));
@@ -279,7 +296,7 @@ fn what_keeps_pose_from_beginning_is_told_in_a_line() {
     nothing_is_left(&out);
 }
 
-/// Whether a program of the user's is there; otherwise that is said.
+/// Whether an external program is installed; prints a line if not.
 #[track_caller]
 fn is_installed(program: &str) -> bool {
     let is_there = Command::new(program).arg("-h").stdin(Stdio::null()).output().is_ok();
@@ -291,14 +308,14 @@ fn is_installed(program: &str) -> bool {
 
 #[cfg(unix)]
 #[test]
-fn of_a_clip_the_sharpest_frame_of_each_window_is_taken() {
+fn the_sharpest_frame_of_each_window_of_a_clip_is_used() {
     if !is_installed("ffmpeg") {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     fs::create_dir(root.join("frames")).unwrap();
-    // Two seconds of eight frames; of each four the third stands still.
+    // Two seconds of eight frames; the third of every four is sharp.
     for index in 0..16 {
         let picture = dark_picture(index / 4);
         let frame =
@@ -334,7 +351,7 @@ fn of_a_clip_the_sharpest_frame_of_each_window_is_taken() {
     nothing_is_left(&out);
 }
 
-/// A clip of one dark picture, made by ffmpeg with these filters and options; `None` where this ffmpeg cannot.
+/// A clip of one dark image, made by ffmpeg with these filters and options; `None` if this ffmpeg cannot.
 #[cfg(unix)]
 fn clip_of(root: &Path, name: &str, filters: &str, options: &[&str]) -> Option<PathBuf> {
     dark_picture(1).save_png8(root.join("source.png")).unwrap();
@@ -364,7 +381,7 @@ fn clip_of(root: &Path, name: &str, filters: &str, options: &[&str]) -> Option<P
 
 #[cfg(unix)]
 #[test]
-fn a_clip_of_high_dynamic_range_or_wide_primaries_gives_the_frames_of_a_plain_one() {
+fn hdr_and_wide_gamut_clips_give_the_frames_of_an_sdr_clip() {
     if !is_installed("ffmpeg") || !is_installed("ffprobe") {
         return;
     }
@@ -413,7 +430,7 @@ fn a_clip_of_high_dynamic_range_or_wide_primaries_gives_the_frames_of_a_plain_on
 
 #[cfg(unix)]
 #[test]
-fn an_ffmpeg_without_the_filters_for_a_wide_range_names_the_command() {
+fn without_the_hdr_filters_of_ffmpeg_the_error_has_the_command() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     dark_picture(1).save_png8(root.join("source.png")).unwrap();
@@ -432,7 +449,7 @@ fn an_ffmpeg_without_the_filters_for_a_wide_range_names_the_command() {
     refused(&arguments, 3, &parts);
     script(&root.join("ffprobe"), "exit 1");
     let (_, message) = run(&arguments, 3);
-    assert!(message.contains("ffprobe") && message.contains("taken for SDR"), "{message}");
+    assert!(message.contains("ffprobe") && message.contains("assuming SDR"), "{message}");
 }
 
 #[test]
@@ -456,7 +473,7 @@ fn colmap_finds_the_cameras_of_a_dark_set() {
     let (truth, found) = (load(&root.join("set")), load(&out));
     assert!(found.views.len() >= 15, "{} of 20", found.views.len());
     assert!(found.points.len() > 50, "{} points", found.points.len());
-    // Distances between cameras, of which only the scale is free.
+    // Distances between cameras, whose scale is free.
     let center = |name: &str, set: &nightsplat::photographs::dataset::Dataset| {
         super::view(set, name).camera.center()
     };
@@ -472,7 +489,7 @@ fn colmap_finds_the_cameras_of_a_dark_set() {
 
 #[test]
 #[ignore = "two minutes: of `make stress`"]
-fn real_dark_photographs_train_with_the_cameras_that_colmap_finds_as_with_those_supplied() {
+fn real_dark_photographs_train_as_well_with_cameras_from_colmap_as_with_supplied_ones() {
     let Some(chair) = shared("data/lom/chair") else { return };
     if !is_installed("colmap") {
         return;

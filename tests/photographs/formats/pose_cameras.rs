@@ -1,4 +1,4 @@
-//! `nightsplat pose`: which photographs share a camera, which are left out, and how COLMAP is asked again.
+//! `nightsplat pose`: photographs that share a camera, photographs left out, and repeated runs of COLMAP.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -9,7 +9,7 @@ use super::pose::{photographed, stub};
 use super::synthetic::*;
 use crate::common::command::{refused, run};
 
-/// Copies a photograph and says in its Exif which focal length it was taken at, as of 35 mm film.
+/// Copies a photograph and sets its equivalent focal length in Exif.
 fn taken_at(path: &Path, focal: u8) {
     let exif = [
         &b"MM\0*\0\0\0\x08\0\x01\x87\x69\0\x04\0\0\0\x01\0\0\0\x1a\0\0\0\0\0\x01\xa4\x05\0\x03\0\0\0\x01\0"[..],
@@ -50,7 +50,7 @@ fn photographs_of_one_size_lens_and_focal_length_share_a_camera() {
 }
 
 #[test]
-fn a_photograph_that_does_not_decode_stops_nothing_and_dot_files_are_none() {
+fn a_photograph_that_does_not_decode_is_left_out_and_hidden_files_are_ignored() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let (photos, out) = (photographed(root), root.join("scene"));
@@ -67,12 +67,12 @@ fn a_photograph_that_does_not_decode_stops_nothing_and_dot_files_are_none() {
     assert!(!stderr.contains("._v00"), "{stderr}");
     let dataset = load(&out);
     let masked: Vec<bool> = dataset.views.iter().map(|view| view.mask.is_some()).collect();
-    // All of it moves, so that nothing is left to train on.
+    // All of it is masked, so nothing is left to train on.
     assert_eq!((dataset.views.len(), masked.contains(&true)), (8, false));
 }
 
 #[test]
-fn a_calibration_that_no_camera_has_is_said_to_be_implausible() {
+fn an_implausible_calibration_is_reported() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let photos = photographed(root);
@@ -98,7 +98,7 @@ fn a_calibration_that_no_camera_has_is_said_to_be_implausible() {
 }
 
 #[test]
-fn few_photographs_begin_with_a_closer_pair_and_options_go_to_the_command_that_has_them() {
+fn few_photographs_start_from_a_closer_pair_and_options_go_to_their_command() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let (photos, out) = (photographed(root), root.join("scene"));
@@ -116,7 +116,7 @@ fn few_photographs_begin_with_a_closer_pair_and_options_go_to_the_command_that_h
     let relaxed = format!("mapper) [ \"$angle\" = 2 ] && {copy}; exit 0;;");
     let (stdout, stderr) = run(&pose(&relaxed, ""), 0);
     assert!(stdout.contains("9 of 9 photographs"), "{stdout}");
-    assert_eq!(stderr.matches("placed once more, from a closer pair").count(), 2, "{stderr}");
+    assert_eq!(stderr.matches("registering again, from a closer pair").count(), 2, "{stderr}");
     let log = fs::read_to_string(out.join("colmap.log")).unwrap();
     assert!(
         log.contains("--Mapper.init_max_forward_motion 1 --Mapper.init_min_num_inliers 50"),
@@ -131,16 +131,16 @@ fn few_photographs_begin_with_a_closer_pair_and_options_go_to_the_command_that_h
     for (option, parts) in [
         (
             "Mapper.nothing=3",
-            ["Mapper.nothing", "feature_extractor, exhaustive_matcher, mapper none has"],
+            ["Mapper.nothing", "none of feature_extractor, exhaustive_matcher, mapper has"],
         ),
-        ("Mapper.init_min_tri_angle", ["Mapper.init_min_tri_angle", "is no NAME=VALUE"]),
+        ("Mapper.init_min_tri_angle", ["Mapper.init_min_tri_angle", "is not NAME=VALUE"]),
     ] {
         refused(&pose(&asked, &format!("--colmap-option {option}")), 2, &parts);
     }
 }
 
 #[test]
-fn an_archive_of_photographs_is_posed_in_place() {
+fn an_archive_of_photographs_is_read_in_place() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     let (photos, out) = (photographed(root), root.join("scene"));

@@ -1,4 +1,4 @@
-//! Camera RAW, of which the smallest is made here: linear light, read and trained on.
+//! Camera RAW: a minimal file, its linear light, and training on it.
 
 use std::fs;
 
@@ -7,19 +7,19 @@ use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 
 use crate::common::command::succeed;
 
-/// What the sensor counts without light, and where it is full.
+/// Sensor values without light, and at saturation.
 const BLACK: u16 = 256;
 const WHITE: u16 = 65_280;
-/// What it counts of white, as a part of the green.
+/// Sensor values of white, relative to green.
 const NEUTRAL: [f32; 3] = [0.5, 1.0, 2.0 / 3.0];
 
-/// What the sensor counts of light.
+/// Sensor value of light.
 fn counted(light: [f32; 3]) -> [u16; 3] {
     let range = f32::from(WHITE - BLACK);
     std::array::from_fn(|k| BLACK + (range * NEUTRAL[k] * light[k]).round() as u16)
 }
 
-/// The smallest linear DNG: 16-bit pixels of three colours in one strip, a neutral of the camera, black and white.
+/// A minimal linear DNG: 16-bit pixels of three colours in one strip, the camera's neutral, black and white levels.
 fn dng(width: u16, height: u16, pixel: impl Fn(u16, u16) -> [u16; 3]) -> Vec<u8> {
     let short = |values: &[u16]| {
         (
@@ -43,7 +43,7 @@ fn dng(width: u16, height: u16, pixel: impl Fn(u16, u16) -> [u16; 3]) -> Vec<u8>
         .flat_map(|(x, y)| pixel(x, y))
         .flat_map(u16::to_le_bytes)
         .collect();
-    // XYZ to the camera's colours: the camera is one of sRGB's.
+    // From XYZ to the camera's colours, which are sRGB's.
     let matrix = [32405, -15371, -4985, -9693, 18760, 416, 556, -2040, 10572].map(|v| [v, 10_000]);
     let mut entries = vec![
         (254, long(0)),
@@ -98,7 +98,7 @@ fn dng(width: u16, height: u16, pixel: impl Fn(u16, u16) -> [u16; 3]) -> Vec<u8>
 fn a_linear_dng_is_linear_light_with_the_cameras_white() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.dng");
-    // Grey of known light, 1/16 to 1/2, as a camera sees it whose red and blue are weaker.
+    // Grey of known light, 1/16 to 1/2, by a camera with weaker red and blue.
     let light = |x: u16| 1.0 / f32::from(16_u16 >> (x / 4));
     fs::write(&path, dng(16, 8, |x, _| counted([light(x); 3]))).unwrap();
     let image = Image::load(&path).unwrap();
@@ -110,7 +110,7 @@ fn a_linear_dng_is_linear_light_with_the_cameras_white() {
             assert!((value - expected).abs() < 2e-4, "{x}: {value}, not {expected}");
         }
     }
-    // Linear light goes the way of EXR: the same photograph, whichever file it is in.
+    // Linear light is processed as in EXR: the same photograph from either file.
     let exr = folder.path().join("a.exr");
     image.save_exr(&exr).unwrap();
     let other = Image::load(&exr).unwrap();
@@ -130,7 +130,7 @@ fn a_damaged_raw_is_named() {
     }
 }
 
-/// The score of a set that is trained for a few steps.
+/// The score after a few steps of training on a dataset.
 fn trained(set: &std::path::Path) -> f64 {
     let out = set.with_extension("run");
     let options = "--steps 60 --sh-degree 0 --model plain --curve auto --progress none";

@@ -1,4 +1,4 @@
-//! Captures from elsewhere: what is committed of them, and the real ones where they are at hand.
+//! Real captures: committed excerpts, and the full ones if available.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
@@ -6,14 +6,14 @@ use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
 use super::{level, load, names, view};
 use crate::common::{fixture, shared};
 
-/// How many of the points appear inside the views that see them.
+/// The share of points that project into the views that see them.
 fn share_of_points_in_their_views(dataset: &Dataset) -> f64 {
     let (mut inside, mut all) = (0, 0);
     for point in &dataset.points {
         for view in &point.views {
             let camera = dataset.views[*view as usize].camera;
             let size = DVec2::new(f64::from(camera.width), f64::from(camera.height));
-            // What the undistortion cut off lies within a twentieth of the border.
+            // The part cut off by undistortion is within a twentieth of the border.
             let seen = camera.project(point.position);
             let seen =
                 seen.is_some_and(|p| p.cmpge(-0.05 * size).all() && p.cmple(1.05 * size).all());
@@ -37,14 +37,14 @@ fn a_set_in_the_layout_of_lom_loads_with_its_split_and_points() {
 }
 
 #[test]
-fn a_colmap_model_made_by_hand_says_the_same_in_both_forms() {
+fn a_handwritten_colmap_model_is_the_same_in_both_formats() {
     for form in ["text", "binary"] {
         let dataset = load(&fixture("colmap").join(form));
-        // By name, of which every eighth from the first is for testing.
+        // By name, every eighth from the first on is a test view.
         assert_eq!(names(&dataset, Split::Test), ["a"]);
         assert_eq!(names(&dataset, Split::Train), ["b", "c"]);
         let half_turn = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
-        // (0.5, 0.5, 0.5, 0.5) takes x to y, y to z and z to x.
+        // (0.5, 0.5, 0.5, 0.5) maps x to y, y to z and z to x.
         let cycle = DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X);
         let expected = [
             ("a", [20, 16], [25.0, 27.0], [10.0, 8.5], half_turn, [0.0, 0.0, 5.0], 20.0),
@@ -111,7 +111,7 @@ fn realx3d_keeps_its_test_poses() {
 }
 
 #[test]
-fn twenty_three_cameras_of_different_sizes_load_in_one_set() {
+fn twenty_three_cameras_of_different_sizes_load_in_one_dataset() {
     let Some(root) = shared("data/fixtures/colmap_multi_camera") else { return };
     let options = LoadOptions { downscale: 4.0, ..LoadOptions::default() };
     let dataset = Dataset::load(&root, &options).unwrap();

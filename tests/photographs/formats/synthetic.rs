@@ -1,4 +1,4 @@
-//! A small capture on a ring of cameras, written in every layout that the loader knows.
+//! A small capture on a ring of cameras, written in every supported layout.
 
 use std::fs;
 use std::path::Path;
@@ -25,7 +25,7 @@ pub(crate) fn name(index: usize) -> String {
     format!("v{index:02}")
 }
 
-/// The dark photograph's value; the normal-light one is four times as bright.
+/// The dark photograph's value; the normal-light photograph is four times as bright.
 pub(crate) fn dark(index: usize) -> f32 {
     (10 + index) as f32 / 255.0
 }
@@ -55,7 +55,7 @@ pub(crate) fn frame(index: usize, file_path: &str) -> Value {
     frame_of(&pose(index), file_path)
 }
 
-/// The same of any pose.
+/// [`frame`] for any pose.
 pub(crate) fn frame_of(pose: &DAffine3, file_path: &str) -> Value {
     let world_from_gl = pose.inverse() * DAffine3::from_scale(DVec3::new(1.0, -1.0, -1.0));
     let (m, t) = (world_from_gl.matrix3, world_from_gl.translation);
@@ -74,7 +74,7 @@ pub(crate) fn write_json(path: impl AsRef<Path>, value: &Value) {
     fs::write(path, serde_json::to_string_pretty(value).unwrap()).unwrap();
 }
 
-/// `low/` for training, `high/` for scores, both for every view: the layout of LOM.
+/// `low/` for training and `high/` for scores, both for every view: the layout of LOM.
 pub(crate) fn lom(root: &Path, views: usize, tests: &[usize]) {
     photographs(root, "low", 0..views, 1.0);
     photographs(root, "high", 0..views, 4.0);
@@ -99,7 +99,7 @@ pub(crate) struct Model {
     pub(crate) points: Vec<(u64, DVec3, Vec<u32>)>,
 }
 
-/// Image ids are 7 more than indices and come in reverse, so that nobody takes an id for an index.
+/// Image ids are indices plus 7 in reverse order, to detect code that confuses ids and indices.
 pub(crate) fn model(views: usize) -> Model {
     let parameters = vec![FOCAL.x, FOCAL.y, PRINCIPAL_POINT.x, PRINCIPAL_POINT.y];
     let image = |index: usize| (index as u32 + 7, pose(index), 3, format!("{}.png", name(index)));

@@ -1,4 +1,4 @@
-//! Gaussians in host memory, and what density control makes of them on the device and by its references.
+//! Gaussians in host memory, and density control of them on the device and in its references.
 
 use glam::{DAffine3, DVec2, DVec3, Vec3};
 use nightsplat::camera::{Camera, CameraModel, Patch};
@@ -42,7 +42,7 @@ pub(super) fn room_for(gpu: &Gpu, count: usize) -> DeviceGaussians {
     DeviceGaussians::uninit(gpu, Layout::new(count, shape(), StorageFormat::Single)).unwrap()
 }
 
-/// Of 64 x 48 pixels, at a position, looking along +z.
+/// A camera of 64 x 48 pixels that looks along +z.
 pub(super) fn camera_at(position: DVec3) -> Camera {
     Camera {
         width: 64,
@@ -66,7 +66,7 @@ pub(super) struct Host {
 }
 
 impl Host {
-    /// Opaque Gaussians of scale 0.01 that nothing pulls at.
+    /// Opaque Gaussians of scale 0.01 without gradients.
     pub(super) fn calm(count: usize) -> Self {
         let wave = |phase: f32| -> Vec<f32> {
             (0..count * COLUMNS).map(|i| (i as f32 * 0.7 + phase).sin()).collect()
@@ -85,7 +85,7 @@ impl Host {
         }
     }
 
-    /// Large and small, faint and opaque ones under gradients of all sizes, some never seen.
+    /// Large and small, faint and opaque Gaussians with gradients of all sizes; some were never visible.
     pub(super) fn mixed(count: usize) -> Self {
         let mut host = Self::calm(count);
         for i in 0..count {
@@ -116,7 +116,7 @@ impl Host {
         Vec3::from_slice(&self.parameters[3 * i..])
     }
 
-    /// All floats of one Gaussian, column by column.
+    /// All floats of one Gaussian, in the order of the columns.
     pub(super) fn row(&self, planes: &[f32], i: usize) -> Vec<f32> {
         [(0, 3), (3, 4), (7, 3), (10, 1), (11, 3), (14, FEATURES), (REST, COLUMNS - REST)]
             .into_iter()
@@ -146,7 +146,7 @@ impl Host {
         self.densify_as_kept(cameras, gpu, settings, round, |_| 1.0)
     }
 
-    /// The same where `keeps` says of a number of Gaussians which share of the splits stays.
+    /// The same, with `keeps` giving the share of the splits to keep for a number of Gaussians.
     pub(super) fn densify_as_kept(
         &self,
         cameras: &[Camera],
@@ -191,7 +191,7 @@ impl Host {
         (host, report)
     }
 
-    /// The same by the references, with sort and prefix sums on the host.
+    /// The same in the references, with sort and prefix sums on the host.
     pub(super) fn reference(
         &self,
         cameras: &[Camera],

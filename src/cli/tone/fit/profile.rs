@@ -63,7 +63,7 @@ fn toml(fitted: &FittedProfile) -> String {
     let segments = rows(&segments.each_ref().map(Vec::as_slice));
     format!(
         "# Camera profile: {:.2} dB on the pairs it was fitted to; the curve auto has {:.2} dB.\n\
-         # Scores of its results know these references.\n\
+         # Scores of its results depend on these references.\n\
          reference = {name}\npairs = {pairs}\n\n\
          # v = 1 - exp(-k x), u = gain (matrix v) + bias; rows and values are red, green and blue.\n\
          matrix = {matrix}\ngain = {}\nbias = {}\n\n\

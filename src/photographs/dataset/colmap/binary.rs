@@ -1,4 +1,4 @@
-//! The binary encoding: little-endian records behind a 64-bit count, every read checked against the file's end.
+//! The binary encoding: little-endian records after a 64-bit count, every read checked against the file's end.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -35,7 +35,7 @@ pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
         let quaternion = [reader.f64()?, reader.f64()?, reader.f64()?, reader.f64()?];
         let translation = [reader.f64()?, reader.f64()?, reader.f64()?];
         let (camera, name) = (reader.u32()?, reader.name()?);
-        // x, y and the point's id of every keypoint; the points' tracks say the same.
+        // x, y and the point's id of every keypoint, which the tracks of points repeat.
         let keypoints = reader.u64()?;
         reader.skip(keypoints, 24)?;
         Ok(ModelImage { id, camera, name, view_from_world: pose(quaternion, translation) })
@@ -66,7 +66,7 @@ fn bytes(path: &Path) -> Result<Vec<u8>> {
 struct Reader<'a> {
     path: &'a Path,
     record: &'static str,
-    /// Of how many, for the message.
+    /// Index and count of the records, for messages.
     progress: (u64, u64),
     rest: &'a [u8],
 }
@@ -76,7 +76,7 @@ impl<'a> Reader<'a> {
         Self { path, record, progress: (0, 0), rest: bytes }
     }
 
-    /// Grows with what is read: a corrupt count ends at the file's end and allocates nothing ahead.
+    /// Grows as records are read: a corrupt count ends at the file's end and allocates nothing in advance.
     fn records<T, C: FromIterator<T>>(
         &mut self,
         mut read: impl FnMut(&mut Self) -> Result<T>,
@@ -118,7 +118,7 @@ impl<'a> Reader<'a> {
         self.take(length.ok_or_else(|| self.cut_short())?).map(drop)
     }
 
-    /// Up to and without the closing zero.
+    /// Up to the terminating zero.
     fn name(&mut self) -> Result<String> {
         let length =
             self.rest.iter().position(|byte| *byte == 0).ok_or_else(|| self.cut_short())?;

@@ -1,4 +1,4 @@
-//! The text encoding: one record a line (images: two), fields by spaces, `#` for comments.
+//! The text encoding: one record per line (images: two), fields separated by spaces, `#` for comments.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -50,13 +50,13 @@ pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
             name,
             view_from_world: pose([w, x, y, z], [tx, ty, tz]),
         });
-        // The keypoints' line, empty where there are none; the points' tracks say the same. Scripts leave it out.
+        // The line of keypoints, empty if there are none, which the tracks of points repeat. Scripts omit it.
         lines.next_if(|(_, line)| !is_image(line));
     }
     Ok(images)
 }
 
-/// Whether a line is an image's and not one of keypoints, which are three numbers each.
+/// Whether a line is that of an image, and not of keypoints, which are three numbers each.
 fn is_image(line: &str) -> bool {
     let fields: Vec<&str> = line.split_whitespace().collect();
     let are_numbers = |fields: &[&str]| fields.iter().all(|field| field.parse::<f64>().is_ok());
@@ -114,7 +114,7 @@ impl<'a> Fields<'a> {
         field.parse().map_err(|_| self.error(what))
     }
 
-    /// A number of pixels; tools write 500.0 too.
+    /// A number of pixels; tools also write 500.0.
     fn side(&mut self, what: &str) -> Result<u64> {
         let pixels: f64 = self.next(what)?;
         let is_whole = pixels.fract() == 0.0 && (0.0..=u64::MAX as f64).contains(&pixels);

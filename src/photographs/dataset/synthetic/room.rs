@@ -10,35 +10,35 @@ use crate::base::random::Stream;
 
 /// The shape of a surface.
 enum Shape {
-    /// The points whose product with the unit normal is the offset; seen from the side the normal points to.
+    /// The points whose dot product with the unit normal is the offset; visible from the side of the normal.
     Plane { normal: DVec3, offset: f64 },
     /// A sphere.
     Sphere { center: DVec3, radius: f64 },
-    /// A box; `turn` takes directions from the world to the box's own axes.
+    /// A box; `turn` maps directions from the world to the box's axes.
     Block { center: DVec3, half: DVec3, turn: DMat3 },
 }
 
 /// A shape with its look.
 struct Surface {
     shape: Shape,
-    /// Linear reflectance at a place: the position in the world for planes, in the shape's own axes otherwise.
+    /// Linear reflectance at a position: in the world for planes, in the shape's own axes otherwise.
     albedo: fn(&Room, DVec3) -> DVec3,
     /// Strength of the highlight.
     gloss: f64,
 }
 
-/// Where a ray meets a surface.
+/// The intersection of a ray and a surface.
 struct Hit {
     distance: f64,
     normal: DVec3,
-    /// The place that the albedo is looked up at.
+    /// The position at which the albedo is evaluated.
     place: DVec3,
 }
 
 /// The scene.
 pub(super) struct Room {
     surfaces: Vec<Surface>,
-    /// Places on the lamp, the same for every position that it lights, so that all views agree on the shadows.
+    /// Positions on the lamp, the same for every position that it lights, so that all views agree on the shadows.
     lamp: Vec<DVec3>,
     noise: Stream,
 }
@@ -109,7 +109,7 @@ impl Room {
         hits.min_by(|(_, a), (_, b)| a.distance.total_cmp(&b.distance))
     }
 
-    /// The lamp's diffuse light (1 where it shines at a right angle and whole) and its highlight at a position.
+    /// The lamp's diffuse light (1 if perpendicular and unoccluded) and its highlight at a position.
     fn lamp(&self, position: DVec3, normal: DVec3, direction: DVec3, gloss: f64) -> (f64, f64) {
         const SHININESS: f64 = 60.0;
         let start = position + 1e-6 * normal;
@@ -137,10 +137,10 @@ impl Room {
             .all(|hit| hit.distance > distance)
     }
 
-    /// The share of the sky that the shapes leave open above a position.
+    /// The share of the sky that is visible above a position.
     ///
-    /// Each solid hides what its bounding sphere would, cosine-weighted (sphere occlusion after Quilez), each plane
-    /// darkens what is close to it.
+    /// Each solid occludes as its bounding sphere, cosine-weighted (sphere occlusion after Quilez); each plane darkens
+    /// nearby positions.
     fn openness(&self, position: DVec3, normal: DVec3) -> f64 {
         const REACH: f64 = 0.4;
         let open = |surface: &Surface| match surface.shape {
@@ -214,7 +214,7 @@ impl Room {
         paper * (0.86 + 0.28 * self.fractal_noise(place * 5.0))
     }
 
-    /// The picture on the wall, at coordinates in [-1, 1], y up.
+    /// The image on the wall, at coordinates in [-1, 1], y up.
     fn sunset(&self, place: DVec2) -> DVec3 {
         let ridge =
             -0.25 + 0.7 * (self.fractal_noise(DVec3::new(place.x * 2.2 + 9.0, 0.0, 7.0)) - 0.5);
@@ -260,7 +260,7 @@ impl Room {
 
     fn checker(&self, place: DVec3) -> DVec3 {
         const CELL: f64 = 0.21;
-        // A little off the faces, so that rounding there does not choose the cell.
+        // Slightly off the faces, so that rounding does not choose the cell.
         let cells = ((place + 1e-4) / CELL).floor().element_sum() as i64;
         let tone = if cells & 1 == 0 {
             DVec3::new(0.78, 0.56, 0.14)

@@ -1,4 +1,4 @@
-//! Intrinsics of a NeRF-style listing: shared, of a frame, or both.
+//! Intrinsics of a NeRF-style listing: shared, per frame, or both.
 
 use std::path::Path;
 
@@ -41,7 +41,7 @@ pub(super) struct Intrinsics {
     is_fisheye: Option<bool>,
 }
 
-/// A number that is there; null stands for NaN, which is not the same as leaving it out.
+/// A number that is present; null represents NaN, which differs from a missing key.
 fn number<'de, D: serde::Deserializer<'de>>(value: D) -> Result<Option<f64>, D::Error> {
     Option::<f64>::deserialize(value).map(|number| number.or(Some(f64::NAN)))
 }
@@ -49,7 +49,7 @@ fn number<'de, D: serde::Deserializer<'de>>(value: D) -> Result<Option<f64>, D::
 impl Intrinsics {
     pub(super) fn over(self, shared: &Self) -> Self {
         let shared = shared.clone();
-        // One focal length's spelling in the frame overrides the other's at the top.
+        // Either spelling of the focal length in the frame overrides both at the top level.
         let own_focal = self.fl_x.is_some() || self.camera_angle_x.is_some();
         let shared_focal = |value: Option<f64>| if own_focal { None } else { value };
         Self {
@@ -71,7 +71,7 @@ impl Intrinsics {
         }
     }
 
-    /// Width and height, pixels: as listed, else the file's.
+    /// Width and height, pixels: as listed, else those of the file.
     pub(super) fn size(&self, file: Option<&Path>) -> Option<DVec2> {
         if let (Some(w), Some(h)) = (self.w, self.h) {
             return Some(DVec2::new(w, h));
@@ -89,7 +89,7 @@ impl Intrinsics {
         let is_fisheye = self.is_fisheye == Some(true) || model.ends_with("FISHEYE");
         let nonzero = |value: Option<f64>| value.unwrap_or(0.0) != 0.0;
         if !is_fisheye && nonzero(self.k4) {
-            // Of r^8 in some exports, in OpenCV's a denominator.
+            // A coefficient of r^8 in some exports, of a denominator in OpenCV.
             return Err(format!("k4 of a lens that is no fisheye is not supported; {undistort}"));
         }
         if is_fisheye && (nonzero(self.p1) || nonzero(self.p2)) {
@@ -100,7 +100,7 @@ impl Intrinsics {
             self.fl_x.or(from_angle).ok_or("there is neither fl_x nor camera_angle_x; add one")?;
         let coefficient = |value: Option<f64>| value.unwrap_or(0.0);
         let lens = Lens {
-            // A saturating cast: nonsense becomes a size that `problem` refuses.
+            // A saturating cast: invalid values become a size that `problem` refuses.
             width: size.x.round() as u32,
             height: size.y.round() as u32,
             focal: DVec2::new(fl_x, self.fl_y.unwrap_or(fl_x)),

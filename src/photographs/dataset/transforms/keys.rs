@@ -1,27 +1,27 @@
-//! Keys of a listing that change nothing here though they name files, or would change the result elsewhere: named once.
+//! Unsupported keys of a listing that name files or change the result in other programs: reported once.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde_json::{Map, Value};
 
-/// Endings of files that a key may name.
+/// Extensions of files that a key may name.
 const ENDINGS: [&str; 17] = [
     "png", "jpg", "jpeg", "exr", "tif", "tiff", "webp", "npy", "npz", "pt", "bin", "ply", "pcd",
     "obj", "las", "mp4", "json",
 ];
-/// Keys that change what other trainers make of a frame.
+/// Keys that change the result in other trainers.
 const MEANT: [&str; 4] = ["rolling_shutter", "k5", "k6", "time"];
 
 /// Collects such keys.
 #[derive(Debug, Default)]
 pub(super) struct Unsupported {
-    /// How often each stands there, and the first value.
+    /// Number of occurrences and first value of each.
     keys: BTreeMap<String, (usize, String)>,
 }
 
 impl Unsupported {
-    /// Adds those of an object, whose supported keys are taken out before.
+    /// Adds those of an object, from which supported keys are already removed.
     pub(super) fn add(&mut self, object: &Map<String, Value>) {
         for (key, value) in object {
             let named = file_of(key, value).or_else(|| meant(key, value));
@@ -31,7 +31,7 @@ impl Unsupported {
         }
     }
 
-    /// One line that names them all; `None` where there is none.
+    /// One line that names them all; `None` if there are none.
     pub(super) fn remark(&self, path: &Path) -> Option<String> {
         let named = |(key, (count, value)): (&String, &(usize, String))| match count {
             1 => format!("{key} ({value})"),
@@ -44,7 +44,7 @@ impl Unsupported {
     }
 }
 
-/// Whether a frame is marked to be left out: `is_bad` of `ScanNet++` and the like.
+/// Whether a frame is marked as bad: `is_bad` of `ScanNet++` and similar keys.
 pub(super) fn is_marked_bad(frame: &Map<String, Value>) -> bool {
     const BAD: [&str; 5] = ["is_bad", "bad", "ignore", "skip", "excluded"];
     const GOOD: [&str; 3] = ["is_valid", "valid", "enabled"];
@@ -60,7 +60,7 @@ pub(super) fn is_marked_bad(frame: &Map<String, Value>) -> bool {
     says(&BAD, true) | says(&GOOD, false)
 }
 
-/// The file that a value names: by its ending, or by its key.
+/// The file that a value names, judged by its extension or by its key.
 fn file_of(key: &str, value: &Value) -> Option<String> {
     let text = match value {
         Value::Array(values) => values.iter().find_map(Value::as_str)?,
@@ -72,7 +72,7 @@ fn file_of(key: &str, value: &Value) -> Option<String> {
     (is_file && !text.is_empty()).then(|| text.to_owned())
 }
 
-/// The value of a key that other trainers act on, where it is not zero.
+/// The value of a key that other trainers use, if it is not zero.
 fn meant(key: &str, value: &Value) -> Option<String> {
     let is_zero = |value: &Value| value.is_null() || value.as_f64() == Some(0.0);
     let is_idle = match value {

@@ -1,12 +1,13 @@
-//! `transform_matrix` as exporters write it: transposed, scaled or rounded ones are mended, left-handed ones are named.
+//! `transform_matrix` as exporters write it: transposed, scaled or rounded ones are corrected, left-handed ones are
+//! refused.
 
 use glam::{DAffine3, DMat3, DVec3};
 use serde::{Deserialize, Deserializer};
 
-/// Rows as listed; `None` stands for NaN.
+/// Rows as listed; `None` represents NaN.
 pub(super) type Rows = Vec<Vec<Option<f64>>>;
 
-/// Rows, or the same numbers one after the other.
+/// Rows, or the same numbers in a flat list.
 pub(super) fn rows<'de, D: Deserializer<'de>>(matrix: D) -> Result<Rows, D::Error> {
     #[derive(Deserialize)]
     #[serde(untagged)]
@@ -20,28 +21,28 @@ pub(super) fn rows<'de, D: Deserializer<'de>>(matrix: D) -> Result<Rows, D::Erro
     })
 }
 
-/// A pose, and what was wrong with its matrix.
+/// A pose, and the corrections of its matrix.
 #[derive(Debug)]
 pub(super) struct Pose {
     /// World to view, `OpenCV` axes.
     pub(super) view_from_world: DAffine3,
-    /// What its columns were divided by; 1 where they have length 1 but for rounding.
+    /// The divisor of its columns; 1 if they have length 1 except for rounding.
     pub(super) scale: f64,
-    /// Whether the nearest rotation stands for one that was rounded.
+    /// Whether the matrix was replaced by the nearest rotation because it is rounded.
     pub(super) is_rounded: bool,
 }
 
-/// How far the lengths of columns may differ from each other, and from 1 where that is rounding.
+/// Maximum difference between the lengths of columns, and from 1 to be a rounding.
 const LENGTH_TOLERANCE: f64 = 0.02;
-/// How far `R^T R` may be from the identity, entry by entry: two decimals are off by 0.02.
+/// Maximum difference of `R^T R` from the identity, per entry: two decimals are off by 0.02.
 const ROTATION_TOLERANCE: f64 = 0.05;
-/// Where it is farther off than this, single precision does not explain it.
+/// A larger difference is not explained by single precision.
 const IS_ROUNDED: f64 = 2e-4;
-/// Where it is closer than this, the matrix is taken as it is.
+/// With a smaller difference, the matrix is used unchanged.
 const IS_EXACT: f64 = 1e-5;
 
-/// Whether a listing writes columns where rows are due: the translation stands in the last row of some frame, and in the
-/// last column of none.
+/// Whether a listing writes columns instead of rows: some frame has its translation in the last row, and none in the
+/// last column.
 pub(super) fn are_transposed<'a>(matrices: impl Iterator<Item = &'a Rows> + Clone) -> bool {
     let moves = |at: fn(&Rows, usize) -> Option<f64>| {
         let mut matrices = matrices.clone();
@@ -56,7 +57,7 @@ pub(super) fn are_transposed<'a>(matrices: impl Iterator<Item = &'a Rows> + Clon
 /// The pose of a camera from view to world in OpenGL axes, as 4x4 or 3x4 rows.
 ///
 /// # Errors
-/// What makes it none, to be read after "its `transform_matrix`".
+/// The problem, to follow "its `transform_matrix`".
 pub(super) fn pose(rows: &Rows, is_transposed: bool) -> Result<Pose, &'static str> {
     let world_from_gl = affine(rows, is_transposed)
         .filter(DAffine3::is_finite)
@@ -64,7 +65,7 @@ pub(super) fn pose(rows: &Rows, is_transposed: bool) -> Result<Pose, &'static st
     let DAffine3 { matrix3: matrix, translation } = world_from_gl;
     let lengths = [matrix.x_axis, matrix.y_axis, matrix.z_axis].map(DVec3::length);
     let mean = lengths.iter().sum::<f64>() / 3.0;
-    // Positive phrasing: a NaN fails the test too.
+    // A positive condition: it is false for NaN.
     let is_uniform =
         lengths.iter().all(|length| (length - mean).abs() <= LENGTH_TOLERANCE * mean) && mean > 0.0;
     if !is_uniform {
@@ -102,7 +103,7 @@ fn affine(rows: &Rows, is_transposed: bool) -> Option<DAffine3> {
     Some(DAffine3 { matrix3, translation: DVec3::new(x[3], y[3], z[3]) })
 }
 
-/// The orthogonal factor of the polar decomposition, by Newton's iteration (Higham 1986): of all rotations the nearest.
+/// The orthogonal factor of the polar decomposition, by Newton's iteration (Higham 1986): the nearest rotation.
 fn nearest_rotation(mut matrix: DMat3) -> DMat3 {
     for _ in 0..10 {
         matrix = (matrix + matrix.inverse().transpose()) * 0.5;
@@ -129,7 +130,7 @@ mod tests {
     const AT: DVec3 = DVec3::new(0.5, -2.0, 3.0);
 
     #[test]
-    fn scale_and_rounding_are_mended_and_told() {
+    fn scale_and_rounding_are_corrected_and_reported() {
         let exact = pose(&rows(turned(), AT), false).unwrap();
         assert_eq!((exact.scale, exact.is_rounded), (1.0, false));
         let scaled = pose(&rows(turned() * 0.25, AT), false).unwrap();
@@ -147,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_rotation_is_named() {
+    fn a_matrix_that_is_not_a_rotation_is_named() {
         let problem = |matrix: DMat3| pose(&rows(matrix, AT), false).unwrap_err();
         let mirror = DMat3::from_diagonal(DVec3::new(-1.0, 1.0, 1.0));
         assert!(problem(mirror * turned()).contains("left-handed"));
@@ -161,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_as_rows_are_found_though_one_camera_stands_at_the_origin() {
+    fn columns_as_rows_are_detected_even_if_one_camera_is_at_the_origin() {
         let transposed = |rows: &Rows| -> Rows {
             (0..4).map(|column| rows.iter().map(|row| row[column]).collect()).collect()
         };
@@ -170,7 +171,7 @@ mod tests {
         assert!(are_transposed(columns.iter()) && !are_transposed(written.iter()));
         let exact = pose(&written[0], false).unwrap().view_from_world;
         assert!(pose(&columns[0], true).unwrap().view_from_world.abs_diff_eq(exact, 1e-12));
-        // Three rows have no last one, and cameras in one spot tell nothing.
+        // Three rows have no last row, and cameras at one position are ambiguous.
         assert!(!are_transposed([written[0][..3].to_vec()].iter()));
         assert!(!are_transposed([rows(turned(), DVec3::ZERO)].iter()));
     }

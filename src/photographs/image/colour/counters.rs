@@ -5,10 +5,10 @@ use std::sync::{Mutex, PoisonError};
 
 use super::Conversion;
 
-/// Counts conversions, from any thread.
+/// Counts conversions, thread-safe.
 #[derive(Debug)]
 pub(crate) struct ColourCounts {
-    /// What is counted, in the singular.
+    /// The name of the counted items, in the singular.
     what: &'static str,
     counts: Mutex<Counts>,
 }
@@ -21,9 +21,9 @@ impl Default for ColourCounts {
 
 #[derive(Debug, Default)]
 struct Counts {
-    /// By colour space: photographs, and the sum of the fractions of their pixels that sRGB does not hold.
+    /// By colour space: the number of photographs, and the sum of their fractions of pixels outside sRGB.
     converted: BTreeMap<String, (usize, f64)>,
-    /// By what is not understood.
+    /// By the metadata that cannot be used.
     unknown: BTreeMap<String, usize>,
 }
 
@@ -31,7 +31,7 @@ struct Counts {
 const SMALL: f64 = 0.01;
 
 impl ColourCounts {
-    /// Of things of this name.
+    /// For items of this name.
     pub(crate) fn of(what: &'static str) -> Self {
         Self { what, counts: Mutex::default() }
     }
@@ -49,7 +49,7 @@ impl ColourCounts {
         }
     }
 
-    /// Says what was counted.
+    /// Logs the counts.
     pub(crate) fn say(&self) {
         self.lines().iter().for_each(|line| tracing::warn!("{line}"));
     }
@@ -65,7 +65,7 @@ impl ColourCounts {
             if outside > SMALL {
                 let percent = 100.0 * outside;
                 lines.push(format!(
-                    "{percent:.0} % of the pixels of {whose} in {space} lie outside sRGB and are clipped to it"
+                    "{percent:.0} % of the pixels of {whose} in {space} are outside sRGB and clipped"
                 ));
             }
         }

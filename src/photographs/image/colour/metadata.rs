@@ -1,4 +1,4 @@
-//! What a file says of its colours, in the order in which its format wants to be believed.
+//! Colour metadata of files, in the order of precedence of each format.
 //!
 //! - JPEG: the ICC profile of its APP2 segments (ICC.1:2022, annex B.4), then Exif.
 //! - PNG: `cICP`, `iCCP`, `sRGB`, then `gAMA` and `cHRM` (PNG third edition, 12.1 and 13.13), then Exif.
@@ -23,23 +23,23 @@ pub(super) enum Statement {
     Profile(Vec<u8>),
     /// Code points of H.273: primaries, transfer characteristics, matrix coefficients, and 1 for full range.
     CodePoints([u8; 4]),
-    /// Chromaticities, and the exponent that makes linear light; sRGB's where one is left out.
+    /// Chromaticities, and the exponent that decodes to linear light; sRGB's if omitted.
     Primaries { chromaticities: Option<Chromaticities>, exponent: Option<f64> },
     /// Adobe RGB (1998).
     AdobeRgb,
-    /// Something that is not understood, in words.
+    /// Metadata that cannot be used, in words.
     Unknown(String),
 }
 
 /// CIE x and y of white, red, green and blue.
 pub(in super::super) type Chromaticities = [[f64; 2]; 4];
 
-/// A profile may take this much when it is inflated, bytes.
+/// Limit for a decompressed profile, bytes.
 const MAX_BYTES: u64 = 1 << 24;
 
 const PNG: [u8; 8] = *b"\x89PNG\r\n\x1a\n";
 
-/// The statements of a file, the one that counts first; empty where it makes none.
+/// The statements of a file, in order of precedence; empty if there are none.
 pub(super) fn statements(bytes: &[u8]) -> Vec<Statement> {
     let mut statements = if bytes.starts_with(&jpeg::MAGIC) {
         jpeg_profile(bytes).into_iter().collect()
@@ -48,7 +48,7 @@ pub(super) fn statements(bytes: &[u8]) -> Vec<Statement> {
     } else {
         webp_profile(bytes).map(Statement::Profile).into_iter().collect()
     };
-    // Nothing overrules sRGB, which every file is taken for.
+    // Nothing overrides sRGB, the default.
     let is_settled = statements.last() == Some(&Statement::Srgb);
     if !is_settled && let Ok(exif) = Reader::new().read_from_container(&mut Cursor::new(bytes)) {
         statements.extend(tiff_profile(&exif));
@@ -57,7 +57,7 @@ pub(super) fn statements(bytes: &[u8]) -> Vec<Statement> {
     statements
 }
 
-/// The profile that the APP2 segments of a JPEG hold, each a numbered part of it.
+/// The profile in the APP2 segments of a JPEG, which are numbered parts of it.
 fn jpeg_profile(bytes: &[u8]) -> Option<Statement> {
     const APP2: u8 = 0xE2;
     let mut parts = BTreeMap::new();
@@ -75,7 +75,7 @@ fn jpeg_profile(bytes: &[u8]) -> Option<Statement> {
     }
     let is_whole = parts.keys().copied().map(usize::from).eq(1..=count);
     let profile = || Statement::Profile(parts.values().copied().collect::<Vec<_>>().concat());
-    let cut = || Statement::Unknown("an ICC profile of which parts are missing".to_owned());
+    let cut = || Statement::Unknown("an ICC profile with missing parts".to_owned());
     Some(if is_whole { profile() } else { cut() })
 }
 
@@ -87,7 +87,7 @@ fn webp_profile(bytes: &[u8]) -> Option<Vec<u8>> {
     reader.into_decoder().ok()?.icc_profile().ok()?
 }
 
-/// The profile of a TIFF, whose tags are read as Exif is.
+/// The profile of a TIFF, whose tags are read like Exif.
 fn tiff_profile(exif: &Exif) -> Option<Statement> {
     const PROFILE: Tag = Tag(Context::Tiff, 0x8773);
     match &exif.get_field(PROFILE, In::PRIMARY)?.value {
@@ -123,7 +123,7 @@ fn of_png(bytes: &[u8]) -> Vec<Statement> {
     }
     let exponent = chunk(b"gAMA").map(|data| match numbers(data)[..] {
         [gamma] if gamma > 0.0 => Ok(1.0 / gamma),
-        _ => Err(Statement::Unknown("a gAMA chunk of no exponent".to_owned())),
+        _ => Err(Statement::Unknown("an invalid gAMA chunk".to_owned())),
     });
     let chromaticities = chunk(b"cHRM").map(|data| match numbers(data)[..] {
         [wx, wy, rx, ry, gx, gy, bx, by] => Ok([[wx, wy], [rx, ry], [gx, gy], [bx, by]]),
@@ -139,7 +139,7 @@ fn of_png(bytes: &[u8]) -> Vec<Statement> {
     statements
 }
 
-/// The profile of an iCCP chunk: a name, a zero, the method 0, and what zlib compressed.
+/// The profile of an iCCP chunk: a name, a zero, the method 0, and zlib data.
 fn inflated(data: &[u8]) -> Statement {
     let compressed = data.iter().position(|&byte| byte == 0).and_then(|at| data.get(at + 2..));
     let mut profile = vec![];
@@ -157,7 +157,7 @@ fn numbers(data: &[u8]) -> Vec<f64> {
     words.iter().map(|&word| f64::from(u32::from_be_bytes(word)) / 1e5).collect()
 }
 
-/// What Exif says, or the tags of the TIFF that it is made as.
+/// Colour information in Exif, or in the tags of a TIFF.
 fn of_exif(exif: &Exif) -> Option<Statement> {
     const SRGB: u32 = 1;
     const ADOBE_RGB: u32 = 2;
@@ -170,7 +170,7 @@ fn of_exif(exif: &Exif) -> Option<Statement> {
     match space {
         Some(SRGB) => return Some(Statement::Srgb),
         Some(ADOBE_RGB) => return Some(Statement::AdobeRgb),
-        // DCF 2.0: an optional file is one in Adobe RGB.
+        // DCF 2.0: an optional file is in Adobe RGB.
         _ if is_optional_file => return Some(Statement::AdobeRgb),
         _ => {}
     }

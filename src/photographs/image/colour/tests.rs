@@ -1,4 +1,4 @@
-//! What files of other colour spaces become.
+//! Conversion of files in other colour spaces.
 
 mod files;
 
@@ -11,7 +11,7 @@ use super::super::jpeg::exif_segment;
 use super::counters::ColourCounts;
 use super::*;
 
-/// Linear colours from near black to bright, none of which is out of any gamut.
+/// Linear colours from nearly black to bright, all within every gamut.
 const COLOURS: [[f64; 3]; 6] = [
     [0.0004, 0.0003, 0.0005],
     [0.001, 0.002, 0.0015],
@@ -21,7 +21,7 @@ const COLOURS: [[f64; 3]; 6] = [
     [0.9, 0.8, 0.95],
 ];
 
-/// The image of a file's bytes, and what was made of its colours.
+/// The image of a file's bytes, and the result of its conversion.
 fn read(bytes: &[u8]) -> (Image, Conversion) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("file");
@@ -39,7 +39,7 @@ fn as_stored(bytes: &[u8]) -> Image {
     Image::load_as_stored(&path).unwrap()
 }
 
-/// Asserts that a file holds [`COLOURS`] in sRGB, to a tolerance, converted from a space of this name.
+/// Asserts that a file contains [`COLOURS`] in sRGB, to a tolerance, converted from a space of this name.
 fn holds_the_colours(bytes: &[u8], name: &str, tolerance: f64) {
     let (image, conversion) = read(bytes);
     assert_eq!(
@@ -64,7 +64,7 @@ fn in_space(space: [[f64; 2]; 4], curve: Encoding) -> Vec<[f64; 3]> {
     COLOURS.map(|linear| encoded(linear, space, curve)).to_vec()
 }
 
-/// Every space that cameras and developers write, with its name and the exponent or curve that it is encoded by.
+/// Every space that cameras and raw converters write, with its encoding and name.
 fn spaces() -> [([[f64; 2]; 4], Encoding, &'static str); 5] {
     [
         (P3, Encoding::Srgb, "Display P3"),
@@ -76,17 +76,17 @@ fn spaces() -> [([[f64; 2]; 4], Encoding, &'static str); 5] {
 }
 
 #[test]
-fn a_profile_of_matrix_and_curve_gives_the_colours_back_from_png_and_tiff() {
+fn a_matrix_profile_restores_the_colours_of_png_and_tiff() {
     for (space, curve, name) in spaces() {
         let (colours, profile) = (in_space(space, curve), matrix_profile(space, curve));
-        // Sixteen bits of a power of 2.2 are coarse near black.
+        // Sixteen bits at a gamma of 2.2 are coarse near black.
         holds_the_colours(&png(&colours, &[(b"iCCP", iccp(&profile))]), name, 3e-4);
         holds_the_colours(&tiff(&colours, &profile), name, 3e-4);
     }
 }
 
 #[test]
-fn a_webp_has_its_profile_too() {
+fn the_profile_of_a_webp_is_used() {
     let colours = in_space(ADOBE, Encoding::Power(2.199_218_75));
     let bytes: Vec<u8> =
         colours.concat().iter().map(|value| (value * 255.0).round() as u8).collect();
@@ -109,7 +109,7 @@ fn jpeg(code: u8) -> Vec<u8> {
 }
 
 #[test]
-fn a_profile_in_parts_is_put_together_in_their_order() {
+fn the_parts_of_a_profile_are_assembled_in_their_order() {
     let profile = matrix_profile(ADOBE, Encoding::Power(2.199_218_75));
     let mut segments = profile_segments(&profile, 100);
     segments.reverse();
@@ -120,11 +120,11 @@ fn a_profile_in_parts_is_put_together_in_their_order() {
     segments.pop();
     let (image, conversion) = read(&with_segments(&jpeg(10), &segments));
     assert_eq!(image.data[0], 10.0 / 255.0);
-    assert_eq!(conversion.unknown.unwrap(), "an ICC profile of which parts are missing");
+    assert_eq!(conversion.unknown.unwrap(), "an ICC profile with missing parts");
 }
 
 #[test]
-fn exif_alone_names_adobe_rgb() {
+fn exif_without_a_profile_can_mean_adobe_rgb() {
     let colour = |segment| read(&with_segments(&jpeg(10), &[segment]));
     for (space, index) in [(Some(65535), Some(b"R03\0")), (None, Some(b"R03\0")), (Some(2), None)] {
         let (image, conversion) = colour(exif(space, index));
@@ -143,7 +143,7 @@ fn exif_alone_names_adobe_rgb() {
 }
 
 #[test]
-fn a_profile_overrules_exif() {
+fn a_profile_overrides_exif() {
     let srgb = profile_segments(&matrix_profile(SRGB, Encoding::Srgb), 60_000);
     let segments = [srgb, vec![exif(Some(65535), Some(b"R03\0"))]].concat();
     let (image, conversion) = read(&with_segments(&jpeg(10), &segments));
@@ -151,7 +151,7 @@ fn a_profile_overrules_exif() {
 }
 
 #[test]
-fn what_is_srgb_keeps_every_bit() {
+fn srgb_values_keep_every_bit() {
     let colours: Vec<[f64; 3]> = (0..256).map(|code| [f64::from(code) / 255.0; 3]).collect();
     let srgb = hundred_thousandths(&SRGB.concat());
     let chunks: [Vec<(&[u8; 4], Vec<u8>)>; 9] = [
@@ -159,12 +159,12 @@ fn what_is_srgb_keeps_every_bit() {
         vec![(b"sRGB", vec![0])],
         vec![(b"iCCP", iccp(&matrix_profile(SRGB, Encoding::Srgb)))],
         vec![(b"cICP", vec![1, 13, 0, 1])],
-        // Frames of clips, as ffmpeg writes them, newer and older.
+        // Frames of clips, from newer and older ffmpeg.
         vec![(b"cICP", vec![1, 1, 0, 1]), (b"gAMA", hundred_thousandths(&[0.50994]))],
         vec![(b"cHRM", srgb.clone()), (b"gAMA", hundred_thousandths(&[0.50994]))],
         vec![(b"gAMA", hundred_thousandths(&[0.45455]))],
         vec![(b"cHRM", srgb)],
-        // The sRGB chunk overrules the others.
+        // The sRGB chunk overrides the others.
         vec![(b"sRGB", vec![0]), (b"gAMA", hundred_thousandths(&[1.0]))],
     ];
     for chunks in chunks {
@@ -176,7 +176,7 @@ fn what_is_srgb_keeps_every_bit() {
 }
 
 #[test]
-fn the_chunks_of_a_png_are_believed_in_the_order_of_its_specification() {
+fn the_chunks_of_a_png_have_the_precedence_of_its_specification() {
     let colours = in_space(P3, Encoding::Srgb);
     let p3 = || (b"iCCP", iccp(&matrix_profile(P3, Encoding::Srgb)));
     let linear = || (b"gAMA", hundred_thousandths(&[1.0]));
@@ -184,7 +184,7 @@ fn the_chunks_of_a_png_are_believed_in_the_order_of_its_specification() {
     let cicp = (b"cICP", vec![12, 13, 0, 1]);
     let adobe = (b"iCCP", iccp(&matrix_profile(ADOBE, Encoding::Power(2.2))));
     holds_the_colours(&png(&colours, &[adobe, cicp]), "Display P3", 3e-4);
-    // A statement that is not understood gives way to the next.
+    // After a statement that cannot be used, the next applies.
     let file = png(&colours, &[(b"cICP", vec![9, 16, 0, 1]), p3()]);
     let conversion = read(&file).1;
     assert_eq!(conversion.from.unwrap().0, "Display P3");
@@ -202,13 +202,13 @@ fn gamma_and_chromaticities_convert_without_a_profile() {
     holds_the_colours(&adobe, "Adobe RGB", 3e-4);
     let wide = file(P3, Encoding::Srgb, &[primaries(P3)]);
     holds_the_colours(&wide, "Display P3", 3e-4);
-    // A frame of a wide clip.
+    // A frame of a wide-gamut clip.
     let frame = file(P3, Encoding::Srgb, &[gamma(0.50994), primaries(P3)]);
     holds_the_colours(&frame, "Display P3", 3e-4);
 }
 
 #[test]
-fn grey_has_a_curve() {
+fn grey_is_converted_by_its_curve() {
     let file =
         with_segments(&jpeg(10), &profile_segments(&grey_profile(Encoding::Power(1.8)), 60_000));
     let (image, conversion) = read(&file);
@@ -218,7 +218,7 @@ fn grey_has_a_curve() {
 }
 
 #[test]
-fn what_cannot_be_used_is_named_and_the_values_stay() {
+fn metadata_that_cannot_be_used_is_named_and_the_values_stay() {
     let whole = matrix_profile(ADOBE, Encoding::Power(2.2));
     let cut = &whole[..whole.len() / 2];
     let gamma = hundred_thousandths(&[0.0]);
@@ -229,8 +229,8 @@ fn what_cannot_be_used_is_named_and_the_values_stay() {
         (b"iCCP", b"name\0\0not deflated".to_vec(), "a damaged ICC profile"),
         (b"cICP", vec![9, 18, 0, 1], "[9, 18, 0, 1] of a cICP chunk (high dynamic range)"),
         (b"cICP", vec![1, 13, 0, 0], "no RGB of full range"),
-        (b"gAMA", gamma, "no exponent"),
-        (b"cHRM", hundred_thousandths(&[0.0; 8]), "no primaries"),
+        (b"gAMA", gamma, "invalid gAMA"),
+        (b"cHRM", hundred_thousandths(&[0.0; 8]), "invalid chromaticities"),
     ];
     for (name, data, problem) in cases {
         let file = png(&[[0.1, 0.2, 0.3]], &[(name, data)]);
@@ -241,7 +241,7 @@ fn what_cannot_be_used_is_named_and_the_values_stay() {
 }
 
 #[test]
-fn no_damage_to_a_profile_ends_more_than_its_use() {
+fn a_damaged_profile_is_only_ignored() {
     for whole in [matrix_profile(ADOBE, Encoding::Power(2.2)), table_profile(PROPHOTO, 1.8)] {
         for at in 0..whole.len() {
             let mut damaged = whole.clone();
@@ -257,7 +257,7 @@ fn no_damage_to_a_profile_ends_more_than_its_use() {
 }
 
 #[test]
-fn what_srgb_does_not_hold_is_clipped_and_counted() {
+fn colours_outside_srgb_are_clipped_and_counted() {
     // The green of Adobe RGB, its white, and a grey.
     let colours = [[0.0, 1.0, 0.0], [1.0, 1.0, 1.0], [0.2, 0.2, 0.2], [0.1, 0.1, 0.1]];
     let file = png(&colours, &[(b"iCCP", iccp(&matrix_profile(ADOBE, Encoding::Power(2.2))))]);
@@ -268,7 +268,7 @@ fn what_srgb_does_not_hold_is_clipped_and_counted() {
 }
 
 #[test]
-fn an_exr_of_other_primaries_is_converted_and_numbers_are_not() {
+fn an_exr_of_other_primaries_is_converted_unless_it_contains_numbers() {
     use exr::prelude::{SpecificChannels, Vec2, WritableImage};
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.exr");
@@ -294,7 +294,7 @@ fn an_exr_of_other_primaries_is_converted_and_numbers_are_not() {
 }
 
 #[test]
-fn the_exif_of_a_converted_picture_says_srgb() {
+fn the_exif_of_a_converted_image_is_set_to_srgb() {
     let file = with_segments(&jpeg(10), &[exif(Some(65535), Some(b"R03\0"))]);
     assert_eq!(convert(&mut Image::filled(1, 1, [0.5; 3]), &file).from.unwrap().0, "Adobe RGB");
     let copied = exif_segment(&file).unwrap();
@@ -303,7 +303,7 @@ fn the_exif_of_a_converted_picture_says_srgb() {
 }
 
 #[test]
-fn many_files_are_told_in_a_line_for_each_colour_space() {
+fn many_files_are_reported_in_a_line_for_each_colour_space() {
     let counters = ColourCounts::default();
     for (count, from, unknown) in [
         (3, Some(("Adobe RGB", 0.0)), None),

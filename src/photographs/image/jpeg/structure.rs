@@ -1,15 +1,15 @@
 //! The grammar of a JPEG file (ITU-T T.81, annex B), as far as libjpeg reads it.
 //!
-//! libjpeg leaves what it cannot read by unwinding through C, which ends a host that aborts on panics. Each rule here
-//! stands for such an error, so that none is left to it. Coded data it only warns of ([`super::warnings`]).
+//! libjpeg reports errors by unwinding through C, which terminates a host that aborts on panics. Each rule here
+//! corresponds to such an error and is checked first. In coded data libjpeg only warns ([`super::warnings`]).
 
 use super::MAGIC;
 
-/// What the segments of a file have defined so far.
+/// Definitions in the segments read so far.
 #[derive(Default)]
 struct Definitions {
     quantization: [bool; 4],
-    /// Huffman codes: those of the DC coefficients, then of the others.
+    /// Huffman tables: those of DC coefficients, then those of AC coefficients.
     codes: [[bool; 4]; 2],
     frame: Option<FrameHeader>,
 }
@@ -21,13 +21,13 @@ struct FrameHeader {
 
 struct Component {
     id: u8,
-    /// Columns and rows of blocks in a unit, which covers the same pixels in all components.
+    /// Columns and rows of blocks in a minimum coded unit, which covers the same pixels in all components.
     sampling: [usize; 2],
     quantization: u8,
     has_scan: bool,
 }
 
-/// Whether libjpeg reads the file from its first marker to its last without an error.
+/// Whether libjpeg reads the file from its first to its last marker without an error.
 pub(super) fn is_sound(bytes: &[u8]) -> bool {
     Definitions::default().read(bytes).is_some()
 }
@@ -36,7 +36,7 @@ impl Definitions {
     fn read(&mut self, bytes: &[u8]) -> Option<()> {
         let mut rest = bytes.strip_prefix(&MAGIC)?;
         loop {
-            // What is no marker is coded data, or is skipped like it.
+            // Bytes that are not a marker are coded data, or skipped like it.
             let at = rest.windows(2).position(|pair| matches!(pair, [0xFF, 0x01..=0xFE]))?;
             let marker = rest[at + 1];
             rest = &rest[at + 2..];
@@ -45,7 +45,7 @@ impl Definitions {
                     let frame = self.frame.as_ref()?;
                     return frame.components.iter().all(|c| c.has_scan).then_some(());
                 }
-                // TEM and RST stand alone.
+                // TEM and RST have no segment.
                 0x01 | 0xD0..=0xD7 => continue,
                 _ => {}
             }
@@ -59,7 +59,7 @@ impl Definitions {
                 0xDB => self.define_quantization(segment)?,
                 0xDA => self.start_scan(segment)?,
                 0xDD if segment.len() == 2 => {}
-                // DNL, APP and COM hold nothing that is read.
+                // DNL, APP and COM are not read.
                 0xDC | 0xE0..=0xEF | 0xFE => {}
                 _ => return None,
             }
@@ -82,7 +82,7 @@ impl Definitions {
             let count = counts.iter().map(|&count| usize::from(count)).sum();
             let (symbols, rest) = rest.split_at_checked(count)?;
             let class = usize::from(place >> 4);
-            // The codes of a length follow those of the shorter ones; the one of all ones stays free.
+            // The codes of one length follow those of shorter ones; the code of all ones is reserved.
             let mut next = 0;
             for (length, &count) in (1..).zip(counts) {
                 next = 2 * next + u32::from(count);
@@ -100,7 +100,7 @@ impl Definitions {
         Some(())
     }
 
-    /// SOF: size and components of the picture.
+    /// SOF: size and components of the image.
     fn start_frame(&mut self, segment: &[u8], is_progressive: bool, bytes: usize) -> Option<()> {
         let [8, y1, y0, x1, x0, count, components @ ..] = segment else { return None };
         let size = [[*x1, *x0], [*y1, *y0]].map(|side| usize::from(u16::from_be_bytes(side)));
@@ -116,7 +116,7 @@ impl Definitions {
             .collect();
         let most = |axis: usize| components.iter().map(|c| c.sampling[axis]).max();
         let sampling = [most(0)?, most(1)?];
-        // Upsampling is by whole numbers.
+        // Upsampling factors are whole numbers.
         let is_whole = |own: usize, most: usize| (1..=4).contains(&own) && most.is_multiple_of(own);
         let has_own_id = |(i, c): (usize, &Component)| components[..i].iter().all(|o| o.id != c.id);
         if self.frame.is_some()
@@ -130,8 +130,8 @@ impl Definitions {
         }
         let units: usize = (0..2).map(|i| size[i].div_ceil(8 * sampling[i])).product();
         let blocks = |component: &Component| units * component.blocks();
-        // A block takes a bit at least: what claims more would only eat memory. And libjpeg sums the DC differences of a
-        // progressive picture, of 11 bits each, in 32.
+        // A block takes at least a bit: a larger declared size would only waste memory. And libjpeg sums the DC
+        // differences of a progressive image, of 11 bits each, in 32 bits.
         if components.iter().map(blocks).sum::<usize>() > 8 * bytes
             || is_progressive && components.iter().any(|component| blocks(component) > 1 << 20)
         {
@@ -141,7 +141,7 @@ impl Definitions {
         Some(())
     }
 
-    /// SOS: which components the coded data after it brings, and how far.
+    /// SOS: the components and coefficients of the coded data that follows.
     fn start_scan(&mut self, segment: &[u8]) -> Option<()> {
         let FrameHeader { is_progressive, components } = self.frame.as_mut()?;
         let (&count, rest) = segment.split_first()?;
@@ -184,7 +184,7 @@ impl Definitions {
 }
 
 impl Component {
-    /// Blocks in a unit.
+    /// Blocks in a minimum coded unit.
     fn blocks(&self) -> usize {
         self.sampling.iter().product()
     }

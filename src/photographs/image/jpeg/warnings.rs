@@ -1,6 +1,6 @@
-//! What libjpeg warns of: coded data that ends early, codes that there are not, restarts that are missing.
+//! Warnings of libjpeg: coded data that ends early, invalid codes, missing restart markers.
 //!
-//! It makes up what is missing, in grey, and goes on; its usual error manager prints what it found.
+//! libjpeg fills missing data with grey and continues; its default error manager prints the warnings.
 
 use std::cell::Cell;
 use std::ffi::c_int;
@@ -13,7 +13,7 @@ thread_local! {
     static WARNINGS: Cell<usize> = const { Cell::new(0) };
 }
 
-/// Lets errors unwind and counts warnings, on the thread that decodes.
+/// An error manager that unwinds on errors and counts warnings on the decoding thread.
 pub(super) fn counting() -> jpeg_error_mgr {
     jpeg_error_mgr {
         error_exit: Some(unwind),
@@ -33,13 +33,13 @@ pub(super) fn counting() -> jpeg_error_mgr {
     }
 }
 
-/// How many warnings this thread has had since it was last asked.
+/// The number of warnings on this thread since the last call.
 pub(super) fn take() -> usize {
     WARNINGS.take()
 }
 
 extern "C-unwind" fn unwind(_: &mut jpeg_common_struct) {
-    // No panic, of which the hook would tell.
+    // Not a panic, which would call the panic hook.
     resume_unwind(Box::new("libjpeg gives up"));
 }
 

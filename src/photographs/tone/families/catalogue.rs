@@ -1,7 +1,7 @@
-//! The one table of curves: numbers, names, formulas, constants, properties and sources.
+//! The table of all curves: numbers, names, formulas, constants, properties and sources.
 //!
-//! A curve is a row here and a function in `include/curves.glsl`. The command line, the help texts, `nightsplat tone list`,
-//! TOML files and fitting all read this table; a row's formula is also the kernels' reference.
+//! A curve is a row here and a function in `include/curves.glsl`. The command line, the help texts, `nightsplat tone
+//! list`, TOML files and fitting all read this table; a row's formula is also the reference of the kernels.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -31,13 +31,13 @@ const FITTED: Family = Family {
     gain_c: 0.0,
 };
 
-/// The constants of a family, and zeros, as the kernels hold them.
+/// The constants of a family, padded with zeros for the kernels.
 pub(crate) type Constants<T> = [T; MAX_CONSTANTS as usize];
 
-/// Rows of `Variant = NUMBER: "name", "formula", [constants] { what differs from a fitted curve }, |t| shape;`.
+/// Rows of `Variant = NUMBER: "name", "formula", [constants] { differences from a fitted curve }, |t| shape;`.
 ///
-/// A constant is `name = default in low..high`. The bounds are those of a fit, which begins at the default or, where that
-/// is a failed fit, at the value behind `from`.
+/// A constant is `name = default in low..high`. The bounds are those of a fit, which starts at the default or, if that
+/// is the result of a failed fit, at the value after `from`.
 macro_rules! families {
     (@start $default:literal) => { $default };
     (@start $default:literal $start:literal) => { $start };
@@ -62,15 +62,15 @@ macro_rules! families {
         #[repr(u32)]
         pub enum ToneCurve {
             $(#[doc = $formula] $variant = $number,)*
-            /// What a [`crate::photographs::tone::Table`] makes.
+            /// The curve of a [`crate::photographs::tone::Table`].
             Table = CURVE_TABLE,
             /// The curve whose gain follows from all photographs: (1 - lambda) soft(x) + lambda x soft(Y) / Y.
             Auto = CURVE_AUTO,
-            /// What a [`crate::photographs::tone::Profile`] makes.
+            /// The curve of a [`crate::photographs::tone::Profile`].
             Profile = CURVE_PROFILE,
         }
 
-        /// Every family, by its number; what a file gives is no family, nor is the automatic curve.
+        /// Every family, by its number; curves from files and the automatic curve are not families.
         pub static FAMILIES: [Family; ToneCurve::Table as usize] = [$(Family {
             curve: ToneCurve::$variant,
             name: $name,
@@ -86,7 +86,7 @@ macro_rules! families {
         }),*];
 
         impl ToneCurve {
-            /// Every curve that has a name of its own, in the table's order.
+            /// Every named curve, in the table's order.
             pub const ALL: [Self; Self::Table as usize] = [$(Self::$variant),*];
         }
 
@@ -221,7 +221,7 @@ families! {
             d = 1.6900 from 6.0 in 0.01..50.0,
         ] {
             bounded: true,
-            // The two terms trade places and, where their rates agree, weights.
+            // The two terms can swap places and, if their rates are equal, weights.
             identifiable: false,
         },
         |t| a * (b * t).one_minus_exp() + c * (d * t).one_minus_exp();
@@ -413,7 +413,7 @@ families! {
         ] {
             source: "Richards 1959, A flexible growth function; the constants make a logistic curve",
             bounded: true,
-            // q and t0 move the curve alike.
+            // q and t0 have the same effect on the curve.
             identifiable: false,
         },
         |t| l * (T::of(1.0) + q * (-k * (t - t0)).exp()).power(-T::of(1.0) / nu);
@@ -433,7 +433,8 @@ families! {
         "delta0 + A ((1 - a) (1 - exp(-g t)) + a t), A such that t = 1 maps as with ASE",
         [a = 0.1 in 0.0..1.0] {
             aliases: &["v4_floor", "adaptive_softexp_v4_floor"],
-            source: "adaptive tone curves for 3DGS, a mode of its code; the share a of the straight line is our choice, 0 is ASE",
+            source: "adaptive tone curves for 3DGS, a mode of its code; the share a of the straight line is our \
+                 choice, 0 is ASE",
             law: OffsetMode::Rescaled,
             alpha: 0.12,
             gain_c: 3.0,

@@ -1,4 +1,4 @@
-//! Small files in other colour spaces, profiles and all, written byte by byte.
+//! Small files in other colour spaces, written byte by byte with their profiles.
 
 use std::io::Write;
 
@@ -52,7 +52,7 @@ pub(super) fn to_d50([white, red, green, blue]: [[f64; 2]; 4]) -> DMat3 {
         * DMat3::from_diagonal(scale)
 }
 
-/// A colour of linear sRGB as another space encodes it.
+/// A linear sRGB colour encoded in another space.
 pub(super) fn encoded(linear: [f64; 3], space: [[f64; 2]; 4], curve: Encoding) -> [f64; 3] {
     let own = to_d50(space).inverse() * to_d50(SRGB) * DVec3::from_array(linear);
     own.to_array().map(|value| curve.encode(value))
@@ -75,7 +75,7 @@ fn curve_tag(curve: Encoding) -> Vec<u8> {
     [b"para\0\0\0\0".to_vec(), kind.to_be_bytes().to_vec(), vec![0; 2], numbers].concat()
 }
 
-/// An ICC profile of these tags.
+/// An ICC profile with these tags.
 fn profile(space: &[u8; 4], tags: &[(&[u8; 4], Vec<u8>)]) -> Vec<u8> {
     let mut table = (tags.len() as u32).to_be_bytes().to_vec();
     let mut body = vec![];
@@ -119,17 +119,17 @@ pub(super) fn matrix_profile(space: [[f64; 2]; 4], curve: Encoding) -> Vec<u8> {
     )
 }
 
-/// A profile of grey of a curve.
+/// A grey profile with a curve.
 pub(super) fn grey_profile(curve: Encoding) -> Vec<u8> {
     profile(b"GRAY", &[(b"desc", name_tag("grey")), (b"kTRC", curve_tag(curve))])
 }
 
-/// A profile that is not for pictures of light.
+/// A profile for print.
 pub(super) fn ink_profile() -> Vec<u8> {
     profile(b"CMYK", &[(b"desc", name_tag("Coated"))])
 }
 
-/// A profile of tables alone: curves of 256 steps, and a lattice of two steps that holds XYZ of the corners.
+/// A profile of tables alone: curves of 256 steps, and a 2 x 2 x 2 lattice with the XYZ of its corners.
 pub(super) fn table_profile(space: [[f64; 2]; 4], exponent: f64) -> Vec<u8> {
     let columns = to_d50(space);
     let mut tag = b"mft2\0\0\0\0\x03\x03\x02\0".to_vec();
@@ -145,7 +145,7 @@ pub(super) fn table_profile(space: [[f64; 2]; 4], exponent: f64) -> Vec<u8> {
             f64::from(corner >> 1 & 1),
             f64::from(corner & 1),
         );
-        // 1.0 of XYZ is 0x8000.
+        // 1.0 in XYZ is 0x8000.
         tag.extend(
             (columns * linear)
                 .to_array()
@@ -245,7 +245,7 @@ pub(super) fn tiff(colours: &[[f64; 3]], profile: &[u8]) -> Vec<u8> {
     file
 }
 
-/// Segments put in a JPEG behind its start.
+/// Inserts segments after the start of a JPEG.
 pub(super) fn with_segments(jpeg: &[u8], segments: &[(u8, Vec<u8>)]) -> Vec<u8> {
     let mut file = jpeg[..2].to_vec();
     for (marker, data) in segments {
@@ -267,7 +267,7 @@ pub(super) fn profile_segments(profile: &[u8], bytes: usize) -> Vec<(u8, Vec<u8>
     (1..).zip(parts).map(part).collect()
 }
 
-/// An Exif segment of a colour space and an interoperability index.
+/// An Exif segment with a colour space and an interoperability index.
 pub(super) fn exif(space: Option<u16>, index: Option<&[u8; 4]>) -> (u8, Vec<u8>) {
     let directory = |entries: &[(u16, u16, u32, [u8; 4])]| {
         let mut bytes = (entries.len() as u16).to_le_bytes().to_vec();
@@ -278,7 +278,7 @@ pub(super) fn exif(space: Option<u16>, index: Option<&[u8; 4]>) -> (u8, Vec<u8>)
         }
         [bytes, vec![0; 4]].concat()
     };
-    // IFD 0 at 8 is of one entry, 18 bytes; that of Exif follows, then that of interoperability.
+    // IFD 0, at 8, has one entry and 18 bytes; the Exif IFD follows, then the interoperability IFD.
     let mut own = vec![];
     let at = 26 + 6 + 12 * (u32::from(space.is_some()) + u32::from(index.is_some()));
     own.extend(space.map(|space| (0xA001, 3, 1, u32::from(space).to_le_bytes())));

@@ -25,7 +25,7 @@ pub(super) fn frames(
     folder: &Path,
 ) -> Result<Vec<PathBuf>> {
     create_folder(folder)?;
-    let transfer = ffmpeg.probed(clip, "color_transfer");
+    let transfer = ffmpeg.probe(clip, "color_transfer");
     let filters = filters(ffmpeg, clip, transfer.as_deref().unwrap_or_default())?;
     let filter = format!("fps={}{filters}", fps * CANDIDATES as f64);
     let pattern = folder.join("frame_%06d.png");
@@ -47,7 +47,7 @@ pub(super) fn frames(
     }
     if transfer.is_none() {
         tracing::warn!(
-            "{}: ffprobe, which comes with ffmpeg, does not tell its colours; it is taken for SDR",
+            "{}: ffprobe, which comes with ffmpeg, does not report its colour space; assuming SDR",
             clip.display()
         );
     }
@@ -68,23 +68,23 @@ pub(super) fn frames(
     Ok(kept)
 }
 
-/// ffmpeg's filters that make sRGB of linear light above which nothing is white: HLG and PQ put that at 203 cd/m2
-/// (BT.2408). What is brighter is clipped; a curve for it would change what is dark, too.
+/// ffmpeg's filters that convert HLG and PQ to sRGB, with white at 203 cd/m2 (BT.2408). Brighter values are clipped: a
+/// curve that compresses them would change dark values, too.
 const STANDARD_RANGE: &str = "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,tonemap=clip:desat=0,\
                               zscale=t=iec61966-2-1:m=gbr:r=full,format=gbrp16le";
 
-/// The filters after `fps` for a clip of this transfer function: those above for high dynamic range. Frames of wide
-/// primaries say so themselves, and are converted where they are read.
+/// The filters after `fps` for a clip with this transfer function: [`STANDARD_RANGE`] for HLG and PQ, else none. Frames
+/// with wide primaries have them in their metadata, and are converted when they are read.
 ///
 /// # Errors
-/// [`Error::Input`] with the command to run where this ffmpeg has no such filters.
+/// [`Error::Input`] with the command to run if this ffmpeg lacks the filters.
 fn filters(ffmpeg: &Tool<'_>, clip: &Path, transfer: &str) -> Result<String> {
     let range = match transfer {
         "arib-std-b67" => "HLG",
         "smpte2084" => "PQ",
         _ => return Ok(String::new()),
     };
-    let has = |filter: &str| ffmpeg.helps_with(&["-hide_banner", "-filters"], filter);
+    let has = |filter: &str| ffmpeg.help_contains(&["-hide_banner", "-filters"], filter);
     if !has(" zscale ") || !has(" tonemap ") {
         let path = clip.display();
         let problem = format!(
@@ -94,21 +94,21 @@ fn filters(ffmpeg: &Tool<'_>, clip: &Path, transfer: &str) -> Result<String> {
         return Err(Error::input(clip, problem));
     }
     tracing::warn!(
-        "{}: HDR ({range}) converted to sRGB; what is brighter than its white is clipped",
+        "{}: HDR ({range}) converted to sRGB; values brighter than its white are clipped",
         clip.display()
     );
     Ok(format!(",{STANDARD_RANGE}"))
 }
 
-/// Detail relative to brightness: mean absolute second difference over the mean. Frames of one moment share their
-/// noise, but not their motion blur.
+/// Detail relative to brightness: mean absolute second difference over the mean. Neighbouring frames have the same
+/// noise level, but not the same motion blur.
 fn sharpness(frame: &Image) -> f64 {
     let (width, pixels) = (frame.width as usize, frame.pixel_count());
     let plane = &frame.data[pixels..2 * pixels];
     let (mut detail, mut light) = (0.0, f64::EPSILON);
     for row in plane.chunks_exact(width) {
         for near in row.windows(5) {
-            // At a distance of two pixels, since neighbours differ mostly by noise and compression.
+            // Two pixels apart, since adjacent pixels differ mostly by noise and compression.
             detail += f64::from((2.0 * near[2] - near[0] - near[4]).abs());
             light += f64::from(near[2]);
         }
@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_frame_that_moved_is_less_sharp_than_one_that_did_not() {
+    fn motion_blur_lowers_the_sharpness_of_a_frame() {
         let frame = |reach: i32| {
             let value = |x: i32, y: u32| 0.05 + 0.04 * f32::from((x / 5 + y as i32 / 5) % 2 == 0);
             Image::from_fn(60, 40, |x, y| {

@@ -2,33 +2,39 @@
 
 use std::path::{Path, PathBuf};
 
+use super::Progress;
 use crate::Result;
 use crate::base::input;
 use crate::base::output::create_folder;
-use crate::cli::progress_bar;
 use crate::gpu::Gpu;
 use crate::photographs::image::files::stem;
 use crate::photographs::image::{ColourCounts, Image, PictureFile, exif_segment};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 
-/// Tone-maps the photographs into `folder`, as stored, and returns the gain of the scene. A JPEG stays one and keeps
-/// its Exif, so that COLMAP finds the focal length; everything else becomes PNG. Those that do not decode are named
-/// and taken out of `photographs`.
+/// Tone-maps the photographs into `folder`, in their stored orientation, and returns the gain of the scene. A JPEG
+/// stays a JPEG and keeps its Exif, where COLMAP finds the focal length; everything else becomes PNG. Photographs that
+/// do not decode are removed from `photographs`, with a warning.
 ///
 /// # Errors
 /// None decodes, all are black, or the device is out of memory.
-pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) -> Result<f64> {
+pub(super) fn write(
+    gpu: &Gpu,
+    photographs: &mut Vec<PathBuf>,
+    folder: &Path,
+    report: &dyn Fn(Progress<'_>),
+) -> Result<f64> {
     create_folder(folder)?;
     // The same curve for all, so that features keep matching.
     let settings = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
     let pseudo_gt = PseudoGt::new(gpu, &settings)?;
-    let progress = progress_bar(2 * photographs.len());
+    let (mut done, all) = (0, photographs.len());
     let root = photographs.first().and_then(|path| path.parent()).unwrap_or(folder).to_owned();
     let colours = ColourCounts::default();
     let (mut measured, mut undecoded) = (vec![], None);
     photographs.retain(|path| {
-        progress.inc(1);
+        done += 1;
+        report(Progress::Photographs { done, all });
         match Image::load_counted(path, &colours) {
             Ok(image) => measured.push(MeasuredPhotograph::of(&image.data)),
             Err(error) => {
@@ -42,9 +48,9 @@ pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) ->
     if let (true, Some(error)) = (photographs.is_empty(), undecoded) {
         return Err(error);
     }
-    progress.suspend(|| colours.say());
+    colours.say();
     let scene = settings.scene(&measured).ok_or_else(|| all_black(&root))?;
-    for (path, measured) in photographs.iter().zip(&measured) {
+    for (at, (path, measured)) in photographs.iter().zip(&measured).enumerate() {
         let (photograph, _) = PictureFile::open(path)?.decode()?;
         let image = pseudo_gt.tone_mapped(&photograph, &settings.tone_mapping(&scene, measured))?;
         let file = folder.join(name(path));
@@ -53,9 +59,8 @@ pub(super) fn write(gpu: &Gpu, photographs: &mut Vec<PathBuf>, folder: &Path) ->
         } else {
             image.save_png8(file)?;
         }
-        progress.inc(1);
+        report(Progress::Photographs { done: at + 1, all: photographs.len() });
     }
-    progress.finish_and_clear();
     Ok(scene.exposure.map_or(1.0, |exposure| exposure.gain))
 }
 

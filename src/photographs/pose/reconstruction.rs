@@ -3,17 +3,16 @@
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 
-use anyhow::Result;
-
 use super::stages::Stage;
 use super::tool::Tool;
-use super::{PoseArgs, cameras, tone_mapped};
-use crate::Error;
+use super::{PoseOptions, Progress, cameras, tone_mapped};
 use crate::base::output::create_folder;
 use crate::photographs::dataset::Dataset;
+use crate::{Error, Result};
 
 /// The pairs of photographs that COLMAP matches.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
 pub enum Matcher {
     /// Every pair
     Exhaustive,
@@ -31,7 +30,8 @@ impl Matcher {
 }
 
 /// The mapper that registers cameras.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
 pub enum Mapper {
     /// One by one (COLMAP's mapper)
     Incremental,
@@ -42,15 +42,16 @@ pub enum Mapper {
 /// The programs and files of one reconstruction.
 pub(super) struct Reconstruction<'a> {
     colmap: Tool<'a>,
-    /// If GLOMAP registers the cameras.
+    /// GLOMAP, if it registers the cameras.
     glomap: Option<Tool<'a>>,
-    args: &'a PoseArgs,
+    options: &'a PoseOptions,
     matcher: Matcher,
+    /// Whether matching uses the two-view geometry that it found before.
     is_guided: bool,
-    /// How the mapper begins where it found nothing to begin with.
+    /// Options of the mapper that relax the choice of the initial pair.
     relaxed: &'static [(&'static str, &'static str)],
-    /// Options of the user's, of one command each.
-    asked: Vec<(&'static str, String, String)>,
+    /// The user's options: command, name and value.
+    user_options: Vec<(&'static str, String, String)>,
     work: &'a Path,
     database: PathBuf,
     models: PathBuf,
@@ -61,8 +62,8 @@ fn placed_in(models: &Path) -> Result<usize> {
     Ok(Dataset::largest_model(models)?.map_or(0, |(_, placed)| placed.len()))
 }
 
-/// How the mapper may begin with few photographs: their first pair may be closer together, along the view, and have
-/// less in common than COLMAP asks for.
+/// Relaxations of the initial pair, for few photographs: a smaller baseline, motion along the viewing direction, and
+/// fewer common features than COLMAP requires by default.
 const RELAXED: [&[(&str, &str)]; 2] = [
     &[("Mapper.init_min_tri_angle", "6"), ("Mapper.init_min_num_inliers", "50")],
     &[
@@ -79,25 +80,26 @@ impl<'a> Reconstruction<'a> {
     /// Sets up the folder, and checks that the programs exist.
     ///
     /// # Errors
-    /// Cameras are to be placed all at once, and neither COLMAP nor GLOMAP is there that does; no command has an
-    /// option that is asked for.
+    /// [`Error::Usage`] if the mapper is global and neither COLMAP nor GLOMAP has one, or no command has one of the
+    /// user's options.
     pub(super) fn new(
-        args: &'a PoseArgs,
+        settings: &'a PoseOptions,
         colmap: Tool<'a>,
         matcher: Matcher,
         work: &'a Path,
     ) -> Result<Self> {
-        let is_apart = args.mapper == Mapper::Global && !colmap.helps_with(&["help"], GLOBAL);
-        let glomap =
-            is_apart.then(|| colmap.beside(&args.glomap, "glomap").found("")).transpose()?;
+        let is_global = settings.mapper == Mapper::Global;
+        let needs_glomap = is_global && !colmap.help_contains(&["help"], GLOBAL);
+        let glomap = || colmap.with_same_log(&settings.glomap, "glomap").found("");
+        let glomap = needs_glomap.then(glomap).transpose()?;
         let (database, models) = (work.join("database.db"), work.join("sparse"));
         create_folder(&models)?;
-        let mapper = if args.mapper == Mapper::Global && !is_apart { GLOBAL } else { "mapper" };
+        let mapper = if is_global && !needs_glomap { GLOBAL } else { "mapper" };
         let commands = ["feature_extractor", matcher.command(), mapper];
-        let mut asked = vec![];
-        for option in &args.colmap_option {
+        let mut user_options = vec![];
+        for option in &settings.colmap_options {
             let (name, value) = option.split_once('=').ok_or_else(|| {
-                Error::Usage(format!("--colmap-option {option} is no NAME=VALUE"))
+                Error::Usage(format!("--colmap-option {option} is not NAME=VALUE"))
             })?;
             let name = name.trim_start_matches("--");
             let tool = |command| {
@@ -107,59 +109,60 @@ impl<'a> Reconstruction<'a> {
                 commands.into_iter().find(|command| tool(*command).has_option(command, name));
             let command = command.ok_or_else(|| {
                 Error::Usage(format!(
-                    "--colmap-option {option}: of {} none has {name}; `colmap mapper -h` lists those of the mapper",
+                    "--colmap-option {option}: none of {} has {name}; `colmap mapper -h` lists those of the mapper",
                     commands.join(", ")
                 ))
             })?;
-            asked.push((command, name.to_owned(), value.to_owned()));
+            user_options.push((command, name.to_owned(), value.to_owned()));
         }
         Ok(Self {
             colmap,
             glomap,
-            args,
+            options: settings,
             matcher,
             is_guided: false,
             relaxed: &[],
-            asked,
+            user_options,
             work,
             database,
             models,
         })
     }
 
-    /// The folder that holds the models, a folder each; none where the photographs show too little. Where one in ten
-    /// or more is left without a camera, they are compared once more, guided: what a small set comes to is luck
-    /// otherwise, and for a large one it would take twice as long. Where most are still left, the mapper begins with
-    /// less.
+    /// The folder of the models, each a folder; it is empty if nothing could be reconstructed. If more than a tenth of
+    /// the photographs have no camera, all are matched again, guided: without it, the result of a small set depends on
+    /// chance; always matching guided would double the time of a large one. If most still have none, the choice of the
+    /// initial pair is relaxed.
     ///
     /// # Errors
-    /// A program fails.
+    /// [`Error::Input`] if a program fails.
     pub(super) fn models(
         mut self,
         (tone_mapped, photographs): (&Path, &[PathBuf]),
-        say: impl Fn(&str) -> Result<()>,
+        report: &dyn Fn(Progress<'_>),
     ) -> Result<PathBuf> {
-        self.extract((tone_mapped, photographs), &say)?;
-        // COLMAP compares no pair twice: another comparison begins with the features alone.
+        self.extract((tone_mapped, photographs), report)?;
+        // COLMAP matches no pair twice: matching again begins with the features alone.
         let features = self.work.join("guided.db");
         if self.database.is_file() {
             std::fs::copy(&self.database, &features)
                 .map_err(|error| Error::output(&features, format!("cannot be written: {error}")))?;
         }
-        self.compare(photographs.len(), &say)?;
-        self.place(tone_mapped, &say)?;
+        self.match_features(photographs.len(), report)?;
+        self.register(tone_mapped, report)?;
         let all = photographs.len();
         let mut placed = placed_in(&self.models)?;
         let mut best = self.models.clone();
         if 10 * placed >= 9 * all {
             return Ok(best);
         }
-        say(&format!("{placed} of {all} have a camera: compared once more, guided"))?;
+        let line = format!("{placed} of {all} have a camera: matching again, guided");
+        report(Progress::Line(&line));
         self.is_guided = true;
         self.use_folder("guided")?;
         self.database = features;
-        match self.compare(all, &say).and_then(|()| self.place(tone_mapped, &say)) {
-            // What the first comparison came to is there.
+        match self.match_features(all, report).and_then(|()| self.register(tone_mapped, report)) {
+            // The models of the first attempt are still there.
             Err(error) if placed > 0 => {
                 tracing::warn!("{error}; using the cameras of the first attempt");
                 return Ok(best);
@@ -168,15 +171,16 @@ impl<'a> Reconstruction<'a> {
         }
         for (step, relaxed) in [&[][..]].into_iter().chain(RELAXED).enumerate() {
             if !relaxed.is_empty() {
-                if 2 * placed >= all || self.args.mapper == Mapper::Global {
+                if 2 * placed >= all || self.options.mapper == Mapper::Global {
                     break;
                 }
-                say(&format!(
-                    "{placed} of {all} have a camera: placed once more, from a closer pair"
-                ))?;
+                let line = format!(
+                    "{placed} of {all} have a camera: registering again, from a closer pair"
+                );
+                report(Progress::Line(&line));
                 self.relaxed = relaxed;
                 self.use_folder(&format!("relaxed{step}"))?;
-                self.place(tone_mapped, &say)?;
+                self.register(tone_mapped, report)?;
             }
             let found = placed_in(&self.models)?;
             if found > placed {
@@ -186,17 +190,17 @@ impl<'a> Reconstruction<'a> {
         Ok(best)
     }
 
-    /// Models go into another folder from here on.
+    /// Writes models into another folder from now on.
     fn use_folder(&mut self, name: &str) -> Result<()> {
         self.models = self.work.join(name);
-        Ok(create_folder(&self.models)?)
+        create_folder(&self.models)
     }
 
-    /// Features of each photograph. Photographs of one lens share a camera; each of a lens of its own has its own.
+    /// Extracts the features of each photograph. Those of one group share a camera.
     fn extract(
         &self,
         (tone_mapped, photographs): (&Path, &[PathBuf]),
-        say: &impl Fn(&str) -> Result<()>,
+        report: &dyn Fn(Progress<'_>),
     ) -> Result<()> {
         let command = "feature_extractor";
         let groups = cameras::groups(photographs);
@@ -213,7 +217,7 @@ impl<'a> Reconstruction<'a> {
             let mut options = self.files(tone_mapped);
             options.extend([
                 ("ImageReader.single_camera".to_owned(), (*is_one_camera).into()),
-                ("ImageReader.camera_model".to_owned(), self.args.camera_model.as_str().into()),
+                ("ImageReader.camera_model".to_owned(), self.options.camera_model.as_str().into()),
                 (use_gpu.clone(), self.gpu().into()),
             ]);
             if runs.len() > 1 {
@@ -223,39 +227,41 @@ impl<'a> Reconstruction<'a> {
                     .map_err(|error| Error::output(&list, format!("cannot be written: {error}")))?;
                 options.push(("image_list_path".to_owned(), list.into()));
             }
-            self.run(&self.colmap, command, options, ("features", say))?;
+            self.run(&self.colmap, command, options, ("features", report))?;
         }
-        say(&match runs.len() {
+        report(Progress::Line(&match runs.len() {
             1 => "features extracted".to_owned(),
             count => format!(
                 "features extracted; {count} groups of photographs by size, lens and focal length"
             ),
-        })
+        }));
+        Ok(())
     }
 
-    fn compare(&self, count: usize, say: &impl Fn(&str) -> Result<()>) -> Result<()> {
+    fn match_features(&self, count: usize, report: &dyn Fn(Progress<'_>)) -> Result<()> {
         let command = self.matcher.command();
         let of_matching = |option| self.named(command, ["FeatureMatching", "SiftMatching"], option);
         let mut options = vec![("database_path".to_owned(), self.database.clone().into())];
         options.push((of_matching("use_gpu"), self.gpu().into()));
-        // Once it is known how two photographs lie to each other, more of their features find their twins.
+        // With the relative pose of two photographs, more of their features are matched.
         if self.is_guided {
             options.push((of_matching("guided_matching"), "1".into()));
         }
         if self.matcher == Matcher::Exhaustive {
-            // What COLMAP says of its progress it says block by block.
+            // COLMAP reports its progress block by block.
             let block = (count / 6).clamp(4, 50);
             options.push(("ExhaustiveMatching.block_size".to_owned(), block.to_string().into()));
         }
-        self.run(&self.colmap, command, options, ("matching", say))?;
-        say("features matched")
+        self.run(&self.colmap, command, options, ("matching", report))?;
+        report(Progress::Line("features matched"));
+        Ok(())
     }
 
-    fn place(&self, tone_mapped: &Path, say: &impl Fn(&str) -> Result<()>) -> Result<()> {
+    fn register(&self, tone_mapped: &Path, report: &dyn Fn(Progress<'_>)) -> Result<()> {
         let mut files = self.files(tone_mapped);
         files.push(("output_path".to_owned(), self.models.clone().into()));
-        let stage = ("placing", say);
-        let placed = match (self.args.mapper, &self.glomap) {
+        let stage = ("registering", report);
+        let registered = match (self.options.mapper, &self.glomap) {
             (Mapper::Incremental, _) => {
                 let relaxed = self.relaxed.iter();
                 files.extend(relaxed.map(|(name, value)| ((*name).to_owned(), (*value).into())));
@@ -263,30 +269,30 @@ impl<'a> Reconstruction<'a> {
             }
             (Mapper::Global, Some(glomap)) => self.run(glomap, "mapper", files, stage),
             (Mapper::Global, None) => {
-                // Placed all at once, cameras need their focal lengths before.
-                let database = files[..1].to_vec();
-                let calibrated =
-                    self.run(&self.colmap, "view_graph_calibrator", database, ("calibrating", say));
+                // Global registration requires focal lengths.
+                let (command, database) = ("view_graph_calibrator", files[..1].to_vec());
+                let calibrated = self.run(&self.colmap, command, database, ("calibrating", report));
                 calibrated.and_then(|()| self.run(&self.colmap, GLOBAL, files, stage))
             }
         };
         // COLMAP fails without an initial pair; the error then names the photographs.
-        match placed {
-            Err(_) if NOTHING.iter().any(|words| self.colmap.printed(words)) => {}
+        match registered {
+            Err(_) if NO_INITIAL_PAIR.iter().any(|words| self.colmap.printed(words)) => {}
             outcome => outcome?,
         }
-        say("cameras placed")
+        report(Progress::Line("cameras placed"));
+        Ok(())
     }
 
-    /// Runs a command with its own options and those that the user asks for, whose values win, and says how far it is.
+    /// Runs a command and reports its progress. The user's options override `options`.
     fn run(
         &self,
         tool: &Tool<'_>,
         command: &str,
         mut options: Options,
-        (what, say): (&str, &impl Fn(&str) -> Result<()>),
+        (what, report): (&str, &dyn Fn(Progress<'_>)),
     ) -> Result<()> {
-        for (_, name, value) in self.asked.iter().filter(|(of, ..)| *of == command) {
+        for (_, name, value) in self.user_options.iter().filter(|(of, ..)| *of == command) {
             options.retain(|(own, _)| own != name);
             options.push((name.clone(), value.into()));
         }
@@ -294,13 +300,11 @@ impl<'a> Reconstruction<'a> {
             options.into_iter().map(|(name, value)| [format!("--{name}").into(), value]).collect();
         let arguments: Vec<&OsStr> = options.iter().flatten().map(OsString::as_os_str).collect();
         let mut stage = Stage::new(what);
-        let mut told = Ok(());
         tool.run_and_watch(command, &arguments, |printed| {
             if let Some(line) = stage.due(printed) {
-                told = say(&line);
+                report(Progress::Line(&line));
             }
-        })?;
-        told
+        })
     }
 
     fn files(&self, tone_mapped: &Path) -> Options {
@@ -317,7 +321,7 @@ impl<'a> Reconstruction<'a> {
     }
 
     fn gpu(&self) -> &'static str {
-        if self.args.colmap_gpu { "1" } else { "0" }
+        if self.options.colmap_gpu { "1" } else { "0" }
     }
 }
 
@@ -325,4 +329,5 @@ impl<'a> Reconstruction<'a> {
 const GLOBAL: &str = "global_mapper";
 
 /// Messages of a mapper that found no initial pair.
-const NOTHING: [&str; 2] = ["No good initial image pair found", "failed to create sparse model"];
+const NO_INITIAL_PAIR: [&str; 2] =
+    ["No good initial image pair found", "failed to create sparse model"];

@@ -1,4 +1,4 @@
-//! Runs external programs, logs their output, and tells how to install them.
+//! Runs external programs and logs their output.
 
 use std::ffi::OsStr;
 use std::fs::{File, OpenOptions};
@@ -25,15 +25,15 @@ impl<'a> Tool<'a> {
     }
 
     /// Another program with the same log.
-    pub(super) fn beside(&self, path: &'a Path, name: &'static str) -> Self {
+    pub(super) fn with_same_log(&self, path: &'a Path, name: &'static str) -> Self {
         Self::new(path, name, self.log)
     }
 
     /// Checks that the program runs.
     ///
     /// # Errors
-    /// [`Error::Usage`] with how to install it, and `besides`.
-    pub(super) fn found(self, besides: &str) -> Result<Self> {
+    /// [`Error::Usage`] with instructions to install it, and `alternative`, if any.
+    pub(super) fn found(self, alternative: &str) -> Result<Self> {
         let started = Command::new(self.path).arg("-h").stdin(Stdio::null()).output();
         let Err(error) = started else { return Ok(self) };
         let (path, name) = (self.path.display(), self.name);
@@ -41,15 +41,16 @@ impl<'a> Tool<'a> {
             ErrorKind::NotFound => format!("`{path}` is not found"),
             _ => format!("`{path}` does not run ({error})"),
         };
-        let besides = if besides.is_empty() { String::new() } else { format!("; {besides}") };
+        let alternative =
+            if alternative.is_empty() { String::new() } else { format!("; {alternative}") };
         Err(Error::Usage(format!(
-            "{problem}; install it ({}) or name it with --{name} PATH{besides}",
-            sources(name)
+            "{problem}; install it ({}) or name it with --{name} PATH{alternative}",
+            how_to_install(name)
         )))
     }
 
-    /// Whether the output of the arguments `help` contains `what`.
-    pub(super) fn helps_with(&self, help: &[&str], what: &str) -> bool {
+    /// Whether the output for the arguments `help` contains `what`.
+    pub(super) fn help_contains(&self, help: &[&str], what: &str) -> bool {
         let output = Command::new(self.path).args(help).stdin(Stdio::null()).output();
         output.is_ok_and(|output| {
             let text = [output.stdout, output.stderr].concat();
@@ -59,11 +60,11 @@ impl<'a> Tool<'a> {
 
     /// Whether the help of a command lists an option.
     pub(super) fn has_option(&self, command: &str, option: &str) -> bool {
-        self.helps_with(&[command, "-h"], &format!("--{option} "))
+        self.help_contains(&[command, "-h"], &format!("--{option} "))
     }
 
-    /// What ffprobe, beside this ffmpeg, tells of the first video stream of a clip; `None` where it tells nothing.
-    pub(super) fn probed(&self, clip: &Path, entry: &str) -> Option<String> {
+    /// An entry of the first video stream of a clip, by the ffprobe next to this ffmpeg; `None` if it fails.
+    pub(super) fn probe(&self, clip: &Path, entry: &str) -> Option<String> {
         let name = self.path.file_name()?.to_str()?.replace("ffmpeg", "ffprobe");
         let arguments =
             ["-v", "error", "-select_streams", "v:0", "-of", "default=nokey=1:noprint_wrappers=1"];
@@ -74,7 +75,7 @@ impl<'a> Tool<'a> {
         output.status.success().then(|| text.lines().next().unwrap_or_default().to_owned())
     }
 
-    /// Runs one of its commands to its end.
+    /// Runs one of its commands to completion.
     ///
     /// # Errors
     /// [`Error::Input`] with its last lines if it fails.
@@ -82,10 +83,10 @@ impl<'a> Tool<'a> {
         self.run_and_watch(command, arguments, |_| {})
     }
 
-    /// The same; while it runs, `watch` sees what it has said, a few times a second.
+    /// [`Tool::run`] that passes the output so far to `watch`, twice a second.
     ///
     /// # Errors
-    /// As there.
+    /// Those of [`Tool::run`].
     pub(super) fn run_and_watch(
         &self,
         command: &str,
@@ -145,7 +146,7 @@ impl<'a> Tool<'a> {
 }
 
 /// How to install a program on each system.
-pub(in crate::cli) fn sources(name: &str) -> &'static str {
+pub fn how_to_install(name: &str) -> &'static str {
     match name {
         "colmap" => {
             "Debian, Ubuntu: apt install colmap; Fedora: dnf install colmap; Arch: colmap of the AUR; macOS: \

@@ -1,4 +1,4 @@
-//! Which photographs share a camera, and whether a calibration can be one.
+//! Groups photographs by camera, and checks calibrations for plausibility.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -8,7 +8,7 @@ use glam::DVec2;
 use crate::camera::Lens;
 use crate::photographs::image::{Image, lens_name};
 
-/// The photographs of one size, lens and focal length, as far as Exif tells; each group by name.
+/// Groups photographs by size and by the lens and focal length of their Exif; each group is sorted by name.
 pub(super) fn groups(photographs: &[PathBuf]) -> Vec<Vec<&Path>> {
     let mut groups: BTreeMap<_, Vec<&Path>> = BTreeMap::new();
     for path in photographs {
@@ -18,22 +18,22 @@ pub(super) fn groups(photographs: &[PathBuf]) -> Vec<Vec<&Path>> {
     groups.into_values().collect()
 }
 
-/// A calibration in a few words.
-pub(super) fn shown(lens: &Lens) -> String {
+/// The image size and focal length of a lens, in pixels.
+pub fn describe(lens: &Lens) -> String {
     let DVec2 { x, y } = lens.focal;
     let focal = if (x - y).abs() < 0.5 { format!("{x:.0}") } else { format!("{x:.0} x {y:.0}") };
     format!("{}x{} with focal length {focal}", lens.width, lens.height)
 }
 
-/// What no lens of a camera has, in a line.
+/// The reason why no real lens has this calibration; `None` if it is plausible.
 pub(super) fn implausible(lens: &Lens) -> Option<String> {
-    /// Pixels are square; lenses for cinema squeeze by a third.
-    const MOST_SQUEEZED: f64 = 1.2;
-    /// Of what the distortion does to the distance of a corner from the principal point.
-    const MOST_DISTORTED: f64 = 0.6;
-    let squeezed = lens.focal.max_element() / lens.focal.min_element();
-    if squeezed > MOST_SQUEEZED {
-        return Some(format!("its focal lengths are {:.0} % apart", 100.0 * (squeezed - 1.0)));
+    /// Ratio of the focal lengths. Pixels are square; an anamorphic lens has 1.33.
+    const MAX_ASPECT: f64 = 1.2;
+    /// Displacement of a corner, relative to its distance from the principal point.
+    const MAX_DISTORTION: f64 = 0.6;
+    let aspect = lens.focal.max_element() / lens.focal.min_element();
+    if aspect > MAX_ASPECT {
+        return Some(format!("its focal lengths are {:.0} % apart", 100.0 * (aspect - 1.0)));
     }
     let size = DVec2::new(lens.width.into(), lens.height.into());
     let off = ((lens.principal_point - 0.5 * size) / size).abs().max_element();
@@ -50,11 +50,11 @@ pub(super) fn implausible(lens: &Lens) -> Option<String> {
     let bent = corners.map(|corner| {
         let at = (corner * size - lens.principal_point) / lens.focal;
         let moved = lens.distortion.distort(at).distance(at) / at.length();
-        // A NaN folds, too.
+        // A NaN counts as folded.
         if lens.distortion.determinant(at) > 0.0 { moved } else { f64::INFINITY }
     });
     let most = bent.into_iter().fold(0.0, f64::max);
-    let is_absurd = most > MOST_DISTORTED;
+    let is_absurd = most > MAX_DISTORTION;
     is_absurd.then(|| match most.is_finite() {
         true => format!("its distortion moves a corner by {:.0} % of its distance", 100.0 * most),
         false => "its distortion folds the image over itself".to_owned(),
@@ -67,7 +67,7 @@ mod tests {
     use crate::camera::Distortion;
 
     #[test]
-    fn a_calibration_of_a_camera_passes_and_one_of_two_lenses_does_not() {
+    fn a_real_calibration_passes_and_a_mixture_of_two_lenses_does_not() {
         let lens = |focal: [f64; 2], k1: f64, k2: f64| Lens {
             width: 500,
             height: 375,
@@ -89,7 +89,10 @@ mod tests {
             let problem = implausible(&lens).unwrap();
             assert!(problem.contains(part), "{problem}");
         }
-        assert_eq!(shown(&lens([520.2, 520.4], 0.0, 0.0)), "500x375 with focal length 520");
-        assert_eq!(shown(&lens([964.0, 686.0], 0.0, 0.0)), "500x375 with focal length 964 x 686");
+        assert_eq!(describe(&lens([520.2, 520.4], 0.0, 0.0)), "500x375 with focal length 520");
+        assert_eq!(
+            describe(&lens([964.0, 686.0], 0.0, 0.0)),
+            "500x375 with focal length 964 x 686"
+        );
     }
 }

@@ -1,25 +1,25 @@
-//! How far COLMAP is, by what it says.
+//! Progress of a COLMAP command, read from its output.
 
 use std::time::{Duration, Instant};
 
-/// Between two lines about one command.
-const PAUSE: Duration = Duration::from_secs(10);
+/// Time between two lines about one command.
+const INTERVAL: Duration = Duration::from_secs(10);
 
-/// A command at work, which says every few seconds how far it is.
+/// The progress of a running command, as a line every few seconds.
 pub(super) struct Stage<'a> {
     what: &'a str,
     last: Instant,
 }
 
 impl<'a> Stage<'a> {
-    /// `what` it does, in a few words.
+    /// Starts a stage; `what` begins its lines.
     pub(super) fn new(what: &'a str) -> Self {
         Self { what, last: Instant::now() }
     }
 
-    /// The line that is due, by what the command has said.
+    /// The next line if it is due, from the output so far.
     pub(super) fn due(&mut self, printed: &str) -> Option<String> {
-        if self.last.elapsed() < PAUSE {
+        if self.last.elapsed() < INTERVAL {
             return None;
         }
         self.last = Instant::now();
@@ -34,8 +34,8 @@ impl<'a> Stage<'a> {
     }
 }
 
-/// The last count that COLMAP printed: files as [3/48], blocks of pairs as [1/6, 2/6], registered photographs by a
-/// line each, of which it does not say the total: 0.
+/// The last count that COLMAP printed, and the total: files as [3/48], blocks of pairs as [1/6, 2/6], and one line per
+/// registered photograph, whose total is unknown: 0.
 fn counted(printed: &str) -> Option<[usize; 2]> {
     let bracket = |line: &str| {
         let inside = line.split_once('[')?.1.split_once(']')?.0;
@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn counts_are_read_off_what_colmap_says() {
+    fn counts_are_read_from_the_output_of_colmap() {
         let cases = [
             (
                 "Processed file [2/48]\n  Name: a\nProcessed file [3/48]\n  Features: 8",
@@ -78,9 +78,9 @@ mod tests {
         }
         let mut stage = Stage::new("matching");
         assert_eq!(stage.due("Matching block [1/1, 1/1]"), None, "too early");
-        stage.last = Instant::now().checked_sub(PAUSE).unwrap();
+        stage.last = Instant::now().checked_sub(INTERVAL).unwrap();
         assert_eq!(stage.due("Matching block [1/2, 1/2]").unwrap(), "matching: 1 of 4");
-        stage.last = Instant::now().checked_sub(PAUSE).unwrap();
+        stage.last = Instant::now().checked_sub(INTERVAL).unwrap();
         assert_eq!(stage.due("").unwrap(), "matching: at work");
     }
 }

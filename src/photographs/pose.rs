@@ -1,0 +1,327 @@
+//! Camera poses of dark photographs: COLMAP runs on brightened copies of them.
+//!
+//! In: a folder of photographs, an archive of them, or a clip. Out: a dataset of the original photographs with the
+//! cameras that COLMAP found.
+
+mod cameras;
+mod clip;
+mod reconstruction;
+mod stages;
+mod tone_mapped;
+mod tool;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+pub use self::cameras::describe;
+pub use self::reconstruction::{Mapper, Matcher};
+pub use self::tool::how_to_install;
+
+use self::reconstruction::Reconstruction;
+use self::tool::Tool;
+use super::dataset::{Dataset, is_mask};
+use super::image::files::{photographs_in, stem, unread_in};
+use crate::base::output::{check_writable, create_folder, write_whole};
+use crate::base::{input, tree};
+use crate::camera::Lens;
+use crate::gpu::{DeviceChoice, Gpu};
+use crate::{Error, Result};
+
+/// The photographs, the dataset to write, and the programs to run.
+#[derive(Clone, Debug)]
+pub struct PoseOptions {
+    /// Folder or archive of photographs of one scene, or a clip.
+    pub photos: PathBuf,
+    /// Dataset to write; it appears when complete.
+    pub out: PathBuf,
+    /// Replace a dataset that this module wrote.
+    pub overwrite: bool,
+    /// Path of COLMAP.
+    pub colmap: PathBuf,
+    /// Path of GLOMAP, for [`Mapper::Global`] with COLMAP before 4.0.
+    pub glomap: PathBuf,
+    /// Path of ffmpeg, for clips.
+    pub ffmpeg: PathBuf,
+    /// By default sequential for a clip, else exhaustive.
+    pub matcher: Option<Matcher>,
+    /// The mapper that registers cameras.
+    pub mapper: Mapper,
+    /// COLMAP options, each `NAME=VALUE`.
+    pub colmap_options: Vec<String>,
+    /// COLMAP camera model.
+    pub camera_model: String,
+    /// Whether COLMAP may use the GPU.
+    pub colmap_gpu: bool,
+    /// Frames per second to take of a clip, above 0 and at most 240.
+    pub fps: f64,
+    /// Device that brightens the photographs.
+    pub device: DeviceChoice,
+}
+
+/// Progress of [`estimate`].
+#[derive(Clone, Copy, Debug)]
+pub enum Progress<'a> {
+    /// A line about a finished or running stage.
+    Line(&'a str),
+    /// Photographs done in the current pass over them.
+    Photographs {
+        /// Done so far.
+        done: usize,
+        /// In all.
+        all: usize,
+    },
+}
+
+/// The result of [`estimate`].
+#[derive(Clone, Debug)]
+pub struct Posed {
+    /// Photographs given to COLMAP.
+    pub photographs: usize,
+    /// Photographs with a camera.
+    pub placed: usize,
+    /// The calibrated lenses.
+    pub lenses: Vec<Lens>,
+}
+
+/// Fewer photographs than this have no reconstruction.
+const MIN_CAMERAS: usize = 3;
+
+/// Estimates the cameras and writes the dataset.
+///
+/// # Errors
+/// [`Error::Usage`] if an option is invalid or a program is missing, [`Error::Input`] if the photographs are unusable
+/// or a program fails or finds too few cameras, [`Error::Output`] if the dataset exists or cannot be written.
+pub fn estimate(options: &PoseOptions, report: &dyn Fn(Progress<'_>)) -> Result<Posed> {
+    if !(options.fps > 0.0 && options.fps <= 240.0) {
+        let problem = format!("--fps is {}; it must be above 0 and at most 240", options.fps);
+        return Err(Error::Usage(problem));
+    }
+    let is_clip = tree::is_file(&options.photos) && !tree::is_dir(&options.photos);
+    check_writable(&options.out)?;
+    let mut out = Unfinished::new(&options.out, options.overwrite)?;
+    let colmap = Tool::new(&options.colmap, "colmap", &out.log)
+        .found(&format!("by hand: {}", by_hand(&options.photos, &options.out)))?;
+    let matcher =
+        options.matcher.unwrap_or(if is_clip { Matcher::Sequential } else { Matcher::Exhaustive });
+    let reconstruction = Reconstruction::new(options, colmap, matcher, &out.work)?;
+    let folder = if tree::archive_of(&options.photos).is_some() {
+        Dataset::folder_of(&options.photos)?
+    } else {
+        options.photos.clone()
+    };
+    let mut photographs = if is_clip {
+        let ffmpeg = Tool::new(&options.ffmpeg, "ffmpeg", &out.log).found("")?;
+        clip::frames(&ffmpeg, &options.photos, options.fps, &out.work.join("frames"))?
+    } else {
+        distinct_photographs(&folder)?
+    };
+    let gpu = Gpu::new(&options.device)?;
+    let tone_mapped = out.work.join("tone-mapped");
+    let gain = tone_mapped::write(&gpu, &mut photographs, &tone_mapped, report)?;
+    let all = photographs.len();
+    report(Progress::Line(&format!("{all} photographs brightened (gain {gain:.1})")));
+    let models = reconstruction.models((&tone_mapped, &photographs), report)?;
+    let largest = Dataset::largest_model(&models)?;
+    let (model, placed) =
+        largest.filter(|(_, placed)| placed.len() >= MIN_CAMERAS).ok_or_else(|| {
+            let problem = format!(
+                "COLMAP found no cameras for these {all} photographs: too little overlap or texture; take more \
+             photographs, closer together, or expose longer ({} has its output)",
+                out.kept_log().display()
+            );
+            Error::input(&options.photos, problem)
+        })?;
+    out.add_photographs(&photographs, &placed)?;
+    out.add_masks(&folder, is_clip)?;
+    let sparse = out.add_model(&model)?;
+    let lenses = Dataset::lenses(&sparse)?;
+    out.finish()?;
+    let placed = placed.len();
+    let target = options.out.display();
+    report(Progress::Line(&format!("{placed} of {all} photographs have a camera -> {target}")));
+    for lens in &lenses {
+        if let Some(problem) = cameras::implausible(lens) {
+            tracing::warn!(
+                "the calibration of {} is implausible: {problem}; photographs of several lenses may \
+                 share it, or overlap too little",
+                describe(lens)
+            );
+        }
+    }
+    if 2 * placed < all {
+        tracing::warn!(
+            "most photographs have no camera; take more of them, closer together, or expose longer"
+        );
+    }
+    Ok(Posed { photographs: all, placed, lenses })
+}
+
+/// The commands to run COLMAP by hand.
+fn by_hand(photos: &Path, out: &Path) -> String {
+    let (photos, out) = (photos.display(), out.display());
+    format!(
+        "nightsplat tone apply {photos} --scene-statistics --out bright && mkdir -p {out}/sparse && colmap \
+         feature_extractor --database_path {out}/database.db --image_path bright --ImageReader.single_camera 1 \
+         && colmap exhaustive_matcher --database_path {out}/database.db && colmap mapper --database_path \
+         {out}/database.db --image_path bright --output_path {out}/sparse && cp -r {photos} {out}/images"
+    )
+}
+
+/// The photographs of a folder.
+///
+/// # Errors
+/// [`Error::Input`] if there are too few, or two differ in their extension alone: COLMAP sees both as one PNG.
+fn distinct_photographs(folder: &Path) -> Result<Vec<PathBuf>> {
+    let mut paths = photographs_in(folder)?;
+    paths.retain(|path| !is_mask(path));
+    if let Some(line) = unread_in(folder) {
+        tracing::warn!("{line}");
+    }
+    if paths.len() < MIN_CAMERAS {
+        let problem = format!(
+            "contains {} photographs (PNG, JPEG, WebP, TIFF or EXR); at least {MIN_CAMERAS} are needed",
+            paths.len()
+        );
+        return Err(Error::input(folder, problem));
+    }
+    let mut seen = BTreeMap::new();
+    for path in &paths {
+        let own = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        if let Some(other) = seen.insert(stem(&own).to_owned(), own.clone()) {
+            let problem = format!("{other} and {own} have the same name; rename one");
+            return Err(Error::input(folder, problem));
+        }
+    }
+    Ok(paths)
+}
+
+/// Creates a hard link in `folder`, or a copy if the file system has no links.
+fn link_or_copy(from: &Path, folder: &Path) -> Result<()> {
+    let to = folder.join(from.file_name().unwrap_or_default());
+    if tree::archive_of(from).is_some() {
+        return write_whole(&to, &input::bytes(from)?);
+    }
+    let from = from.canonicalize().unwrap_or_else(|_| from.to_owned());
+    if fs::hard_link(&from, &to).is_ok() {
+        return Ok(());
+    }
+    fs::copy(&from, &to)
+        .map(drop)
+        .map_err(|error| Error::output(&to, format!("cannot be written: {error}")))
+}
+
+/// A dataset under a temporary name, removed unless it is finished.
+struct Unfinished {
+    target: PathBuf,
+    replaces: bool,
+    /// The folder that becomes the dataset.
+    folder: PathBuf,
+    /// Working folder of COLMAP.
+    work: PathBuf,
+    /// Output of the programs.
+    log: PathBuf,
+    is_finished: bool,
+}
+
+impl Unfinished {
+    fn new(target: &Path, overwrite: bool) -> Result<Self> {
+        let mut folder = target.as_os_str().to_owned();
+        folder.push(".partial");
+        let folder = PathBuf::from(folder);
+        let has_files =
+            |folder: &Path| fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_some());
+        let is_ours = target.join(LOG).is_file();
+        if target.is_file() || (has_files(target) && !(overwrite && is_ours)) {
+            let remedy = if is_ours {
+                "pass --overwrite, or choose another folder"
+            } else {
+                "choose another folder"
+            };
+            return Err(Error::output(target, format!("exists already; {remedy}")));
+        }
+        if folder.exists() {
+            let problem = "belongs to an interrupted or running `nightsplat pose`; remove it";
+            return Err(Error::output(folder, problem));
+        }
+        let work = folder.join("work");
+        create_folder(&work)?;
+        let log = folder.join(LOG);
+        let replaces = has_files(target);
+        Ok(Self { target: target.to_owned(), replaces, folder, work, log, is_finished: false })
+    }
+
+    /// Adds those of `photographs` that are placed, by their names without extension.
+    fn add_photographs(&self, photographs: &[PathBuf], placed: &[String]) -> Result<()> {
+        let by_name: BTreeMap<&str, &PathBuf> = photographs
+            .iter()
+            .filter_map(|path| Some((stem(path.file_name()?.to_str()?), path)))
+            .collect();
+        let images = self.folder.join("images");
+        create_folder(&images)?;
+        let placed = placed.iter().filter_map(|name| by_name.get(stem(name)));
+        placed.into_iter().try_for_each(|path| link_or_copy(path, &images))
+    }
+
+    /// Adds the masks in `masks` of the source folder and, unless it is a clip, those next to the photographs.
+    fn add_masks(&self, source: &Path, is_clip: bool) -> Result<()> {
+        let masks = source.join("masks");
+        if masks.is_dir() {
+            let folder = self.folder.join("masks");
+            create_folder(&folder)?;
+            photographs_in(&masks)?.iter().try_for_each(|mask| link_or_copy(mask, &folder))?;
+        }
+        if is_clip {
+            return Ok(());
+        }
+        let images = self.folder.join("images");
+        let files = photographs_in(source)?;
+        files.iter().filter(|file| is_mask(file)).try_for_each(|mask| link_or_copy(mask, &images))
+    }
+
+    /// Adds the files of a COLMAP model; returns their folder.
+    fn add_model(&self, model: &Path) -> Result<PathBuf> {
+        let sparse = self.folder.join("sparse/0");
+        create_folder(&sparse)?;
+        for file in ["cameras.bin", "images.bin", "points3D.bin"] {
+            link_or_copy(&model.join(file), &sparse)?;
+        }
+        Ok(sparse)
+    }
+
+    /// Where the log of a failed attempt is kept.
+    fn kept_log(&self) -> PathBuf {
+        let mut path = self.target.as_os_str().to_owned();
+        path.push(".");
+        path.push(LOG);
+        path.into()
+    }
+
+    /// Gives the dataset its name.
+    fn finish(&mut self) -> Result<()> {
+        let failed = |error| Error::output(&self.target, format!("cannot be written: {error}"));
+        fs::remove_dir_all(&self.work).map_err(failed)?;
+        if self.replaces {
+            fs::remove_dir_all(&self.target).map_err(failed)?;
+        }
+        // The rename replaces an empty folder.
+        fs::rename(&self.folder, &self.target).map_err(failed)?;
+        self.is_finished = true;
+        // The log of an earlier attempt.
+        let _ = fs::remove_file(self.kept_log());
+        Ok(())
+    }
+}
+
+/// Name of the log in the dataset.
+const LOG: &str = "colmap.log";
+
+impl Drop for Unfinished {
+    fn drop(&mut self) {
+        if !self.is_finished {
+            // The cause is reported elsewhere; errors of the cleanup are not.
+            let _ = fs::rename(&self.log, self.kept_log());
+            let _ = fs::remove_dir_all(&self.folder);
+        }
+    }
+}
