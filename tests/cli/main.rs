@@ -366,6 +366,7 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
         "conv3x3_half",
         "conv3x3_weight_gradient_half",
         "conv_strided",
+        "depth_limits",
         "expose",
         "expose_backward",
         "exposure_center",
@@ -376,6 +377,7 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
         "mask_render",
         "max_pool",
         "pack_map",
+        "pack_pixels",
         "pack_weights",
         "parameter_terms",
     ];
