@@ -72,13 +72,19 @@ typedef struct {
     int read, different;
 } Ring;
 
-/* Waits until the reader gives a slot back. A reader that died closes its socket: no slot is its own then. */
+/* A reader that died closed its socket: no slot is its own then. */
+static void go_on_alone(Ring *ring)
+{
+    ring->is_alone = 1;
+    for (int i = 0; i < RING; i++) ring->is_free[i] = 1;
+}
+
+/* Waits until the reader gives a slot back. */
 static void take_back(Ring *ring)
 {
     Read read;
     if (recv(ring->socket, &read, sizeof read, MSG_WAITALL) != sizeof read) {
-        ring->is_alone = 1;
-        for (int i = 0; i < RING; i++) ring->is_free[i] = 1;
+        go_on_alone(ring);
         return;
     }
     ring->is_free[read.slot] = 1;
@@ -147,8 +153,9 @@ static int render(int socket, const char *path, uint64_t frame_count)
         submit(&gpu, slot->commands, VK_NULL_HANDLE, 0, gpu.frames, frame);
         /* Without a timeline that both know, the message is what tells that the frame is done. */
         if (!gpu.hello.has_semaphore) wait_frame(&gpu, frame);
-        if (!ring.is_alone && send(socket, &drawn, sizeof drawn, MSG_NOSIGNAL) == sizeof drawn)
-            ring.is_free[drawn.slot] = 0;
+        if (ring.is_alone) continue;
+        ring.is_free[drawn.slot] = 0;
+        if (send(socket, &drawn, sizeof drawn, MSG_NOSIGNAL) != sizeof drawn) go_on_alone(&ring);
     }
     shutdown(socket, SHUT_WR);
     wait_frame(&gpu, frame_count);
