@@ -61,16 +61,14 @@ fn main() -> Outcome<()> {
         is_dragging: false,
         cursor: PhysicalPosition::default(),
         running: None,
+        messages: 0,
         failed: None,
     };
     EventLoop::new()?.run_app(&mut app)?;
-    let messages = app.running.take().map_or(0, Running::destroy);
-    if let Some(error) = app.failed {
-        return Err(error);
-    }
-    match messages {
-        0 => Ok(()),
-        _ => Err(format!("{messages} validation messages").into()),
+    match app {
+        App { failed: Some(error), .. } => Err(error),
+        App { messages: 0, .. } => Ok(()),
+        App { messages, .. } => Err(format!("{messages} validation messages").into()),
     }
 }
 
@@ -354,14 +352,16 @@ struct App {
     is_dragging: bool,
     cursor: PhysicalPosition<f64>,
     running: Option<Running>,
+    /// Of the validation layers.
+    messages: u32,
     failed: Option<Box<dyn Error>>,
 }
 
 impl App {
     /// One frame, and what the options ask for after it.
     fn redraw(&mut self, events: &ActiveEventLoop) -> Outcome<()> {
-        let Self { options, scene, orbit, .. } = self;
-        let Some(running) = &mut self.running else { return Ok(()) };
+        let Self { options, scene, orbit, running, .. } = self;
+        let Some(running) = running else { return Ok(()) };
         let is_last = options.frames.is_some_and(|frames| running.number + 1 >= frames);
         let is_shot = is_last && options.screenshot.is_some();
         let Some(shot) = running.frame(scene, orbit, !options.has_no_geometry, is_shot)? else {
@@ -399,6 +399,11 @@ impl ApplicationHandler for App {
         let made = Running::new(events, &self.options, &self.model);
         let made = made.map(|running| self.running = Some(running));
         self.ends_on_error(events, made);
+    }
+
+    /// While there still is a display.
+    fn exiting(&mut self, _: &ActiveEventLoop) {
+        self.messages = self.running.take().map_or(0, Running::destroy);
     }
 
     fn about_to_wait(&mut self, _: &ActiveEventLoop) {

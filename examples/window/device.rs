@@ -125,7 +125,7 @@ impl Device {
         }
     }
 
-    /// Waits until a frame is done; the first two have none before them.
+    /// Waits until a frame is done; 0 is none.
     pub(crate) fn wait_frame(&self, number: u64) -> Result<(), vk::Result> {
         let (semaphores, values) = ([self.frames], [number]);
         let info = vk::SemaphoreWaitInfo::default().semaphores(&semaphores).values(&values);

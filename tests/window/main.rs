@@ -5,6 +5,7 @@
 #[path = "../common/mod.rs"]
 #[macro_use]
 mod common;
+#[allow(dead_code, reason = "the near plane is that of the depth image alone")]
 #[path = "../../examples/window/scene.rs"]
 mod scene;
 
@@ -77,6 +78,7 @@ fn render(gaussians: &Gaussians, camera: &Camera) -> [Image; 2] {
     let on_device = gaussians.upload(&gpu).unwrap();
     let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
     let mut renderer = Renderer::new(&gpu, settings).unwrap();
+    renderer.reserve(COUNT, [camera]).unwrap();
     let [black, white] = [0.0, 1.0].map(|background| {
         let options = RenderOptions { sh_degree: 0, background: [background; 3] };
         renderer.render_image(&on_device, camera, &options).unwrap()
@@ -102,7 +104,8 @@ fn hit(blocks: &[Block], camera: &Camera, x: u32, y: u32) -> Option<(f64, DVec3)
         let axis = enters.max_position();
         let depth = enters[axis];
         let shade = 1.0 - 0.2 * axis as f64;
-        (depth < leaves.min_element() && depth > 0.0).then(|| (depth, shade * block.color.as_dvec3()))
+        (depth < leaves.min_element() && depth > 0.0)
+            .then(|| (depth, shade * block.color.as_dvec3()))
     };
     blocks.iter().filter_map(hit).min_by(|a, b| a.0.total_cmp(&b.0))
 }
@@ -158,7 +161,10 @@ fn off(picture: &Image, has_geometry: bool, is_srgb: bool) -> f64 {
         }
     }
     if has_geometry {
-        assert!(hidden > 1000 && open > 1000, "{hidden} pixels are hidden, {open} are before boxes");
+        assert!(
+            hidden > 1000 && open > 1000,
+            "{hidden} pixels are hidden, {open} are before boxes"
+        );
     }
     f64::from(wrong) / (3 * picture.width * picture.height) as f64
 }
@@ -187,7 +193,8 @@ fn a_window_shows_splats_before_and_behind_the_geometry_of_its_host() {
 fn a_camera_that_is_dragged_still_looks_at_the_scene() {
     let scene = Scene::around(&[Vec3::new(2.0, 3.0, 5.0), Vec3::new(4.0, 3.0, 5.0)], true);
     let mut orbit = Orbit::default();
-    let distance = |orbit: &Orbit| orbit.camera(&scene, [40, 30]).center().distance(DVec3::new(3.0, 3.0, 5.0));
+    let distance =
+        |orbit: &Orbit| orbit.camera(&scene, [40, 30]).center().distance(DVec3::new(3.0, 3.0, 5.0));
     let before = distance(&orbit);
     orbit.turn(300.0, -20.0);
     assert!((distance(&orbit) - before).abs() < 1e-9);
