@@ -11,7 +11,7 @@ use super::device::Device;
 use super::scene::Block;
 use super::swapchain::{DEPTH_FORMAT, Picture, Swapchain};
 
-const SKY: [f32; 4] = [0.1, 0.12, 0.2, 1.0];
+const SKY: [f32; 4] = [0.06, 0.07, 0.23, 1.0];
 /// Reversed: 1 at the near plane, 0 at infinity.
 const FAR: f32 = 0.0;
 /// A matrix and three vectors.

@@ -47,7 +47,8 @@ impl Scene {
         NEAR * self.radius
     }
 
-    /// A ground below the model, a wall across its left half, a pillar through its right half.
+    /// A ground below the model, a wall across its left half, a pillar through its right half. None of their shades lies
+    /// half-way between two bytes, which devices may round to either.
     pub(crate) fn blocks(&self) -> [Block; 3] {
         let block = |center: [f64; 3], half_size: [f64; 3], color: [f32; 3]| Block {
             center: self.center + self.radius * (self.axes * DVec3::from(center)),
@@ -55,9 +56,9 @@ impl Scene {
             color: color.into(),
         };
         [
-            block([0.0, 0.0, -1.8], [4.0, 4.0, 0.1], [0.4, 0.5, 0.6]),
-            block([-1.6, 0.0, -0.4], [1.5, 0.1, 1.3], [0.8, 0.3, 0.2]),
-            block([0.8, 0.1, -0.5], [0.2, 0.2, 1.2], [0.3, 0.7, 0.4]),
+            block([0.0, 0.0, -1.8], [4.0, 4.0, 0.1], [0.45, 0.51, 0.57]),
+            block([-1.6, 0.0, -0.4], [1.5, 0.1, 1.3], [0.77, 0.27, 0.23]),
+            block([0.8, 0.1, -0.5], [0.2, 0.2, 1.2], [0.27, 0.73, 0.45]),
         ]
     }
 }
