@@ -26,7 +26,7 @@ publish = false
 
 [dependencies]
 nightsplat = {{ path = "{root}", default-features = false, features = {features} }}
-{window}
+{more}
 
 [workspace]
 
@@ -49,11 +49,11 @@ def main() -> None:
     needed = re.search(r"^window = \[(.*)\]$", manifest, re.M)[1].replace('"', "").replace("dep:", "").split(", ")
     window = [re.search(rf"^{name} = .*$", manifest, re.M)[0].replace(", optional = true", "") for name in needed]
 
-    def write_manifest(features: str) -> None:
-        text = MANIFEST.format(root=ROOT, features=features, window="\n".join(window), profile=profile[0])
+    def write_manifest(features: str, more: list[str]) -> None:
+        text = MANIFEST.format(root=ROOT, features=features, more="\n".join(more), profile=profile[0])
         (package / "Cargo.toml").write_text(text)
 
-    write_manifest('["glslang", "io"]')
+    write_manifest('["glslang", "io"]', window)
     (package / "Cargo.lock").write_bytes((ROOT / "Cargo.lock").read_bytes())
     for example in (ROOT / "examples").glob("*.rs"):
         if example.stem not in INSTRUMENTS:
@@ -68,7 +68,7 @@ def main() -> None:
     environment = os.environ | {"CARGO_TARGET_DIR": str(target)}
     subprocess.run(["cargo", "check", "--bins"], cwd=package, env=environment, check=True)
 
-    write_manifest('["glslang"]')
+    write_manifest('["glslang"]', [])
     model, picture = target / "outside/model.ply", target / "outside/frame.ppm"
     write_model(model)
     draw = ["cargo", "run", "--quiet", "--bin", "embed", "--", str(model), str(picture)]
