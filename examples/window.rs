@@ -142,7 +142,7 @@ impl Splats {
     /// Records the splats into the host's command buffer, which is submitted once, in the order of recording.
     ///
     /// Its geometry is in the colour image as in the depth image, with `near` as the plane at depth 1. One call does
-    /// both directions: splats behind the geometry are hidden, and those in front are blended over it.
+    /// both directions: splats beyond the geometry are hidden, and those in front are blended over it.
     fn record(
         &mut self,
         (commands, number): (vk::CommandBuffer, u64),
@@ -284,7 +284,7 @@ impl Running {
         }
     }
 
-    /// Behind the frame, the timeline reaches its number.
+    /// Once the frame is done, the timeline reaches its number.
     fn submit(
         &self,
         commands: vk::CommandBuffer,

@@ -214,21 +214,21 @@ static void read_image(const Slot *slot, VkImage image)
                          0, NULL, 0, NULL);
 }
 
-/* Submits; behind it `signal` reaches `value`. It waits until `wait` has reached `from`, where there is one. */
+/* Submits; `signal` reaches `value` afterwards. It waits until `wait` has reached `from`, where there is one. */
 static void submit(const Gpu *gpu, VkCommandBuffer commands, VkSemaphore wait, uint64_t from, VkSemaphore signal,
                    uint64_t value)
 {
     VK(vkEndCommandBuffer(commands));
     VkSemaphoreSubmitInfo before = {.sType = VK_STRUCTURE_TYPE_SEMAPHORE_SUBMIT_INFO, .semaphore = wait, .value = from,
                                     .stageMask = VK_PIPELINE_STAGE_2_ALL_COMMANDS_BIT};
-    VkSemaphoreSubmitInfo behind = {.sType = VK_STRUCTURE_TYPE_SEMAPHORE_SUBMIT_INFO, .semaphore = signal,
+    VkSemaphoreSubmitInfo after = {.sType = VK_STRUCTURE_TYPE_SEMAPHORE_SUBMIT_INFO, .semaphore = signal,
                                     .value = value, .stageMask = VK_PIPELINE_STAGE_2_ALL_COMMANDS_BIT};
     VkCommandBufferSubmitInfo buffer = {.sType = VK_STRUCTURE_TYPE_COMMAND_BUFFER_SUBMIT_INFO,
                                         .commandBuffer = commands};
     VkSubmitInfo2 info = {.sType = VK_STRUCTURE_TYPE_SUBMIT_INFO_2,
         .waitSemaphoreInfoCount = wait != VK_NULL_HANDLE, .pWaitSemaphoreInfos = &before,
         .commandBufferInfoCount = 1, .pCommandBufferInfos = &buffer,
-        .signalSemaphoreInfoCount = 1, .pSignalSemaphoreInfos = &behind};
+        .signalSemaphoreInfoCount = 1, .pSignalSemaphoreInfos = &after};
     VK(vkQueueSubmit2(gpu->queue, 1, &info, VK_NULL_HANDLE));
 }
 

@@ -4,7 +4,7 @@
  *   ./share MODEL.ply [FRAMES [LAST]]        the reader leaves after frame LAST
  *
  * The library needs no function for this: an image with exportable memory is an image. The renderer keeps a ring of
- * three, and renders into those that the reader has given back. Behind a frame it releases the image to
+ * three, and renders into those that the reader has given back. After a frame it releases the image to
  * VK_QUEUE_FAMILY_EXTERNAL, from which the reader acquires it. What orders the two is the renderer's timeline semaphore
  * where the driver exports it; otherwise the renderer waits for the frame and then tells of it.
  */

@@ -22,11 +22,11 @@ use nightsplat::splats::scene::{Gaussians, ply};
 use scene::{Block, Orbit, Scene};
 
 const SKY: [f64; 3] = [0.06, 0.07, 0.23];
-/// As many from the first on are before the wall; the others are behind it.
+/// The first of the splats are before the wall, the others beyond it.
 const BEFORE: usize = 300;
 const COUNT: usize = 600;
 
-/// Two layers of splats, a model's radius before and behind the middle of the scene.
+/// Two layers of splats, one before and one beyond the middle of the scene.
 fn gaussians() -> Gaussians {
     let mut gaussians = Gaussians::zeros(COUNT, 0);
     let mut random = Random::new(7);
@@ -58,8 +58,8 @@ fn shot(model: &Path, options: &str) -> Image {
         .env_remove("WAYLAND_DISPLAY")
         .output()
         .unwrap();
-    let said = String::from_utf8_lossy(&run.stderr);
-    assert!(run.status.success(), "{}: {said}", program.display());
+    let errors = String::from_utf8_lossy(&run.stderr);
+    assert!(run.status.success(), "{}: {errors}", program.display());
     let bytes = std::fs::read(picture).unwrap();
     let mut parts = bytes.splitn(4, |byte| *byte == b'\n');
     let mut line = || String::from_utf8(parts.next().unwrap().to_vec()).unwrap();
@@ -134,13 +134,13 @@ fn off(picture: &Image, has_geometry: bool, is_srgb: bool) -> f64 {
         means.map(|mean| camera.view_from_world.transform_point3(mean).z).collect::<Vec<_>>()
     };
     let last_before = depths(0..BEFORE).into_iter().fold(0.0, f64::max);
-    let first_behind = depths(BEFORE..COUNT).into_iter().fold(f64::MAX, f64::min);
+    let first_beyond = depths(BEFORE..COUNT).into_iter().fold(f64::MAX, f64::min);
     let blocks = if has_geometry { scene.blocks().to_vec() } else { vec![] };
     let [mut hidden, mut over, mut wrong] = [0, 0, 0];
     for (x, y) in (0..picture.height).flat_map(|y| (0..picture.width).map(move |x| (x, y))) {
         let (depth, under) = hit(&blocks, &camera, x, y).unwrap_or((f64::MAX, SKY.into()));
-        // A wall between the layers hides the second; what is behind both hides none.
-        let is_hidden = depth < first_behind;
+        // A wall between the layers hides the second; what is beyond both hides none.
+        let is_hidden = depth < first_beyond;
         let [color, through] = if is_hidden { &front } else { &all };
         let (color, through) = (color.pixel(x, y), f64::from(through.pixel(x, y)[0]));
         assert!(!is_hidden || depth > last_before || through == 1.0, "splats are in the wall");
@@ -164,7 +164,7 @@ fn off(picture: &Image, has_geometry: bool, is_srgb: bool) -> f64 {
 }
 
 #[test]
-fn a_window_shows_splats_before_and_behind_the_geometry_of_its_host() {
+fn a_window_shows_splats_before_and_beyond_the_geometry_of_its_host() {
     if Command::new("xvfb-run").arg("--help").output().is_err() {
         return not_run("there is no xvfb-run (on Debian `apt install xvfb xauth`)");
     }
