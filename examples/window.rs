@@ -75,7 +75,7 @@ fn main() -> Outcome<()> {
 #[derive(Debug, Default)]
 struct Options {
     model: PathBuf,
-    /// Ends after so many.
+    /// The number after which it ends.
     frames: Option<u64>,
     screenshot: Option<PathBuf>,
     size: [u32; 2],

@@ -47,8 +47,8 @@ impl Scene {
         NEAR * self.radius
     }
 
-    /// A ground below the model, a wall across its left half, a pillar through its right half. None of their shades lies
-    /// half-way between two bytes, which devices may round to either.
+    /// A ground below the model, a wall across its left half, a pillar through its right half. None of their shades is
+    /// half-way between two bytes, which devices round to either.
     pub(crate) fn blocks(&self) -> [Block; 3] {
         let block = |center: [f64; 3], half_size: [f64; 3], color: [f32; 3]| Block {
             center: self.center + self.radius * (self.axes * DVec3::from(center)),
