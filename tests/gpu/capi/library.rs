@@ -97,6 +97,50 @@ fn the_c_host_draws_our_own_render_without_a_message() {
 }
 
 #[test]
+fn two_processes_share_images_and_one_goes_on_where_the_other_dies() {
+    if !has_vulkan_headers() {
+        return;
+    }
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let linked = linked();
+    let mut linked: Vec<&str> = linked.iter().map(String::as_str).collect();
+    linked.push("-lm");
+    let source = root.join("examples/c/share.c");
+    let folder = tempfile::tempdir().unwrap();
+    Model::from(gaussians(1)).save(folder.path().join("model.ply")).unwrap();
+    let run = |program: &Path, frames: &[&str], layers: &str| {
+        let mut command = Command::new(program);
+        command.current_dir(folder.path()).arg("model.ply").args(frames);
+        command.env("VK_INSTANCE_LAYERS", layers);
+        command
+            .env("VK_LAYER_ENABLES", "VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT");
+        let done = command.output().unwrap();
+        let printed = String::from_utf8_lossy(&done.stdout).into_owned();
+        assert!(done.status.success(), "{printed} {}", String::from_utf8_lossy(&done.stderr));
+        printed
+    };
+    let program = compile("cc", "-std=c99", &source, &linked);
+    let printed = run(&program, &["7"], "VK_LAYER_KHRONOS_validation");
+    // The layer of the reader does not know of the layout that the other process left its images in.
+    let is_known = |line: &str| {
+        line.contains("InvalidImageLayout") && line.ends_with("is VK_IMAGE_LAYOUT_UNDEFINED.")
+    };
+    let messages = printed.lines().filter(|line| line.contains("Validation") && !is_known(line));
+    assert_eq!(messages.collect::<Vec<_>>(), [""; 0]);
+    assert!(
+        printed.contains("7 frames of 7 were read by the other process, 0 differ"),
+        "{printed}"
+    );
+
+    // Layers have leaks of their own.
+    linked.extend(["-g", "-fsanitize=address,undefined"]);
+    let program = compile("cc", "-std=c99", &source, &linked);
+    run(&program, &["5"], "");
+    let printed = run(&program, &["9", "4"], "");
+    assert!(printed.contains("which is gone, 0 differ"), "{printed}");
+}
+
+#[test]
 fn the_header_is_c_and_cpp_and_names_what_the_library_exports() {
     if !has_vulkan_headers() {
         return;

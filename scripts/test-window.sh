@@ -1,0 +1,7 @@
+#!/usr/bin/env bash
+# Builds examples/window.rs and compares its picture, on an X server without a screen, with our own render.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+cargo build --locked --features window --example window
+cargo test --locked --features window --test window
