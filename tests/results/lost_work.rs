@@ -187,7 +187,10 @@ fn a_damaged_checkpoint_is_reported_and_the_previous_one_resumes_to_the_same_bit
     for damaged in [&flipped[..], &whole[..whole.len() - 7], b""] {
         fs::write(&checkpoint, damaged).unwrap();
         let (_, stderr) = run(&place.train("run", &format!("{options} --resume")), 0);
-        assert!(stderr.contains("checkpoint.safetensors") && stderr.contains("previous checkpoint"), "{stderr}");
+        assert!(
+            stderr.contains("checkpoint.safetensors") && stderr.contains("previous checkpoint"),
+            "{stderr}"
+        );
         assert!(place.read("run/model.ply") == expected);
         fs::remove_file(place.path("run/done.json")).unwrap();
     }

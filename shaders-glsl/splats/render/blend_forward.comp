@@ -21,9 +21,9 @@ layout(push_constant, scalar) uniform Params {
     uvec2 size;
     uint tile_columns;
     uint longest_run;  // the most splats of a tile that this device can process
-    uint has_limits;   // 1: `limits` has a depth for each pixel
-    uint takes_median; // 1: the last channel is the median depth
     float background[MAX_CHANNELS];
+    uint has_limits;    // 1: `limits` has a depth for each pixel
+    uint takes_median;  // 1: the last channel is the median depth
 };
 
 layout(binding = 0) readonly  buffer Counts     { uint counts[]; };        // [0]: intersections
