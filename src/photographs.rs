@@ -8,7 +8,7 @@
 //! - [`tone`]: curves that brighten a photograph
 //! - [`fit`]: the constants of a curve from pairs of photographs
 //! - [`dataset`]: photographs with their cameras and points, from disk
-//! - [`pose`]: camera poses of dark photographs, by COLMAP
+//! - `pose`: camera poses of dark photographs, by COLMAP (feature `cli`)
 //! - [`pseudo_gt`]: dark photograph and curve to target, on the device
 //! - [`structure`]: the edges of a pseudo-GT that do not depend on its illumination
 
@@ -19,7 +19,7 @@ pub mod fit;
 pub mod image;
 #[cfg(feature = "io")]
 pub mod metrics;
-#[cfg(feature = "io")]
+#[cfg(feature = "cli")]
 pub mod pose;
 #[cfg(feature = "io")]
 pub mod pseudo_gt;

@@ -231,8 +231,8 @@ impl Trainer {
     }
 
     /// The frame in which the Gaussians are trained.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn frame(&self) -> &TrainingFrame {
+    #[cfg(feature = "testing")]
+    pub fn frame(&self) -> &TrainingFrame {
         &self.frame
     }
 

@@ -185,10 +185,4 @@ impl Gpu {
         }
         self.shared.collect(self.shared.reached());
     }
-
-    /// The number of the last frame of the host's that is done.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn frames_reached(&self) -> u64 {
-        self.shared.frames_reached()
-    }
 }

@@ -8,7 +8,7 @@ use ash::vk;
 ///
 /// The host must have enabled [`super::required_device_features`] on the device. It should enable
 /// `VK_KHR_push_descriptor` where that is supported, which makes recording faster. It keeps device, instance and queue
-/// alive for as long as the [`Gpu`] and everything made with it. What is left at its default is not used:
+/// alive for as long as the [`Gpu`](super::Gpu) and everything made with it. What is left at its default is not used:
 ///
 /// ```
 /// use nightsplat::HostDevice;
@@ -37,7 +37,8 @@ pub struct HostDevice {
     pub names_objects: bool,
     /// Held around each of our submissions. `None`: no other thread uses the queue meanwhile.
     pub queue_lock: Option<QueueLock>,
-    /// A timeline `VkSemaphore` that reaches the number of each frame; null: the host calls [`Gpu::frames_done`].
+    /// A timeline `VkSemaphore` that reaches the number of each frame; null: the host calls
+    /// [`Gpu::frames_done`](super::Gpu::frames_done).
     pub frames: u64,
     /// The host's `VkPipelineCache`; null: one of ours that is not saved.
     pub pipeline_cache: u64,

@@ -79,6 +79,7 @@ impl Gaussians {
 ///
 /// # Errors
 /// [`Error::Output`] if the file cannot be written.
+#[cfg(any(test, feature = "testing"))]
 pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
     save_with_comments(gaussians, path, &[""; 0])
 }
