@@ -9,7 +9,6 @@ use rawler::imgop::develop::{Intermediate, ProcessingStep, RawDevelop};
 use rawler::rawsource::RawSource;
 
 use super::{Image, from_interleaved, srgb_from_linear};
-use crate::base::input;
 use crate::{Error, Result};
 
 /// Black and white level, demosaicing, white balance, colour matrix and crop: all steps that keep light linear.

@@ -374,3 +374,118 @@ fn the_hosts_allocator_gives_all_memory_and_gets_it_back() {
     assert_eq!(own.out.load(Ordering::Acquire), 0);
     session.end();
 }
+
+#[test]
+fn a_lost_device_is_a_code_and_everything_can_be_destroyed() {
+    let mut session = Session::with_flags(0, |_| {});
+    // SAFETY: valid.
+    let gpu = unsafe { &*session.device }.gpu();
+    let dataset = session.folder.path().join("dataset");
+    write(&dataset, &SyntheticOptions { width: 24, height: 20, ..Default::default() }).unwrap();
+    let dataset = c_path(&dataset);
+    ok(session.load());
+    lose_at_submission(&gpu, 5);
+    let mut trainer = null_mut();
+    // SAFETY: valid.
+    unsafe {
+        let result = nsp_trainer_create(session.device, dataset.as_ptr(), null(), &mut trainer);
+        refused(result, NSP_ERROR_LOST, &["nsp_trainer_create", "was lost"]);
+        assert!(trainer.is_null());
+        ok(nsp_frames_done(session.device, u64::MAX));
+    }
+    drop(gpu);
+    session.end();
+}
+
+/// The host's allocations for Vulkan objects that are out.
+static OBJECTS: AtomicU64 = AtomicU64::new(0);
+/// A block's size and alignment lie before its first byte, in as many bytes as its alignment.
+const PREFIX: usize = 16;
+
+unsafe extern "system" fn allocate_object(
+    _: *mut c_void,
+    size: usize,
+    alignment: usize,
+    _: vk::SystemAllocationScope,
+) -> *mut c_void {
+    let alignment = alignment.max(PREFIX);
+    let layout = std::alloc::Layout::from_size_align(size + alignment, alignment).unwrap();
+    // SAFETY: the layout is not empty; the numbers fit before the block.
+    unsafe {
+        let block = std::alloc::alloc(layout).add(alignment);
+        block.cast::<usize>().sub(1).write(alignment);
+        block.cast::<usize>().sub(2).write(size);
+        OBJECTS.fetch_add(1, Ordering::AcqRel);
+        block.cast()
+    }
+}
+
+unsafe extern "system" fn free_object(_: *mut c_void, block: *mut c_void) {
+    if block.is_null() {
+        return;
+    }
+    // SAFETY: of `allocate_object`.
+    unsafe {
+        let alignment = block.cast::<usize>().sub(1).read();
+        let size = block.cast::<usize>().sub(2).read();
+        let layout = std::alloc::Layout::from_size_align(size + alignment, alignment).unwrap();
+        std::alloc::dealloc(block.cast::<u8>().sub(alignment), layout);
+    }
+    OBJECTS.fetch_sub(1, Ordering::AcqRel);
+}
+
+unsafe extern "system" fn reallocate_object(
+    user: *mut c_void,
+    block: *mut c_void,
+    size: usize,
+    alignment: usize,
+    scope: vk::SystemAllocationScope,
+) -> *mut c_void {
+    // SAFETY: of `allocate_object`, or null.
+    unsafe {
+        let new = allocate_object(user, size, alignment, scope);
+        if !block.is_null() {
+            let old = block.cast::<usize>().sub(2).read();
+            std::ptr::copy_nonoverlapping(block.cast::<u8>(), new.cast(), old.min(size));
+            free_object(user, block);
+        }
+        new
+    }
+}
+
+#[test]
+fn objects_come_from_the_hosts_callbacks_and_its_pipeline_cache_stays_its_own() {
+    let callbacks = vk::AllocationCallbacks::default()
+        .pfn_allocation(Some(allocate_object))
+        .pfn_reallocation(Some(reallocate_object))
+        .pfn_free(Some(free_object));
+    let (device, cache) = (OnceLock::new(), OnceLock::new());
+    let mut session = Session::new(|lent| {
+        lent.host_memory = &callbacks;
+        let info = vk::PipelineCacheCreateInfo::default();
+        // SAFETY: the handles are live.
+        unsafe {
+            let get = lent.get_instance_proc_addr.unwrap();
+            let get = ash::StaticFn { get_instance_proc_addr: get };
+            let instance = ash::Instance::load(&get, lent.instance);
+            let own = device.get_or_init(|| ash::Device::load(instance.fp_v1_0(), lent.device));
+            lent.pipeline_cache = own.create_pipeline_cache(&info, None).unwrap();
+        }
+        cache.set(lent.pipeline_cache).unwrap();
+    });
+    let (device, cache) = (device.get().unwrap(), *cache.get().unwrap());
+    ok(session.load());
+    ok(session.create());
+    ok(session.frame(1));
+    assert_close(&session.pixels(), &own_render(&Model::from(gaussians(2))));
+    assert!(OBJECTS.load(Ordering::Acquire) > 10);
+    // SAFETY: every frame is done; the cache is still there for the host to destroy, which validation would refute.
+    unsafe {
+        nsp_renderer_destroy(std::mem::replace(&mut session.renderer, null_mut()));
+        nsp_model_destroy(std::mem::replace(&mut session.model, null_mut()));
+        nsp_device_destroy(std::mem::replace(&mut session.device, null_mut()));
+        device.destroy_pipeline_cache(cache, None);
+    }
+    assert_eq!(OBJECTS.load(Ordering::Acquire), 0, "objects that are not destroyed");
+    session.end();
+}
