@@ -120,7 +120,7 @@ typedef struct NspHostDevice {
     VkSemaphore frames;
 } NspHostDevice;
 
-// A pinhole camera in OpenCV's axes: x right, y down, z forward.
+// A pinhole camera, in axes x right, y down, z forward.
 typedef struct NspCamera {
     // Pixels.
     uint32_t width;
@@ -166,7 +166,7 @@ typedef struct NspImageState {
     VkAccessFlags2 access;
 } NspImageState;
 
-// A layer of an image: mip level 0, one sample; usage TRANSFER_DST to be written, TRANSFER_SRC to be read.
+// A layer of an image: mip level 0, one sample; usage `TRANSFER_DST` to be written, `TRANSFER_SRC` to be read.
 typedef struct NspImage {
     // The image.
     VkImage image;
