@@ -19,8 +19,9 @@ shift
 cd "$(dirname "$0")/.."
 
 profile=${NIGHTSPLAT_PROFILE:-release}
-features=capi
-[ -d precompiled ] || features=capi,glslang
+# A checkout may hold the kernels of an earlier package.
+features=capi,glslang
+[ -e .git ] || [ ! -d precompiled ] || features=capi
 built=${CARGO_TARGET_DIR:-target}/$([ "$profile" = dev ] && echo debug || echo "$profile")
 options=(--profile "$profile" --lib --no-default-features --features "$features" "$@")
 
