@@ -11,6 +11,7 @@ mod patch;
 mod path;
 #[cfg(feature = "io")]
 mod poses;
+mod rigid;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3, Vec2Swizzles as _};
 
@@ -23,6 +24,7 @@ pub use patch::Patch;
 pub use path::CameraPath;
 #[cfg(feature = "io")]
 pub(crate) use poses::CameraPoses;
+pub(crate) use rigid::deviation_from_rigid;
 
 /// A pinhole or fisheye camera with its pose.
 #[derive(Clone, Copy, Debug, PartialEq)]

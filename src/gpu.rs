@@ -366,7 +366,7 @@ impl Drop for Shared {
         }
         // SAFETY: every object below was created here and nothing uses it any more.
         unsafe {
-            if !self.host.as_ref().is_some_and(|host| host.owns_pipeline_cache) {
+            if !self.host.as_ref().is_some_and(|host| host.lends_pipeline_cache) {
                 self.device.destroy_pipeline_cache(self.pipeline_cache, self.callbacks());
             }
             self.device.destroy_semaphore(self.timeline, self.callbacks());

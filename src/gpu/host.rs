@@ -28,7 +28,7 @@ pub(super) struct Host {
     /// Uploads for the next recording, in order.
     uploads: Mutex<Vec<Upload>>,
     /// The pipeline cache is the host's.
-    pub(super) owns_pipeline_cache: bool,
+    pub(super) lends_pipeline_cache: bool,
 }
 
 // SAFETY: the host promises that its callbacks may be called from any thread.
@@ -76,7 +76,7 @@ impl Host {
             frames_done: AtomicU64::new(0),
             last_frame: AtomicU64::new(0),
             uploads: Mutex::default(),
-            owns_pipeline_cache: lent.pipeline_cache != 0,
+            lends_pipeline_cache: lent.pipeline_cache != 0,
         }
     }
 

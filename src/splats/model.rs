@@ -3,10 +3,12 @@
 use std::borrow::Cow;
 
 #[cfg(feature = "capi")]
-use glam::{DAffine3, DMat3, DQuat};
+use glam::{DAffine3, DQuat};
 
 #[cfg(any(test, not(feature = "io")))]
 use crate::base::input;
+#[cfg(feature = "capi")]
+use crate::camera::deviation_from_rigid;
 use crate::splats::render::RenderSettings;
 #[cfg(feature = "capi")]
 use crate::splats::scene::Features;
@@ -96,7 +98,7 @@ impl Model {
         let mut at = 0;
         for (index, (part, pose)) in parts.iter().enumerate() {
             let refuse = |problem: &str| Err(Error::Usage(format!("model {index} {problem}")));
-            if !is_rigid(pose) {
+            if deviation_from_rigid(pose).is_some() {
                 return refuse("has a pose that is not rigid; take scale and reflection out");
             }
             if part.raw_colors != first.raw_colors || part.max_alpha != first.max_alpha {
@@ -153,14 +155,6 @@ impl Model {
     pub fn load(path: impl AsRef<std::path::Path>) -> Result<Self> {
         load_ply(path.as_ref())
     }
-}
-
-/// A rotation within a thousandth, and a translation.
-#[cfg(feature = "capi")]
-fn is_rigid(pose: &DAffine3) -> bool {
-    let off = pose.matrix3 * pose.matrix3.transpose() - DMat3::IDENTITY;
-    let is_rotation = off.to_cols_array().iter().all(|x| x.abs() <= 1e-3);
-    is_rotation && pose.matrix3.determinant() > 0.0 && pose.translation.is_finite()
 }
 
 /// What a build without the feature `io` reads.

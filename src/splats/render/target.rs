@@ -4,7 +4,7 @@ use std::fmt::Debug;
 
 use glam::Vec3;
 
-use crate::camera::Camera;
+use crate::camera::{Camera, deviation_from_rigid};
 use crate::gpu::{HostImage, ImageFormat};
 use crate::kernels::pixels::{
     DEPTH_16, DEPTH_24, DEPTH_FLOAT, PIXELS_DISPLAY_HALF, PIXELS_LINEAR_HALF, PIXELS_SRGB,
@@ -169,9 +169,6 @@ fn names<T: Debug>(all: &[T]) -> String {
     all.iter().map(|own| format!("{own:?}")).collect::<Vec<_>>().join(", ")
 }
 
-/// How far a rotation may be from rigid, in each entry of its product with its transpose.
-const RIGID: f64 = 1e-3;
-
 fn check_camera(index: usize, camera: &Camera) -> Result<()> {
     let Camera { width, height, focal, principal_point, view_from_world: pose, .. } = camera;
     if *width == 0 || *height == 0 {
@@ -183,9 +180,7 @@ fn check_camera(index: usize, camera: &Camera) -> Result<()> {
     if !(principal_point.is_finite() && pose.is_finite()) {
         return refused(format!("camera {index} has a number that is not finite"));
     }
-    let product = pose.matrix3 * pose.matrix3.transpose() - glam::DMat3::IDENTITY;
-    let off = product.to_cols_array().into_iter().fold(0.0, |most: f64, x| most.max(x.abs()));
-    if off > RIGID || pose.matrix3.determinant() < 0.0 {
+    if let Some(off) = deviation_from_rigid(pose) {
         return refused(format!(
             "camera {index} has a pose that is not rigid, by {off:.4}; take scale and reflection out"
         ));
