@@ -11,7 +11,7 @@ use std::io::Write;
 use anyhow::Result;
 use serde_json::{Map, Value, json};
 
-use super::{finish, table};
+use super::{driver, finish, table};
 use crate::Error;
 use crate::gpu::{CheckReport, DeviceChoice, Gpu, PassTime};
 use crate::kernels;
@@ -85,7 +85,7 @@ pub fn run(args: &BenchArgs) -> Result<()> {
             "--width and --height take 16 to 8192, --gaussians 1 to 10000000, --repeats 1 or more";
         return Err(Error::Usage(rule.to_owned()).into());
     }
-    let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
+    let gpu = driver::open(&args.device.clone().unwrap_or_default())?;
     let bench = Bench { gpu, repeats: args.repeats };
     if args.tune {
         let is_sized = args.width.is_some() || args.height.is_some();
