@@ -188,9 +188,9 @@ fn the_passes_of_a_slow_step_are_submitted_one_by_one_and_no_bit_changes() {
         let submits = submitted(&gpu) - before;
         (submits, trainer.gaussians().unwrap())
     };
-    let (few, whole) = run(Duration::MAX);
-    let (many, cut) = run(Duration::ZERO);
-    assert!(many >= few + 10 * STEPS, "{many} and {few} submissions");
+    let (at_once, whole) = run(Duration::MAX);
+    let (one_by_one, cut) = run(Duration::ZERO);
+    assert!(one_by_one >= at_once + 10 * STEPS, "{one_by_one} and {at_once} submissions");
     assert_eq!(cut, whole);
 }
 
