@@ -16,6 +16,7 @@ use serde_json::Value;
 mod common;
 mod curves_command;
 mod doctor;
+mod live;
 mod progress;
 mod refusals;
 mod stress;
@@ -454,6 +455,7 @@ fn help_fits_a_screen_and_help_all_has_every_option_in_lines_that_fit() {
         "eval",
         "render",
         "export",
+        "view",
         "tone",
         "tone list",
         "tone apply",
