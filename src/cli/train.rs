@@ -57,7 +57,8 @@ pub struct TrainArgs {
     /// Serve a live page of the run on this address [default with the option: 127.0.0.1:7007]
     ///
     /// Serve a live page of the run: the model as it trains, photographs and targets, progress; it can pause, save and
-    /// stop. On another machine, forward the port: ssh -L 7007:127.0.0.1:7007 HOST. Watching changes no bit of the model.
+    /// stop. On another machine, forward the port: ssh -L 7007:127.0.0.1:7007 HOST. Watching changes no bit of the
+    /// model.
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = live::DEFAULT_ADDRESS)]
     pub view: Option<live::Listen>,
     /// Print every setting, its value and where that comes from; do not train

@@ -103,8 +103,8 @@ impl Feed {
         (state.version > 0).then(|| state.model.clone())
     }
 
-    /// Progress and the version of the model, as JSON. Whoever asks is watching: a training in this process is asked
-    /// for a snapshot.
+    /// Progress and the version of the model, as JSON. A page that asks is being watched, so a training in this process
+    /// is asked for a snapshot.
     pub(super) fn state(&self) -> Value {
         let mut state = self.lock();
         if let Some((_, known)) = state.told.as_ref().filter(|(at, _)| at.elapsed() < STATE_EVERY) {

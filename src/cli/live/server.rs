@@ -89,7 +89,7 @@ impl Server {
             .spawn(move || {
                 runtime.block_on(async {
                     tokio::spawn(accept(listener, prefix, site));
-                    // Ends as well if the server is dropped without a word.
+                    // An error means that the sender is gone, which ends the server as well.
                     let _ = stopped.await;
                 });
                 runtime.shutdown_background();
@@ -97,7 +97,7 @@ impl Server {
             .map_err(unusable)?;
         if !address.ip().is_loopback() {
             tracing::warn!(
-                "whoever reaches {address} and has the address of the page sees the photographs, unencrypted"
+                "{address} is not encrypted: anyone who learns the address of the page can see the photographs"
             );
         }
         Ok(Self { address, token, stop: Some(stop), thread: Some(thread) })
