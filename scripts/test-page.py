@@ -5,11 +5,11 @@
 
 Trains a small synthetic set, opens the page from disk at the size of its views and at twice that, and requires 30 dB or
 more for every view. Turns the background grey by its key and black again by its control: grey must show where the
-model is empty, and not where it is opaque. Shows the other layers, and the difference to a photograph. Opens the page
-of a training under way: a new model must be shown within two seconds of its checkpoint, and the page pauses, continues and
-stops the training. Touch and keys move the camera. No console message may appear. Then opens the page in a browser
-without WebGL, which it must report. Needs
-Python and Chromium, which it controls by the DevTools protocol through a pipe; without Chromium it prints `not run`.
+model is empty, and not where it is opaque. Shows the other layers, and the difference to a photograph; touches move the
+camera. Opens the page of a training under way: a new model must be shown within two seconds of its checkpoint, and the
+page pauses, continues and stops the training. No console message may appear. Then opens the page in a browser without
+WebGL, which it must report. Needs Python and Chromium, which it controls by the DevTools protocol through a pipe;
+without Chromium it prints `not run`.
 """
 
 import base64

@@ -150,8 +150,8 @@ fn view(bookmark: &Bookmark) -> serde_json::Value {
 }
 
 /// The model as the viewer reads it: the number of Gaussians and the SH degree in 32 bits each, positions as floats,
-/// then the other attributes as half floats: opacity, log scales, rotation and coefficients, Gaussian by Gaussian. Degrees
-/// whose coefficients are all 0 are omitted.
+/// then the other attributes as half floats: opacity, log scales, rotation and coefficients, Gaussian by Gaussian.
+/// Degrees whose coefficients are all 0 are omitted.
 pub(crate) fn packed(gaussians: &Gaussians) -> Vec<u8> {
     let gaussians = &gaussians.with_sh_degree(gaussians.sh_degree_in_use());
     let sh_degree = gaussians.shape.sh_degree;
