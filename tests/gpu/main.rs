@@ -13,4 +13,5 @@ mod faults;
 mod gpu;
 mod host;
 mod images;
+mod spirv;
 mod stereo;
