@@ -27,8 +27,7 @@ nightsplat=${NIGHTSPLAT:-${CARGO_TARGET_DIR:-target}/debug/nightsplat}
 installed=$(PATH="$PATH:/usr/sbin:/sbin" ldconfig -p | sed -n '0,/libvulkan\.so\.1 /s|.*libvulkan\.so\.1 .*=> ||p')
 installed=$(dirname "$installed")
 if [ ! -e "$installed/libvulkan_radeon.so" ]; then
-    echo "not run: radv: the compilers of GPUs: there is no RADV (on Debian \`apt install mesa-vulkan-drivers\`)"
-    exit 0
+    exec scripts/not-run.sh radv 'the compilers of GPUs: there is no RADV (on Debian `apt install mesa-vulkan-drivers`)'
 fi
 cc -O1 -Wall -Wextra -shared -fPIC -o "$work/null-device.so" scripts/gpu-compilers/null-device.c -ldl
 echo "{\"file_format_version\": \"1.0.0\", \"ICD\": {\"library_path\": \"$work/null-device.so\", \"api_version\": \"1.3.0\"}}" \
@@ -60,12 +59,27 @@ run() {
         MESA_SHADER_CACHE_DISABLE=true NIGHTSPLAT_TUNE=off "${own[@]}" "$@"
 }
 
+# Compiles what the bench uses, and what else training does; the matrices of the half precision only some devices have.
+compile() {
+    run "$1" "$nightsplat" bench --unchecked --repeats 1 --gaussians 1000 || return
+    local train=(train "$work/set" --out "$work/run" --overwrite --plan none --steps 2 --sh-degree 3)
+    run "$1" "$nightsplat" "${train[@]}" --model plain --exposure on --set loss.opacity_weight=0.01 || return
+    case $1 in
+        navi31 | gfx1201) run "$1" "$nightsplat" "${train[@]}" --model lita --denoiser-precision half ;;
+    esac
+}
+
+if [ ! -e "$work/set/masks" ]; then
+    rm -rf "$work/set"
+    "$nightsplat" synth "$work/set" --views 3 --width 64 --height 48 > /dev/null
+    # Any image is a mask.
+    cp -r "$work/set/high" "$work/set/masks"
+fi
 status=0
 for architecture in "$@"; do
     statistics=$work/$architecture.jsonl
     rm -f "$statistics"
-    if ! NIGHTSPLAT_STATISTICS=$statistics run "$architecture" "$nightsplat" bench --unchecked --repeats 1 --gaussians 1000 \
-        > "$work/$architecture.log" 2>&1; then
+    if ! NIGHTSPLAT_STATISTICS=$statistics compile "$architecture" > "$work/$architecture.log" 2>&1; then
         tail -n 5 "$work/$architecture.log"
         echo "failed: $architecture: the kernels do not compile"
         status=1
