@@ -106,6 +106,24 @@ impl CheckReport {
         }
     }
 
+    /// The numbers of passes by how they compare with their references, in a line.
+    pub fn outcomes(&self) -> String {
+        let count = |is_meant: &dyn Fn(&CheckedPass) -> bool| {
+            self.passes.iter().filter(|pass| is_meant(pass)).count()
+        };
+        let failed = count(&|pass| pass.difference.is_some());
+        let identical = count(&|pass| pass.error == Some(0.0) && pass.difference.is_none());
+        let unchecked = count(&|pass| pass.error.is_none());
+        let rounded = self.passes.len() - failed - identical - unchecked;
+        let mut line = format!(
+            "passes: {identical} identical to the reference, {rounded} within its rounding, {failed} failed"
+        );
+        if unchecked > 0 {
+            line += &format!(", {unchecked} not compared");
+        }
+        line
+    }
+
     /// Each kernel once, in the order of its first pass, with its number of passes and its largest error.
     pub fn kernels(&self) -> Vec<(&'static str, usize, f64)> {
         let mut kernels: Vec<(&'static str, usize, f64)> = vec![];

@@ -11,4 +11,5 @@ mod defects;
 mod documents;
 mod install;
 mod settings;
+mod skips;
 mod words;

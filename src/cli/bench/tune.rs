@@ -3,6 +3,7 @@
 use std::io::Write;
 
 use anyhow::Result;
+use rayon::prelude::*;
 use serde_json::{Map, Value, json};
 
 use super::{Bench, finish, median, scene, stages, table, total};
@@ -139,10 +140,17 @@ impl Case {
             let is_large = tile.subgroups == 1 || pixels >= SHARED_PIXELS;
             is_large && gpu.properties().suits_tile(*tile)
         };
-        let (mut candidates, mut first) = (vec![], None);
-        for tile in SIZES.into_iter().flat_map(sharing).filter(is_tried) {
+        let tiles: Vec<_> = SIZES.into_iter().flat_map(sharing).filter(is_tried).collect();
+        // Compiling takes longer than everything else.
+        let compiled = tiles.into_par_iter().map(|tile| {
             let settings = RenderSettings { shape, tile: Some(tile), ..RenderSettings::default() };
-            let mut renderer = Renderer::new(gpu, settings)?;
+            let renderer = Renderer::new(gpu, settings)?;
+            let statistics = renderer.blend_statistics()?;
+            Ok((tile, renderer, statistics))
+        });
+        let compiled = compiled.collect::<crate::Result<Vec<_>>>()?;
+        let (mut candidates, mut first) = (vec![], None);
+        for (tile, mut renderer, statistics) in compiled {
             renderer.reserve(gaussians, [&camera])?;
             let render = renderer.render_channels(&on_device, &camera, &OPTIONS)?;
             let first = first.get_or_insert_with(|| render.clone());
@@ -153,7 +161,7 @@ impl Case {
                 forward: 0.0,
                 backward: 0.0,
                 rasteriser: 0.0,
-                statistics: renderer.blend_statistics()?,
+                statistics,
             };
             candidates.push(Candidate { renderer, measured, times: vec![] });
         }
