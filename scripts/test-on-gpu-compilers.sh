@@ -30,8 +30,8 @@ if [ ! -e "$installed/libvulkan_radeon.so" ]; then
     exec scripts/not-run.sh radv 'the compilers of GPUs: there is no RADV (on Debian `apt install mesa-vulkan-drivers`)'
 fi
 cc -O1 -Wall -Wextra -shared -fPIC -o "$work/null-device.so" scripts/gpu-compilers/null-device.c -ldl
-echo "{\"file_format_version\": \"1.0.0\", \"ICD\": {\"library_path\": \"$work/null-device.so\", \"api_version\": \"1.3.0\"}}" \
-    > "$work/null-device.json"
+printf '{"file_format_version": "1.0.0", "ICD": {"library_path": "%s", "api_version": "1.3.0"}}\n' \
+    "$work/null-device.so" > "$work/null-device.json"
 
 # run ARCHITECTURE COMMAND..: on the null device with the compiler of the architecture.
 run() {

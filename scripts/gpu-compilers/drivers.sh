@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Unpacks Mesa's Vulkan drivers of Debian 13 into target/gpu-compilers/trixie, with what they link to, and builds next to
-# them what stands in for the kernel drivers of NVIDIA's and Intel's GPUs: drm-shim, from the same version of Mesa's
-# source. Nothing is installed, and root is not needed. On Debian this takes `apt install gcc libdrm-dev pkg-config
-# python3-mako xz-utils`.
+# Unpacks Mesa's Vulkan drivers of Debian 13 into target/gpu-compilers/trixie, with what they link to, and builds next
+# to them what stands in for the kernel drivers of NVIDIA's and Intel's GPUs: drm-shim, from the same version of Mesa's
+# source. Nothing is installed, and root is not needed. On Debian this takes `apt install gcc dpkg-dev libdrm-dev
+# pkg-config python3-mako xz-utils`.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 suite=trixie
@@ -76,8 +76,8 @@ shim() {
 }
 shim nouveau src/nouveau/drm-shim/nouveau_noop.c
 intel=src/intel/dev
-shim intel src/intel/tools/intel_noop_drm_shim.c $intel/intel_{device_info,hwconfig,kmd,wa,device_info_serialize_gen}.c \
-    $intel/{i915,xe}/intel_device_info.c src/intel/common/intel_{gem,engine}.c \
+shim intel src/intel/tools/intel_noop_drm_shim.c $intel/intel_{device_info,device_info_serialize_gen}.c \
+    $intel/intel_{hwconfig,kmd,wa}.c $intel/{i915,xe}/intel_device_info.c src/intel/common/intel_{gem,engine}.c \
     src/intel/common/{i915,xe}/intel_{gem,engine}.c src/intel/common/xe/intel_device_query.c
 
 rm -rf "$root"/{apt,source}

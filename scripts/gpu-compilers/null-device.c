@@ -1,6 +1,6 @@
-// A Vulkan driver for a device that is not there: it passes to a real driver what describes the device and what compiles
-// kernels, and answers everything else itself. Memory is the host's and holds zeros, commands are dropped, and a
-// submission is done at once. So a program runs to its end while the real driver compiles all of its pipelines.
+// A Vulkan driver for a device that is not there: it passes to a real driver what describes the device and what
+// compiles kernels, and answers everything else itself. Memory is the host's and holds zeros, commands are dropped, and
+// a submission is done at once. So a program runs to its end while the real driver compiles all of its pipelines.
 //
 // NULL_DEVICE_DRIVER is the path of the real driver, which must be able to open its device: Mesa's can, by
 // RADV_FORCE_FAMILY or with a kernel interface that is preloaded.
@@ -18,7 +18,7 @@
 // ---------------------------------------------------------------------------
 // The real driver
 
-static PFN_vk_icdNegotiateLoaderICDInterfaceVersion real_negotiate;
+static VkResult (*real_negotiate)(uint32_t *version);
 static PFN_vk_icdGetInstanceProcAddr real_instance_proc;
 static PFN_vk_icdGetInstanceProcAddr real_physical_device_proc;
 static PFN_vkGetDeviceProcAddr real_device_proc;
@@ -31,7 +31,7 @@ __attribute__((constructor)) static void open_driver(void) {
         fprintf(stderr, "null-device: %s\n", path ? dlerror() : "NULL_DEVICE_DRIVER names no driver");
         exit(1);
     }
-    real_negotiate = (PFN_vk_icdNegotiateLoaderICDInterfaceVersion)dlsym(driver, "vk_icdNegotiateLoaderICDInterfaceVersion");
+    real_negotiate = (VkResult(*)(uint32_t *))dlsym(driver, "vk_icdNegotiateLoaderICDInterfaceVersion");
     real_instance_proc = (PFN_vk_icdGetInstanceProcAddr)dlsym(driver, "vk_icdGetInstanceProcAddr");
     real_physical_device_proc = (PFN_vk_icdGetInstanceProcAddr)dlsym(driver, "vk_icdGetPhysicalDeviceProcAddr");
     if (!real_negotiate || !real_instance_proc || !real_physical_device_proc) {
@@ -112,7 +112,8 @@ static VkResult allocate(VkDevice device, const VkMemoryAllocateInfo *info, cons
                          VkDeviceMemory *memory) {
     (void)device, (void)callbacks;
     // A page takes space once it is written.
-    void *pages = mmap(NULL, info->allocationSize, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
+    int flags = MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE;
+    void *pages = mmap(NULL, info->allocationSize, PROT_READ | PROT_WRITE, flags, -1, 0);
     if (pages == MAP_FAILED) return VK_ERROR_OUT_OF_DEVICE_MEMORY;
     Object *object = new_object(info->allocationSize);
     object->memory = pages;
@@ -127,8 +128,8 @@ static void free_memory(VkDevice device, VkDeviceMemory memory, const VkAllocati
     free(OBJECT(memory));
 }
 
-static VkResult map(VkDevice device, VkDeviceMemory memory, VkDeviceSize offset, VkDeviceSize size, VkMemoryMapFlags flags,
-                    void **data) {
+static VkResult map(VkDevice device, VkDeviceMemory memory, VkDeviceSize offset, VkDeviceSize size,
+                    VkMemoryMapFlags flags, void **data) {
     (void)device, (void)size, (void)flags;
     *data = (char *)OBJECT(memory)->memory + offset;
     return VK_SUCCESS;
@@ -179,8 +180,8 @@ static VkResult counter(VkDevice device, VkSemaphore semaphore, uint64_t *value)
 }
 
 // Timestamps a thousand ticks apart.
-static VkResult query_results(VkDevice device, VkQueryPool pool, uint32_t first, uint32_t count, size_t size, void *data,
-                              VkDeviceSize stride, VkQueryResultFlags flags) {
+static VkResult query_results(VkDevice device, VkQueryPool pool, uint32_t first, uint32_t count, size_t size,
+                              void *data, VkDeviceSize stride, VkQueryResultFlags flags) {
     (void)device, (void)pool, (void)flags;
     for (uint32_t i = 0; i < count && i * stride + sizeof(uint64_t) <= size; i++) {
         uint64_t ticks = 1000ull * (first + i);

@@ -6,12 +6,13 @@ const OPERATIONS_PER_TURN: u32 = 16;
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, Slices { source, target }: Slices<'_>) {
         let operations = params.turns * OPERATIONS_PER_TURN;
-        for i in 0..params.vector_count as usize {
+        let vectors = params.vector_count as usize;
+        for i in 0..vectors {
             // All exchanges but the last cancel each other.
             let lane_bits = if constants.operation == 2 { params.lane_bits as usize } else { 0 };
             let from = i ^ lane_bits;
             for component in 0..4 {
-                let mut value = source[4 * from + component];
+                let mut value = if from < vectors { source[4 * from + component] } else { 0.0 };
                 for _ in 0..if constants.operation == 1 { operations } else { 0 } {
                     value = value * params.factor + 1.0;
                 }

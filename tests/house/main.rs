@@ -7,6 +7,7 @@ mod common;
 
 mod architecture;
 mod circles;
+mod compilers;
 mod defects;
 mod documents;
 mod install;
