@@ -314,8 +314,8 @@ def main():
     nightsplat = sys.argv[1] if len(sys.argv) > 1 else nightsplat_of_this_tree()
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if program is None:
-        print("not run: the page in a browser, as there is no chromium (on Debian `apt install chromium`)")
-        return 0
+        why = "the page in a browser: there is none (on Debian `apt install chromium`)"
+        return subprocess.call([pathlib.Path(__file__).parent / "not-run.sh", "chromium", why])
     failed = 0
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         folder = pathlib.Path(folder)

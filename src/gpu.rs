@@ -78,7 +78,7 @@ pub use recorder::{Recorder, Threads};
 pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
 pub(crate) use ring::Ring;
 pub use slice::{Slice, SliceMut};
-pub use statistics::Statistic;
+pub use statistics::{Resources, Statistic};
 pub use subgroups::SUBGROUP_VARIABLE;
 pub use submission::{PassTime, Submission};
 pub use supported::PUSH_VARIABLE;

@@ -16,6 +16,7 @@ pub mod camera;
 pub mod camera_backward;
 #[cfg(feature = "testing")]
 mod camera_gradient;
+mod ceiling;
 mod ciconv_columns;
 mod ciconv_moments;
 mod ciconv_normalize;

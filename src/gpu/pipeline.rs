@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use ash::vk;
 
-use super::{Gpu, Interface, Kernel, Retired, Shared, reconvergence};
+use super::{Gpu, Interface, Kernel, Retired, Shared, reconvergence, statistics};
 use crate::Result;
 
 /// A kernel ready to be dispatched.
@@ -30,11 +30,13 @@ impl Gpu {
     /// Specialises kernel `K` with `constants`.
     ///
     /// # Errors
-    /// The driver refuses the kernel.
+    /// The driver refuses the kernel, or the file of its statistics cannot be written.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
         let objects = self.objects(K::INTERFACE, K::constants(constants))?;
-        Ok(Pipeline { constants: *constants, objects })
+        let pipeline = Pipeline { constants: *constants, objects };
+        statistics::log(&pipeline)?;
+        Ok(pipeline)
     }
 
     fn objects(

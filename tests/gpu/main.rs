@@ -7,10 +7,12 @@
 mod common;
 
 mod capi;
+mod ceiling;
 mod descriptors;
 mod embedding;
 mod faults;
 mod gpu;
 mod host;
 mod images;
+mod spirv;
 mod stereo;

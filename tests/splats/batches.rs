@@ -12,6 +12,7 @@ use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::{Gaussians, Layout, Shape, width};
 use nightsplat::train::{TrainConfig, Trainer};
 
+use crate::common::not_run;
 use crate::common::setup::{Setup, features};
 use crate::common::train::{advance, dataset};
 
@@ -141,8 +142,7 @@ fn gaussians_beyond_a_binding_are_rendered() {
     let binding = gpu.properties().max_storage_buffer_range as usize;
     let hidden = binding / (width(shape) * size_of::<f32>());
     if hidden > 1_000_000 {
-        eprintln!("not run: this device binds {binding} bytes");
-        return;
+        return not_run("lavapipe", format_args!("this device binds {binding} bytes"));
     }
     let seen = Setup::new(500, [64, 48], shape, 5);
     let own = seen.gaussians();

@@ -18,8 +18,8 @@ use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::render::{RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::Shape;
 
-use crate::common::Random;
 use crate::common::setup::{Setup, features};
+use crate::common::{Random, not_run};
 
 #[test]
 fn more_intersections_than_can_be_counted_are_an_overflow() {
@@ -108,8 +108,7 @@ fn memory_for_intersections_grows_to_the_largest_binding_and_no_further() {
     let most = renderer.max_intersections();
     // If a device binds gigabytes, allocating them makes no sense in a test.
     if most > 1 << 23 {
-        eprintln!("not run: this device binds {most} intersections at once");
-        return;
+        return not_run("lavapipe", format_args!("this device binds {most} intersections at once"));
     }
     renderer.grow(most - most / 4).unwrap();
     renderer.grow(most).unwrap();
@@ -289,8 +288,7 @@ fn slots_that_no_tile_fills_are_padding_and_do_not_change_the_sums() {
 fn a_view_has_at_most_the_tiles_that_a_subgroup_of_covering_gaussians_can_process() {
     let most = gpu().properties().max_loop_iterations;
     if most == u32::MAX {
-        eprintln!("not run: this device has no loop limit");
-        return;
+        return not_run("lavapipe", "this device has no loop limit");
     }
     let mut renderer = Renderer::new(&gpu(), Setup::new(1, [32, 32], 0, 1).settings).unwrap();
     let view = |size| Setup::new(1, size, 0, 1).camera;
