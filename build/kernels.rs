@@ -17,7 +17,7 @@ mod rust;
 pub(crate) fn compile(out_dir: &Path) {
     let mut structs = Structs::default();
     let mut text = Text::default();
-    let mut kernels = String::new();
+    let (mut kernels, mut all) = (String::new(), String::new());
     let mut names = BTreeSet::new();
     for path in kernel_paths(Path::new(crate::SHADERS)) {
         let source = fs::read_to_string(&path).expect("a listed file can be read");
@@ -29,11 +29,16 @@ pub(crate) fn compile(out_dir: &Path) {
             .expect("OUT_DIR is ours");
         let says = Text::read_with_includes(&source);
         kernel.write(&says, &mut kernels);
+        all += &kernel.entry();
         text.add_comments(says);
     }
     let names: Vec<&String> = names.iter().collect();
-    let all = format!("/// Every kernel, by name.\npub const NAMES: &[&str] = &{names:?};\n");
-    let kernels = structs.write(&text) + &glsl::include_modules() + &all + &kernels;
+    let names = format!("/// Every kernel, by name.\npub const NAMES: &[&str] = &{names:?};\n");
+    let all = format!(
+        "/// Every kernel and the bits of its default constants.
+pub const ALL: &[(&gpu::Interface, fn() -> Vec<(u32, u32)>)] = &[\n{all}];\n"
+    );
+    let kernels = structs.write(&text) + &glsl::include_modules() + &names + &all + &kernels;
     fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");
 }
 

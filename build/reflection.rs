@@ -84,9 +84,24 @@ impl Kernel {
         if kernel.subgroup_size_id.is_some() {
             kernel.workgroup_size[0] = 0;
         }
+        kernel.take_quads_apart();
         kernel.buffers.sort_by_key(|buffer| buffer.binding);
         kernel.constants.sort_by_key(|constant| constant.id);
         kernel
+    }
+
+    /// An array of `vec4` moves plain floats four at a time, and the host sees the floats; beside one, an array of
+    /// `uvec4` moves plain words. Elsewhere four words are one value.
+    fn take_quads_apart(&mut self) {
+        let floats = |buffer: &Buffer| buffer.element == "[f32; 4]";
+        if self.buffers.iter().any(floats) {
+            for buffer in &mut self.buffers {
+                let element = buffer.element.strip_prefix('[');
+                if let Some(element) = element.and_then(|element| element.strip_suffix("; 4]")) {
+                    buffer.element = element.to_owned();
+                }
+            }
+        }
     }
 
     fn add(&mut self, variable: Variable, defaults: &BTreeMap<u32, u32>, structs: &mut Structs) {
@@ -124,7 +139,7 @@ impl Kernel {
                 let Type::Array(array) = &member.ty else {
                     panic!("{kernel}: {:?} is not an array", member.name)
                 };
-                let element = structs.element_type(&array.element_ty, &kernel);
+                let element = structs.rust_type(&array.element_ty, &kernel);
                 let size = array.element_ty.min_nbyte();
                 assert_eq!(array.stride, size, "{kernel}: {element} is padded");
                 self.buffers.push(Buffer {
@@ -205,14 +220,6 @@ impl Structs {
             })
             .collect();
         Struct { name: name.to_owned(), fields, size: ty.min_nbyte().expect("a sized struct") }
-    }
-
-    /// The element of a buffer: an array of `vec4` moves plain floats four at a time, and the host sees the floats.
-    fn element_type(&mut self, ty: &Type, kernel: &str) -> String {
-        match self.rust_type(ty, kernel).as_str() {
-            "[f32; 4]" => "f32".to_owned(),
-            other => other.to_owned(),
-        }
     }
 
     fn rust_type(&mut self, ty: &Type, kernel: &str) -> String {

@@ -79,6 +79,12 @@ impl Constant {
 }
 
 impl Kernel {
+    /// Its element of the list of all kernels.
+    pub(crate) fn entry(&self) -> String {
+        let kernel = format!("<{}::Kernel as gpu::Kernel>", self.name);
+        format!("    ({kernel}::INTERFACE, || {kernel}::constants(&Default::default())),\n")
+    }
+
     pub(crate) fn write(&self, text: &Text, out: &mut String) {
         let Self { name, docs, workgroup_size, params, constants, subgroup_size_id, buffers } =
             self;

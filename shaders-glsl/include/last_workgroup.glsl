@@ -13,5 +13,7 @@ bool is_last_workgroup(uint workgroup_count) {
     bool is_last = subgroupBroadcastFirst(before) + 1 == workgroup_count;
     if (is_last && subgroupElect()) arrivals[0] = 0;
     memoryBarrierBuffer();
+    // The barrier above is the elected lane's, which saw all arrivals; this one extends what it saw to the other lanes.
+    subgroupBarrier();
     return is_last;
 }

@@ -40,6 +40,7 @@ void main() {
         uint word = status[0];
         if (!is_finite(first) || !is_finite(second)) word |= STATUS_NOT_FINITE;
         status[0] = word;
+        status[3] = word;
         statuses[slot] = word;
     }
 }

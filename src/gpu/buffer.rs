@@ -6,6 +6,7 @@ use ash::vk::Handle as _;
 use gpu_allocator::MemoryLocation;
 
 use super::allocated::DeviceMemory;
+use super::limits::whole_quads;
 use super::{Bound, Gpu, Properties, Slice, SliceMut};
 use crate::{Error, Result};
 
@@ -84,7 +85,7 @@ impl Gpu {
     pub(crate) fn uninit<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
         let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
         let Properties { name: device, max_storage_buffer_range: limit, .. } = self.properties();
-        if bytes > *limit {
+        if whole_quads(bytes) > *limit {
             let (buffer, device, limit) = (name.to_owned(), device.clone(), *limit);
             return Err(Error::BufferTooLarge { buffer, bytes, device, limit });
         }

@@ -11,6 +11,7 @@ use ash::vk::Handle as _;
 #[cfg(feature = "check")]
 use super::Tolerance;
 use super::descriptors::Sets;
+use super::limits::whole_quads;
 use super::pipeline::Objects;
 use super::{
     Binding, Bound, Buffer, HostFrame, Interface, Pipeline, Properties, Recordable, Shared,
@@ -343,11 +344,12 @@ impl<'g> Recorder<'g> {
         }
     }
 
-    /// A buffer that is bound in windows may be longer than a binding; one that is bound whole may not.
+    /// A buffer that is bound in windows may be longer than a binding; one that is bound whole may not. What is bound
+    /// is rounded up.
     fn check_sizes(&self, bindings: &[Binding], bound: &[Bound]) -> Result<()> {
         let Properties { name: device, max_storage_buffer_range: limit, .. } =
             &self.shared.properties;
-        match bindings.iter().zip(bound).find(|(_, bound)| bound.size > *limit) {
+        match bindings.iter().zip(bound).find(|(_, bound)| whole_quads(bound.size) > *limit) {
             Some((Binding { name, .. }, &Bound { size: bytes, .. })) => {
                 let (buffer, device, limit) = ((*name).to_owned(), device.clone(), *limit);
                 Err(Error::BufferTooLarge { buffer, bytes, device, limit })

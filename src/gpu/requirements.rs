@@ -2,7 +2,7 @@
 
 use ash::vk;
 
-use super::limits::{MAX_BUFFERS, SUBGROUP_SIZES};
+use super::limits::{MAX_BUFFERS, SHARED_MEMORY, SUBGROUP_SIZES};
 use super::supported::Supported;
 use crate::{Error, Result};
 
@@ -50,7 +50,7 @@ pub const REQUIREMENTS: &[Requirement] = &[
         supported: |o| o.compute_family.is_some(),
     },
     Requirement {
-        name: "maxPerStageDescriptorStorageBuffers >= 16",
+        name: "maxPerStageDescriptorStorageBuffers >= 12",
         why: "the most buffers that one pass binds",
         supported: |o| o.properties.limits.max_per_stage_descriptor_storage_buffers >= MAX_BUFFERS,
     },
@@ -103,9 +103,9 @@ pub const REQUIREMENTS: &[Requirement] = &[
         supported: |o| o.properties.limits.max_compute_work_group_invocations >= 256,
     },
     Requirement {
-        name: "maxComputeSharedMemorySize >= 24576",
+        name: "maxComputeSharedMemorySize >= 16384",
         why: "the state of a tile",
-        supported: |o| o.properties.limits.max_compute_shared_memory_size >= 24_576,
+        supported: |o| o.properties.limits.max_compute_shared_memory_size >= SHARED_MEMORY,
     },
 ];
 
@@ -153,8 +153,8 @@ mod tests {
         let mut properties =
             vk::PhysicalDeviceProperties { api_version: vk::API_VERSION_1_3, ..Default::default() };
         properties.limits.max_compute_work_group_invocations = 256;
-        properties.limits.max_compute_shared_memory_size = 24_576;
-        properties.limits.max_per_stage_descriptor_storage_buffers = 16;
+        properties.limits.max_compute_shared_memory_size = 16_384;
+        properties.limits.max_per_stage_descriptor_storage_buffers = 12;
         for (to, from) in properties.device_name.iter_mut().zip(b"Abacus 3000") {
             *to = *from as _;
         }
@@ -188,8 +188,8 @@ mod tests {
         let breaks: [Break; 13] = [
             ("Vulkan 1.3", |o| o.properties.api_version = vk::API_VERSION_1_2),
             ("compute queue", |o| o.compute_family = None),
-            ("maxPerStageDescriptorStorageBuffers >= 16", |o| {
-                o.properties.limits.max_per_stage_descriptor_storage_buffers = 15;
+            ("maxPerStageDescriptorStorageBuffers >= 12", |o| {
+                o.properties.limits.max_per_stage_descriptor_storage_buffers = 11;
             }),
             ("timelineSemaphore", |o| o.vulkan12.timeline_semaphore = vk::FALSE),
             ("scalarBlockLayout", |o| o.vulkan12.scalar_block_layout = vk::FALSE),
@@ -203,7 +203,7 @@ mod tests {
                 o.properties.limits.max_compute_work_group_invocations = 128;
             }),
             ("maxComputeSharedMemorySize", |o| {
-                o.properties.limits.max_compute_shared_memory_size = 16_384;
+                o.properties.limits.max_compute_shared_memory_size = 16_383;
             }),
         ];
         assert!(sufficient().check().is_ok());

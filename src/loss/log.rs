@@ -3,6 +3,7 @@
 use super::Term;
 use crate::gpu::{Buffer, Download, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::loss_log;
+use crate::kernels::status::STATUS_WORDS;
 use crate::{Error, Result};
 
 /// The terms of one step.
@@ -109,9 +110,9 @@ impl LogSlot<'_> {
     /// Checks that the log has the slot, before anything is recorded.
     pub(super) fn check(&self) -> Result<()> {
         let (slot, slots) = (self.slot, self.log.statuses.len());
-        if slot as usize >= slots || self.status.is_empty() {
+        if slot as usize >= slots || self.status.len() < STATUS_WORDS as usize {
             return Err(Error::Usage(format!(
-                "the loss log has no slot {slot} of {slots}, or there is no status word"
+                "the loss log has no slot {slot} of {slots}, or there are no status words"
             )));
         }
         Ok(())

@@ -72,10 +72,9 @@ fn before(
     parameters: &[f32],
     gradients: &[f32],
     [first, second]: [&[f32]; 2],
-    both: &[f32],
+    both: &[u32],
 ) -> [f32; 4] {
-    let [m, v] =
-        if constants.half_moments { from_halves(both[i].to_bits()) } else { [first[i], second[i]] };
+    let [m, v] = if constants.half_moments { from_halves(both[i]) } else { [first[i], second[i]] };
     [parameters[i], gradients[i], m, v]
 }
 
@@ -94,7 +93,7 @@ impl Reference for Kernel {
             parameters[i] = parameter;
             if constants.half_moments {
                 let (moments, chance) = moments_after(params.step, before);
-                both_moments[i] = f32::from_bits(in_halves(moments, chance));
+                both_moments[i] = in_halves(moments, chance);
             } else {
                 (first_moments[i], second_moments[i]) = (first, second);
             }

@@ -26,6 +26,7 @@ impl Reference for Kernel {
                 status[0] |= STATUS_NOT_FINITE;
             }
         }
+        status[3] = status[0];
         statuses[params.slot as usize] = status[0];
     }
 

@@ -32,6 +32,7 @@ impl Reference for Kernel {
         if !fits && !truncates {
             status[0] |= STATUS_OVERFLOWED;
         }
+        status[3] = status[0];
         status[1] = status[1].max(total);
     }
 }

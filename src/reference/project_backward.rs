@@ -221,8 +221,8 @@ impl Reference for Kernel {
             ..
         } = slices;
         let Slices { status, gradients, grad_norm_sums, visit_counts, .. } = slices;
-        // Of all Gaussians, since the device may process them in any order.
-        let before = status[0];
+        // From before the pass, since the device may process Gaussians in any order.
+        let before = status[3];
         let scene = ProjectionInputs::new(params, constants, slices.cameras);
         let parameters = scene.planes.floats(parameters, constants.half_rest);
         gradients[..scene.planes.float_count()].fill(0.0);

@@ -229,7 +229,7 @@ impl Adam {
                 gradients,
                 first_moments,
                 second_moments,
-                both_moments,
+                both_moments: both_moments.words(),
                 status: status.slice(),
             },
             Threads::Exactly([(len as u32).div_ceil(4), 1, 1]),

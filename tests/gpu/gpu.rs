@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use glam::UVec2;
 use nightsplat::Error;
-use nightsplat::gpu::testing::{gpu, gpu_that_launches, misuse, not_run};
+use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_that_launches, misuse, not_run};
 use nightsplat::gpu::{Buffer, DeviceChoice, Gpu, Pipeline, Threads, devices};
 use nightsplat::kernels::{blend_forward, relu_backward};
 use nightsplat::splats::render::{RenderSettings, Renderer};
@@ -131,6 +131,15 @@ fn a_buffer_beyond_the_limit_is_named_with_the_limit() {
         let message = error.to_string();
         assert!(message.contains("`monster`") && message.contains(&limit.to_string()), "{message}");
     }
+}
+
+/// A binding of whole quads is up to 15 bytes longer than the elements.
+#[test]
+fn a_buffer_whose_binding_exceeds_the_limit_by_its_padding_is_refused() {
+    let gpu = gpu_that_binds((1 << 20) + 8);
+    assert!(gpu.uninit::<u32>("padded", 1 << 18).is_ok());
+    let refused = gpu.uninit::<u32>("padded", (1 << 18) + 1);
+    assert!(matches!(refused, Err(Error::BufferTooLarge { .. })), "{refused:?}");
 }
 
 #[test]

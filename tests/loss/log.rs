@@ -22,7 +22,7 @@ fn loss_log_matches_its_reference() {
                 mean_scales: [1.0 / 300.0, 1.0 / 500.0].into(),
             };
             let constants = loss_log::Constants::default();
-            let (log, statuses, status) = (vec![7.0f32; 12], vec![0u32; 4], vec![1u32]);
+            let (log, statuses, status) = (vec![7.0f32; 12], vec![0u32; 4], vec![1u32, 0, 0, 0]);
             let expected = run_reference!(
                 loss_log,
                 constants,

@@ -21,7 +21,7 @@ use std::collections::BTreeMap;
 use common::{largest, widen};
 use nightsplat::Result;
 use nightsplat::gpu::{Gpu, Recorder};
-use nightsplat::kernels::status::STATUS_NOT_FINITE as NOT_FINITE;
+use nightsplat::kernels::status::{STATUS_NOT_FINITE as NOT_FINITE, STATUS_WORDS};
 use nightsplat::loss::{LogSlot, LossLog, StepLosses, Term};
 
 /// The terms of one step in the log.
@@ -36,7 +36,7 @@ fn log_step(
     record: impl FnOnce(&mut Recorder<'_>, &mut LogSlot<'_>) -> Result<()>,
 ) -> Result<Logged> {
     let mut log = LossLog::new(gpu, 3)?;
-    let mut status = gpu.zeros("status", 1)?;
+    let mut status = gpu.zeros("status", STATUS_WORDS as usize)?;
     let mut download = None;
     gpu.run("losses", |pass| {
         let mut slot = LogSlot { log: &mut log, slot: 1, status: &mut status };

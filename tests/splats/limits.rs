@@ -37,7 +37,7 @@ fn more_intersections_than_can_be_counted_are_an_overflow() {
         let constants = order_counts::Constants { partition_size: 2 };
         let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
         let (intersection_offsets, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
-        let (counts, status) = (vec![7], vec![before[0], before[1], 0]);
+        let (counts, status) = (vec![7], vec![before[0], before[1], 0, 9]);
         let (_, _, counts, after, arrivals) = run_kernel!(
             order_counts,
             constants,
@@ -47,7 +47,8 @@ fn more_intersections_than_can_be_counted_are_an_overflow() {
             [intersection_offsets, sums, counts, status, arrivals]
         );
         assert_eq!(counts[0], if flag == 0 { total } else { 0 });
-        assert_eq!(after, [before[0] | flag, before[1].max(total), 0]);
+        let flags = before[0] | flag;
+        assert_eq!(after, [flags, before[1].max(total), 0, flags]);
         assert_eq!(arrivals, [0]);
     }
 }
@@ -58,7 +59,7 @@ fn truncated(tile_counts: Vec<u32>, capacity: u32) -> (u32, Vec<u32>) {
     let gaussian_count = tile_counts.len() as u32;
     let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
     let (intersection_offsets, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
-    let (counts, status) = (vec![7], vec![0, 1, 0]);
+    let (counts, status) = (vec![7], vec![0, 1, 0, 9]);
     let (_, _, counts, status, _) = run_kernel!(
         order_counts,
         constants,
@@ -73,7 +74,7 @@ fn truncated(tile_counts: Vec<u32>, capacity: u32) -> (u32, Vec<u32>) {
 #[test]
 fn what_exceeds_the_memory_is_left_out_without_a_flag() {
     for (capacity, kept) in [(5, 5), (9, 9), (12, 9)] {
-        assert_eq!(truncated(vec![4, 3, 2], capacity), (kept, vec![0, 9, 0]));
+        assert_eq!(truncated(vec![4, 3, 2], capacity), (kept, vec![0, 9, 0, 0]));
     }
     // Where the sum wraps around, so do the offsets.
     let (kept, status) = truncated(vec![1 << 31, 1 << 31, 3], 5);
@@ -233,7 +234,7 @@ fn sums(intersection_ranges: Vec<UVec2>, gradient_records: &[Record]) -> Vec<f32
     let rendered = setup.render();
     let frame = rendered.renderer.frame();
     let (splats, colors) = (gpu().read(&frame.splats).unwrap(), gpu().read(&frame.colors).unwrap());
-    let (parameters, tile_counts, status) = (setup.parameters.clone(), vec![1; count], vec![0; 3]);
+    let (parameters, tile_counts, status) = (setup.parameters.clone(), vec![1; count], vec![0; 4]);
     let gradient_records: Vec<Vec3> = gradient_records.concat();
     let gradients = vec![f32::NAN; parameters.len()];
     let (grad_norm_sums, visit_counts) = (vec![0.0f32; count], vec![0; count]);

@@ -7,7 +7,7 @@ use nightsplat::gpu::testing::{Defect, gpu, with_defect};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::train::{NotFinite, TrainConfig, Trainer};
 
-use crate::common::setup::Setup;
+use crate::common::setup::{Rendered, Setup};
 use crate::common::train::{advance, dataset};
 
 /// The background of the render is NaN, and therefore the loss.
@@ -103,4 +103,31 @@ fn a_gradient_that_is_not_finite_raises_a_flag_and_does_not_change_the_statistic
     assert!(status.gradient_not_finite && !status.not_finite);
     assert!(gradients.parameters.iter().any(|gradient| !gradient.is_finite()));
     assert!(gradients.grad_norm_sums.iter().all(|sum| sum.is_finite()));
+}
+
+/// Else the statistics would depend on which Gaussian raised the flag, and when.
+#[test]
+fn a_gaussian_adds_to_the_statistics_whether_or_not_another_has_raised_the_flag() {
+    let count = 2000;
+    let setup = Setup::new(count, [33, 17], 0, 6);
+    let mut rendered = setup.render();
+    let mut d_render = vec![0.1; rendered.render.len()];
+    d_render[40] = f32::NAN;
+    let gradients = rendered.backward(&d_render);
+    let tile_counts = gpu().read(&rendered.renderer.frame().tile_counts).unwrap();
+    let is_finite = |i: usize| {
+        let gradient = setup.planes().load(&gradients.parameters, i);
+        gradient.mean.is_finite()
+            && gradient.quat.is_finite()
+            && gradient.log_scale.is_finite()
+            && gradient.raw_opacity.is_finite()
+            && gradient.sh.iter().all(|sh| sh.is_finite())
+    };
+    let adds = |i: usize| tile_counts[i] > 0 && is_finite(i);
+    let expected: Vec<u32> =
+        (0..count).map(|i| Rendered::VISITS_BEFORE + u32::from(adds(i))).collect();
+    let adding = (0..count).filter(|&i| adds(i)).count();
+    let seen = tile_counts[..count].iter().filter(|&&tiles| tiles > 0).count();
+    assert!(adding > 100 && adding < seen, "{adding} of {seen}");
+    assert_eq!(gradients.visit_counts, expected);
 }

@@ -28,7 +28,7 @@ layout(binding = 0)           buffer Parameters    { vec4 parameters[]; };      
 layout(binding = 1) readonly  buffer Gradients     { vec4 gradients[]; };       // planes
 layout(binding = 2)           buffer FirstMoments  { vec4 first_moments[]; };   // planes; none with half moments
 layout(binding = 3)           buffer SecondMoments { vec4 second_moments[]; };  // as many
-layout(binding = 4)           buffer BothMoments { vec4 both_moments[]; };  // their bits, with half moments
+layout(binding = 4)           buffer BothMoments   { uvec4 both_moments[]; };    // their bits, with half moments
 layout(binding = 5) readonly  buffer Status        { uint status[]; };
 
 // With the largest scale, the determinant of a projected covariance is finite at the near plane: (f / 0.2)^2 times its
@@ -55,7 +55,7 @@ void main() {
     bvec4 takes_part = lessThan(i, uvec4(end));
     vec4 gradient = clamp_gradient(gradients[quad]);
     Moments moments;
-    if (HALF_MOMENTS) moments = from_halves(floatBitsToUint(both_moments[quad]));
+    if (HALF_MOMENTS) moments = from_halves(both_moments[quad]);
     else moments = Moments(first_moments[quad], second_moments[quad]);
     moments = updated(moments, gradient);
     vec4 before = parameters[quad];
@@ -65,7 +65,8 @@ void main() {
     value = mix(value, clamp(value, LOG_SCALE_MIN, LOG_SCALE_MAX), is_log_scale);
     parameters[quad] = mix(before, value, takes_part);
     if (HALF_MOMENTS) {
-        vec4 halves = uintBitsToFloat(in_halves(moments, chance_of(before, moments, step)));
+        // As integers: a device may flush a float whose bits are those of a second moment alone.
+        uvec4 halves = in_halves(moments, chance_of(before, moments, step));
         both_moments[quad] = mix(both_moments[quad], halves, takes_part);
     } else {
         first_moments[quad] = mix(first_moments[quad], moments.first, takes_part);

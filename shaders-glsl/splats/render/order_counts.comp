@@ -67,7 +67,10 @@ void main() {
         // Where the sum wrapped around, the offsets did too.
         uint kept = truncates != 0 && !wraps ? capacity : 0;
         counts[0] = fits ? total : kept;
-        if (!fits && truncates == 0) status[0] |= STATUS_OVERFLOWED;
+        uint flags = status[0];
+        if (!fits && truncates == 0) flags |= STATUS_OVERFLOWED;
+        status[0] = flags;
+        status[3] = flags;
         status[1] = max(status[1], total);
     }
 }

@@ -183,11 +183,12 @@ void main() {
     bits = max(max(bits, largest_bits(vec3(d_quat.w, d_raw_opacity, 0.0))), largest_bits(8.0 * d_color));
     [[unroll]] for (uint k = 0; k < FEATURE_COUNT; k++)
         bits = max(bits, largest_bits(vec3(record[RECORD_HEAD + 3 + k])));
+    uint flags = status[3];
     if (bits >= 0x7f800000u) {
-        if ((status[0] & ~STATUS_GRADIENT) == 0) atomicOr(status[0], STATUS_GRADIENT);
+        if ((flags & ~STATUS_GRADIENT) == 0) atomicOr(status[0], STATUS_GRADIENT);
         return;
     }
-    if (status[0] == 0) {
+    if (flags == 0) {
         float nearness = min(1.0, camera_depth(mean_in_view, camera) / damping_depth);
         float damping = damping_weight * nearness * nearness + 1.0 - damping_weight;
         grad_norm_sums[i] += damping * length(half_view * d_mean2d);
