@@ -81,12 +81,12 @@ impl Projection {
         }
     }
 
-    /// mean2d, conic, opacity, half extent, colour, depth.
+    /// mean2d, half extent, conic, opacity, colour, depth.
     fn numbers(&self) -> [f64; 12] {
         let Splat { mean2d, conic, opacity } = self.splat;
         let ([x, y], [a, b, c]) = (mean2d.to_array(), conic.to_array());
         let ([w, h], [r, g, blue]) = (self.half_extent.to_array(), self.color.to_array());
-        [x, y, a, b, c, opacity, w, h, r, g, blue, self.depth]
+        [x, y, w, h, a, b, c, opacity, r, g, blue, self.depth]
     }
 }
 
@@ -184,12 +184,12 @@ impl<'a> ProjectionInputs<'a> {
         let own = [
             16.0 * center.x,
             16.0 * center.y,
+            extent.x,
+            extent.y,
             widest,
             widest,
             widest,
             8.0 * opacity,
-            extent.x,
-            extent.y,
             color,
             color,
             color,
@@ -204,10 +204,10 @@ impl<'a> ProjectionInputs<'a> {
         let conic = splat.conic.as_dvec3();
         let shift = errors[0].max(errors[1]) * (conic.x + conic.z).sqrt();
         let grown = [
-            errors[2] / conic.x,
-            errors[4] / conic.z,
-            errors[6] / extent.x,
-            errors[7] / extent.y,
+            errors[2] / extent.x,
+            errors[3] / extent.y,
+            errors[4] / conic.x,
+            errors[6] / conic.z,
             extent_error(splat.opacity),
         ];
         let radius = f64::from(splat_level(splat.opacity)).sqrt();
@@ -226,7 +226,6 @@ impl Reference for Kernel {
         let scene = ProjectionInputs::new(params, constants, cameras);
         let parameters = scene.planes.floats(parameters, constants.half_rest);
         let stored = stored_color(constants.channels);
-        let colors = bytemuck::cast_slice_mut::<_, f32>(colors);
         for i in 0..scene.planes.count {
             ids[i] = params.first_gaussian + i as u32;
             depth_keys[i] = CULLED;

@@ -1,6 +1,6 @@
 //! From the records of a splat to the gradients of its Gaussian, in f64.
 
-use glam::{DMat3, DVec2, DVec3, DVec4, UVec2, Vec3};
+use glam::{DMat3, DVec2, DVec3, DVec4, UVec2};
 
 use super::camera::Camera;
 use super::gaussian::{Gaussian, Planes, sigmoid};
@@ -140,8 +140,8 @@ impl<'a> ProjectionInputs<'a> {
     }
 
     /// The gradients in the `record` of Gaussian `i`; clamped colours have none.
-    fn d_splat(&self, colors: &[Vec3], record: &[f64], i: usize) -> DSplat {
-        let color = colors[stored_color(self.constants.channels) / 3 * i];
+    fn d_splat(&self, colors: &[f32], record: &[f64], i: usize) -> DSplat {
+        let color = &colors[stored_color(self.constants.channels) * i..];
         let is_free = |c: usize| self.constants.raw_colors || color[c] > 0.0;
         let passes = |c: usize| if is_free(c) { record[HEAD + c] } else { 0.0 };
         DSplat {
@@ -187,9 +187,8 @@ impl<'a> ProjectionInputs<'a> {
 pub(super) fn summed_record(
     channels: u32,
     intersection_ids: UVec2,
-    gradient_records: &[Vec3],
+    gradient_records: &[f32],
 ) -> Vec<Rounded> {
-    let gradient_records = bytemuck::cast_slice::<_, f32>(gradient_records);
     let intersection_ids = intersection_ids.x as usize..intersection_ids.y as usize;
     let sum = |k: usize| {
         let numbers = intersection_ids

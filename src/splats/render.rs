@@ -34,7 +34,7 @@ use crate::{Error, Result};
 
 pub use buffers::RenderBuffers;
 pub use buffers::Status;
-use buffers::{RANKS_PER_PARTITION, color_vectors};
+use buffers::{RANKS_PER_PARTITION, color_floats};
 #[cfg(feature = "testing")]
 pub use cameras::CameraGradient;
 pub use cameras::{Viewpoint, Viewpoints};
@@ -265,7 +265,7 @@ impl Renderer {
                 "a renderer with Purpose::Show has no gradients; make it with Purpose::Train";
             return Err(Error::Usage(problem.to_owned()));
         };
-        let color_vectors = color_vectors(self.settings.channels());
+        let color_floats = color_floats(self.settings.channels());
         let frame = &mut self.frame;
         pass.dispatch(
             blend_backward,
@@ -298,7 +298,7 @@ impl Renderer {
                 project_backward::Buffers {
                     parameters: batch.rows(parameters, layout.words())?,
                     splats: batch.rows(&frame.splats, 1)?,
-                    colors: batch.rows(&frame.colors, color_vectors)?,
+                    colors: batch.rows(&frame.colors, color_floats)?,
                     tile_counts: batch.rows(&frame.tile_counts, 1)?,
                     intersection_ranges: batch.rows(&frame.intersection_ranges, 1)?,
                     gradient_records: frame.gradient_records.slice(),
@@ -321,7 +321,7 @@ impl Renderer {
         view: &View<'_>,
         sh_degree: u32,
     ) -> Result<()> {
-        let color_vectors = color_vectors(view.channels);
+        let color_floats = color_floats(view.channels);
         let frame = &mut self.frame;
         let project = &self.projections[&(view.model, view.view_depths)].forward;
         layout.batches(&self.gpu).iter().try_for_each(|batch| {
@@ -337,7 +337,7 @@ impl Renderer {
                 project::Buffers {
                     parameters: batch.rows(parameters, layout.words())?,
                     splats: batch.rows_mut(&mut frame.splats, 1)?,
-                    colors: batch.rows_mut(&mut frame.colors, color_vectors)?,
+                    colors: batch.rows_mut(&mut frame.colors, color_floats)?,
                     depth_keys: batch.rows_mut(&mut frame.depth_keys, 1)?,
                     ids: batch.rows_mut(&mut frame.ids, 1)?,
                     tile_counts: batch.rows_mut(&mut frame.tile_counts, 1)?,

@@ -63,7 +63,7 @@ fn config() -> TrainConfig {
     config.schedule.sh_degree_interval = 7;
     config.density.gradient_threshold = 1e-6;
     // Small Gaussians, which intersect few tiles: a binding holds the intersections of all of them on each device.
-    config.start.scale = 0.2;
+    config.start.scale = 0.1;
     config
 }
 

@@ -35,11 +35,11 @@ layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in t
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // planes
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
-layout(binding = 2) readonly  buffer Colors     { vec3 colors[]; };       // (gaussian_count, COLOR_VECTORS)
+layout(binding = 2) readonly  buffer Colors     { vec4 colors[]; };       // (gaussian_count, COLOR_VECTORS)
 layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
 // first intersection, one past the last
 layout(binding = 4) readonly  buffer IntersectionRanges    { uvec2 intersection_ranges[]; };
-layout(binding = 5) readonly  buffer GradientRecords    { vec3 gradient_records[]; };      // (slots, RECORD_VECTORS)
+layout(binding = 5) readonly  buffer GradientRecords    { vec4 gradient_records[]; };      // (slots, RECORD_VECTORS)
 layout(binding = 6)           buffer Status     { uint status[]; };
 layout(binding = 7) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
 layout(binding = 8) buffer GradNormSums { float grad_norm_sums[]; };
@@ -111,7 +111,7 @@ void store_zero(uint i) {
 void main() {
     uint i = THREAD_INDEX;
     bool is_seen = i < gaussian_count && tile_counts[i] > 0;
-    vec3 sum[RECORD_VECTORS];
+    vec4 sum[RECORD_VECTORS];
     sum_gradient_records(is_seen ? intersection_ranges[i] : uvec2(0), sum);
     if (i >= gaussian_count) return;
     if (!is_seen) {
@@ -119,14 +119,14 @@ void main() {
         return;
     }
     ProjectedSplat splat = splats[i];
-    float record[3 * RECORD_VECTORS];
+    float record[4 * RECORD_VECTORS];
     [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) {
-        [[unroll]] for (uint c = 0; c < 3; c++) record[3 * k + c] = sum[k][c];
+        [[unroll]] for (uint c = 0; c < 4; c++) record[4 * k + c] = sum[k][c];
     }
     vec2 d_mean2d = vec2(record[0], record[1]);
     vec3 d_conic = vec3(record[2], record[3], record[4]);
     float d_opacity = record[5];
-    vec3 color = colors[COLOR_VECTORS * i], d_color;
+    vec3 color = colors[COLOR_VECTORS * i].rgb, d_color;
     for (uint c = 0; c < 3; c++) {
         // A colour clamped at zero passes nothing on.
         bool passes = color[c] > 0.0;
