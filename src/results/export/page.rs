@@ -186,7 +186,7 @@ mod tests {
             focal: glam::DVec2::splat(35.0),
             principal_point: glam::DVec2::new(20.0, 15.0),
             model: CameraModel::Pinhole,
-            view_from_world: glam::DAffine3::IDENTITY,
+            view_from_world: DAffine3::IDENTITY,
         };
         let evil = "</script><b>@MODEL@";
         let picture = Picture::Embedded(Image::from_fn(4, 3, |_, _| [0.5; 3]));
