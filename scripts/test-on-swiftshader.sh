@@ -11,4 +11,7 @@ if [ ! -e "$driver" ]; then
 fi
 # Older loaders know only the second name.
 export VK_DRIVER_FILES=$driver VK_ICD_FILENAMES=$driver
-exec scripts/test-with-known-failures.sh scripts/known-failures/swiftshader.txt "$@"
+status=0
+scripts/test-with-known-failures.sh scripts/known-failures/swiftshader.txt "$@" || status=1
+scripts/record-driver.sh || status=1
+exit "$status"

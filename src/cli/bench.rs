@@ -17,17 +17,19 @@ use serde_json::{Map, Value, json};
 
 use super::{finish, table};
 use crate::Error;
+use crate::ceilings::Ceiling;
 use crate::gpu::{CheckReport, DeviceChoice, Gpu, PassTime};
 use crate::kernels;
-use ceilings::{Ceiling, Ceilings};
+use ceilings::Ceilings;
 use scene::BenchScene;
 use stages::KernelTime;
 use steady::Steady;
 
 /// Check a training step against the CPU references, then time its kernels and stages.
 ///
-/// The scene is synthetic and always the same. A disagreement is an error once everything is printed. With --tune, times the rasteriser with every tile size that the device
-/// supports, and stores the fastest in the user's cache folder, where training finds it unless `NIGHTSPLAT_TUNE=off`.
+/// The scene is synthetic and always the same. A disagreement is an error once everything is printed. With --tune, times
+/// the rasteriser with every tile size that the device supports, and stores the fastest in the user's cache folder, where
+/// training finds it unless `NIGHTSPLAT_TUNE=off`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct BenchArgs {
     /// Print JSON instead of tables
@@ -145,7 +147,7 @@ impl Findings {
         let kernels = stages::time_kernels(bench, &mut trainers)?;
         let stages = stages::time(bench, &mut trainers)?;
         let ceilings = match ceiling.filter(|_| args.ceilings) {
-            Some(mut ceiling) => Some(ceiling.measure(bench)?),
+            Some(mut ceiling) => Some(Ceilings::measure(bench, &mut ceiling)?),
             None => None,
         };
         let steady = match args.steady {
@@ -173,6 +175,10 @@ impl Findings {
         let properties = bench.gpu.properties();
         let Self { stages, .. } = self;
         let errors = self.checked.kernels();
+        let of_kernels = |number: fn(&KernelTime) -> f64| {
+            let entry = |(name, time): (&&str, _)| ((*name).to_owned(), json!(number(time)));
+            self.kernels.iter().map(entry).collect::<Map<_, _>>()
+        };
         json!({
             "device": properties.name,
             "driver": properties.driver,
@@ -181,8 +187,8 @@ impl Findings {
             "disagreeing": self.disagreeing(),
             "passes": self.checked.outcomes(),
             "not_covered": self.not_covered(),
-            "kernels": self.kernels.iter().map(|(&name, time)| (name, time.milliseconds)).collect::<BTreeMap<_, _>>(),
-            "gb_per_s_at_most": self.kernels.iter().map(|(&name, time)| (name, time.speed() * 1e-9)).collect::<BTreeMap<_, _>>(),
+            "kernels": of_kernels(|time| time.milliseconds),
+            "gb_per_s_at_most": of_kernels(|time| time.speed() * 1e-9),
             "groups": stages.groups.iter().map(entry).collect::<Map<String, Value>>(),
             "step_ms": stages.step.1,
             "ceilings": self.ceilings.as_ref().map(Ceilings::as_json),

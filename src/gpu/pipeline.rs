@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use ash::vk;
 
-use super::{Gpu, Interface, Kernel, Retired, Shared, reconvergence, statistics};
+use super::{Gpu, Interface, Kernel, Retired, Shared, Statistic, reconvergence, statistics};
 use crate::Result;
 
 /// A kernel ready to be dispatched.
@@ -35,7 +35,11 @@ impl Gpu {
     pub(crate) fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
         let objects = self.objects(K::INTERFACE, K::constants(constants))?;
         let pipeline = Pipeline { constants: *constants, objects };
-        statistics::log(&pipeline)?;
+        if let Some(file) = statistics::file() {
+            let all = pipeline.statistics()?.unwrap_or_default();
+            let kernel = K::INTERFACE.name;
+            statistics::log(&file, kernel, constants, &self.shared.properties, &all)?;
+        }
         Ok(pipeline)
     }
 
@@ -70,6 +74,28 @@ impl Gpu {
                     Err(shared.error("vkCreateComputePipelines", result))
                 }
             }
+        }
+    }
+}
+
+impl<K: Kernel> Pipeline<K> {
+    /// The driver's statistics of the kernel; `None` where the driver has none. Compiles it again.
+    ///
+    /// # Errors
+    /// The driver refuses the kernel.
+    pub fn statistics(&self) -> Result<Option<Vec<Statistic>>> {
+        let shared = &self.objects.shared;
+        let Some(functions) = &shared.executables else { return Ok(None) };
+        let fail = |call| move |result| shared.error(call, result);
+        let constants = K::constants(&self.constants);
+        let flags = vk::PipelineCreateFlags::CAPTURE_STATISTICS_KHR;
+        // SAFETY: the device and the layout are live; the pipeline is used by nothing else.
+        unsafe {
+            let raw = raw_pipeline(shared, K::INTERFACE, self.objects.layout, constants, flags)
+                .map_err(fail("vkCreateComputePipelines"))?;
+            let all = statistics::read(functions, raw);
+            shared.device.destroy_pipeline(raw, shared.callbacks());
+            Ok(Some(all.map_err(fail("vkGetPipelineExecutableStatisticsKHR"))?))
         }
     }
 }
@@ -119,7 +145,7 @@ unsafe fn pipeline_layout(
 
 /// # Safety
 /// The device and the layout are live.
-pub(super) unsafe fn raw_pipeline(
+unsafe fn raw_pipeline(
     shared: &Shared,
     interface: &Interface,
     layout: vk::PipelineLayout,

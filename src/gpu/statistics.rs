@@ -1,6 +1,7 @@
 //! The driver's statistics of compiled kernels: registers, spills, memory.
 
 use std::ffi::CStr;
+use std::fmt::Debug;
 use std::fs::OpenOptions;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -9,11 +10,11 @@ use ash::{khr, vk};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::{Kernel, Pipeline, Properties, pipeline};
+use super::Properties;
 use crate::{Error, Result};
 
-/// The variable with the path of a file that takes a line of JSON for every pipeline: the kernel, its constants, and its
-/// [`Resources`].
+/// The variable with the path of a file that takes a line of JSON for every pipeline: the kernel, its constants, and
+/// its [`Resources`].
 const STATISTICS_VARIABLE: &str = "NIGHTSPLAT_STATISTICS";
 
 /// The device extension for statistics.
@@ -101,27 +102,31 @@ impl Resources {
     }
 }
 
-/// Appends a line for the pipeline to the file that the variable names.
+/// The file that the variable names, if it is set.
+pub(super) fn file() -> Option<PathBuf> {
+    std::env::var_os(STATISTICS_VARIABLE).filter(|value| !value.is_empty()).map(PathBuf::from)
+}
+
+/// Appends a line for a pipeline to the file.
 ///
 /// # Errors
-/// The driver refuses to compile it again, or the file cannot be written.
-pub(super) fn log<K: Kernel>(pipeline: &Pipeline<K>) -> Result<()> {
-    let Some(path) = std::env::var_os(STATISTICS_VARIABLE).filter(|value| !value.is_empty()) else {
-        return Ok(());
-    };
-    let path = PathBuf::from(path);
-    let statistics = pipeline.statistics()?.unwrap_or_default();
-    let properties = &pipeline.objects.shared.properties;
-    let line = line(K::INTERFACE.name, &pipeline.constants, properties, &statistics);
-    append(&path, &line).map_err(|error| {
-        Error::output(&path, format!("cannot be written ({error}); {STATISTICS_VARIABLE} names it"))
+/// The file cannot be written.
+pub(super) fn log(
+    path: &Path,
+    kernel: &str,
+    constants: &impl Debug,
+    properties: &Properties,
+    statistics: &[Statistic],
+) -> Result<()> {
+    append(path, &line(kernel, constants, properties, statistics)).map_err(|error| {
+        Error::output(path, format!("cannot be written ({error}); {STATISTICS_VARIABLE} names it"))
     })
 }
 
-/// The constants are those of [`Kernel::Constants`], by name.
+/// The constants are those of the kernel, by name.
 fn line(
     kernel: &str,
-    constants: &impl std::fmt::Debug,
+    constants: &impl Debug,
     properties: &Properties,
     statistics: &[Statistic],
 ) -> Value {
@@ -148,42 +153,27 @@ fn append(path: &Path, line: &Value) -> std::io::Result<()> {
     file.write_all(format!("{line}\n").as_bytes())
 }
 
-impl<K: Kernel> Pipeline<K> {
-    /// The driver's statistics of a kernel; empty where the driver has none. Compiles the kernel again.
-    ///
-    /// # Errors
-    /// The driver refuses the kernel.
-    pub fn statistics(&self) -> Result<Option<Vec<Statistic>>> {
-        let shared = &self.objects.shared;
-        let Some(functions) = &shared.executables else { return Ok(None) };
-        let fail = |call| move |result| shared.error(call, result);
-        // SAFETY: the device and the layout are live, the infos point at live locals, the pipeline is never used.
-        unsafe {
-            let flags = vk::PipelineCreateFlags::CAPTURE_STATISTICS_KHR;
-            let raw = pipeline::raw_pipeline(
-                shared,
-                K::INTERFACE,
-                self.objects.layout,
-                K::constants(&self.constants),
-                flags,
-            )
-            .map_err(fail("vkCreateComputePipelines"))?;
-            let info = vk::PipelineInfoKHR::default().pipeline(raw);
-            let told =
-                functions.get_pipeline_executable_properties(&info).and_then(|executables| {
-                    let mut told = vec![];
-                    for index in 0..executables.len() as u32 {
-                        let info = vk::PipelineExecutableInfoKHR::default();
-                        let info = info.pipeline(raw).executable_index(index);
-                        told.extend(functions.get_pipeline_executable_statistics(&info)?);
-                    }
-                    Ok(told)
-                });
-            shared.device.destroy_pipeline(raw, None);
-            let told = told.map_err(fail("vkGetPipelineExecutableStatisticsKHR"))?;
-            Ok(Some(told.iter().map(Statistic::from).collect()))
+/// The driver's statistics of a pipeline that was created with `CAPTURE_STATISTICS`.
+///
+/// # Safety
+/// The pipeline is live.
+pub(super) unsafe fn read(
+    functions: &khr::pipeline_executable_properties::Device,
+    raw: vk::Pipeline,
+) -> Result<Vec<Statistic>, vk::Result> {
+    let info = vk::PipelineInfoKHR::default().pipeline(raw);
+    let mut all = vec![];
+    // SAFETY: as the caller promises; the infos point at live locals.
+    unsafe {
+        let executables = functions.get_pipeline_executable_properties(&info)?;
+        for index in 0..executables.len() as u32 {
+            let info = vk::PipelineExecutableInfoKHR::default();
+            let info = info.pipeline(raw).executable_index(index);
+            let own = functions.get_pipeline_executable_statistics(&info)?;
+            all.extend(own.iter().map(Statistic::from));
         }
     }
+    Ok(all)
 }
 
 impl From<&vk::PipelineExecutableStatisticKHR<'_>> for Statistic {

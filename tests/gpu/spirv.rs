@@ -3,8 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-/// In SPIR-V 1.6, a kernel that asks for no subgroup size may be run at any that the device has; before, at the one that
-/// the device reports, on which the sizes of our workgroups rest.
+/// In SPIR-V 1.6, a kernel that asks for no subgroup size may be run at any that the device has; before, at the one
+/// that the device reports, on which the sizes of our workgroups rest.
 #[test]
 fn every_kernel_is_spirv_1_5() {
     let modules: Vec<_> = fs::read_dir(Path::new(env!("OUT_DIR")))

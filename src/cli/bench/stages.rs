@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use super::ceilings::Ceiling;
 use super::scene::{self, Trainers};
 use super::{Bench, Timing, median, total};
 use crate::Result;
 use crate::base::random::Stream;
+use crate::ceilings::Ceiling;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{ToneCurve, ToneParameters, ToneSettings};
