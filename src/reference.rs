@@ -78,6 +78,7 @@ pub mod rotation;
 pub mod rounding;
 mod scan_downsweep;
 mod scan_upsweep;
+mod self_test;
 pub mod sh;
 mod sort_downsweep;
 mod sort_spine;

@@ -42,6 +42,11 @@ impl Batches {
         Self { planes, size }
     }
 
+    /// Floats of a batch that is full.
+    pub(crate) fn window(&self) -> usize {
+        self.size * self.planes.columns
+    }
+
     /// The layout of the same Gaussians with `columns` words each instead of their floats.
     pub(crate) fn with_columns(self, columns: usize) -> Self {
         Self { planes: PlaneCounts { columns, ..self.planes }, ..self }
@@ -70,7 +75,7 @@ impl Batches {
     /// # Errors
     /// The device is out of memory.
     pub fn uninit(&self, gpu: &Gpu, name: &str) -> Result<Buffer<f32>> {
-        gpu.uninit_in_windows(name, self.planes.total())
+        gpu.uninit_in_windows(name, self.planes.total(), self.window())
     }
 
     /// A buffer of zeroed planes.

@@ -438,7 +438,11 @@ impl Densifier {
     ) -> Result<SpareBuffers> {
         let DeviceGaussians { layout, parameters, .. } = gaussians;
         let (columns, capacity) = (layout.floats().columns, capacity(count, limit));
-        let buffer = |columns| self.gpu.uninit_in_windows("planes", capacity * columns);
+        let batches = layout.batches(&self.gpu);
+        let buffer = |columns| {
+            let window = batches.with_columns(columns).window();
+            self.gpu.uninit_in_windows("planes", capacity * columns, window)
+        };
         // Parameters with halves are shorter than planes of floats, and cannot replace them.
         let (turns, words) = match layout.sh_rest {
             StorageFormat::Single => (Some(parameters), None),

@@ -107,8 +107,10 @@ impl Model {
         let new = Layout { shape: Shape { sh_degree, ..own.shape }, ..own };
         let (capacity, columns) = (own.capacity, new.floats().columns);
         // Grows one buffer after the other, keeping contents and capacity.
-        lengthen(gpu, &mut self.gaussians.parameters, capacity * new.words())?;
-        self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, capacity * columns))?;
+        let windows = [new.parameter_batches(gpu), new.batches(gpu)].map(|all| all.window());
+        lengthen(gpu, &mut self.gaussians.parameters, capacity * new.words(), windows[0])?;
+        self.planes_mut()
+            .try_for_each(|plane| lengthen(gpu, plane, capacity * columns, windows[1]))?;
         let parameters = self.gaussians.read(gpu)?;
         let batches = own.batches(gpu);
         let planes = self.planes_mut().map(|plane| batches.read(gpu, &*plane));
@@ -267,10 +269,10 @@ impl Model {
     }
 }
 
-/// Grows a buffer to `len`, keeping its contents.
-fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize) -> Result<()> {
-    if buffer.len() < len {
-        let mut longer = gpu.uninit_in_windows(buffer.name(), len)?;
+/// Grows a buffer to `len` elements in such windows, keeping its contents.
+fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize, window: usize) -> Result<()> {
+    if buffer.len() < len || !buffer.suits_windows(window) {
+        let mut longer = gpu.uninit_in_windows(buffer.name(), len.max(buffer.len()), window)?;
         gpu.write(&mut longer, &gpu.read(&*buffer)?)?;
         *buffer = longer;
     }

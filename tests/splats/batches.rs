@@ -5,7 +5,7 @@
 use glam::{DVec3, Vec3};
 
 use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::{gpu, gpu_that_binds};
+use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_that_creates};
 use nightsplat::photographs::dataset::Dataset;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
@@ -22,15 +22,30 @@ const BATCH: usize = 2176;
 
 #[test]
 fn planes_are_written_in_batches_and_read_back_whole() {
-    let gpu = gpu_that_binds(LITTLE);
+    written_and_read_back(&gpu_that_binds(LITTLE));
+}
+
+#[test]
+fn planes_beyond_the_largest_buffer_are_written_and_read_back_whole() {
+    written_and_read_back(&gpu_that_creates(LITTLE));
+}
+
+fn written_and_read_back(gpu: &Gpu) {
     let shape = Shape { sh_degree: 2, features: features(5) };
     let columns = width(shape);
     for (count, batches) in [(0, vec![0]), (3000, vec![3000]), (7000, vec![3264, 3264, 472])] {
-        let all = Layout::new(count, shape, StorageFormat::Single).batches(&gpu);
+        let all = Layout::new(count, shape, StorageFormat::Single).batches(gpu);
         assert_eq!(all.iter().map(|batch| batch.count).collect::<Vec<_>>(), batches);
         let planes: Vec<f32> = (0..count * columns).map(|i| i as f32).collect();
-        let buffer = all.upload(&gpu, "planes", &planes).unwrap();
-        assert_eq!(all.read(&gpu, &buffer).unwrap(), planes);
+        let buffer = all.upload(gpu, "planes", &planes).unwrap();
+        assert_eq!(all.read(gpu, &buffer).unwrap(), planes);
+        assert!(
+            all.zeros(gpu, "zeros")
+                .and_then(|zeros| gpu.read(&zeros))
+                .unwrap()
+                .iter()
+                .all(|x| *x == 0.0)
+        );
         for (float, value) in gpu.read(&buffer).unwrap().into_iter().enumerate() {
             assert_eq!(all.place_of(float) as f32, value);
         }
@@ -69,10 +84,19 @@ fn config() -> TrainConfig {
 
 #[test]
 fn training_in_batches_gives_the_bits_of_one_batch() {
+    trains_to_the_bits_of_one_batch(&gpu_that_binds(LITTLE));
+}
+
+#[test]
+fn training_beyond_the_largest_buffer_gives_the_bits_of_one_buffer() {
+    trains_to_the_bits_of_one_batch(&gpu_that_creates(LITTLE));
+}
+
+fn trains_to_the_bits_of_one_batch(little: &Gpu) {
     let (dataset, folder) = (views(), tempfile::tempdir().unwrap());
     let new = |gpu: &Gpu| Trainer::new(gpu, config(), &dataset).unwrap();
-    let (whole, little) = (gpu(), gpu_that_binds(LITTLE));
-    let (mut expected, mut batched) = (new(&whole), new(&little));
+    let whole = &gpu();
+    let (mut expected, mut batched) = (new(whole), new(little));
     let [whole_reports, batched_reports] =
         [&mut expected, &mut batched].map(|trainer| advance(trainer, 30));
     assert!(
@@ -94,7 +118,7 @@ fn training_in_batches_gives_the_bits_of_one_batch() {
 
     // The run resumes with larger and with smaller bindings.
     let checkpoint = folder.path().join("checkpoint.safetensors");
-    for [from, to] in [[&whole, &little], [&little, &whole]] {
+    for [from, to] in [[whole, little], [little, whole]] {
         let (mut first, mut second) = (new(from), new(to));
         advance(&mut first, 22);
         first.save_checkpoint(&checkpoint).unwrap();

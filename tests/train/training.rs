@@ -2,13 +2,15 @@
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
+use std::time::Duration;
+
 use glam::{DVec2, UVec2, Vec3};
 use nightsplat::Error;
 use nightsplat::photographs::dataset::{Dataset, Split};
 use nightsplat::results::eval::{self, ModelRenderer};
 use nightsplat::splats::densify::DensityControl;
 
-use nightsplat::gpu::testing::{gpu, recorded};
+use nightsplat::gpu::testing::{gpu, recorded, submitted};
 use nightsplat::gpu::{DeviceChoice, Gpu};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::metrics::Scores;
@@ -169,6 +171,27 @@ fn how_steps_are_submitted_changes_no_bit() {
     for (in_flight, steps) in [(2, Some(1)), (1, Some(64)), (2, Some(7)), (2, None)] {
         assert_eq!(run(in_flight, steps), one_by_one, "{in_flight} in flight, {steps:?} steps");
     }
+}
+
+/// Systems reset a device whose submission takes seconds.
+#[test]
+fn the_passes_of_a_slow_step_are_submitted_one_by_one_and_no_bit_changes() {
+    const STEPS: u64 = 20;
+    // A separate device: other tests would add to its counts.
+    let (gpu, dataset) = (Gpu::new(&DeviceChoice::Best).unwrap(), dataset());
+    let run = |slow_step: Duration| {
+        let mut trainer = Trainer::new(&gpu, config(), &dataset).unwrap();
+        trainer.set_batching(2, Some(1));
+        trainer.set_slow_step(slow_step);
+        let before = submitted(&gpu);
+        advance(&mut trainer, STEPS);
+        let submits = submitted(&gpu) - before;
+        (submits, trainer.gaussians().unwrap())
+    };
+    let (few, whole) = run(Duration::MAX);
+    let (many, cut) = run(Duration::ZERO);
+    assert!(many >= few + 10 * STEPS, "{many} and {few} submissions");
+    assert_eq!(cut, whole);
 }
 
 #[test]
