@@ -2,6 +2,7 @@
 // pages includes this file, too: it is also valid GLSL ES 3.00.
 
 const uint MAX_SH_DEGREE = 3u;
+const uint MAX_COEFFICIENTS = 16u;
 
 const float SH_C0 = 0.28209479177387814;  // 1 / (2 sqrt(pi)): the constant basis function
 const float SH_C1 = 0.4886025119029199;

@@ -27,11 +27,21 @@ layout(binding = 4)           buffer Status         { uint status[]; };
 
 bool is_finite(float x) { return (floatBitsToUint(x) & 0x7f800000u) != 0x7f800000u; }
 
+// Loads in flight.
+const uint AHEAD = 8;
+
+// A lane's part of the sum of the first `count` partial sums of a term, in order.
+#define SUM(partials, count, sum) \
+    for (uint i = gl_LocalInvocationID.x; i < count; i += AHEAD * SUBGROUP_SIZE) { \
+        float ahead[AHEAD]; \
+        [[unroll]] for (uint k = 0; k < AHEAD; k++) ahead[k] = partials[min(i + k * SUBGROUP_SIZE, count - 1)]; \
+        [[unroll]] for (uint k = 0; k < AHEAD; k++) sum += i + k * SUBGROUP_SIZE < count ? ahead[k] : 0.0; \
+    }
+
 void main() {
-    float first = 0.0;
-    for (uint i = gl_LocalInvocationID.x; i < partial_counts.x; i += SUBGROUP_SIZE) first += first_partials[i];
-    float second = 0.0;
-    for (uint i = gl_LocalInvocationID.x; i < partial_counts.y; i += SUBGROUP_SIZE) second += second_partials[i];
+    float first = 0.0, second = 0.0;
+    SUM(first_partials, partial_counts.x, first)
+    SUM(second_partials, partial_counts.y, second)
     first = subgroupAdd(first) * mean_scales.x;
     second = subgroupAdd(second) * mean_scales.y;
     if (subgroupElect()) {

@@ -71,6 +71,25 @@ pub fn gpu_that_launches(workgroups: u32) -> Gpu {
     open(|shared| shared.properties.max_workgroups = workgroups)
 }
 
+/// Another device with validation, for which kernels are chosen as for a CPU or as for a GPU.
+///
+/// # Panics
+/// As [`gpu`].
+pub fn gpu_taken_for(is_cpu: bool) -> Gpu {
+    open(|shared| shared.properties.is_cpu = is_cpu)
+}
+
+/// [`gpu_taken_for`] a GPU, with this limit on the bytes of a binding.
+///
+/// # Panics
+/// As [`gpu`].
+pub fn gpu_taken_for_one_that_binds(bytes: u64) -> Gpu {
+    open(|shared| {
+        shared.properties.is_cpu = false;
+        shared.properties.max_storage_buffer_range = bytes;
+    })
+}
+
 #[expect(clippy::panic, reason = "a test without a device must fail")]
 fn open(adapt: impl FnOnce(&mut Shared)) -> Gpu {
     super::validation::fail_at_exit();
