@@ -26,10 +26,23 @@ vec3 rest_coefficient(uint i, uint k) {
     return vec3(parameters[at], parameters[at + stride], parameters[at + 2 * stride]);
 }
 
+// From the camera to a Gaussian. `precise`, here and below: two kernels get the same gradients of the coefficients.
+vec3 offset_from_camera(vec3 mean, mat4x3 view_from_world) {
+    vec3 shift = view_from_world[3];
+    precise vec3 offset;
+    for (uint axis = 0; axis < 3; axis++) {
+        vec3 own = view_from_world[axis];
+        offset[axis] = mean[axis] + (own.x * shift.x + own.y * shift.y + own.z * shift.z);
+    }
+    return offset;
+}
+
 // The viewing direction of a Gaussian at `offset` from the camera, and the distance in `scale` times world units.
 vec3 direction_of(vec3 offset, out float scale, out float distance) {
     scale = finite_scale(length(offset));
-    offset *= scale;
-    distance = max(length(offset), 1e-12);
-    return offset / distance;
+    precise vec3 own = scale * offset;
+    precise float squared = own.x * own.x + own.y * own.y + own.z * own.z;
+    distance = max(sqrt(squared), 1e-12);
+    precise vec3 direction = own / distance;
+    return direction;
 }

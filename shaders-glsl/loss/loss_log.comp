@@ -1,12 +1,10 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
-#include "status.glsl"
 
 //! The means of two loss terms from their partial sums, into the step's slot of the log.
 //!
-//! One subgroup, in a fixed order. A term that is NaN or infinite sets a sticky flag in the status word, so that later
-//! steps of the recording change nothing. Reference: `src/reference/loss_log.rs`.
+//! One subgroup, in a fixed order. Reference: `src/reference/loss_log.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -25,32 +23,12 @@ layout(binding = 2) writeonly buffer Log            { float log[]; };       // (
 layout(binding = 3) writeonly buffer Statuses       { uint statuses[]; };   // (slots,), status[0] after the step
 layout(binding = 4)           buffer Status         { uint status[]; };
 
-bool is_finite(float x) { return (floatBitsToUint(x) & 0x7f800000u) != 0x7f800000u; }
-
-// Loads in flight.
-const uint AHEAD = 8;
-
-// A lane's part of the sum of the first `count` partial sums of a term, in order.
-#define SUM(partials, count, sum) \
-    for (uint i = gl_LocalInvocationID.x; i < count; i += AHEAD * SUBGROUP_SIZE) { \
-        float ahead[AHEAD]; \
-        [[unroll]] for (uint k = 0; k < AHEAD; k++) ahead[k] = partials[min(i + k * SUBGROUP_SIZE, count - 1)]; \
-        [[unroll]] for (uint k = 0; k < AHEAD; k++) sum += i + k * SUBGROUP_SIZE < count ? ahead[k] : 0.0; \
-    }
+#include "log_row.glsl"
 
 void main() {
-    float first = 0.0, second = 0.0;
-    SUM(first_partials, partial_counts.x, first)
-    SUM(second_partials, partial_counts.y, second)
-    first = subgroupAdd(first) * mean_scales.x;
-    second = subgroupAdd(second) * mean_scales.y;
-    if (subgroupElect()) {
-        if (partial_counts.x > 0) log[slot * term_count + terms.x] = first;
-        if (partial_counts.y > 0) log[slot * term_count + terms.y] = second;
-        uint word = status[0];
-        if (!is_finite(first) || !is_finite(second)) word |= STATUS_NOT_FINITE;
-        status[0] = word;
-        status[3] = word;
-        statuses[slot] = word;
-    }
+    vec2 sums = vec2(0.0);
+    ADD_PARTIALS(first_partials, partial_counts.x, sums.x)
+    ADD_PARTIALS(second_partials, partial_counts.y, sums.y)
+    vec2 means = vec2(subgroupAdd(sums.x), subgroupAdd(sums.y)) * mean_scales;
+    if (subgroupElect()) write_row(means, greaterThan(partial_counts, uvec2(0)));
 }

@@ -4,9 +4,11 @@
 #include "kernel.glsl"
 
 //! The gradient of (1 - w) mean|a - b| + w (1 - mean SSIM) with respect to a render a, from the derivatives that
-//! `ssim_forward` writes, and partial sums of |a - b|: the second of two passes that together are `ssim`.
+//! `ssim_forward` writes, and the means of |a - b| and SSIM into the step's slot of the log: the second of two passes that
+//! together are `ssim` and `loss_log`.
 //!
-//! A subgroup blurs the derivatives of a strip (include/ssim_strip.glsl). The first term of a step writes the gradient,
+//! A subgroup blurs the derivatives of a strip (include/ssim_strip.glsl). The last one to finish adds up the partial sums
+//! of all, in a fixed order. The first term of a step writes the gradient,
 //! the others add to it. Reference: `src/reference/ssim_backward.rs`.
 
 layout(local_size_x_id = 100) in;
@@ -21,6 +23,11 @@ layout(push_constant, scalar) uniform Params {
     uvec2 loss_end;    // one past the last
     float l1_scale;    // (1 - w) / (3hw), h x w the loss region
     float ssim_scale;  // w / (3hw)
+    float mean_scale;  // 1 / (3hw)
+    uint  strips;      // workgroups, and partial sums of each term
+    uint  slot;        // row of `log`
+    uint  term_count;  // columns of `log`
+    uvec2 terms;       // a column each
 };
 
 layout(binding = 0) readonly  buffer Render   { float render[]; };    // (3, H, W), not clamped
@@ -29,10 +36,17 @@ layout(binding = 2) readonly  buffer DMean    { float d_mean[]; };    // (3, H, 
 layout(binding = 3) readonly  buffer DSquare  { float d_square[]; };  // (3, H, W), dS/dE[aa]
 layout(binding = 4) readonly  buffer DProduct { float d_product[]; };  // (3, H, W), dS/dE[ab]
 layout(binding = 5)           buffer DRender  { float d_render[]; };  // (3, H, W)
-layout(binding = 6) writeonly buffer Partials { float partials[]; };  // one per workgroup: sum of |a - b|
+layout(binding = 6) coherent  buffer L1Partials   { float l1_partials[]; };    // one per strip: sum of |a - b|
+layout(binding = 7) readonly  buffer SsimPartials { float ssim_partials[]; };  // one per strip: sum of S
+layout(binding = 8) writeonly buffer Log      { float log[]; };       // (slots, term_count)
+layout(binding = 9) writeonly buffer Statuses { uint statuses[]; };   // (slots,), status[0] after the step
+layout(binding = 10)          buffer Status   { uint status[]; };
+layout(binding = 11) coherent buffer Arrivals { uint arrivals[]; };
 
 #include "ssim_window.glsl"
 #include "ssim_strip.glsl"
+#include "last_workgroup.glsl"
+#include "log_row.glsl"
 
 shared vec3 shared_rows[2 * ROW];
 
@@ -85,5 +99,12 @@ void main() {
         sum += abs(difference);
     }
     sum = subgroupAdd(sum);
-    if (subgroupElect()) partials[WORKGROUP_INDEX] = sum;
+    if (subgroupElect()) l1_partials[WORKGROUP_INDEX] = sum;
+
+    if (!is_last_workgroup(strips)) return;
+    vec2 sums = vec2(0.0);
+    ADD_PARTIALS(l1_partials, strips, sums.x)
+    ADD_PARTIALS(ssim_partials, strips, sums.y)
+    vec2 means = vec2(subgroupAdd(sums.x), subgroupAdd(sums.y)) * mean_scale;
+    if (subgroupElect()) write_row(means, bvec2(true));
 }

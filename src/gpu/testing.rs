@@ -9,7 +9,7 @@ use std::sync::{Arc, OnceLock};
 
 use ash::vk;
 
-use super::{DeviceChoice, Gpu, Shared};
+use super::{DeviceChoice, Gpu, Properties, Shared};
 
 static GPU: OnceLock<Gpu> = OnceLock::new();
 
@@ -63,31 +63,20 @@ pub fn gpu_that_binds(bytes: u64) -> Gpu {
     open(|shared| shared.properties.max_storage_buffer_range = bytes)
 }
 
+/// Another device with validation, with these properties instead of its own.
+///
+/// # Panics
+/// As [`gpu`].
+pub fn gpu_with(adapt: impl FnOnce(&mut Properties)) -> Gpu {
+    open(|shared| adapt(&mut shared.properties))
+}
+
 /// Another device with validation, with this limit on the workgroups of a dispatch along either dimension.
 ///
 /// # Panics
 /// As [`gpu`].
 pub fn gpu_that_launches(workgroups: u32) -> Gpu {
     open(|shared| shared.properties.max_workgroups = workgroups)
-}
-
-/// Another device with validation, for which kernels are chosen as for a CPU or as for a GPU.
-///
-/// # Panics
-/// As [`gpu`].
-pub fn gpu_taken_for(is_cpu: bool) -> Gpu {
-    open(|shared| shared.properties.is_cpu = is_cpu)
-}
-
-/// [`gpu_taken_for`] a GPU, with this limit on the bytes of a binding.
-///
-/// # Panics
-/// As [`gpu`].
-pub fn gpu_taken_for_one_that_binds(bytes: u64) -> Gpu {
-    open(|shared| {
-        shared.properties.is_cpu = false;
-        shared.properties.max_storage_buffer_range = bytes;
-    })
 }
 
 #[expect(clippy::panic, reason = "a test without a device must fail")]

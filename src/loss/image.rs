@@ -206,7 +206,10 @@ impl Loss {
             }
             Kernels::Ssim(ssim) => {
                 ssim_count = workgroups;
-                ssim.record(pass, inputs, d_render, [l1_partials, ssim_partials])?;
+                let partials = [l1_partials, ssim_partials];
+                if ssim.record(pass, inputs, d_render, partials, (self.terms, log))? {
+                    return Ok(());
+                }
             }
         }
         let scale = 1.0 / inputs.loss_region.value_count() as f32;

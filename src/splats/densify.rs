@@ -195,10 +195,8 @@ impl Densifier {
             gpu: gpu.clone(),
             settings,
             cameras: gpu.buffer("cameras", &cameras)?,
-            score: gpu.pipeline(&densify_score::Constants {
-                rest_by_column,
-                ..Default::default()
-            })?,
+            score: gpu
+                .pipeline(&densify_score::Constants { rest_by_column, ..Default::default() })?,
             decide: gpu.pipeline(&densify_decide::Constants { conserving })?,
             scatter: gpu.pipeline(&densify_scatter::Constants { conserving, rest_by_column })?,
             moments: gpu.pipeline(&densify_moments::Constants { rest_by_column })?,

@@ -5,7 +5,7 @@
 use glam::{DVec3, Vec3};
 
 use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::{gpu, gpu_taken_for, gpu_taken_for_one_that_binds, gpu_that_binds};
+use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_with};
 use nightsplat::photographs::dataset::Dataset;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
@@ -20,11 +20,16 @@ use crate::common::train::{advance, dataset};
 const LITTLE: u64 = 1 << 19;
 const BATCH: usize = 2176;
 
+/// A device that is taken for a GPU.
+fn little_gpu() -> Gpu {
+    gpu_with(|own| (own.is_cpu, own.max_storage_buffer_range) = (false, LITTLE))
+}
+
 #[test]
 fn the_planes_of_a_gpu_are_written_column_by_column_and_read_back_whole() {
     let shape = Shape { sh_degree: 2, features: features(5) };
     let (columns, before_rest) = (width(shape), width(shape) - 24);
-    let gpu = gpu_taken_for_one_that_binds(LITTLE);
+    let gpu = little_gpu();
     for count in [0, 1, 3000, 7000] {
         let all = Layout::new(count, shape, StorageFormat::Single).batches(&gpu);
         let planes: Vec<f32> = (0..count * columns).map(|i| i as f32).collect();
@@ -146,7 +151,7 @@ fn training_as_on_a_gpu_gives_the_bits_of_training_as_on_a_cpu() {
         };
         let expected = train(&gpu());
         assert!(expected.shape.sh_degree == 3 && expected.count > BATCH);
-        for gpu in [gpu_taken_for(false), gpu_taken_for_one_that_binds(LITTLE)] {
+        for gpu in [gpu_with(|own| own.is_cpu = false), little_gpu()] {
             assert!(train(&gpu) == expected, "{rest:?} {moments:?}");
         }
     }

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use nightsplat::Error;
 use nightsplat::base::random::Stream;
-use nightsplat::gpu::testing::{Defect, gpu, gpu_taken_for, is_checked, with_defect};
+use nightsplat::gpu::testing::{Defect, gpu, gpu_with, is_checked, with_defect};
 use nightsplat::gpu::{CheckReport, Gpu};
 use nightsplat::networks::NetworkVariant;
 use nightsplat::photographs::dataset::Dataset;
@@ -122,7 +122,7 @@ fn every_pass_of_a_step_agrees_with_its_reference_for_every_part_of_the_model() 
 
 #[test]
 fn every_pass_of_a_step_of_a_gpu_agrees_with_its_reference() {
-    let gpu = gpu_taken_for(false);
+    let gpu = gpu_with(|own| own.is_cpu = false);
     let plain = assert_steps_agree_on(&gpu, "plain", &config(&[]));
     for kernel in ["ssim_forward", "ssim_backward", "adam_gaussian"] {
         assert!(plain.contains(kernel), "{kernel} is not in {plain:?}");

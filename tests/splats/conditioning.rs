@@ -64,7 +64,8 @@ fn errors_of(count: usize) -> [f64; 2] {
     let splats = gpu().read(&frame.splats).unwrap();
     let splats: Vec<Splat> = splats[..count].iter().map(Splat::from).collect();
     let colors = gpu().read(&frame.colors).unwrap();
-    let colors: Vec<f32> = colors[..4 * count].chunks(4).flat_map(|four| &four[..3]).copied().collect();
+    let colors: Vec<f32> =
+        colors[..4 * count].chunks(4).flat_map(|four| &four[..3]).copied().collect();
     let colors = widen(&colors);
     // The view is one tile, so every layer has one slot.
     let intersection_ids = gpu().read(&frame.intersection_ranges).unwrap();

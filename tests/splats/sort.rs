@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
-use nightsplat::gpu::testing::{gpu, gpu_taken_for};
+use nightsplat::gpu::testing::{gpu, gpu_with};
 use nightsplat::gpu::{Buffer, Gpu, Threads};
 use nightsplat::kernels::{scan_downsweep, scan_upsweep, sort_downsweep, sort_upsweep};
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
@@ -66,7 +66,7 @@ fn assert_sorts(gpu: &Gpu, sort: &mut RadixSort, what: &str, keys: &[u32], count
 #[test]
 fn sorts_of_all_sizes_are_correct_and_stable() {
     for is_cpu in [true, false] {
-        let gpu = gpu_taken_for(is_cpu);
+        let gpu = gpu_with(|own| own.is_cpu = is_cpu);
         let mut sort = RadixSort::new(&gpu, 0).unwrap();
         for size in SIZES {
             let keys = noise(size);

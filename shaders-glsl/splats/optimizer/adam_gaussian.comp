@@ -74,7 +74,7 @@ void main() {
     // Before the mean changes.
     Camera camera = cameras[camera_index];
     vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
-    vec3 offset = mean + transpose(mat3(camera.view_from_world)) * camera.view_from_world[3];
+    vec3 offset = offset_from_camera(mean, camera.view_from_world);
     [[unroll]] for (uint plane = 0; plane < PLANE_COUNT - 1; plane++) {
         uint column = plane_column(plane, FEATURE_COUNT, 0);
         uint width = plane + 2 == PLANE_COUNT ? FEATURE_COUNT : plane_column(plane + 1, FEATURE_COUNT, 0) - column;

@@ -176,8 +176,8 @@ void main() {
     vec3 d_row0 = view_rotation * (scaled_axes * d.u0);
     vec3 d_row1 = view_rotation * (scaled_axes * d.u1);
     vec3 d_mean_in_view = camera_backward(mean_in_view, camera, d_mean2d, d_row0, d_row1);
-    vec3 center = -world_from_view * camera.view_from_world[3];
-    vec3 d_mean = world_from_view * d_mean_in_view + sh_backward(i, mean - center, d_color);
+    vec3 offset = offset_from_camera(mean, camera.view_from_world);
+    vec3 d_mean = world_from_view * d_mean_in_view + sh_backward(i, offset, d_color);
 
     STORE_VEC3(MEANS_COLUMN, i, d_mean);
     STORE_VEC4(QUATS_COLUMN, i, d_quat);

@@ -2,13 +2,15 @@
 
 use glam::UVec2;
 
+use super::super::Term;
+use super::super::log::{LogRow, LogSlot};
 use super::LossInputs;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::ssim_window::RADIUS;
 use crate::kernels::{ssim, ssim_backward, ssim_forward};
 
-/// The gradient of L1 + SSIM, and their partial sums.
+/// The gradient of L1 + SSIM, and their partial sums or, where the last kernel writes it, their row of the log.
 #[derive(Debug)]
 pub(super) struct Ssim {
     /// w, above 0.
@@ -28,6 +30,8 @@ enum Kernels {
         backward: Pipeline<ssim_backward::Kernel>,
         /// (3, H, W) each: the derivatives with respect to E\[a\], E\[aa\] and E\[ab\].
         derivatives: [Buffer<f32>; 3],
+        /// Workgroups of `backward` that are done; 0 between steps.
+        arrivals: Buffer<u32>,
     },
 }
 
@@ -98,6 +102,7 @@ impl Ssim {
                     gpu.uninit("d_square", 0)?,
                     gpu.uninit("d_product", 0)?,
                 ],
+                arrivals: gpu.zeros("ssim_arrivals", 1)?,
             },
         };
         Ok(Self { weight, lanes: gpu.properties().subgroup_size, kernels })
@@ -125,6 +130,8 @@ impl Ssim {
         }
     }
 
+    /// Returns whether both terms are in the log already.
+    ///
     /// # Errors
     /// A pass exceeds what the device can launch.
     pub(super) fn record(
@@ -133,16 +140,18 @@ impl Ssim {
         LossInputs { size, loss_region, render, target }: LossInputs<'_>,
         d_render: &mut Buffer<f32>,
         [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],
-    ) -> Result<()> {
-        let threads = Threads::Workgroups([self.workgroups(size), 1, 1]);
+        (terms, log): ([Term; 2], &mut LogSlot<'_>),
+    ) -> Result<bool> {
+        let strips = self.workgroups(size);
+        let threads = Threads::Workgroups([strips, 1, 1]);
         let mean_scale = 1.0 / f64::from(loss_region.value_count());
         let l1_scale = ((1.0 - self.weight) * mean_scale) as f32;
         let ssim_scale = (self.weight * mean_scale) as f32;
         let (UVec2 { x: width, y: height }, rows) = (size, rows(size, self.lanes));
         let (loss_begin, loss_end) = (loss_region.origin, loss_region.end());
-        let (forward, backward, [d_mean, d_square, d_product]) = match &mut self.kernels {
+        let (forward, backward, [d_mean, d_square, d_product], arrivals) = match &mut self.kernels {
             Kernels::One(kernels) => {
-                return pass.dispatch(
+                pass.dispatch(
                     &layout_of(kernels, size).1,
                     &ssim::Params { width, height, loss_begin, loss_end, l1_scale, ssim_scale },
                     ssim::Buffers {
@@ -153,9 +162,12 @@ impl Ssim {
                         ssim_partials: ssim_partials.slice_mut(),
                     },
                     threads,
-                );
+                )?;
+                return Ok(false);
             }
-            Kernels::Two { forward, backward, derivatives } => (forward, backward, derivatives),
+            Kernels::Two { forward, backward, derivatives, arrivals } => {
+                (forward, backward, derivatives, arrivals)
+            }
         };
         pass.dispatch(
             forward,
@@ -170,6 +182,7 @@ impl Ssim {
             },
             threads,
         )?;
+        let LogRow { slot, term_count, log, statuses, status } = log.row();
         pass.dispatch(
             backward,
             &ssim_backward::Params {
@@ -180,6 +193,11 @@ impl Ssim {
                 loss_end,
                 l1_scale,
                 ssim_scale,
+                mean_scale: mean_scale as f32,
+                strips,
+                slot,
+                term_count,
+                terms: terms.map(|term| term.index() as u32).into(),
             },
             ssim_backward::Buffers {
                 render: render.slice(),
@@ -188,10 +206,16 @@ impl Ssim {
                 d_square: d_square.slice(),
                 d_product: d_product.slice(),
                 d_render: d_render.slice_mut(),
-                partials: l1_partials.slice_mut(),
+                l1_partials: l1_partials.slice_mut(),
+                ssim_partials: ssim_partials.slice(),
+                log,
+                statuses,
+                status,
+                arrivals: arrivals.slice_mut(),
             },
             threads,
-        )
+        )?;
+        Ok(true)
     }
 }
 
