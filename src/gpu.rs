@@ -74,6 +74,7 @@ pub use kernel::{Binding, Bound, Interface, Kernel, Recordable};
 #[cfg(feature = "check")]
 pub use kernel::{OnHost, Reference};
 pub use lent::{HostAllocation, HostDevice, HostFrame, MemoryFunctions, QueueLock};
+pub(crate) use limits::WORKGROUP;
 pub use memory::MemoryBudget;
 pub use pci::PciAddress;
 pub use pipeline::Pipeline;
