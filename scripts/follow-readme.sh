@@ -28,13 +28,13 @@ photograph() {
 follow() {
     case $1 in
     "make test"* | podman*)
-        echo "not run: $1"
+        "$root/scripts/not-run.sh" readme "$1"
         return
         ;;
     "nightsplat pose "*)
         photograph
         if ! has colmap; then
-            echo "not run: $1 (colmap is not installed)"
+            "$root/scripts/not-run.sh" colmap "$1"
             cp -r taken photos
             return
         fi

@@ -28,6 +28,7 @@ failed=()
 for test in $tests; do
     inside "$test" || failed+=("$test")
 done
+scripts/record-driver.sh chroot "$root" env HOME=/root bash -c "cd '$PWD' && \"\$@\"" bash || failed+=(bench)
 if [ ${#failed[@]} -gt 0 ]; then
     printf 'failed on %s: %s\n' "$suite" "${failed[@]}"
     exit 1

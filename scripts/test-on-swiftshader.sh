@@ -7,9 +7,11 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 driver=${SWIFTSHADER_ICD:-/usr/lib/chromium/vk_swiftshader_icd.json}
 if [ ! -e "$driver" ]; then
-    echo "not run: the tests on SwiftShader: there is no $driver (on Debian \`apt install chromium\`)"
-    exit 0
+    exec scripts/not-run.sh chromium "SwiftShader: there is no $driver (on Debian \`apt install chromium\`)"
 fi
 # Older loaders know only the second name.
 export VK_DRIVER_FILES=$driver VK_ICD_FILENAMES=$driver
-exec scripts/test-with-known-failures.sh scripts/known-failures/swiftshader.txt "$@"
+status=0
+scripts/test-with-known-failures.sh scripts/known-failures/swiftshader.txt "$@" || status=1
+scripts/record-driver.sh || status=1
+exit "$status"

@@ -1,12 +1,15 @@
 #!/usr/bin/env python3
-"""Opens the page of `export --format html` in a headless Chromium and compares its canvas with `render`.
+"""Opens the pages of `export --format html` and `view` in a headless Chromium and compares their canvas with `render`.
 
     scripts/test-page.py [NIGHTSPLAT]      (default: target/release/nightsplat, or debug)
 
 Trains a small synthetic set, opens the page from disk at the size of its views and at twice that, and requires 30 dB or
 more for every view. Turns the background grey by its key and black again by its control: grey must show where the
-model is empty, and not where it is opaque. Then opens the page in a browser without WebGL, which it must report. Needs
-Python and Chromium, which it controls by the DevTools protocol through a pipe; without Chromium it prints `not run`.
+model is empty, and not where it is opaque. Shows the other layers, and the difference to a photograph; touches move the
+camera. Opens the page of a training under way: a new model must be shown within two seconds of its checkpoint, and the
+page pauses, continues and stops the training. No console message may appear. Then opens the page in a browser without
+WebGL, which it must report. Needs Python and Chromium, which it controls by the DevTools protocol through a pipe;
+without Chromium it prints `not run`.
 """
 
 import base64
@@ -14,9 +17,11 @@ import json
 import os
 import pathlib
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 
 ENOUGH = 30.0  # dB
@@ -48,6 +53,7 @@ GREY = """(async () => {
   const press = (key) => canvas.dispatchEvent(new KeyboardEvent('keydown', { key, bubbles: true }));
   const red = async () => {
     await new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)));
+    while (document.documentElement.dataset.settled !== 'true') await new Promise((done) => setTimeout(done, 20));
     const pixels = new Uint8Array(4 * canvas.width * canvas.height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
@@ -87,9 +93,13 @@ class Browser:
         os.close(theirs_out)
         self.received = b""
         self.last = 0
+        # What the page or the browser complains of.
+        self.complaints = []
         self.session = None
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Runtime", "Log"):
+            self.call(f"{domain}.enable")
 
     def __enter__(self):
         return self
@@ -112,6 +122,8 @@ class Browser:
                 self.received += more
             answer, self.received = self.received.split(b"\0", 1)
             answer = json.loads(answer)
+            if answer.get("method") in ("Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded"):
+                self.complaints.append(json.dumps(answer["params"])[:500])
             if answer.get("id") == self.last:
                 if "error" in answer:
                     raise RuntimeError(f"{method}: {answer['error']['message']}")
@@ -131,17 +143,30 @@ class Browser:
         # Two frames: one in which the page sees its size, one in which it has drawn.
         self.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done())))")
 
-    def open(self, page, view=0):
+    def settle(self):
+        """Waits until all of the model is drawn in its order."""
+        self.wait("document.documentElement.dataset.settled === 'true'")
+
+    def wait(self, condition):
+        """Waits for a condition of the page, and returns the seconds."""
+        begin = time.monotonic()
+        while not self.evaluate(condition):
+            if time.monotonic() > begin + PATIENCE:
+                raise RuntimeError(f"never: {condition}; {self.complaints}")
+            time.sleep(0.05)
+        return time.monotonic() - begin
+
+    def open(self, url, view=0):
         """Opens the page and returns its state: `true` or `failed`."""
         self.call("Page.navigate", url="about:blank")
-        self.call("Page.navigate", url=f"{page.as_uri()}#view={view}")
+        self.call("Page.navigate", url=f"{url}#view={view}")
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             ready = self.evaluate("document.documentElement?.dataset.ready")
             if ready:
                 return ready
             time.sleep(0.1)
-        raise RuntimeError(f"{page} did not open in {PATIENCE} s")
+        raise RuntimeError(f"{url} did not open in {PATIENCE} s; {self.complaints}")
 
     def fit_canvas(self, width, height):
         """Resizes the window so that the canvas has this size."""
@@ -151,9 +176,132 @@ class Browser:
             self.resize(*window)
             now = self.evaluate("[canvas.width, canvas.height]")
             if now == [width, height]:
+                self.settle()
                 return
             window = [window[0] + width - now[0], window[1] + height - now[1]]
         raise RuntimeError(f"the canvas is {now}, not {[width, height]}")
+
+
+class Serving:
+    """A command that serves a page."""
+
+    def __init__(self, nightsplat, *arguments):
+        command = [nightsplat, *map(str, arguments)]
+        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        for line in self.process.stderr:
+            if "http://" in line:
+                self.url = next(word for word in line.split() if word.startswith("http://"))
+                # What it writes later must not block it.
+                threading.Thread(target=self.process.stderr.read, daemon=True).start()
+                return
+        raise RuntimeError(f"{command} serves nothing")
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.wait()
+
+
+# Red, green and blue of the whole canvas.
+MEAN = """(() => {
+  const canvas = document.getElementById('canvas'), gl = canvas.getContext('webgl2');
+  const pixels = new Uint8Array(4 * canvas.width * canvas.height);
+  gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+  const mean = (k) => pixels.reduce((sum, value, at) => sum + (at % 4 === k ? value : 0), 0) / pixels.length * 4;
+  return [0, 1, 2].map(mean);
+})()"""
+
+
+# Left, top, width and height of the canvas.
+BOX = "(() => { const b = canvas.getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; })()"
+
+
+def select(browser, control, value):
+    browser.evaluate(f"""(() => {{
+      const control = document.getElementById('{control}');
+      if (control.type === 'checkbox') control.checked = {json.dumps(value)}; else control.value = {json.dumps(value)};
+      control.dispatchEvent(new Event('change'));
+    }})()""")
+    browser.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done())))")
+    browser.settle()
+
+
+def layers(browser):
+    """Every layer is another picture, pixels count their Gaussians, and the difference to a photograph is shown."""
+    seen = []
+    for layer in range(4):
+        select(browser, "layer", str(layer))
+        seen.append(browser.evaluate(MEAN))
+    box = browser.evaluate(BOX)
+    browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=box[0] + 0.6 * box[2], y=box[1] + 0.5 * box[3])
+    message = browser.evaluate("document.getElementById('message').textContent")
+    select(browser, "layer", "0")
+    select(browser, "difference", True)
+    blend = browser.evaluate("getComputedStyle(document.getElementById('picture')).mixBlendMode")
+    select(browser, "difference", False)
+    is_right = len({tuple(color) for color in seen}) == 4 and seen[2][0] == seen[2][1] == seen[2][2]
+    is_right = is_right and message.split()[0].isdigit() and int(message.split()[0]) > 0 and blend == "difference"
+    print(f"{'ok' if is_right else 'BAD':3} layers: {seen}, {message}, {blend}")
+    return is_right
+
+
+def fingers(box, *places):
+    """Touches at these shares of the width of a box."""
+    return [{"x": box[0] + x * box[2], "y": box[1] + 0.3 * box[3], "id": k} for k, x in enumerate(places)]
+
+
+def touch(browser):
+    """Two fingers that part bring the camera nearer."""
+    free = "document.getElementById('views').value === ''"
+    box = browser.evaluate(BOX)
+    browser.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+    before = browser.evaluate(MEAN)
+    browser.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=fingers(box, 0.65, 0.75))
+    browser.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=fingers(box, 0.62, 0.85))
+    browser.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=fingers(box, 0.6, 0.95))
+    browser.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+    browser.settle()
+    is_right = browser.evaluate(free) and browser.evaluate(MEAN) != before
+    print(f"{'ok' if is_right else 'BAD':3} touch moves the camera")
+    return is_right
+
+
+def live(browser, nightsplat, dataset, run):
+    """A page of a training under way, and of its files."""
+    failed = 0
+    train = ["train", dataset, "--out", run, "--steps", 100000, "--progress", "none", "--view", 0]
+    with Serving(nightsplat, *train) as serving:
+        if browser.open(serving.url) != "true":
+            raise RuntimeError(browser.evaluate("document.getElementById('message').textContent"))
+        first = browser.evaluate("Number(document.documentElement.dataset.version)")
+        browser.wait(f"Number(document.documentElement.dataset.version) > {first} + 1")
+        browser.evaluate("document.getElementById('pause').click()")
+        browser.wait("document.getElementById('progress').textContent.startsWith('paused')")
+        browser.evaluate("document.getElementById('pause').click()")
+        browser.wait("document.getElementById('progress').textContent.startsWith('training')")
+        line = browser.evaluate("document.getElementById('progress').textContent")
+        with Serving(nightsplat, "view", run, "--listen", 0) as files:
+            browser.evaluate("document.getElementById('save').click()")
+            while not (run / "model.ply").exists():
+                time.sleep(0.05)
+            browser.open(files.url)
+            shown = browser.evaluate("Number(document.documentElement.dataset.version)")
+            before = (run / "model.ply").stat().st_mtime_ns
+            os.kill(serving.process.pid, signal.SIGUSR1)
+            while (run / "model.ply").stat().st_mtime_ns == before:
+                time.sleep(0.02)
+            seconds = browser.wait(f"Number(document.documentElement.dataset.version) > {shown}")
+        browser.open(serving.url)
+        browser.evaluate("document.getElementById('stop').click()")
+        code = serving.process.wait(PATIENCE)
+        browser.wait("document.getElementById('progress').textContent.includes('has ended')")
+    is_right = seconds <= 2.0 and code == 130 and "of at most 100000" in line
+    print(f"{'ok' if is_right else 'BAD':3} live: a checkpoint is shown after {seconds:.2f} s; code {code}; {line}")
+    failed += not is_right
+    return failed
 
 
 def nightsplat_of_this_tree():
@@ -166,8 +314,8 @@ def main():
     nightsplat = sys.argv[1] if len(sys.argv) > 1 else nightsplat_of_this_tree()
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if program is None:
-        print("not run: the page in a browser, as there is no chromium (on Debian `apt install chromium`)")
-        return 0
+        why = "the page in a browser: there is none (on Debian `apt install chromium`)"
+        return subprocess.call([pathlib.Path(__file__).parent / "not-run.sh", "chromium", why])
     failed = 0
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         folder = pathlib.Path(folder)
@@ -187,7 +335,7 @@ def main():
                 run("render", folder / "run", "--split", "test", "--out", renders, "--dataset", folder / f"set-{width}")
                 pictures = sorted(renders.rglob("*.png"))
                 for view, picture in enumerate(pictures):
-                    if browser.open(page, view) != "true":
+                    if browser.open(page.as_uri(), view) != "true":
                         raise RuntimeError(browser.evaluate("document.getElementById('message').textContent"))
                     browser.fit_canvas(width, height)
                     png = "data:image/png;base64," + base64.b64encode(picture.read_bytes()).decode()
@@ -202,8 +350,16 @@ def main():
             is_grey = is_grey and seen["opaque"] > 0 and seen["changed"] == 0
             print(f"{'ok' if is_grey else 'BAD':3} before grey: {seen}")
             failed += not is_grey
+            browser.open(page.as_uri())
+            failed += not layers(browser)
+            failed += not touch(browser)
+            failed += bool(browser.complaints)
+            for size in SIZES:
+                browser.fit_canvas(*size)
+            print(f"{'BAD' if browser.complaints else 'ok':3} console: {browser.complaints or 'nothing'}")
+            failed += live(browser, nightsplat, trained, folder / "live")
         with Browser(program, NO_GL, folder / "profile-without") as browser:
-            ready = browser.open(page)
+            ready = browser.open(page.as_uri())
             message = browser.evaluate("document.getElementById('message').textContent")
             is_said = ready == "failed" and "no WebGL 2" in message
             print(f"{'ok' if is_said else 'BAD':3} without WebGL: {message}")

@@ -24,6 +24,7 @@ pub mod eval;
 pub mod export;
 mod help;
 mod hints;
+pub mod live;
 pub mod man;
 pub mod pose;
 pub mod progress;
@@ -34,6 +35,7 @@ pub mod synth;
 mod table;
 pub mod tone;
 pub mod train;
+pub mod view;
 mod words;
 
 pub use hints::hint;
@@ -58,10 +60,12 @@ const EXAMPLES: &str = "Start with:
   nightsplat eval run --save-images                 score it where there are references
   nightsplat render run --split all --out pictures  see the model from every camera
   nightsplat export run --format html                   a page with the splat to fly through
+  nightsplat view run                               the same while it trains, in a browser
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
   nightsplat sweep photos --out s --table presets   what time and memory buy
 
 For developers:
+  bench        time every kernel, and find the fastest tiles
   check        hold every pass of a training step to its CPU reference, on this device
   synth        write a small dark set with known references
   completions  print what a shell completes
@@ -79,12 +83,14 @@ enum Command {
     Eval(eval::EvalArgs),
     Render(render::RenderArgs),
     Export(export::ExportArgs),
+    View(view::ViewArgs),
     Tone(tone::ToneArgs),
     Sweep(Box<sweep::SweepArgs>),
     #[command(hide = true)]
     Synth(synth::SynthArgs),
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
+    #[command(hide = true)]
     Bench(bench::BenchArgs),
     #[command(hide = true)]
     Check(Box<check::CheckArgs>),
@@ -121,6 +127,7 @@ impl Cli {
             Command::Eval(args) => eval::run(&args),
             Command::Render(args) => render::run(&args),
             Command::Export(args) => export::run(&args),
+            Command::View(args) => view::run(&args),
             Command::Tone(args) => tone::run(&args),
             Command::Sweep(args) => sweep::run(&args),
             Command::Synth(args) => synth::run(args),

@@ -74,6 +74,7 @@ pub use kernel::{Binding, Bound, Interface, Kernel, Recordable};
 #[cfg(feature = "check")]
 pub use kernel::{OnHost, Reference};
 pub use lent::{HostAllocation, HostDevice, HostFrame, MemoryFunctions, QueueLock};
+pub(crate) use limits::WORKGROUP;
 pub use memory::MemoryBudget;
 pub use pci::PciAddress;
 pub use pipeline::Pipeline;
@@ -81,7 +82,7 @@ pub use recorder::{Recorder, Threads};
 pub use requirements::{REQUIREMENTS, Requirement, required_device_features};
 pub(crate) use ring::Ring;
 pub use slice::{Slice, SliceMut};
-pub use statistics::Statistic;
+pub use statistics::{Resources, Statistic};
 pub use subgroups::SUBGROUP_VARIABLE;
 pub use submission::{PassTime, Submission};
 pub use supported::PUSH_VARIABLE;

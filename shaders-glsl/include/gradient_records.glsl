@@ -4,7 +4,7 @@
 //
 // The lanes share the slots of a Gaussian that has many: each sums every SUBGROUP_SIZE-th, then a tree sums the lanes.
 // The fixed order gives the same bits every time.
-void sum_gradient_records(uvec2 intersection_ids, out vec3 sum[RECORD_VECTORS]) {
+void sum_gradient_records(uvec2 intersection_ids, out vec4 sum[RECORD_VECTORS]) {
     uint lane = gl_SubgroupInvocationID;
     bool is_shared = intersection_ids.y - intersection_ids.x > SHARED_INTERSECTIONS;
     uvec4 sharing = subgroupBallot(is_shared);
@@ -14,14 +14,14 @@ void sum_gradient_records(uvec2 intersection_ids, out vec3 sum[RECORD_VECTORS]) 
     uvec2 walked = is_shared ? uvec2(0) : intersection_ids;
     uint owner = lane, stride = 1;
     while (true) {
-        vec3 part[RECORD_VECTORS];
-        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) part[k] = vec3(0.0);
+        vec4 part[RECORD_VECTORS];
+        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) part[k] = vec4(0.0);
         for (uint slot = walked.x; slot < walked.y; slot += stride) {
             [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) part[k] += gradient_records[RECORD_VECTORS * slot + k];
         }
         bool is_alone = stride == 1;
         [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) {
-            vec3 of_all = subgroup_sum(part[k]);
+            vec4 of_all = subgroup_sum(part[k]);
             if (owner == lane) sum[k] = is_alone ? part[k] : of_all;
         }
         if (all(equal(sharing, uvec4(0)))) break;

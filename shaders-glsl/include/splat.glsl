@@ -17,19 +17,20 @@ layout(constant_id = 2) const uint CHANNELS = 3;
 // Values of a gradient record before its channels: mean2d 2, conic 3, opacity 1.
 const uint RECORD_HEAD = 6;
 const uint RECORD = RECORD_HEAD + CHANNELS;
-// The vectors of three floats of a record: loading or storing three floats costs hardly more than one.
-const uint RECORD_VECTORS = (RECORD + 2) / 3;
-// The vectors of three floats of a splat's values.
-const uint COLOR_VECTORS = (CHANNELS + 2) / 3;
+// The vectors of four floats of a record and of a splat's values, filled up with zeros: a device loads sixteen bytes at
+// once.
+const uint RECORD_VECTORS = (RECORD + 3) / 4;
+const uint COLOR_VECTORS = (CHANNELS + 3) / 4;
 // In pixels; a subgroup owns at most 32 rows of lanes.
 layout(constant_id = 3) const uint TILE_WIDTH = 16;
 layout(constant_id = 4) const uint TILE_HEIGHT = 16;
 
+// In memory, each half has sixteen bytes.
 struct ProjectedSplat {
     vec2  mean2d;       // pixels
+    vec2  half_extent;  // pixels: the box around the ellipse alpha = 1/255, slightly enlarged
     vec3  conic;        // upper triangle (xx, xy, yy) of the inverse cov2d, 1 / pixels^2
     float opacity;      // after the sigmoid
-    vec2  half_extent;  // pixels: the box around the ellipse alpha = 1/255, slightly enlarged
 };
 
 // Exponent of the Gaussian at an offset from its mean, sign reversed: alpha = opacity exp(-sigma).

@@ -11,7 +11,7 @@ float subgroup_sum(float x) {
 
 vec2 subgroup_sum(vec2 x) { return vec2(subgroup_sum(x.x), subgroup_sum(x.y)); }
 
-vec3 subgroup_sum(vec3 x) { return vec3(subgroup_sum(x.x), subgroup_sum(x.y), subgroup_sum(x.z)); }
+vec4 subgroup_sum(vec4 x) { return vec4(subgroup_sum(x.xy), subgroup_sum(x.zw)); }
 
 // The sum of `x` over this lane and those before it.
 uint subgroup_inclusive_sum(uint x) {

@@ -1,26 +1,35 @@
 //! `nightsplat bench`: checks a training step against the CPU references, then times its kernels and stages; or finds
 //! the fastest tiles.
 
+mod ceilings;
 pub mod scene;
 mod stages;
+mod steady;
 mod tune;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write;
+use std::path::PathBuf;
+use std::time::Duration;
 
 use anyhow::Result;
 use serde_json::{Map, Value, json};
 
 use super::{driver, finish, table};
 use crate::Error;
+use crate::ceilings::Ceiling;
 use crate::gpu::{CheckReport, DeviceChoice, Gpu, PassTime};
 use crate::kernels;
+use ceilings::Ceilings;
 use scene::BenchScene;
+use stages::KernelTime;
+use steady::Steady;
 
 /// Check a training step against the CPU references, then time its kernels and stages.
 ///
-/// The scene is synthetic and always the same. With --tune, times the rasteriser with every tile size that the device
-/// supports, and stores the fastest in the user's cache folder, where training finds it unless `NIGHTSPLAT_TUNE=off`.
+/// The scene is synthetic and always the same. A disagreement is an error once everything is printed. With --tune, times
+/// the rasteriser with every tile size that the device supports, and stores the fastest in the user's cache folder, where
+/// training finds it unless `NIGHTSPLAT_TUNE=off`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct BenchArgs {
     /// Print JSON instead of tables
@@ -47,6 +56,18 @@ pub struct BenchArgs {
     /// Timed repetitions, after one for warm-up; the median is reported
     #[arg(long, default_value_t = 5, value_name = "N")]
     pub repeats: usize,
+    /// Also time this number of steps as training submits them
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pub steady: u64,
+    /// Also measure what the device can do at most, and print each kernel's share of the memory's speed
+    #[arg(long)]
+    pub ceilings: bool,
+    /// Compute for this time first, so that the clocks of an idle device rise
+    #[arg(long, default_value_t = 0.0, value_name = "SECONDS")]
+    pub warm: f64,
+    /// Write the scene's Gaussians as PLY, for other programs
+    #[arg(long, value_name = "FILE")]
+    pub ply: Option<PathBuf>,
 }
 
 const SIZE: [u32; 2] = [512, 384];
@@ -65,9 +86,10 @@ struct Bench {
 /// The results.
 struct Findings {
     checked: CheckReport,
-    /// Milliseconds per kernel of a step.
-    kernels: BTreeMap<&'static str, f64>,
+    kernels: BTreeMap<&'static str, KernelTime>,
     stages: stages::Stages,
+    ceilings: Option<Ceilings>,
+    steady: Option<Steady>,
 }
 
 /// Checks, times and prints.
@@ -79,10 +101,11 @@ pub fn run(args: &BenchArgs) -> Result<()> {
     let sizes_hold = (16..=8192).contains(&width)
         && (16..=8192).contains(&height)
         && (1..=10_000_000).contains(&args.gaussians)
-        && args.repeats > 0;
+        && args.repeats > 0
+        && (0.0..=60.0).contains(&args.warm);
     if !sizes_hold {
-        let rule =
-            "--width and --height take 16 to 8192, --gaussians 1 to 10000000, --repeats 1 or more";
+        let rule = "--width and --height take 16 to 8192, --gaussians 1 to 10000000, --repeats 1 or more, \
+                    --warm at most 60";
         return Err(Error::Usage(rule.to_owned()).into());
     }
     let gpu = driver::open(&args.device.clone().unwrap_or_default())?;
@@ -93,15 +116,10 @@ pub fn run(args: &BenchArgs) -> Result<()> {
         return tune::run(&bench, sizes, args.gaussians, args.json);
     }
     let scene = BenchScene::new(width, height, args.gaussians);
-    let mut trainers = scene::trainers(&bench.gpu, &scene)?;
-    let checked = match args.unchecked {
-        true => CheckReport::default(),
-        false => stages::check(&bench, &mut trainers)?,
-    };
-    checked.agree()?;
-    let kernels = stages::time_kernels(&bench, &mut trainers)?;
-    let stages = stages::time(&bench, &mut trainers)?;
-    let findings = Findings { checked, kernels, stages };
+    if let Some(path) = &args.ply {
+        scene.gaussians.save(path)?;
+    }
+    let findings = Findings::gather(&bench, &scene, args)?;
     let mut out = std::io::stdout().lock();
     if args.json {
         writeln!(out, "{:#}", findings.as_json(&bench))?;
@@ -109,10 +127,42 @@ pub fn run(args: &BenchArgs) -> Result<()> {
         write!(out, "{}", findings.as_text(&bench, &scene))?;
         finish("", "nightsplat bench --tune")?;
     }
-    Ok(())
+    Ok(findings.checked.agree()?)
 }
 
 impl Findings {
+    fn gather(bench: &Bench, scene: &BenchScene, args: &BenchArgs) -> crate::Result<Self> {
+        let mut trainers = scene::trainers(&bench.gpu, scene)?;
+        let checked = match args.unchecked {
+            true => CheckReport::default(),
+            false => stages::check(bench, &mut trainers)?,
+        };
+        let mut ceiling = match args.ceilings || args.warm > 0.0 {
+            true => Some(Ceiling::large(&bench.gpu)?),
+            false => None,
+        };
+        if let Some(ceiling) = &mut ceiling {
+            ceiling.warm(&bench.gpu, Duration::from_secs_f64(args.warm))?;
+        }
+        let kernels = stages::time_kernels(bench, &mut trainers)?;
+        let stages = stages::time(bench, &mut trainers)?;
+        let ceilings = match ceiling.filter(|_| args.ceilings) {
+            Some(mut ceiling) => Some(Ceilings::measure(bench, &mut ceiling)?),
+            None => None,
+        };
+        let steady = match args.steady {
+            0 => None,
+            steps => Some(steady::time(bench, &mut trainers.plain, steps)?),
+        };
+        Ok(Self { checked, kernels, stages, ceilings, steady })
+    }
+
+    /// The kernels of which a pass disagrees with its reference.
+    fn disagreeing(&self) -> BTreeSet<&'static str> {
+        let passes = self.checked.passes.iter();
+        passes.filter(|pass| pass.difference.is_some()).map(|pass| pass.kernel).collect()
+    }
+
     /// The kernels that no checked pass ran.
     fn not_covered(&self) -> Vec<&'static str> {
         let covered = self.checked.kernels();
@@ -125,15 +175,24 @@ impl Findings {
         let properties = bench.gpu.properties();
         let Self { stages, .. } = self;
         let errors = self.checked.kernels();
+        let of_kernels = |number: fn(&KernelTime) -> f64| {
+            let entry = |(name, time): (&&str, _)| ((*name).to_owned(), json!(number(time)));
+            self.kernels.iter().map(entry).collect::<Map<_, _>>()
+        };
         json!({
             "device": properties.name,
             "driver": properties.driver,
             "intersections": stages.intersections,
             "errors": errors.into_iter().map(|(name, _, error)| (name.to_owned(), json!(error))).collect::<Map<_, _>>(),
+            "disagreeing": self.disagreeing(),
+            "passes": self.checked.outcomes(),
             "not_covered": self.not_covered(),
-            "kernels": self.kernels,
+            "kernels": of_kernels(|time| time.milliseconds),
+            "gb_per_s_at_most": of_kernels(|time| time.speed() * 1e-9),
             "groups": stages.groups.iter().map(entry).collect::<Map<String, Value>>(),
             "step_ms": stages.step.1,
+            "ceilings": self.ceilings.as_ref().map(Ceilings::as_json),
+            "steady": self.steady.as_ref().map(Steady::as_json),
         })
     }
 
@@ -150,7 +209,7 @@ impl Findings {
             bench.repeats
         );
         let header = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect::<Vec<_>>();
-        let mut rows = vec![header(&["kernel", "largest error / bound", "ms"])];
+        let mut rows = vec![header(&["kernel", "largest error / bound", "ms", "GB/s at most"])];
         let or_dash = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
         let checked = self.checked.kernels();
         let errors: BTreeMap<_, _> =
@@ -160,8 +219,10 @@ impl Findings {
         let names = checked.iter().map(|&(name, ..)| name).chain(unchecked);
         rows.extend(names.map(|name| {
             let error = errors.get(name).map(|error| format!("{error:.3}"));
-            let milliseconds = self.kernels.get(name).map(|ms| format!("{ms:.2}"));
-            vec![name.to_owned(), or_dash(error), or_dash(milliseconds)]
+            let time = self.kernels.get(name);
+            let milliseconds = time.map(|time| format!("{:.3}", time.milliseconds));
+            let speed = time.map(|time| self.speed(time));
+            vec![name.to_owned(), or_dash(error), or_dash(milliseconds), or_dash(speed)]
         }));
         let kernel_table = table::aligned(&rows);
         let mut rows = vec![header(&["stage", "ms"])];
@@ -174,7 +235,21 @@ impl Findings {
         );
         let not_covered = self.not_covered().join(", ");
         let stage_table = table::aligned(&rows);
-        format!("{head}\n\n{kernel_table}not covered: {not_covered}\n\n{stage_table}")
+        let outcomes = self.checked.outcomes();
+        let more = [self.ceilings.map(|own| own.as_text()), self.steady.map(|own| own.as_text())];
+        let more: String = more.into_iter().flatten().map(|line| line + "\n").collect();
+        format!(
+            "{head}\n\n{kernel_table}{outcomes}\nnot covered: {not_covered}\n\n{stage_table}{more}"
+        )
+    }
+
+    /// The bytes that a kernel's passes bind, per second, and their share of what the device can move.
+    fn speed(&self, time: &KernelTime) -> String {
+        let speed = format!("{:.1}", time.speed() * 1e-9);
+        match self.ceilings {
+            Some(own) => format!("{speed} ({:.0} %)", 100.0 * time.speed() / own.bytes),
+            None => speed,
+        }
     }
 }
 

@@ -6,17 +6,16 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::ValueEnum;
-use glam::{DAffine3, DVec3};
+use glam::DVec3;
 
 use super::{driver, finish, word};
 use crate::base::output::{check_writable, is_same_file, write_whole};
-use crate::camera::Camera;
 use crate::camera::frame::relative_to;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::photographs::tone::ToneCurve;
-use crate::results::export::page::{Bookmark, Page};
+use crate::results::export::page::{Bookmark, Page, Picture, moved};
 use crate::results::export::{Format, Provenance, spz};
 use crate::results::finished_run::{FinishedRun, config_of_file, is_model, needs_photographs};
 use crate::results::models;
@@ -258,6 +257,7 @@ fn page(
     };
     let near = provenance.facts.near.or(config.facts(&frame).near);
     let near = near.unwrap_or_else(|| RenderSettings::default().near).into();
+    let gaussians = Some(gaussians);
     Ok(Page { title, gaussians, provenance, bookmarks, near, up }.html()?)
 }
 
@@ -303,8 +303,9 @@ fn bookmarks(
         let photograph = view.loaded()?.map(|own| ("photograph".to_owned(), own.into_owned()));
         let pictures = [photograph, lit, rendered(view)?];
         // A mirrored photograph is of a mirrored world, which the page shows as it is.
-        let turned =
-            |(label, image): (String, Image)| (label, image.turned(view.orientation.turn()));
+        let turned = |(label, image): (String, Image)| {
+            (label, Picture::Embedded(image.turned(view.orientation.turn())))
+        };
         Ok(Bookmark {
             name: view.name.clone(),
             camera: moved(&view.upright_camera(), origin),
@@ -312,11 +313,4 @@ fn bookmarks(
         })
     };
     (0..count).map(bookmark).collect()
-}
-
-/// The same camera in a world whose origin is moved to `origin`.
-fn moved(camera: &Camera, origin: DVec3) -> Camera {
-    let DAffine3 { matrix3, translation } = camera.view_from_world;
-    let view_from_world = DAffine3 { matrix3, translation: translation + matrix3 * origin };
-    Camera { view_from_world, ..*camera }
 }

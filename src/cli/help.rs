@@ -8,7 +8,7 @@ use crate::train::{TrainConfig, values};
 
 /// The options of a command that `-h` shows; of a command that is not listed it shows all.
 const COMMON: [(&str, &str); 8] = [
-    ("train", "out resume overwrite preset steps curve downscale max-vram device explain"),
+    ("train", "out resume overwrite preset steps curve downscale max-vram device view explain"),
     ("sweep", "out curves presets seeds grid table steps downscale jobs dry-run"),
     ("check", "json steps curve parts downscale device"),
     ("pose", "out matcher fps camera-model colmap overwrite device"),
@@ -36,7 +36,7 @@ const GROUPS: [(&str, &str); 6] = [
         "Time, memory and checkpoints",
         "steps max-minutes checkpoint-every checkpoint-minutes device max-vram max-ram cache",
     ),
-    ("Logs and checks", "progress eval-every tensorboard hash-every check-every check-stops"),
+    ("Logs and checks", "progress view eval-every tensorboard hash-every check-every check-stops"),
 ];
 
 /// Whether a list of names contains a name.

@@ -10,7 +10,7 @@ use anyhow::Result;
 pub(crate) use self::options::TrainOptions;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
-use super::{driver, finish, signals, word};
+use super::{driver, finish, live, signals, view, word};
 use crate::base::output::{check_writable, printable};
 use crate::camera::frame;
 use crate::gpu::DeviceChoice;
@@ -54,6 +54,13 @@ pub struct TrainArgs {
     /// Progress output [default: a bar on a terminal, else plain]
     #[arg(long, value_enum, value_name = "FORM")]
     pub progress: Option<ProgressForm>,
+    /// Serve a live page of the run on this address [default with the option: 127.0.0.1:7007]
+    ///
+    /// Serve a live page of the run: the model as it trains, photographs and targets, progress; it can pause, save and
+    /// stop. On another machine, forward the port: ssh -L 7007:127.0.0.1:7007 HOST. Watching changes no bit of the
+    /// model.
+    #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = live::DEFAULT_ADDRESS)]
+    pub view: Option<live::Listen>,
     /// Print every setting, its value and where that comes from; do not train
     #[arg(long)]
     pub explain: bool,
@@ -115,15 +122,17 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let if_exists =
         if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
     let mut progress = Reporter::new(form).with_facts(serde_json::json!(facts));
-    let session = Session {
-        plan: plan.as_ref(),
-        settings: Some(&settings),
-        if_exists,
-        requests: signals::requests()?,
-    };
+    let requests = signals::requests()?;
+    let page =
+        args.view.map(|listen| view::of_training(listen, &args.out, &config, &gpu, &requests));
+    let page = page.transpose()?;
+    let session = Session { plan: plan.as_ref(), settings: Some(&settings), if_exists, requests };
     let RunSummary { trainer, ended, scored, spent, .. } =
         run::train_in(&gpu, &config, &dataset, &args.out, &session, |event| {
             progress.observe(event);
+            if let Some((site, _)) = &page {
+                site.feed.observe(event);
+            }
         })?;
     if !is_text {
         return Ok(());

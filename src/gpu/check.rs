@@ -106,6 +106,24 @@ impl CheckReport {
         }
     }
 
+    /// The numbers of passes by how they compare with their references, in a line.
+    pub fn outcomes(&self) -> String {
+        let count = |is_meant: &dyn Fn(&CheckedPass) -> bool| {
+            self.passes.iter().filter(|pass| is_meant(pass)).count()
+        };
+        let failed = count(&|pass| pass.difference.is_some());
+        let identical = count(&|pass| pass.error == Some(0.0) && pass.difference.is_none());
+        let unchecked = count(&|pass| pass.error.is_none());
+        let rounded = self.passes.len() - failed - identical - unchecked;
+        let mut line = format!(
+            "passes: {identical} identical to the reference, {rounded} within its rounding, {failed} failed"
+        );
+        if unchecked > 0 {
+            line += &format!(", {unchecked} not compared");
+        }
+        line
+    }
+
     /// Each kernel once, in the order of its first pass, with its number of passes and its largest error.
     pub fn kernels(&self) -> Vec<(&'static str, usize, f64)> {
         let mut kernels: Vec<(&'static str, usize, f64)> = vec![];
@@ -229,7 +247,34 @@ impl Comparison {
 
 #[cfg(test)]
 mod tests {
-    use super::{Comparison, Tolerance, Versions};
+    use super::{CheckReport, CheckedPass, Comparison, Difference, Tolerance, Versions};
+
+    #[test]
+    fn a_line_counts_the_passes_by_how_they_compare() {
+        let pass = |error: Option<f64>| CheckedPass {
+            recording: String::new(),
+            kernel: "kernel",
+            error,
+            difference: error.filter(|&error| error > 1.0).map(|_| Difference {
+                pass: 0,
+                kernel: "kernel",
+                buffer: "buffer",
+                index: 0,
+                device: 0.0,
+                reference: 1.0,
+                bound: 0.5,
+                count: 1,
+            }),
+        };
+        let of = |errors: &[Option<f64>]| {
+            CheckReport { passes: errors.iter().copied().map(pass).collect() }.outcomes()
+        };
+        let sound = "passes: 2 identical to the reference, 1 within its rounding, 0 failed";
+        assert_eq!(of(&[Some(0.0), Some(0.5), Some(0.0)]), sound);
+        let unsound =
+            "passes: 0 identical to the reference, 1 within its rounding, 1 failed, 1 not compared";
+        assert_eq!(of(&[Some(1.0), Some(2.0), None]), unsound);
+    }
 
     fn compare(device: &[f32], reference: &[f32], tolerance: &Tolerance) -> Comparison {
         let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();

@@ -5,7 +5,9 @@ use std::sync::Arc;
 
 use ash::vk;
 
-use super::{Gpu, Interface, Kernel, Properties, Retired, Shared, reconvergence, spirv};
+use super::{
+    Gpu, Interface, Kernel, Properties, Retired, Shared, Statistic, reconvergence, spirv, statistics,
+};
 use crate::{Error, Result};
 
 /// A kernel ready to be dispatched.
@@ -30,11 +32,17 @@ impl Gpu {
     /// Specialises kernel `K` with `constants`.
     ///
     /// # Errors
-    /// The driver refuses the kernel.
+    /// The driver refuses the kernel, or the file of its statistics cannot be written.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
         let objects = self.objects(K::INTERFACE, K::constants(constants))?;
-        Ok(Pipeline { constants: *constants, objects })
+        let pipeline = Pipeline { constants: *constants, objects };
+        if let Some(file) = statistics::file() {
+            let all = pipeline.statistics()?.unwrap_or_default();
+            let kernel = K::INTERFACE.name;
+            statistics::log(&file, kernel, constants, &self.shared.properties, &all)?;
+        }
+        Ok(pipeline)
     }
 
     /// Compiles a kernel, which the pipeline cache then has.
@@ -83,6 +91,28 @@ impl Gpu {
                     Err(refused(shared, &name, result))
                 }
             }
+        }
+    }
+}
+
+impl<K: Kernel> Pipeline<K> {
+    /// The driver's statistics of the kernel; `None` where the driver has none. Compiles it again.
+    ///
+    /// # Errors
+    /// The driver refuses the kernel.
+    pub fn statistics(&self) -> Result<Option<Vec<Statistic>>> {
+        let shared = &self.objects.shared;
+        let Some(functions) = &shared.executables else { return Ok(None) };
+        let fail = |call| move |result| shared.error(call, result);
+        let constants = K::constants(&self.constants);
+        let flags = vk::PipelineCreateFlags::CAPTURE_STATISTICS_KHR;
+        // SAFETY: the device and the layout are live; the pipeline is used by nothing else.
+        unsafe {
+            let raw = raw_pipeline(shared, K::INTERFACE, self.objects.layout, constants, flags)
+                .map_err(fail("vkCreateComputePipelines"))?;
+            let all = statistics::read(functions, raw);
+            shared.device.destroy_pipeline(raw, shared.callbacks());
+            Ok(Some(all.map_err(fail("vkGetPipelineExecutableStatisticsKHR"))?))
         }
     }
 }
@@ -157,7 +187,7 @@ unsafe fn pipeline_layout(
 
 /// # Safety
 /// The device and the layout are live.
-pub(super) unsafe fn raw_pipeline(
+unsafe fn raw_pipeline(
     shared: &Shared,
     interface: &Interface,
     layout: vk::PipelineLayout,

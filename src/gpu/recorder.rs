@@ -44,7 +44,8 @@ pub struct Recorder<'g> {
     /// The timeline value that signals the end of this recording.
     pub(super) value: u64,
     queries: Option<vk::QueryPool>,
-    pub(super) labels: Vec<&'static str>,
+    /// Each pass with the bytes of the buffers that it binds.
+    pub(super) labels: Vec<(&'static str, u64)>,
     /// Buffers accessed since the last barrier; true if written.
     pending: HashMap<vk::Buffer, bool>,
     /// The stages outside this recording that read our buffers, before it or after it.
@@ -239,7 +240,7 @@ impl<'g> Recorder<'g> {
             // SAFETY: recording; a retired buffer outlives this submission.
             unsafe { self.shared.device.cmd_dispatch(self.commands, x, y, z) };
         }
-        self.end_label(name);
+        self.end_label(name, bound.iter().map(|bound| bound.size).sum());
         Ok(())
     }
 
@@ -398,13 +399,13 @@ impl<'g> Recorder<'g> {
         }
     }
 
-    fn end_label(&mut self, name: &'static str) {
+    fn end_label(&mut self, name: &'static str, bytes: u64) {
         if let Some(debug) = &self.shared.labels {
             // SAFETY: recording; every label that is ended was begun.
             unsafe { debug.cmd_end_debug_utils_label(self.commands) };
         }
         self.shared.recorded.dispatches.fetch_add(1, Ordering::Relaxed);
-        self.labels.push(name);
+        self.labels.push((name, bytes));
         self.timestamp();
     }
 

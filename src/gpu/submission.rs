@@ -27,6 +27,8 @@ pub struct PassTime {
     pub name: &'static str,
     /// Milliseconds on the device.
     pub milliseconds: f64,
+    /// Bytes of the buffers that it binds: what it moves if it reads or writes each element once.
+    pub bytes: u64,
 }
 
 impl Submission {
@@ -143,7 +145,11 @@ impl Gpu {
         times
     }
 
-    fn pass_times(&self, queries: vk::QueryPool, labels: &[&'static str]) -> Result<Vec<PassTime>> {
+    fn pass_times(
+        &self,
+        queries: vk::QueryPool,
+        labels: &[(&'static str, u64)],
+    ) -> Result<Vec<PassTime>> {
         let mut ticks = vec![0u64; (labels.len() + 1).min(MAX_TIMESTAMPS as usize)];
         let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
         // SAFETY: as many timestamps were written.
@@ -155,7 +161,9 @@ impl Gpu {
         let milliseconds =
             |pair: &[u64]| (pair[1].wrapping_sub(pair[0]) & counting) as f64 * period;
         let times = labels.iter().zip(ticks.windows(2));
-        Ok(times.map(|(&name, pair)| PassTime { name, milliseconds: milliseconds(pair) }).collect())
+        let time =
+            |(&(name, bytes), pair)| PassTime { name, milliseconds: milliseconds(pair), bytes };
+        Ok(times.map(time).collect())
     }
 
     fn record_and_submit(
@@ -163,7 +171,7 @@ impl Gpu {
         label: &str,
         queries: Option<vk::QueryPool>,
         record: Record<'_>,
-    ) -> Result<(Submission, Vec<&'static str>)> {
+    ) -> Result<(Submission, Vec<(&'static str, u64)>)> {
         let shared = &self.shared;
         let recording = shared.begin_recording(label)?;
         let fail = |call| move |result| shared.error(call, result);
@@ -193,7 +201,7 @@ impl Gpu {
         label: &str,
         queries: Option<vk::QueryPool>,
         record: Record<'_>,
-    ) -> Result<(u64, Vec<&'static str>)> {
+    ) -> Result<(u64, Vec<(&'static str, u64)>)> {
         let shared = &self.shared;
         #[cfg(feature = "check")]
         if queries.is_none() && shared.checks.are_on() {

@@ -1,6 +1,9 @@
 //! The validated device that all tests of a process share, and injected faults.
 
 use std::cell::Cell;
+use std::fmt::Display;
+use std::io::Write;
+use std::panic::Location;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, OnceLock};
 
@@ -9,6 +12,31 @@ use ash::vk;
 use super::{DeviceChoice, Gpu, Interface, Properties, Shared};
 
 static GPU: OnceLock<Gpu> = OnceLock::new();
+
+/// The variable with what tests must not go without, separated by commas: lavapipe, validation, colmap, ffmpeg, ...
+const REQUIRE_VARIABLE: &str = "NIGHTSPLAT_REQUIRE";
+
+/// Prints that a test, or the rest of it, is not run for lack of `need`, and why.
+///
+/// The harness captures the output of `println!` and `eprintln!` in a passing test, but not that of the handle of
+/// standard error: this line is shown by every `cargo test`.
+///
+/// # Panics
+/// `NIGHTSPLAT_REQUIRE` names `need`.
+#[track_caller]
+#[allow(clippy::explicit_write, reason = "`eprintln!` is what the harness swallows")]
+pub fn not_run(need: &str, why: impl Display) {
+    let (thread, place) = (std::thread::current(), Location::caller());
+    let test = thread.name().unwrap_or("a test");
+    // A closed standard error is no reason to fail.
+    let _ = writeln!(std::io::stderr(), "not run: {test} ({place}): {need}: {why}");
+    let required = std::env::var(REQUIRE_VARIABLE).unwrap_or_default();
+    assert!(!names(&required, need), "{REQUIRE_VARIABLE} names {need}");
+}
+
+fn names(required: &str, need: &str) -> bool {
+    required.split(',').any(|required| required.trim() == need)
+}
 
 /// The device that tests share, with validation and synchronization validation: any message fails the process at its
 /// exit, with the name of the test. `NIGHTSPLAT_DEVICE` selects another device than the default.
@@ -205,4 +233,15 @@ pub(super) fn with_defect_of(kernel: &str, params: &[u8]) -> Vec<u8> {
         bytes.zip(defect.bits.to_le_bytes()).for_each(|(byte, bits)| *byte ^= bits);
     }
     params
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_list_of_what_is_required_names_whole_words() {
+        assert!(names("lavapipe, radv", "radv") && names("radv", "radv"));
+        assert!(!names("", "radv") && !names("radv2,x", "radv"));
+    }
 }

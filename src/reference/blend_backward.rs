@@ -144,8 +144,7 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
         let alpha_max = constants.alpha_max.into();
-        let gradient_records: &mut [f32] =
-            bytemuck::cast_slice_mut(std::mem::take(&mut slices.gradient_records));
+        let gradient_records = std::mem::take(&mut slices.gradient_records);
         let write = |at: usize, sum: f64| gradient_records[at] = sum as f32;
         for_each_tile(params, constants, &slices, write, |list, pixel, sums| {
             let Pixel { center, render, d_render } = pixel;
@@ -163,7 +162,7 @@ impl Reference for Kernel {
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let mut bounds = vec![0.0; 3 * slices.gradient_records.len()];
+        let mut bounds = vec![0.0; slices.gradient_records.len()];
         let write = |at: usize, bound: f64| bounds[at] = bound;
         for_each_tile(params, constants, &slices, write, |list, pixel, bounds| {
             add_bounds(constants, list, pixel, bounds);

@@ -1,6 +1,6 @@
 //! The colour of one pixel, in f64, over all splats of its tile.
 
-use glam::{DVec2, UVec2, Vec3};
+use glam::{DVec2, UVec2};
 
 use super::blending::PixelModel;
 use super::splat::{Fragment, Splat, fragments, stored_color};
@@ -43,13 +43,12 @@ impl TileList {
         intersection_ids: &[u32],
         gaussian_ids: &[u32],
         splats: &[ProjectedSplat],
-        colors: &[Vec3],
+        colors: &[f32],
     ) -> Self {
         let (channels, ids) = (channels as usize, || {
             intersection_ids.iter().map(|&slot| gaussian_ids[slot as usize] as usize)
         });
-        let (stored, colors) =
-            (stored_color(channels as u32), bytemuck::cast_slice::<_, f32>(colors));
+        let stored = stored_color(channels as u32);
         let color = |id| colors[stored * id..][..channels].iter().map(|&c| f64::from(c));
         Self {
             intersection_ids: intersection_ids.to_vec(),

@@ -6,14 +6,14 @@ use super::rounding::UNIT;
 use crate::kernels::ProjectedSplat;
 use crate::kernels::splat::{ALPHA_MIN, RECORD_HEAD, TRANSMITTANCE_MIN};
 
-/// Floats of a gradient record as stored: in vectors of three, padded with zeros.
+/// Floats of a gradient record as stored: in vectors of four, padded with zeros.
 pub(super) fn stored_record(channels: u32) -> usize {
-    (RECORD_HEAD + channels).next_multiple_of(3) as usize
+    (RECORD_HEAD + channels).next_multiple_of(4) as usize
 }
 
-/// Floats of a splat's values as stored: in vectors of three, padded with zeros.
+/// Floats of a splat's values as stored: in vectors of four, padded with zeros.
 pub(super) fn stored_color(channels: u32) -> usize {
-    channels.next_multiple_of(3) as usize
+    channels.next_multiple_of(4) as usize
 }
 
 /// The part of a [`ProjectedSplat`] that determines its alpha.

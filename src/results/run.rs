@@ -12,6 +12,8 @@ mod lock;
 mod meter;
 mod progress;
 mod requests;
+#[cfg(feature = "cli")]
+mod tail;
 mod tensorboard;
 mod train;
 
@@ -25,4 +27,6 @@ pub use load::{
 };
 pub use meter::{ResourceUsage, energy_counters};
 pub use requests::Requests;
+#[cfg(feature = "cli")]
+pub(crate) use tail::RunTail;
 pub use train::{IfExists, Session, train, train_in};

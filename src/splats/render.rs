@@ -28,13 +28,14 @@ use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
+use crate::splats::batches::GradientKind;
 use crate::splats::scene::{GaussianSlice, Layout};
 use crate::splats::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
 pub use buffers::RenderBuffers;
 pub use buffers::Status;
-use buffers::{RANKS_PER_PARTITION, color_vectors};
+use buffers::{RANKS_PER_PARTITION, color_floats};
 #[cfg(feature = "testing")]
 pub use cameras::CameraGradient;
 pub use cameras::{Viewpoint, Viewpoints};
@@ -78,6 +79,7 @@ pub struct Gradients<'a> {
 pub struct Renderer {
     gpu: Gpu,
     settings: RenderSettings,
+    gradients: GradientKind,
     tile: Tile,
     /// The most splats of one tile that the blending kernels can process.
     longest_run: u32,
@@ -163,6 +165,19 @@ impl Renderer {
         let [width, height] = self.tile.size;
         let (tile, device) = (format!("{width}x{height}"), self.gpu.properties().name.clone());
         Error::TileLimit { view, splats, tile, device, limit: self.longest_run }
+    }
+
+    /// What the backward pass writes.
+    pub(crate) fn gradient_kind(&self) -> GradientKind {
+        self.gradients
+    }
+
+    /// The camera of a recorded viewpoint: its buffer and index.
+    pub(crate) fn camera_of<'a>(
+        &'a self,
+        viewpoint: &Viewpoint<'a>,
+    ) -> (&'a Buffer<kernels::Camera>, u32) {
+        viewpoint.on_device.unwrap_or((&self.frame.camera, 0))
     }
 
     /// Clears all status flags.
@@ -265,7 +280,7 @@ impl Renderer {
                 "a renderer with Purpose::Show has no gradients; make it with Purpose::Train";
             return Err(Error::Usage(problem.to_owned()));
         };
-        let color_vectors = color_vectors(self.settings.channels());
+        let color_floats = color_floats(self.settings.channels());
         let frame = &mut self.frame;
         pass.dispatch(
             blend_backward,
@@ -298,7 +313,7 @@ impl Renderer {
                 project_backward::Buffers {
                     parameters: batch.rows(parameters, layout.words())?,
                     splats: batch.rows(&frame.splats, 1)?,
-                    colors: batch.rows(&frame.colors, color_vectors)?,
+                    colors: batch.rows(&frame.colors, color_floats)?,
                     tile_counts: batch.rows(&frame.tile_counts, 1)?,
                     intersection_ranges: batch.rows(&frame.intersection_ranges, 1)?,
                     gradient_records: frame.gradient_records.slice(),
@@ -321,7 +336,7 @@ impl Renderer {
         view: &View<'_>,
         sh_degree: u32,
     ) -> Result<()> {
-        let color_vectors = color_vectors(view.channels);
+        let color_floats = color_floats(view.channels);
         let frame = &mut self.frame;
         let project = &self.projections[&(view.model, view.view_depths)].forward;
         layout.batches(&self.gpu).iter().try_for_each(|batch| {
@@ -337,7 +352,7 @@ impl Renderer {
                 project::Buffers {
                     parameters: batch.rows(parameters, layout.words())?,
                     splats: batch.rows_mut(&mut frame.splats, 1)?,
-                    colors: batch.rows_mut(&mut frame.colors, color_vectors)?,
+                    colors: batch.rows_mut(&mut frame.colors, color_floats)?,
                     depth_keys: batch.rows_mut(&mut frame.depth_keys, 1)?,
                     ids: batch.rows_mut(&mut frame.ids, 1)?,
                     tile_counts: batch.rows_mut(&mut frame.tile_counts, 1)?,

@@ -159,6 +159,26 @@ impl Gaussians {
         other
     }
 
+    /// Removes the Gaussians whose `keep` is false; the others keep their order.
+    #[cfg(feature = "io")]
+    pub(crate) fn retain(&mut self, keep: &[bool]) {
+        let kept = keep.iter().filter(|keep| **keep).count();
+        if kept == self.count {
+            return;
+        }
+        let mut to = 0;
+        for spec in &ATTRIBUTES {
+            let (column, width) = self.columns(spec.attribute);
+            for (index, _) in keep.iter().enumerate().filter(|(_, keep)| **keep) {
+                let from = column * self.count + index * width;
+                self.parameters.copy_within(from..from + width, to);
+                to += width;
+            }
+        }
+        self.parameters.truncate(to);
+        self.count = kept;
+    }
+
     /// The lowest SH degree that includes all nonzero coefficients.
     pub(crate) fn sh_degree_in_use(&self) -> u32 {
         let own = rest_coefficients(self.shape.sh_degree);

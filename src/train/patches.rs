@@ -130,7 +130,7 @@ mod tests {
 
     use super::*;
     use crate::camera::CameraModel;
-    use crate::gpu::testing::gpu;
+    use crate::gpu::testing::{gpu, not_run};
     use crate::train::Part;
 
     fn camera(width: u32, height: u32) -> Camera {
@@ -149,8 +149,8 @@ mod tests {
     fn the_device_limits_determine_the_number_of_patches() {
         let gpu = gpu();
         if gpu.properties().max_storage_buffer_range != 1 << 27 {
-            eprintln!("not run: this device binds {}", gpu.properties().max_storage_buffer_range);
-            return;
+            let binds = gpu.properties().max_storage_buffer_range;
+            return not_run("lavapipe", format_args!("this device binds {binds} bytes"));
         }
         let mut config = TrainConfig::bare();
         let count = |config: &TrainConfig, width, height| {

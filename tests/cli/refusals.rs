@@ -280,7 +280,10 @@ fn an_unknown_device_and_no_device_are_refused_with_the_remedy() {
 #[test]
 fn a_validation_message_fails_the_command() {
     if !cfg!(debug_assertions) {
-        return crate::common::not_run("commands are validated in debug builds alone");
+        return crate::common::not_run(
+            "debug-build",
+            "commands are validated in debug builds alone",
+        );
     }
     // Advice on best practices, which the code does not follow, is reported in every run.
     let advice = "VK_VALIDATION_FEATURE_ENABLE_BEST_PRACTICES_EXT";

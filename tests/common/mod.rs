@@ -16,13 +16,11 @@ pub(crate) mod safetensors;
 pub(crate) mod setup;
 pub(crate) mod train;
 
-use std::fmt::Display;
-use std::io::Write;
-use std::panic::Location;
 use std::path::PathBuf;
 
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::Gpu;
+pub(crate) use nightsplat::gpu::testing::not_run;
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 
 /// A device that no other test uses, to count memory and passes.
@@ -115,18 +113,6 @@ pub(crate) fn widen(values: &[f32]) -> Vec<f64> {
     values.iter().map(|&value| value.into()).collect()
 }
 
-/// Prints that a test, or the rest of it, is not run, and why.
-///
-/// The harness captures the output of `println!` and `eprintln!` in a passing test, but not that of the handle of
-/// standard error: this line is shown by every `cargo test`.
-#[track_caller]
-#[allow(clippy::explicit_write, reason = "`eprintln!` is what the harness swallows")]
-pub(crate) fn not_run(why: impl Display) {
-    let (thread, place) = (std::thread::current(), Location::caller());
-    let test = thread.name().unwrap_or("a test");
-    writeln!(std::io::stderr(), "not run: {test} ({place}): {why}").unwrap();
-}
-
 /// A file or folder of captures that may be next to the checkout; without it, the rest of the test is not run.
 #[track_caller]
 pub(crate) fn shared(name: &str) -> Option<PathBuf> {
@@ -134,7 +120,7 @@ pub(crate) fn shared(name: &str) -> Option<PathBuf> {
     if path.exists() {
         return Some(path);
     }
-    not_run(format_args!("../shared/{name} is absent"));
+    not_run("captures", format_args!("../shared/{name} is absent"));
     None
 }
 

@@ -26,7 +26,7 @@ use nightsplat::capi::model::*;
 use nightsplat::capi::render::*;
 use nightsplat::capi::train::*;
 use nightsplat::gpu::ImageFormat;
-use nightsplat::gpu::testing::{allocations, fail_allocation, gpu, lose_at_submission};
+use nightsplat::gpu::testing::{allocations, fail_allocation, gpu, lose_at_submission, not_run};
 use nightsplat::photographs::dataset::synthetic::{SyntheticOptions, write};
 use nightsplat::splats::model::Model;
 use nightsplat::splats::render::{RenderOptions, Renderer};

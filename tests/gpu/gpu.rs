@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use glam::UVec2;
 use nightsplat::Error;
-use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_that_launches, misuse};
+use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_that_launches, misuse, not_run};
 use nightsplat::gpu::{Buffer, DeviceChoice, Gpu, Pipeline, Threads, devices};
 use nightsplat::kernels::{blend_forward, relu_backward};
 use nightsplat::splats::render::{RenderSettings, Renderer};
@@ -52,6 +52,15 @@ fn an_unknown_device_is_refused_with_the_list_of_devices() {
         assert!(matches!(error, Error::NoDevice(_)) && message.contains(wanted), "{message}");
         assert!(all.iter().all(|device| message.contains(&device.name)), "{message}");
         assert!(!message.contains('\n'), "{message}");
+    }
+}
+
+/// A run that must be on lavapipe, and is on another device, proves something else.
+#[test]
+fn tests_run_on_the_device_that_is_required() {
+    let name = gpu().properties().name.clone();
+    if !name.contains("llvmpipe") {
+        not_run("lavapipe", format_args!("tests run on {name}"));
     }
 }
 

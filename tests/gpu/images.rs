@@ -22,7 +22,7 @@ use nightsplat::splats::render::{
 };
 use nightsplat::splats::scene::{DeviceGaussians, Gaussians};
 
-use crate::common::Random;
+use crate::common::{Random, not_run};
 use crate::host::{Host, Picture, usual_extensions};
 use kernels::halves;
 
@@ -337,7 +337,7 @@ fn the_hosts_depth_hides_what_is_beyond_it_in_every_format_and_convention() {
                 // A wall beyond everything, one before everything, and one before the left half.
                 let wall = |z: f32| bits(value(z, convention));
                 let Some(beyond) = scene(host, format, |_| wall(35.0)) else {
-                    eprintln!("not run: this device has no {format:?} images to copy");
+                    not_run("image-formats", format_args!("no {format:?} images to copy"));
                     break;
                 };
                 let seen = alphas(&mut shown, frame, Some((&beyond, convention)));

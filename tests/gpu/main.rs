@@ -7,6 +7,7 @@
 mod common;
 
 mod capi;
+mod ceiling;
 mod descriptors;
 mod embedding;
 mod faults;

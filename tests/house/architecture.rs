@@ -203,7 +203,9 @@ fn unsafe_code_is_only_in_the_gpu_layer_and_the_c_interface() {
             continue;
         }
         for (number, line) in text.lines().enumerate() {
-            let is_unsafe = code(line).split(|c: char| !c.is_alphanumeric() && c != '_');
+            // A browser's policy has a keyword of this name.
+            let line = line.replace("'unsafe-inline'", "");
+            let is_unsafe = code(&line).split(|c: char| !c.is_alphanumeric() && c != '_');
             let is_unsafe = is_unsafe.filter(|word| *word == "unsafe").count() > 0;
             assert!(!is_unsafe, "{}:{}: {line}", path.display(), number + 1);
         }
@@ -231,11 +233,11 @@ fn a_file_can_be_read_in_one_sitting() {
 }
 
 #[test]
-fn a_clock_that_jumps_changes_nothing_but_the_dates_of_event_files_and_whether_photographs_are_decoded_again()
- {
+fn a_clock_that_jumps_changes_nothing_but_the_dates_of_event_files_and_which_files_are_read_again()
+{
     let clocks = ["SystemTime", "UNIX_EPOCH", ".modified()"];
-    // A changed time stamp costs only a checksum of the pixels.
-    let may_ask = ["src/base/tree.rs", "src/results/run/tensorboard.rs"];
+    // A changed time stamp costs only a checksum of the pixels, or another look at a model.
+    let may_ask = ["src/base/tree.rs", "src/cli/live/feed.rs", "src/results/run/tensorboard.rs"];
     for (path, text) in files("src", "rs") {
         let asks =
             text.lines().map(code).any(|line| clocks.iter().any(|clock| line.contains(clock)));

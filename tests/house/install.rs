@@ -21,7 +21,7 @@ fn every_shell_completes_every_subcommand() {
 #[test]
 fn bash_loads_the_completions_and_completes_with_them() {
     let Ok(version) = Command::new("bash").arg("--version").output() else {
-        return crate::common::not_run("there is no bash");
+        return crate::common::not_run("bash", "it is not installed");
     };
     assert!(version.status.success());
     let script = succeed("completions bash")

@@ -7,8 +7,10 @@ mod common;
 
 mod architecture;
 mod circles;
+mod compilers;
 mod defects;
 mod documents;
 mod install;
 mod settings;
+mod skips;
 mod words;

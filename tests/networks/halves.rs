@@ -15,7 +15,7 @@ fn matrix() -> Option<CooperativeMatrix> {
     let matrix = gpu.properties().cooperative_matrix;
     if matrix.is_none() {
         let name = &gpu.properties().name;
-        not_run(format_args!("{name} has no cooperative matrices"));
+        not_run("cooperative-matrices", format_args!("{name} has none"));
     }
     matrix
 }

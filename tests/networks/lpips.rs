@@ -148,7 +148,7 @@ fn every_measure_has_its_own_key() {
 fn the_output_of_the_converter_is_read() {
     let python = Command::new("python3").arg("--version").output();
     if !python.is_ok_and(|output| output.status.success()) {
-        return not_run("there is no python3");
+        return not_run("python3", "it is not installed");
     }
     let folder = tempfile::tempdir().unwrap();
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/scripts/test-lpips-weights.py");

@@ -72,7 +72,7 @@ fn scores_agree_with_the_scoring_script() {
     let Some(script) = shared("tools/score.py") else { return };
     let python = Command::new("python3").args(["-c", "import numpy, PIL"]).output();
     if !python.is_ok_and(|output| output.status.success()) {
-        return not_run("there is no python3 with numpy and PIL");
+        return not_run("numpy", "there is no python3 with numpy and PIL");
     }
     let dir = tempfile::tempdir().unwrap();
     let (render, reference) = pattern(60, 40);

@@ -160,7 +160,7 @@ fn a_tiny_scene_trains_to_the_ledger_of_this_driver() {
     let name = file_name(&properties.name, &properties.driver);
     let ledger = fixture("ledger").join(&name);
     let Ok(expected) = fs::read_to_string(&ledger) else {
-        not_run(format_args!("there is no ledger of this driver, tests/fixtures/ledger/{name}"));
+        not_run("ledger", format_args!("this driver has none, tests/fixtures/ledger/{name}"));
         return;
     };
     let (_folder, run) = tiny_run();

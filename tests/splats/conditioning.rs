@@ -5,10 +5,10 @@
 
 use std::ops::Range;
 
-use glam::{DVec2, DVec3, Vec3};
+use glam::{DVec2, DVec3};
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::kernels::adam::{LOG_SCALE_MAX, LOG_SCALE_MIN};
+use nightsplat::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
 use nightsplat::photographs::tone::{Statistics, percentile};
 use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
@@ -24,6 +24,8 @@ use crate::common::{Random, widen};
 
 /// Numbers in a record of three channels: mean2d, conic, opacity, colour.
 const RECORD: usize = 9;
+/// The same as stored, with zeros.
+const STORED_RECORD: usize = 12;
 
 /// The opacity of `count` layers that together let a fiftieth of the light through; above 1/255 everywhere in the view.
 fn opacity_of(count: usize) -> f64 {
@@ -61,14 +63,18 @@ fn errors_of(count: usize) -> [f64; 2] {
     let frame = rendered.renderer.frame();
     let splats = gpu().read(&frame.splats).unwrap();
     let splats: Vec<Splat> = splats[..count].iter().map(Splat::from).collect();
-    let colors = widen(bytemuck::cast_slice(&gpu().read(&frame.colors).unwrap()[..count]));
+    let colors = gpu().read(&frame.colors).unwrap();
+    let colors: Vec<f32> =
+        colors[..4 * count].chunks(4).flat_map(|four| &four[..3]).copied().collect();
+    let colors = widen(&colors);
     // The view is one tile, so every layer has one slot.
     let intersection_ids = gpu().read(&frame.intersection_ranges).unwrap();
     let stored = gpu().read(&frame.gradient_records).unwrap();
     let sums: Vec<f32> = intersection_ids[..count]
         .iter()
         .flat_map(|slot| {
-            stored[3 * slot.x as usize..3 * slot.y as usize].iter().flat_map(Vec3::to_array)
+            let record = &stored[STORED_RECORD * slot.x as usize..];
+            record[..RECORD].to_vec()
         })
         .collect();
     let (pixels, alpha_max) = (setup.pixels(), f64::from(setup.settings.max_alpha));

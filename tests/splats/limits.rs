@@ -18,8 +18,8 @@ use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::render::{RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::Shape;
 
-use crate::common::Random;
 use crate::common::setup::{Setup, features};
+use crate::common::{Random, not_run};
 
 #[test]
 fn more_intersections_than_can_be_counted_are_an_overflow() {
@@ -109,8 +109,7 @@ fn memory_for_intersections_grows_to_the_largest_binding_and_no_further() {
     let most = renderer.max_intersections();
     // If a device binds gigabytes, allocating them makes no sense in a test.
     if most > 1 << 23 {
-        eprintln!("not run: this device binds {most} intersections at once");
-        return;
+        return not_run("lavapipe", format_args!("this device binds {most} intersections at once"));
     }
     renderer.grow(most - most / 4).unwrap();
     renderer.grow(most).unwrap();
@@ -125,7 +124,7 @@ fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>, Vec<u32>)
     let (count, size) = (sorted_tiles.len() as u32, UVec2::new(5 * 16, 24 * 16));
     let (counts, sorted_intersections, gaussian_ids) =
         (vec![count], (0..count).collect::<Vec<_>>(), vec![0; count as usize]);
-    let (colors, pixels) = (vec![Vec3::splat(0.5)], size.element_product() as usize);
+    let (colors, pixels) = (vec![0.5; 4], size.element_product() as usize);
     let (render, transmittances) = (vec![0.0; 3 * pixels], vec![0.0; pixels]);
     let (tile_ranges, status, limits) = (vec![UVec2::ONE; 120], vec![0; 3], vec![0.0f32]);
     let params = blend_forward::Params {
@@ -222,7 +221,7 @@ fn emit_wide(count: u32, size: UVec2, extra: u32) -> (Vec<u32>, Vec<UVec2>, u32)
 }
 
 /// A record of four channels.
-type Record = [Vec3; 4];
+type Record = [f32; 12];
 
 /// Sums the records of Gaussians with one feature, all at one position, which have these slots: the gradients of the
 /// features are the sums of the last channel.
@@ -236,7 +235,7 @@ fn sums(intersection_ranges: Vec<UVec2>, gradient_records: &[Record]) -> Vec<f32
     let frame = rendered.renderer.frame();
     let (splats, colors) = (gpu().read(&frame.splats).unwrap(), gpu().read(&frame.colors).unwrap());
     let (parameters, tile_counts, status) = (setup.parameters.clone(), vec![1; count], vec![0; 4]);
-    let gradient_records: Vec<Vec3> = gradient_records.concat();
+    let gradient_records: Vec<f32> = gradient_records.concat();
     let gradients = vec![f32::NAN; parameters.len()];
     let (grad_norm_sums, visit_counts) = (vec![0.0f32; count], vec![0; count]);
     let cameras = vec![kernels::Camera::from(&Patch::from(&setup.camera))];
@@ -267,7 +266,7 @@ fn gaussians_that_cover_the_whole_of_a_large_image_fill_their_slots_and_are_summ
     assert!(tiles.chunks(per_splat as usize).all(|own| (0..per_splat).eq(own.iter().copied())));
     let mut random = Random::new(3);
     let mut number = || random.between(-1.0, 1.0) as f32;
-    let mut record = || array::from_fn(|_| Vec3::new(number(), number(), number()));
+    let mut record = || array::from_fn(|_| number());
     let gradient_records: Vec<Record> = tiles.iter().map(|_| record()).collect();
     sums(intersection_ranges, &gradient_records);
 }
@@ -280,7 +279,7 @@ fn slots_that_no_tile_fills_are_padding_and_do_not_change_the_sums() {
         let is_padding = |slot: usize| slot as u32 % per_splat >= per_splat - 5;
         assert!((0..tiles.len()).all(|slot| (tiles[slot] == emit::NO_TILE) == is_padding(slot)));
         // No tile writes the records of padding.
-        let record = |slot: usize| [if is_padding(slot) { Vec3::NAN } else { Vec3::ONE }; 4];
+        let record = |slot: usize| [if is_padding(slot) { f32::NAN } else { 1.0 }; 12];
         let gradient_records: Vec<Record> = (0..tiles.len()).map(record).collect();
         assert_eq!(sums(intersection_ranges, &gradient_records), [(per_splat - 5) as f32; 11]);
     }
@@ -290,8 +289,7 @@ fn slots_that_no_tile_fills_are_padding_and_do_not_change_the_sums() {
 fn a_view_has_at_most_the_tiles_that_a_subgroup_of_covering_gaussians_can_process() {
     let most = gpu().properties().max_loop_iterations;
     if most == u32::MAX {
-        eprintln!("not run: this device has no loop limit");
-        return;
+        return not_run("lavapipe", "this device has no loop limit");
     }
     let mut renderer = Renderer::new(&gpu(), Setup::new(1, [32, 32], 0, 1).settings).unwrap();
     let view = |size| Setup::new(1, size, 0, 1).camera;
@@ -318,7 +316,7 @@ fn a_view_has_at_most_the_tiles_that_a_subgroup_of_covering_gaussians_can_proces
     let intersection_ids = (tiles * lanes) as usize;
     let intersection_ranges: Vec<_> = (0..lanes).map(|i| UVec2::new(i, i + 1) * tiles).collect();
     assert_eq!(
-        sums(intersection_ranges, &vec![[Vec3::ONE; 4]; intersection_ids]),
+        sums(intersection_ranges, &vec![[1.0; 12]; intersection_ids]),
         vec![tiles as f32; lanes as usize]
     );
 }

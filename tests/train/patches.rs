@@ -15,11 +15,11 @@ use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer};
 use nightsplat::train::{OnOff, Part, Rendered, TrainConfig, Trainer};
 
-use crate::common::Random;
 use crate::common::command::{command, refused, succeed};
 use crate::common::place::Place;
 use crate::common::setup::{Setup, features};
 use crate::common::train::advance;
+use crate::common::{Random, not_run};
 
 /// Gaussians of every kind in a view of several patches; some are far outside it.
 fn setup(patch_pixels: Option<u64>) -> Setup {
@@ -272,8 +272,7 @@ fn more_intersections_than_the_device_binds_are_rendered_in_halves() {
     let mut renderer = renderer(&own);
     let most = renderer.max_intersections();
     if most > 1 << 22 {
-        eprintln!("not run: this device binds {most} intersections at once");
-        return;
+        return not_run("lavapipe", format_args!("this device binds {most} intersections at once"));
     }
     let gaussians = own.upload();
     let shown = renderer.render_channels(&gaussians, &own.camera, &own.options).unwrap();
@@ -290,8 +289,7 @@ fn more_intersections_than_the_device_binds_are_rendered_in_halves() {
 fn training_uses_patches_whose_intersections_the_device_can_process() {
     let own = covering(300, [1440, 1280]);
     if renderer(&own).max_intersections() > 1 << 22 {
-        eprintln!("not run: this device binds more intersections at once");
-        return;
+        return not_run("lavapipe", "this device binds more intersections at once");
     }
     let dark = Image::filled(1440, 1280, [0.1; 3]);
     let view = |name| View::new(name, Split::Train, own.camera, Some(dark.clone()));

@@ -166,7 +166,7 @@ fn off(picture: &Image, has_geometry: bool, is_srgb: bool) -> f64 {
 #[test]
 fn a_window_shows_splats_before_and_beyond_the_geometry_of_its_host() {
     if Command::new("xvfb-run").arg("--help").output().is_err() {
-        return not_run("there is no xvfb-run (on Debian `apt install xvfb xauth`)");
+        return not_run("xvfb", "there is no xvfb-run (on Debian `apt install xvfb xauth`)");
     }
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("model.ply");

@@ -24,11 +24,11 @@ layout(binding = 0) readonly  buffer Ranges  { uvec2 tile_ranges[]; };
 layout(binding = 1) readonly  buffer IntersectionIds   { uint sorted_intersections[]; };
 layout(binding = 2) readonly  buffer GaussianIds  { uint gaussian_ids[]; };
 layout(binding = 3) readonly  buffer Splats  { ProjectedSplat splats[]; };
-layout(binding = 4) readonly  buffer Colors  { vec3 colors[]; };  // (Gaussians, COLOR_VECTORS)
+layout(binding = 4) readonly  buffer Colors  { vec4 colors[]; };  // (Gaussians, COLOR_VECTORS)
 layout(binding = 5) readonly  buffer Render  { float render[]; };    // (CHANNELS, H, W)
 layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNELS, H, W)
 // (slots, RECORD_VECTORS): mean2d 2, conic 3, opacity 1, colour CHANNELS, zeros
-layout(binding = 7) writeonly buffer GradientRecords { vec3 gradient_records[]; };
+layout(binding = 7) writeonly buffer GradientRecords { vec4 gradient_records[]; };
 
 // What every part but the first adds to the records of a batch; a tile of one part has room for one that is not used.
 shared float shares[(SUBGROUPS_PER_TILE - 1 + 1 / SUBGROUPS_PER_TILE) * RECORD * SUBGROUP_SIZE];
@@ -80,7 +80,7 @@ void main() [[subgroup_uniform_control_flow]] {
         uint slot = sorted_intersections[first + min(lane, batch - 1)];
         uint id = gaussian_ids[slot];
         ProjectedSplat mine = splats[id];
-        vec3 my_color[COLOR_VECTORS];
+        vec4 my_color[COLOR_VECTORS];
         [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) my_color[k] = colors[COLOR_VECTORS * id + k];
         uint my_groups = splat_groups(mine, origin);
         if (lane >= batch) mine.opacity = 0.0;
@@ -102,7 +102,7 @@ void main() [[subgroup_uniform_control_flow]] {
                 float opacity = subgroupShuffle(mine.opacity, j);
                 float splat_color[CHANNELS];
                 [[unroll]] for (uint c = 0; c < CHANNELS; c++)
-                    splat_color[c] = subgroupShuffle(my_color[c / 3][c % 3], j);
+                    splat_color[c] = subgroupShuffle(my_color[c / 4][c % 4], j);
                 // Moments of dL/dsigma over the pixels: what every gradient of the ellipse is made of.
                 float moment = 0.0;
                 vec2 moment_x_y = vec2(0.0);
@@ -157,8 +157,8 @@ void main() [[subgroup_uniform_control_flow]] {
             turn += SPLATS_PER_TURN;
             if (turn >= batch) break;
         }
-        float record[3 * RECORD_VECTORS];
-        [[unroll]] for (uint k = 0; k < 3 * RECORD_VECTORS; k++) record[k] = 0.0;
+        float record[4 * RECORD_VECTORS];
+        [[unroll]] for (uint k = 0; k < 4 * RECORD_VECTORS; k++) record[k] = 0.0;
         record[0] = my_d_mean2d.x;
         record[1] = my_d_mean2d.y;
         record[2] = my_d_conic.x;
@@ -179,12 +179,13 @@ void main() [[subgroup_uniform_control_flow]] {
                 [[unroll]] for (uint k = 0; k < RECORD; k++) record[k] += shares[share + k * SUBGROUP_SIZE];
             }
             [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++)
-                gradient_records[RECORD_VECTORS * slot + k] = vec3(record[3 * k], record[3 * k + 1], record[3 * k + 2]);
+                gradient_records[RECORD_VECTORS * slot + k] =
+                    vec4(record[4 * k], record[4 * k + 1], record[4 * k + 2], record[4 * k + 3]);
         }
     }
     // After a tile that is done every gradient is zero.
     for (uint i = first + gl_LocalInvocationIndex; i < range.y; i += SUBGROUP_SIZE * SUBGROUPS_PER_TILE) {
         uint at = RECORD_VECTORS * sorted_intersections[i];
-        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) gradient_records[at + k] = vec3(0.0);
+        [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) gradient_records[at + k] = vec4(0.0);
     }
 }

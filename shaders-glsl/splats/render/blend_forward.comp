@@ -30,7 +30,7 @@ layout(binding = 0) readonly  buffer Counts     { uint counts[]; };        // [0
 layout(binding = 1) readonly  buffer IntersectionIds      { uint sorted_intersections[]; };
 layout(binding = 2) readonly  buffer GaussianIds     { uint gaussian_ids[]; };
 layout(binding = 3) readonly  buffer Splats     { ProjectedSplat splats[]; };
-layout(binding = 4) readonly  buffer Colors     { vec3 colors[]; };      // (Gaussians, COLOR_VECTORS)
+layout(binding = 4) readonly  buffer Colors     { vec4 colors[]; };      // (Gaussians, COLOR_VECTORS)
 layout(binding = 5) writeonly buffer Render     { float render[]; };  // (CHANNELS, H, W)
 layout(binding = 6) writeonly buffer Transmittances { float transmittances[]; };  // (H, W)
 layout(binding = 7) readonly  buffer Tiles      { uint sorted_tiles[]; };
@@ -79,7 +79,7 @@ void main() [[subgroup_uniform_control_flow]] {
         // Lanes beyond the batch load its last splat, which counts on no pixel without opacity.
         uint id = gaussian_ids[sorted_intersections[first + min(lane, batch - 1)]];
         ProjectedSplat mine = splats[id];
-        vec3 my_color[COLOR_VECTORS];
+        vec4 my_color[COLOR_VECTORS];
         [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) my_color[k] = colors[COLOR_VECTORS * id + k];
         uint my_groups = splat_groups(mine, origin);
         if (lane >= batch) mine.opacity = 0.0;
@@ -94,7 +94,7 @@ void main() [[subgroup_uniform_control_flow]] {
                 float opacity = subgroupShuffle(mine.opacity, j);
                 float splat_color[CHANNELS];
                 [[unroll]] for (uint c = 0; c < CHANNELS; c++)
-                    splat_color[c] = subgroupShuffle(my_color[c / 3][c % 3], j);
+                    splat_color[c] = subgroupShuffle(my_color[c / 4][c % 4], j);
 
                 [[unroll]] for (uint g = 0; g < GROUPS; g++) {
                     if ((groups >> g & 1) == 0) continue;

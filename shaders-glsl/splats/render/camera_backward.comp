@@ -26,7 +26,7 @@ layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer TileCounts { uint tile_counts[]; };
 // first intersection, one past the last
 layout(binding = 3) readonly  buffer IntersectionRanges    { uvec2 intersection_ranges[]; };
-layout(binding = 4) readonly  buffer GradientRecords    { vec3 gradient_records[]; };      // (slots, RECORD_VECTORS)
+layout(binding = 4) readonly  buffer GradientRecords    { vec4 gradient_records[]; };      // (slots, RECORD_VECTORS)
 layout(binding = 5) readonly  buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
 layout(binding = 6) readonly  buffer Cameras    { Camera cameras[]; };
 layout(binding = 7) writeonly buffer Shares     { float shares[]; };      // (gaussian_count, CAMERA_WIDTH)
@@ -40,16 +40,16 @@ layout(binding = 7) writeonly buffer Shares     { float shares[]; };      // (ga
 void main() {
     uint i = THREAD_INDEX;
     bool is_seen = i < gaussian_count && tile_counts[i] > 0;
-    vec3 sum[RECORD_VECTORS];
+    vec4 sum[RECORD_VECTORS];
     sum_gradient_records(is_seen ? intersection_ranges[i] : uvec2(0), sum);
     if (i >= gaussian_count) return;
     if (!is_seen) {
         [[unroll]] for (uint k = 0; k < CAMERA_WIDTH; k++) shares[CAMERA_WIDTH * i + k] = 0.0;
         return;
     }
-    float record[3 * RECORD_VECTORS];
+    float record[4 * RECORD_VECTORS];
     [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) {
-        [[unroll]] for (uint c = 0; c < 3; c++) record[3 * k + c] = sum[k][c];
+        [[unroll]] for (uint c = 0; c < 4; c++) record[4 * k + c] = sum[k][c];
     }
     vec2 d_mean2d = vec2(record[0], record[1]);
     vec3 d_conic = vec3(record[2], record[3], record[4]);

@@ -31,7 +31,7 @@ layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in t
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // planes
 layout(binding = 1) writeonly buffer Splats     { ProjectedSplat splats[]; };
-layout(binding = 2) writeonly buffer Colors { vec3 colors[]; };  // (gaussian_count, COLOR_VECTORS): CHANNELS, zeros
+layout(binding = 2) writeonly buffer Colors { vec4 colors[]; };  // (gaussian_count, COLOR_VECTORS): CHANNELS, zeros
 layout(binding = 3) writeonly buffer DepthKeys  { uint depth_keys[]; };
 layout(binding = 4) writeonly buffer Ids        { uint ids[]; };
 layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };
@@ -56,7 +56,10 @@ vec3 sh_color(uint i, vec3 direction) {
     float basis[16];
     sh_basis(sh_degree, direction, basis);
     vec3 color = basis[0] * LOAD_VEC3(parameters, DC_COLUMN, gaussian_count, i);
-    for (uint k = 1; k < sh_count(sh_degree); k++) color += basis[k] * rest_coefficient(i, k);
+    // With constant bounds, the basis is in registers and the loads are issued together.
+    [[unroll]] for (uint k = 1; k < MAX_COEFFICIENTS; k++) {
+        if (k < sh_count(SH_DEGREE) && k < sh_count(sh_degree)) color += basis[k] * rest_coefficient(i, k);
+    }
     if (RAW_COLORS) return color;
     return max(color + 0.5, vec3(0.0));
 }
@@ -102,16 +105,17 @@ void main() {
 
     vec3 center = -transpose(mat3(camera.view_from_world)) * camera.view_from_world[3];
     vec3 offset = mean - center;
-    colors[COLOR_VECTORS * i] = sh_color(i, normalize(offset * finite_scale(length(offset))));
+    vec3 rgb = sh_color(i, normalize(offset * finite_scale(length(offset))));
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
-    [[unroll]] for (uint k = 1; k < COLOR_VECTORS; k++) {
-        vec3 three = vec3(0);
-        [[unroll]] for (uint c = 0; c < 3; c++) {
-            uint feature = 3 * (k - 1) + c;
-            if (feature < FEATURE_COUNT) three[c] = parameters[features + feature];
-            else if (VIEW_DEPTHS != 0 && feature == FEATURE_COUNT) three[c] = depth;
+    [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) {
+        vec4 four = vec4(0);
+        [[unroll]] for (uint c = 0; c < 4; c++) {
+            uint channel = 4 * k + c;
+            if (channel < 3) four[c] = rgb[c];
+            else if (channel < 3 + FEATURE_COUNT) four[c] = parameters[features + channel - 3];
+            else if (VIEW_DEPTHS != 0 && channel == 3 + FEATURE_COUNT) four[c] = depth;
         }
-        colors[COLOR_VECTORS * i + k] = three;
+        colors[COLOR_VECTORS * i + k] = four;
     }
 
     uint count = 0;

@@ -7,10 +7,26 @@ use super::scene::{self, Trainers};
 use super::{Bench, Timing, median, total};
 use crate::Result;
 use crate::base::random::Stream;
+use crate::ceilings::Ceiling;
 use crate::gpu::{Buffer, CheckReport, Gpu, PassTime};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{ToneCurve, ToneParameters, ToneSettings};
 use crate::splats::sort::{Count, RadixSort};
+
+/// A kernel over all its passes of a step.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct KernelTime {
+    pub(super) milliseconds: f64,
+    /// What its passes bind.
+    bytes: u64,
+}
+
+impl KernelTime {
+    /// Bytes per second, if the kernel reads or writes each element that it binds once.
+    pub(super) fn speed(&self) -> f64 {
+        self.bytes as f64 / (self.milliseconds * 1e-3)
+    }
+}
 
 /// Times of the stages.
 pub(super) struct Stages {
@@ -28,6 +44,7 @@ pub(super) fn check(bench: &Bench, trainers: &mut Trainers) -> Result<CheckRepor
     let (done, mut report) =
         bench.gpu.checked(|| bench.gpu.run("pseudo-GT", |pass| photograph.record(pass)));
     done?;
+    report.extend(Ceiling::check(&bench.gpu)?);
     report.extend(trainers.lita_begins.clone());
     for trainer in [&mut trainers.plain, &mut trainers.lita] {
         let before = trainer.steps_done();
@@ -41,14 +58,14 @@ pub(super) fn check(bench: &Bench, trainers: &mut Trainers) -> Result<CheckRepor
     Ok(report)
 }
 
-/// Milliseconds of each kernel over all its passes: of the plain step, then of the others.
+/// Each kernel's time over all its passes: of the plain step, then of the others.
 ///
 /// # Errors
 /// The device is out of memory or lost.
 pub(super) fn time_kernels(
     bench: &Bench,
     trainers: &mut Trainers,
-) -> Result<BTreeMap<&'static str, f64>> {
+) -> Result<BTreeMap<&'static str, KernelTime>> {
     let mut photograph = BenchPhotograph::new(&bench.gpu)?;
     let mut kernels = BTreeMap::new();
     let Trainers { plain, lita, .. } = trainers;
@@ -60,7 +77,11 @@ pub(super) fn time_kernels(
         let names: Vec<_> = times[0].iter().map(|time| time.name).collect();
         for name in names {
             let of_run = |times: &Vec<PassTime>| of_kernels(times, &[name]);
-            let own = || median(times.iter().map(of_run).collect());
+            let passes = times[0].iter().filter(|time| time.name == name);
+            let own = || KernelTime {
+                milliseconds: median(times.iter().map(of_run).collect()),
+                bytes: passes.map(|time| time.bytes).sum(),
+            };
             kernels.entry(name).or_insert_with(own);
         }
     }
@@ -87,7 +108,7 @@ pub(super) fn of_kernels(times: &[PassTime], names: &[&str]) -> f64 {
 pub(super) fn time(bench: &Bench, trainers: &mut Trainers) -> Result<Stages> {
     let steps = repeated(bench, || trainers.plain.profile_step())?;
     let of_step = |names: &[&str]| median(steps.iter().map(|t| of_kernels(t, names)).collect());
-    let loss_kernels = ["ssim", "loss_log"];
+    let loss_kernels = ["ssim", "ssim_forward", "ssim_backward", "loss_log"];
     let mut photograph = BenchPhotograph::new(&bench.gpu)?;
     let times = repeated(bench, || photograph.profile(&bench.gpu))?;
     let full_hd = median(times.iter().map(|times| total(times)).collect());

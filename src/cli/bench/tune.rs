@@ -3,11 +3,12 @@
 use std::io::Write;
 
 use anyhow::Result;
+use rayon::prelude::*;
 use serde_json::{Map, Value, json};
 
 use super::{Bench, finish, median, scene, stages, table, total};
 use crate::camera::Camera;
-use crate::gpu::{Buffer, Statistic, TUNE_VARIABLE, Tile, TunedTile};
+use crate::gpu::{Buffer, Resources, Statistic, TUNE_VARIABLE, Tile, TunedTile};
 use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
 use crate::splats::scene::{DeviceGaussians, Features, Layout, MAX_SH_DEGREE, Shape};
 
@@ -97,12 +98,13 @@ pub(super) fn run(
     finish(&wrote, "nightsplat train photos --out run")
 }
 
-/// The tile with the least sum over sizes of its time relative to the fastest at that size.
+/// The tile with the least sum over sizes of its time relative to the fastest at that size. One whose kernels spill is
+/// taken only where all do: the timed scene leaves caches to spills that a larger one does not.
 fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
     let cases = || cases.iter().filter(|case| case.channels == channels);
     let cost = |tile: Tile| {
         let relative = |case: &Case| {
-            let own = case.tiles.iter().find(|measured| measured.tile == tile && measured.agrees());
+            let own = case.candidates().find(|measured| measured.tile == tile);
             own.map_or(f64::INFINITY, |own| own.rasteriser / case.least())
         };
         cases().map(relative).sum::<f64>()
@@ -138,10 +140,17 @@ impl Case {
             let is_large = tile.subgroups == 1 || pixels >= SHARED_PIXELS;
             is_large && gpu.properties().suits_tile(*tile)
         };
-        let (mut candidates, mut first) = (vec![], None);
-        for tile in SIZES.into_iter().flat_map(sharing).filter(is_tried) {
+        let tiles: Vec<_> = SIZES.into_iter().flat_map(sharing).filter(is_tried).collect();
+        // Compiling takes longer than everything else.
+        let compiled = tiles.into_par_iter().map(|tile| {
             let settings = RenderSettings { shape, tile: Some(tile), ..RenderSettings::default() };
-            let mut renderer = Renderer::new(gpu, settings)?;
+            let renderer = Renderer::new(gpu, settings)?;
+            let statistics = renderer.blend_statistics()?;
+            Ok((tile, renderer, statistics))
+        });
+        let compiled = compiled.collect::<crate::Result<Vec<_>>>()?;
+        let (mut candidates, mut first) = (vec![], None);
+        for (tile, mut renderer, statistics) in compiled {
             renderer.reserve(gaussians, [&camera])?;
             let render = renderer.render_channels(&on_device, &camera, &OPTIONS)?;
             let first = first.get_or_insert_with(|| render.clone());
@@ -152,7 +161,7 @@ impl Case {
                 forward: 0.0,
                 backward: 0.0,
                 rasteriser: 0.0,
-                statistics: renderer.blend_statistics()?,
+                statistics,
             };
             candidates.push(Candidate { renderer, measured, times: vec![] });
         }
@@ -169,10 +178,16 @@ impl Case {
         Ok(Self { channels: features.channels(), size: [width, height], tiles })
     }
 
+    /// The tiles to choose from: those that render what the others do, without the ones that spill unless all do.
+    fn candidates(&self) -> impl Iterator<Item = &TileTiming> {
+        let agree = || self.tiles.iter().filter(|measured| measured.agrees());
+        let all_spill = agree().all(TileTiming::spills);
+        agree().filter(move |measured| all_spill || !measured.spills())
+    }
+
     /// The time of the fastest tile.
     fn least(&self) -> f64 {
-        let agree = self.tiles.iter().filter(|measured| measured.agrees());
-        agree.map(|measured| measured.rasteriser).fold(f64::INFINITY, f64::min)
+        self.candidates().map(|measured| measured.rasteriser).fold(f64::INFINITY, f64::min)
     }
 
     fn as_json(&self) -> Value {
@@ -193,6 +208,7 @@ impl Case {
             let note = match measured.agrees() {
                 false => "renders differently",
                 true if measured.rasteriser == self.least() => "fastest",
+                true if measured.spills() => "spills registers",
                 true => "",
             };
             let times = [measured.forward, measured.backward, measured.rasteriser];
@@ -274,6 +290,12 @@ impl TileTiming {
         self.differences.0 <= LARGEST_DIFFERENCE && self.differences.1 <= MEAN_DIFFERENCE
     }
 
+    /// Whether registers do not suffice a blend kernel, as far as the driver reports.
+    fn spills(&self) -> bool {
+        let spill = |statistics: &Vec<Statistic>| Resources::of(statistics).spill();
+        self.statistics.as_ref().is_some_and(|kernels| kernels.iter().any(spill))
+    }
+
     fn as_json(&self) -> Value {
         let of_kernel = |statistics: &Vec<Statistic>| {
             let entry = |told: &Statistic| (told.name.clone(), json!(told.value));
@@ -286,6 +308,7 @@ impl TileTiming {
             "tile": self.tile,
             "intersections": self.intersections,
             "agrees": self.agrees(),
+            "spills": self.spills(),
             "largest_difference": self.differences.0,
             "blend_forward_ms": self.forward,
             "blend_backward_ms": self.backward,
@@ -345,6 +368,24 @@ mod tests {
         ];
         assert_eq!(fastest(&cases, 3), Some(TunedTile { channels: 3, tile: large.into() }));
         assert_eq!(fastest(&cases, 11), Some(TunedTile { channels: 11, tile: small.into() }));
+    }
+
+    #[test]
+    fn a_tile_that_spills_is_taken_only_where_all_do() {
+        let (small, large) = ([8, 8], [16, 16]);
+        let chosen = |spills: [f64; 2]| {
+            let mut own = case(3, &[(small, 2.0, 0.0), (large, 1.0, 0.0)]);
+            for (measured, value) in own.tiles.iter_mut().zip(spills) {
+                let told = |value| vec![Statistic { name: "Spilled VGPRs".to_owned(), value }];
+                measured.statistics = Some([told(0.0), told(value)]);
+            }
+            let text = own.as_text(1);
+            (fastest(&[own], 3).unwrap().tile, text)
+        };
+        assert_eq!(chosen([0.0, 0.0]).0, large.into());
+        let (tile, text) = chosen([0.0, 4.0]);
+        assert!(tile == small.into() && text.contains("spills registers"), "{text}");
+        assert_eq!(chosen([8.0, 4.0]).0, large.into());
     }
 
     #[test]

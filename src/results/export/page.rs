@@ -1,9 +1,10 @@
-//! One page with the model, its viewer, and images to compare with. It opens from disk and needs only WebGL 2.
+//! One page with the model, its viewer, and images to compare with. It opens from disk and needs only WebGL 2. Without
+//! the model it is the page of `view`, which asks its server for model, images and progress.
 //!
 //! The viewer projects, shades and blends as the kernels do: a test view on the page equals the render of `eval` up to
 //! the rounding of the model to half floats.
 
-use glam::DVec3;
+use glam::{DAffine3, DVec3};
 use half::f16;
 use serde_json::json;
 
@@ -17,6 +18,10 @@ use crate::splats::render::RenderSettings;
 use crate::splats::scene::Gaussians;
 use crate::{Error, Result};
 
+/// The scripts of the page, in one scope.
+const VIEWER: [&str; 3] =
+    [include_str!("viewer/draw.js"), include_str!("viewer/live.js"), include_str!("viewer/fly.js")];
+
 /// A bookmark: a camera and images of its view.
 #[derive(Clone, Debug)]
 pub struct Bookmark {
@@ -25,7 +30,16 @@ pub struct Bookmark {
     /// A pinhole camera in the coordinates of the Gaussians.
     pub camera: Camera,
     /// Captions and images.
-    pub pictures: Vec<(String, Image)>,
+    pub pictures: Vec<(String, Picture)>,
+}
+
+/// An image to compare with.
+#[derive(Clone, Debug)]
+pub enum Picture {
+    /// Part of the page.
+    Embedded(Image),
+    /// Fetched when it is shown, from an address relative to the page.
+    At(String),
 }
 
 /// The contents of a page.
@@ -33,8 +47,8 @@ pub struct Bookmark {
 pub struct Page<'a> {
     /// The window's title.
     pub title: String,
-    /// In the colours that viewers expect.
-    pub gaussians: &'a Gaussians,
+    /// In the colours that viewers expect; `None`: fetched from the page's server, as often as they change.
+    pub gaussians: Option<&'a Gaussians>,
     /// Provenance, shown on the page.
     pub provenance: Provenance,
     /// The page opens at the first.
@@ -58,17 +72,16 @@ impl Page<'_> {
                 "view {name} is a fisheye, and the page renders pinhole cameras; load its dataset with --undistort"
             )));
         }
-        // Degrees whose coefficients are all 0 are omitted.
-        let gaussians = &gaussians.with_sh_degree(gaussians.sh_degree_in_use());
         let scene = json!({
             "generator": GENERATOR,
             "provenance": provenance.lines(),
-            "count": gaussians.count,
-            "shDegree": gaussians.shape.sh_degree,
+            "isLive": gaussians.is_none(),
             "near": near,
             "up": up.to_array(),
             "views": bookmarks.iter().map(view).collect::<Vec<_>>(),
         });
+        let packed = |gaussians: &Gaussians| Ok::<_, Error>(base64(&gzip(&packed(gaussians))?));
+        let model = gaussians.map(packed).transpose()?.unwrap_or_default();
         let stated = provenance.facts.max_alpha;
         let max_alpha = stated.unwrap_or_else(|| RenderSettings::default().max_alpha);
         let parts = [
@@ -78,8 +91,8 @@ impl Page<'_> {
             ("@SCENE@", scene.to_string().replace('<', "\\u003c")),
             ("@VERTEX@", shader(include_str!("viewer/splat.vert"), max_alpha)),
             ("@FRAGMENT@", shader(include_str!("viewer/splat.frag"), max_alpha)),
-            ("@VIEWER@", include_str!("viewer/viewer.js").to_owned()),
-            ("@MODEL@", base64(&gzip(&model(gaussians))?)),
+            ("@VIEWER@", VIEWER.concat()),
+            ("@MODEL@", model),
         ];
         let mut html = String::new();
         let mut rest = include_str!("viewer/page.html");
@@ -94,6 +107,13 @@ impl Page<'_> {
         }
         Ok(html + rest)
     }
+}
+
+/// The same camera in a world whose origin is moved to `origin`.
+pub(crate) fn moved(camera: &Camera, origin: DVec3) -> Camera {
+    let DAffine3 { matrix3, translation } = camera.view_from_world;
+    let view_from_world = DAffine3 { matrix3, translation: translation + matrix3 * origin };
+    Camera { view_from_world, ..*camera }
 }
 
 /// A shader of the page, with the constants and functions that it shares with the kernels.
@@ -112,8 +132,13 @@ fn shader(text: &str, max_alpha: f32) -> String {
 fn view(bookmark: &Bookmark) -> serde_json::Value {
     let Bookmark { name, camera, pictures } = bookmark;
     let Camera { width, height, focal, principal_point, view_from_world, .. } = camera;
-    let pictures =
-        pictures.iter().map(|(label, image)| json!({ "label": label, "image": jpeg(image) }));
+    let pictures = pictures.iter().map(|(label, picture)| {
+        let image = match picture {
+            Picture::Embedded(image) => jpeg(image),
+            Picture::At(address) => address.clone(),
+        };
+        json!({ "label": label, "image": image })
+    });
     json!({
         "name": name,
         "size": [width, height],
@@ -124,11 +149,15 @@ fn view(bookmark: &Bookmark) -> serde_json::Value {
     })
 }
 
-/// Positions as floats, then the other attributes as half floats: opacity, log scales, rotation and coefficients,
-/// Gaussian by Gaussian.
-fn model(gaussians: &Gaussians) -> Vec<u8> {
-    let mut bytes: Vec<u8> = bytemuck::cast_slice(gaussians.means()).to_vec();
-    let coefficients = crate::splats::scene::rest_coefficients(gaussians.shape.sh_degree);
+/// The model as the viewer reads it: the number of Gaussians and the SH degree in 32 bits each, positions as floats,
+/// then the other attributes as half floats: opacity, log scales, rotation and coefficients, Gaussian by Gaussian.
+/// Degrees whose coefficients are all 0 are omitted.
+pub(crate) fn packed(gaussians: &Gaussians) -> Vec<u8> {
+    let gaussians = &gaussians.with_sh_degree(gaussians.sh_degree_in_use());
+    let sh_degree = gaussians.shape.sh_degree;
+    let mut bytes = [gaussians.count as u32, sh_degree].map(u32::to_le_bytes).concat();
+    bytes.extend_from_slice(bytemuck::cast_slice(gaussians.means()));
+    let coefficients = crate::splats::scene::rest_coefficients(sh_degree);
     let mut push =
         |value: f32| bytes.extend(f16::from_f32(value.clamp(-65_504.0, 65_504.0)).to_le_bytes());
     gaussians.raw_opacities().iter().for_each(|&value| push(value));
@@ -157,13 +186,14 @@ mod tests {
             focal: glam::DVec2::splat(35.0),
             principal_point: glam::DVec2::new(20.0, 15.0),
             model: CameraModel::Pinhole,
-            view_from_world: glam::DAffine3::IDENTITY,
+            view_from_world: DAffine3::IDENTITY,
         };
         let evil = "</script><b>@MODEL@";
-        let picture = (evil.to_owned(), Image::from_fn(4, 3, |_, _| [0.5; 3]));
+        let picture = Picture::Embedded(Image::from_fn(4, 3, |_, _| [0.5; 3]));
+        let picture = (evil.to_owned(), picture);
         let page = Page {
             title: evil.to_owned(),
-            gaussians: &gaussians,
+            gaussians: Some(&gaussians),
             provenance: Provenance { dataset: evil.to_owned(), ..Provenance::default() },
             bookmarks: vec![Bookmark { name: evil.to_owned(), camera, pictures: vec![picture] }],
             near: 0.2,
@@ -182,6 +212,6 @@ mod tests {
         for outside in ["http://", "https://", "src=\"/", "@import"] {
             assert!(!html.contains(outside), "{outside}");
         }
-        assert_eq!(model(&gaussians).len(), 5 * (12 + 2 * (1 + 3 + 4 + 12)));
+        assert_eq!(packed(&gaussians).len(), 8 + 5 * (12 + 2 * (1 + 3 + 4 + 12)));
     }
 }

@@ -2,6 +2,7 @@
 
 use super::meter::ResourceUsage;
 use crate::results::eval::ViewScore;
+use crate::splats::model::Model;
 use crate::train::{Ended, MemoryEstimate, StepReport, Trainer};
 
 /// An event of a run, in order of occurrence.
@@ -25,6 +26,15 @@ pub enum Event<'a> {
     Checkpointed {
         /// Steps done.
         step: u64,
+    },
+    /// The model as it is, on request.
+    Snapshot {
+        /// Steps done.
+        step: u64,
+        /// The model, in the dataset's world.
+        model: &'a Model,
+        /// The time that the training waited for it.
+        seconds: f64,
     },
     /// The held-out views were scored against their targets.
     HeldOut {

@@ -11,21 +11,45 @@ pub struct Requests {
     /// 0, or 1 + the index in [`STOPS`].
     stop: Arc<AtomicUsize>,
     save: Arc<AtomicBool>,
+    pause: Arc<AtomicBool>,
+    snapshot: Arc<AtomicBool>,
 }
 
 const STOPS: [Stop; 3] = [Stop::Interrupted, Stop::Terminated, Stop::TimeUp];
 
 impl Requests {
     /// Requests to save and stop.
-    #[cfg(feature = "testing")]
+    #[cfg(feature = "cli")]
     pub fn stop(&self, cause: Stop) {
         self.stop.store(Self::code(cause), Ordering::Relaxed);
     }
 
     /// Requests to save and continue.
-    #[cfg(feature = "testing")]
+    #[cfg(feature = "cli")]
     pub fn save(&self) {
         self.save.store(true, Ordering::Relaxed);
+    }
+
+    /// Requests to wait before the next steps, or no longer.
+    #[cfg(feature = "cli")]
+    pub fn pause(&self, waits: bool) {
+        self.pause.store(waits, Ordering::Relaxed);
+    }
+
+    /// Whether the run is to wait.
+    pub(crate) fn is_paused(&self) -> bool {
+        self.pause.load(Ordering::Relaxed)
+    }
+
+    /// Requests the model as it is, in an [`Event::Snapshot`](super::Event::Snapshot).
+    #[cfg(feature = "cli")]
+    pub fn snapshot(&self) {
+        self.snapshot.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether a snapshot was requested since the last call.
+    pub(crate) fn takes_snapshot(&self) -> bool {
+        self.snapshot.swap(false, Ordering::Relaxed)
     }
 
     /// The cause of a request to stop, if there is one.
@@ -69,5 +93,11 @@ mod tests {
         }
         requests.save();
         assert!(requests.takes_save() && !requests.takes_save());
+        requests.clone().snapshot();
+        assert!(requests.takes_snapshot() && !requests.takes_snapshot());
+        requests.clone().pause(true);
+        assert!(requests.is_paused());
+        requests.pause(false);
+        assert!(!requests.is_paused());
     }
 }

@@ -289,6 +289,7 @@ impl<'a> TrainLoop<'a> {
             minutes > 0.0 && since.elapsed() >= Duration::from_secs_f64(60.0 * minutes)
         };
         while !trainer.has_ended() {
+            self.attend(trainer, directory, requests, observe)?;
             let next = |every| (trainer.steps_done() + 1).checked_next_multiple_of(every);
             let until = [config.eval_every, config.checkpoint_every, config.hash_every];
             let until = until.into_iter().filter_map(next).min().unwrap_or(config.steps);
@@ -329,6 +330,34 @@ impl<'a> TrainLoop<'a> {
             }
         }
         Ok(losses)
+    }
+
+    /// Hands out the model if it is requested, and waits as long as a pause is.
+    fn attend(
+        &mut self,
+        trainer: &mut Trainer,
+        directory: &mut RunDirectory,
+        requests: &Requests,
+        observe: &mut impl FnMut(Event<'_>),
+    ) -> Result<()> {
+        const LOOKS_AGAIN: Duration = Duration::from_millis(50);
+        loop {
+            let (step, begin) = (trainer.steps_done(), Instant::now());
+            if requests.takes_snapshot() {
+                let model = &trainer.model()?;
+                let seconds = begin.elapsed().as_secs_f64();
+                observe(Event::Snapshot { step, model, seconds });
+            }
+            if !requests.is_paused() || requests.stops().is_some() {
+                return Ok(());
+            }
+            if requests.takes_save() {
+                directory.save_checkpoint(trainer)?;
+                self.saved = step;
+                observe(Event::Checkpointed { step });
+            }
+            std::thread::sleep(LOOKS_AGAIN);
+        }
     }
 
     /// Restores the best model if the last is worse, scores the test views and writes the model.

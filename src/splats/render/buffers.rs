@@ -1,6 +1,6 @@
 //! The memory of one view: intermediate buffers of a render.
 
-use glam::{UVec2, Vec3};
+use glam::UVec2;
 
 use super::Purpose;
 use crate::Result;
@@ -13,13 +13,14 @@ use crate::kernels::{self, ProjectedSplat};
 
 /// The first estimate of tiles per Gaussian; a view that needs more grows the memory.
 const TILES_PER_GAUSSIAN: u32 = 6;
-/// The same without gradients, where an intersection takes a quarter of the bytes, and the least estimate: a first draw
+/// The same without gradients, where an intersection takes a fifth of the bytes, and the least estimate: a first draw
 /// should not have to leave out any.
 const SHOWN_TILES_PER_GAUSSIAN: u32 = 16;
 const LEAST_SHOWN_INTERSECTIONS: u32 = 1 << 20;
 
-/// Depth ranks whose tiles one subgroup counts. Small, because `emit` sums the counts before a rank within them.
-pub(super) const RANKS_PER_PARTITION: u32 = 256;
+/// Depth ranks whose tiles one subgroup counts. With more, fewer subgroups would share the loads; with fewer, the last
+/// one would have more sums to add up.
+pub(super) const RANKS_PER_PARTITION: u32 = 1024;
 
 /// The decoded status words.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,7 +62,7 @@ pub struct RenderBuffers {
     /// `[0]`: the number of rendered Gaussians
     pub gaussian_counts: Buffer<u32>,
     pub splats: Buffer<ProjectedSplat>,
-    pub colors: Buffer<Vec3>,
+    pub colors: Buffer<f32>,
     pub depth_keys: Buffer<u32>,
     pub ids: Buffer<u32>,
     pub tile_counts: Buffer<u32>,
@@ -73,7 +74,7 @@ pub struct RenderBuffers {
     pub tiles: Buffer<u32>,
     pub intersection_ids: Buffer<u32>,
     pub gaussian_ids: Buffer<u32>,
-    pub gradient_records: Buffer<Vec3>,
+    pub gradient_records: Buffer<f32>,
     // pixels and tiles
     pub render: Buffer<f32>,
     pub transmittances: Buffer<f32>,
@@ -122,7 +123,7 @@ impl RenderBuffers {
             return Ok(());
         }
         let pixels = self.render.len() / self.channels;
-        let colors = color_vectors(channels) * self.splats.len();
+        let colors = color_floats(channels) * self.splats.len();
         if self.colors.len() < colors {
             self.colors = gpu.uninit("colors", colors)?;
         }
@@ -143,7 +144,7 @@ impl RenderBuffers {
     ) -> Result<()> {
         if self.splats.len() < count {
             let count = capacity.max(count);
-            self.colors = gpu.uninit("colors", color_vectors(self.channels) * count)?;
+            self.colors = gpu.uninit("colors", color_floats(self.channels) * count)?;
             self.depth_keys = gpu.uninit("depth_keys", count)?;
             self.ids = gpu.uninit("ids", count)?;
             self.tile_counts = gpu.uninit("tile_counts", count)?;
@@ -177,7 +178,7 @@ impl RenderBuffers {
     /// Grows the capacity while earlier renders may be in flight; where memory is out, it is as it was.
     pub(super) fn grow_intersections(&mut self, gpu: &Gpu, capacity: u32) -> Result<()> {
         let capacity = capacity as usize;
-        let records = gpu.uninit("gradient_records", self.record_vectors() * capacity)?;
+        let records = gpu.uninit("gradient_records", self.record_floats() * capacity)?;
         let tiles = gpu.uninit("tiles", capacity)?;
         let intersection_ids = gpu.uninit("intersection_ids", capacity)?;
         self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
@@ -198,7 +199,7 @@ impl RenderBuffers {
             self.intersection_ids = gpu.uninit("intersection_ids", capacity)?;
             self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
             self.gradient_records =
-                gpu.uninit("gradient_records", self.record_vectors() * capacity)?;
+                gpu.uninit("gradient_records", self.record_floats() * capacity)?;
             // Its length says that the others are there.
             self.tiles = gpu.uninit("tiles", capacity)?;
         }
@@ -207,27 +208,27 @@ impl RenderBuffers {
 
     /// Bytes per Gaussian.
     pub(super) fn bytes_per_gaussian(&self) -> usize {
-        let color = color_vectors(self.channels) * size_of::<Vec3>();
+        let color = color_floats(self.channels) * size_of::<f32>();
         let numbers = 4 * size_of::<f32>() + size_of::<UVec2>();
         size_of::<ProjectedSplat>() + color + numbers
     }
 
     /// Bytes per intersection.
     pub(super) fn bytes_per_intersection(&self) -> usize {
-        3 * size_of::<u32>() + self.record_vectors() * size_of::<Vec3>()
+        3 * size_of::<u32>() + self.record_floats() * size_of::<f32>()
     }
 
-    /// The vectors of a gradient record; 0 without gradients.
-    pub(super) fn record_vectors(&self) -> usize {
+    /// The floats of a gradient record, in vectors of four; 0 without gradients.
+    pub(super) fn record_floats(&self) -> usize {
         match self.purpose {
-            Purpose::Train => (RECORD_HEAD as usize + self.channels).div_ceil(3),
+            Purpose::Train => (RECORD_HEAD as usize + self.channels).next_multiple_of(4),
             Purpose::Show => 0,
         }
     }
 
     /// The number of intersections whose records, or ids, fit one binding.
     pub(super) fn max_intersections(&self, gpu: &Gpu) -> u32 {
-        let record = (self.record_vectors() * size_of::<Vec3>()).max(size_of::<u32>()) as u64;
+        let record = (self.record_floats() * size_of::<f32>()).max(size_of::<u32>()) as u64;
         (gpu.properties().max_storage_buffer_range / record).min(u32::MAX.into()) as u32
     }
 
@@ -236,9 +237,9 @@ impl RenderBuffers {
     }
 }
 
-/// The vectors of three that hold the values of a splat.
-pub(super) fn color_vectors(channels: usize) -> usize {
-    channels.div_ceil(3)
+/// The floats of a splat's values, in vectors of four.
+pub(super) fn color_floats(channels: usize) -> usize {
+    channels.next_multiple_of(4)
 }
 
 #[cfg(test)]

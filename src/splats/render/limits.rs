@@ -1,9 +1,9 @@
 //! Limits of kernels on a device that ends loops after a number of iterations.
 
-use glam::{UVec2, Vec3};
+use glam::UVec2;
 
 use super::RenderSettings;
-use super::buffers::color_vectors;
+use super::buffers::color_floats;
 use crate::gpu::{Gpu, Properties, Tile};
 use crate::kernels::ProjectedSplat;
 use crate::{Error, Result};
@@ -26,7 +26,7 @@ impl RenderSettings {
     /// which one binding has to hold. Other planes are bound in [`Batches`](crate::splats::batches::Batches).
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn peak_gaussians(&self, gpu: &Gpu) -> usize {
-        let color = color_vectors(self.channels()) * size_of::<Vec3>();
+        let color = color_floats(self.channels()) * size_of::<f32>();
         let bytes = size_of::<ProjectedSplat>().max(color) as u64;
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
     }

@@ -47,7 +47,7 @@ fn has_vulkan_headers() -> bool {
     let is_there = found.is_ok_and(|status| status.success());
     assert!(is_there || std::env::var_os("CI").is_none(), "install libvulkan-dev");
     if !is_there {
-        eprintln!("not run: the Vulkan headers are not installed (libvulkan-dev)");
+        not_run("vulkan-headers", "they are not installed (on Debian `apt install libvulkan-dev`)");
     }
     is_there
 }

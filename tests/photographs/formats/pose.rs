@@ -301,7 +301,7 @@ fn problems_before_the_start_are_reported_in_a_line() {
 fn is_installed(program: &str) -> bool {
     let is_there = Command::new(program).arg("-h").stdin(Stdio::null()).output().is_ok();
     if !is_there {
-        not_run(format_args!("`{program}` is not installed"));
+        not_run(program, "it is not installed");
     }
     is_there
 }
@@ -416,7 +416,7 @@ fn hdr_and_wide_gamut_clips_give_the_frames_of_an_sdr_clip() {
         let tags =
             ["-color_primaries", "bt2020", "-color_trc", transfer, "-colorspace", "bt2020nc"];
         let Some(clip) = clip_of(root, "wide.mkv", &filters, &tags) else {
-            not_run(format_args!("this ffmpeg has no zscale"));
+            not_run("ffmpeg", "this one has no zscale");
             return;
         };
         let (frame, message) = seen(&clip);

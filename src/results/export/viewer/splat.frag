@@ -5,6 +5,9 @@ precision highp float;
 in vec2 fromMean;
 flat in vec3 conic;
 flat in vec4 color;
+flat in float depth;
+
+uniform int layer;  // 0: colours, 1: depths, 2: alphas, 3: numbers
 
 out vec4 fragment;
 
@@ -15,5 +18,6 @@ void main() {
     float sigma = 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
     float alpha = min(ALPHA_MAX, color.a * exp(-sigma));
     if (!(sigma >= 0.0 && alpha >= ALPHA_MIN)) discard;
-    fragment = vec4(color.rgb * alpha, alpha);
+    if (layer == 3) fragment = vec4(1.0, 0.0, 0.0, 0.0);
+    else fragment = vec4((layer == 1 ? vec3(depth) : color.rgb) * alpha, alpha);
 }

@@ -19,6 +19,7 @@ in uint id;
 out vec2 fromMean;  // pixels
 flat out vec3 conic;
 flat out vec4 color;
+flat out float depth;
 
 @CONSTANTS@
 @HARMONICS@
@@ -57,6 +58,7 @@ void main() {
     vec2 reach = sqrt(2.0 * log(a.w / ALPHA_MIN) * vec2(xx, yy)) + 0.5;
     fromMean = corner * reach;
     vec2 pixel = focal * mean.xy / mean.z + principalPoint + fromMean;
+    depth = mean.z;
     color = vec4(shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye)), a.w);
     gl_Position = vec4((pixel + offset) * scale + vec2(-1.0, 1.0), 0.0, 1.0);
 }

@@ -1,0 +1,16 @@
+//! The live page: what `view` and `train --view` serve to a browser.
+//!
+//! A [`Feed`] knows the model and the progress of its training, [`Pictures`] makes images of the dataset's views, and a
+//! [`Server`] answers requests for both.
+
+mod feed;
+mod listen;
+mod pictures;
+mod server;
+mod site;
+
+pub(super) use self::feed::{Feed, Source};
+pub use self::listen::{DEFAULT_ADDRESS, Listen};
+pub(super) use self::pictures::Pictures;
+pub(super) use self::server::Server;
+pub(super) use self::site::Site;

@@ -1,0 +1,275 @@
+//! The model and the progress that the live page shows: of a run, by its files or by the training in this process, or
+//! of a model file.
+
+use std::borrow::Cow;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use glam::Vec3;
+use hyper::body::Bytes;
+use serde_json::{Value, json};
+
+use crate::Stop;
+use crate::results::export::page::packed;
+use crate::results::models;
+use crate::results::run::{Event, Requests, RunTail};
+use crate::splats::scene::Gaussians;
+
+/// The most Gaussians that are sent: those that cover most, by opacity and size.
+const MOST_GAUSSIANS: usize = 500_000;
+/// The shortest time between two snapshots of a training.
+const SNAPSHOT_EVERY: Duration = Duration::from_secs(1);
+/// The largest share of the training's time that snapshots may take.
+const SNAPSHOT_SHARE: f64 = 0.04;
+/// Progress is read from files at most this often, however many pages ask.
+const STATE_EVERY: Duration = Duration::from_millis(250);
+
+/// What is shown.
+#[derive(Debug)]
+pub(in crate::cli) enum Source {
+    /// A run directory.
+    Run(PathBuf),
+    /// A model file, read again when it changes.
+    File(PathBuf),
+    /// Gaussians that do not change.
+    Fixed(Gaussians),
+}
+
+/// The source of the model and the progress.
+#[derive(Debug)]
+pub(in crate::cli) struct Feed {
+    source: Source,
+    /// To the training in this process.
+    requests: Option<Requests>,
+    state: Mutex<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    /// Counts the models; 0: there is none yet.
+    version: u64,
+    model: Bytes,
+    /// Steps of the model, if it is of the training in this process.
+    step: Option<u64>,
+    /// Time and length of the file that it was read from.
+    file: Option<(SystemTime, u64)>,
+    /// Why the newest model cannot be shown, on one line.
+    problem: Option<String>,
+    /// When the next snapshot may be requested.
+    next: Option<Instant>,
+    /// The last answer.
+    told: Option<(Instant, Value)>,
+}
+
+impl Feed {
+    /// `requests`: to the training in this process, if there is one.
+    pub(in crate::cli) fn new(source: Source, requests: Option<Requests>) -> Self {
+        let mut state = State::default();
+        if let Source::Fixed(gaussians) = &source {
+            state.show(gaussians, None);
+        }
+        Self { source, requests, state: Mutex::new(state) }
+    }
+
+    /// Takes what the training in this process reports.
+    pub(in crate::cli) fn observe(&self, event: Event<'_>) {
+        let Event::Snapshot { step, model, seconds } = event else { return };
+        let begin = Instant::now();
+        let mut state = self.lock();
+        state.show(&model.shown(), Some(step));
+        let spent = seconds + begin.elapsed().as_secs_f64();
+        let rest = Duration::from_secs_f64(spent / SNAPSHOT_SHARE).max(SNAPSHOT_EVERY);
+        state.next = Some(Instant::now() + rest);
+    }
+
+    /// Fulfils a request of the page; false if there is no such request, or no training in this process.
+    pub(super) fn follow(&self, what: &str) -> bool {
+        let Some(requests) = &self.requests else { return false };
+        match what {
+            "pause" => requests.pause(true),
+            "resume" => requests.pause(false),
+            "save" => requests.save(),
+            "stop" => requests.stop(Stop::Interrupted),
+            _ => return false,
+        }
+        self.lock().told = None;
+        true
+    }
+
+    /// The newest model, as the viewer reads it.
+    pub(super) fn model(&self) -> Option<Bytes> {
+        let state = self.lock();
+        (state.version > 0).then(|| state.model.clone())
+    }
+
+    /// Progress and the version of the model, as JSON. A page that asks is being watched, so a training in this process
+    /// is asked for a snapshot.
+    pub(super) fn state(&self) -> Value {
+        let mut state = self.lock();
+        if let Some((_, known)) = state.told.as_ref().filter(|(at, _)| at.elapsed() < STATE_EVERY) {
+            return known.clone();
+        }
+        let now = Instant::now();
+        match &self.requests {
+            Some(requests) if state.next.is_none_or(|next| next <= now) => {
+                requests.snapshot();
+                state.next = Some(now + SNAPSHOT_EVERY);
+            }
+            Some(_) => {}
+            None => self.read(&mut state),
+        }
+        let mut told = match &self.source {
+            Source::Run(run) => json!(RunTail::of(run)),
+            Source::File(_) | Source::Fixed(_) => json!({ "phase": "model" }),
+        };
+        let paused = self.requests.as_ref().is_some_and(Requests::is_paused);
+        if paused {
+            told["phase"] = "paused".into();
+        }
+        told["model"] = state.version.into();
+        told["modelStep"] = state.step.into();
+        told["canControl"] = self.requests.is_some().into();
+        told["problem"] = state.problem.clone().into();
+        state.told = Some((now, told.clone()));
+        told
+    }
+
+    /// Reads the model file if it has changed. A file that has vanished or is damaged leaves the last model.
+    fn read(&self, state: &mut State) {
+        let path = match &self.source {
+            Source::Run(run) => run.join("model.ply"),
+            Source::File(path) => path.clone(),
+            Source::Fixed(_) => return,
+        };
+        let found = std::fs::metadata(&path).and_then(|file| Ok((file.modified()?, file.len())));
+        match found {
+            Ok(found) if state.file == Some(found) => state.problem = None,
+            Ok(found) => {
+                state.file = Some(found);
+                self.reread(&path, state);
+            }
+            Err(error) if state.version > 0 => {
+                state.problem =
+                    Some(format!("{} is gone ({error}); the last model is shown", path.display()));
+            }
+            // The first checkpoint of a run is still to come.
+            Err(_) => {}
+        }
+    }
+
+    fn reread(&self, path: &Path, state: &mut State) {
+        let from = if let Source::Run(run) = &self.source { run } else { path };
+        match models::read(from) {
+            Ok((gaussians, _)) => state.show(&gaussians, None),
+            Err(error) => state.problem = Some(error.to_string()),
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn show(&mut self, gaussians: &Gaussians, step: Option<u64>) {
+        self.model = packed(&most_visible(gaussians, MOST_GAUSSIANS)).into();
+        (self.step, self.problem) = (step, None);
+        self.version += 1;
+    }
+}
+
+/// The `most` Gaussians with the largest product of opacity and area, in their order.
+fn most_visible(gaussians: &Gaussians, most: usize) -> Cow<'_, Gaussians> {
+    if gaussians.count <= most {
+        return Cow::Borrowed(gaussians);
+    }
+    let opacity = |raw: f32| 1.0 / (1.0 + (-raw).exp());
+    let area = |scale: Vec3| (scale.element_sum() - scale.min_element()).exp();
+    let scales = gaussians.log_scales().iter();
+    let seen: Vec<f32> = gaussians
+        .raw_opacities()
+        .iter()
+        .zip(scales)
+        .map(|(&raw, &scale)| opacity(raw) * area(scale))
+        .collect();
+    let mut order: Vec<usize> = (0..seen.len()).collect();
+    order.select_nth_unstable_by(most, |&a, &b| seen[b].total_cmp(&seen[a]).then(a.cmp(&b)));
+    let mut keep = vec![false; seen.len()];
+    order[..most].iter().for_each(|&index| keep[index] = true);
+    let mut kept = gaussians.clone();
+    kept.retain(&keep);
+    Cow::Owned(kept)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::splats::scene::{Features, Shape};
+
+    fn model(opacities: &[f32]) -> Gaussians {
+        let shape = Shape { sh_degree: 0, features: Features::NONE };
+        let mut gaussians = Gaussians::zeros(opacities.len(), shape);
+        gaussians.raw_opacities_mut().copy_from_slice(opacities);
+        gaussians.quats_mut().fill([1.0, 0.0, 0.0, 0.0]);
+        gaussians
+    }
+
+    #[test]
+    fn of_too_many_gaussians_those_that_cover_most_are_sent_in_their_order() {
+        let mut gaussians = model(&[3.0, -2.0, 1.0, 2.0]);
+        gaussians.log_scales_mut()[1] = Vec3::splat(4.0);
+        let kept = most_visible(&gaussians, 3);
+        assert_eq!(kept.raw_opacities(), [3.0, -2.0, 2.0]);
+        assert_eq!(most_visible(&gaussians, 4).count, 4);
+    }
+
+    #[test]
+    fn a_model_file_is_shown_again_when_it_changes_and_stays_when_it_vanishes() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("model.ply");
+        let feed = Feed::new(Source::File(path.clone()), None);
+        assert_eq!((feed.state()["model"].as_u64(), feed.model()), (Some(0), None));
+        let state = || {
+            feed.lock().told = None;
+            feed.state()
+        };
+        model(&[1.0]).save(&path).unwrap();
+        assert_eq!(state()["model"], 1);
+        let first = feed.model().unwrap();
+        assert_eq!(state()["model"], 1);
+        model(&[1.0, 2.0]).save(&path).unwrap();
+        assert_eq!(state()["model"], 2);
+        assert_ne!(feed.model().unwrap(), first);
+        std::fs::write(&path, "ply\n").unwrap();
+        assert!(state()["problem"].as_str().unwrap().contains("model.ply"));
+        std::fs::remove_file(&path).unwrap();
+        let gone = state();
+        assert!(gone["problem"].as_str().unwrap().contains("is gone"), "{gone}");
+        assert_eq!((gone["model"].as_u64(), gone["canControl"].as_bool()), (Some(2), Some(false)));
+        assert!(!feed.follow("stop"));
+    }
+
+    #[test]
+    fn a_page_asks_the_training_for_a_model_at_a_bounded_rate_and_controls_it() {
+        let requests = Requests::default();
+        let feed = Feed::new(Source::Run("no such run".into()), Some(requests.clone()));
+        assert_eq!(feed.state()["model"], 0);
+        assert!(requests.takes_snapshot());
+        feed.lock().told = None;
+        feed.state();
+        assert!(!requests.takes_snapshot(), "within a second");
+        let model = crate::splats::model::Model::of_shown(model(&[1.0]), &Default::default());
+        feed.observe(Event::Snapshot { step: 7, model: &model, seconds: 10.0 });
+        feed.lock().told = None;
+        let state = feed.state();
+        assert_eq!((state["model"].as_u64(), state["modelStep"].as_u64()), (Some(1), Some(7)));
+        let wait = feed.lock().next.unwrap() - Instant::now();
+        assert!(wait > Duration::from_secs(200), "a slow snapshot is repeated after {wait:?}");
+        assert!(feed.follow("pause") && requests.is_paused());
+        assert_eq!(feed.state()["phase"], "paused");
+        assert!(feed.follow("resume") && !requests.is_paused());
+        assert!(feed.follow("stop") && requests.stops() == Some(Stop::Interrupted));
+        assert!(!feed.follow("format"));
+    }
+}

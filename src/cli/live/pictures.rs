@@ -1,0 +1,127 @@
+//! Images of a dataset's views for the live page, made when they are asked for.
+
+use std::collections::VecDeque;
+
+use hyper::body::Bytes;
+
+use crate::Result;
+use crate::gpu::Gpu;
+use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::image::Image;
+use crate::photographs::tone::ToneCurve;
+use crate::results::export::page::{Bookmark, Picture, moved};
+use crate::train::{TestTargets, TrainConfig};
+
+/// What an image shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Kind {
+    Photograph,
+    Target,
+    Reference,
+}
+
+const KINDS: [(&str, Kind); 3] =
+    [("photograph", Kind::Photograph), ("target", Kind::Target), ("reference", Kind::Reference)];
+
+/// Quality of the JPEGs.
+const QUALITY: u8 = 90;
+/// The most memory of finished images, in bytes.
+const KEPT: usize = 64 << 20;
+
+/// The images of a dataset's views.
+#[derive(Debug)]
+pub(in crate::cli) struct Pictures {
+    dataset: Dataset,
+    config: TrainConfig,
+    /// Opened for the first target.
+    gpu: Option<Gpu>,
+    /// The training photographs are measured for the first target.
+    targets: Option<TestTargets>,
+    /// The last are kept.
+    finished: VecDeque<((usize, Kind), Bytes)>,
+}
+
+impl Pictures {
+    /// Loads the dataset of a configuration, but no photograph. Without a device, one is opened for the first target.
+    ///
+    /// # Errors
+    /// Those of [`Dataset::load`].
+    pub(in crate::cli) fn load(config: TrainConfig, gpu: Option<Gpu>) -> Result<Self> {
+        let mut options = config.load_options();
+        // The viewer has a pinhole camera.
+        (options.undistort, options.load_low_test, options.keep) = (true, true, Some(0));
+        let dataset = Dataset::load(&config.dataset, &options)?;
+        Ok(Self { dataset, config, gpu, targets: None, finished: VecDeque::new() })
+    }
+
+    pub(in crate::cli) fn dataset(&self) -> &Dataset {
+        &self.dataset
+    }
+
+    /// The cameras of all views, for a model whose origin is that of the dataset's training frame, and the addresses of
+    /// their images.
+    pub(in crate::cli) fn bookmarks(&self) -> Vec<Bookmark> {
+        let origin = self.config.frame.unwrap_or_else(|| self.dataset.frame()).file_origin();
+        let bookmark = |(place, view): (usize, &View)| {
+            let kinds = KINDS.iter().filter(|(_, kind)| self.has(view, *kind));
+            let picture = |(name, _): &(&str, Kind)| {
+                ((*name).to_owned(), Picture::At(format!("picture/{place}/{name}")))
+            };
+            Bookmark {
+                name: view.name.clone(),
+                camera: moved(&view.upright_camera(), origin),
+                pictures: kinds.map(picture).collect(),
+            }
+        };
+        self.dataset.views.iter().enumerate().map(bookmark).collect()
+    }
+
+    fn has(&self, view: &View, kind: Kind) -> bool {
+        match kind {
+            Kind::Photograph => view.has_photograph(),
+            Kind::Reference => view.has_reference(),
+            Kind::Target => view.has_photograph() && self.config.tone.curve != ToneCurve::None,
+        }
+    }
+
+    /// An image of the view at `place` in the dataset, upright, as JPEG; `None` if there is none.
+    ///
+    /// # Errors
+    /// Its file can no longer be read, or the device is lost or out of memory.
+    pub(super) fn of(&mut self, place: usize, kind: &str) -> Result<Option<Bytes>> {
+        let Some((_, kind)) = KINDS.iter().find(|(name, _)| *name == kind) else { return Ok(None) };
+        let wanted = (place, *kind);
+        if let Some((_, known)) = self.finished.iter().find(|(key, _)| *key == wanted) {
+            return Ok(Some(known.clone()));
+        }
+        let Some(image) = self.image(place, *kind)? else { return Ok(None) };
+        let jpeg = Bytes::from(image.to_jpeg(QUALITY)?);
+        self.finished.push_back((wanted, jpeg.clone()));
+        while self.finished.iter().map(|(_, jpeg)| jpeg.len()).sum::<usize>() > KEPT {
+            self.finished.pop_front();
+        }
+        Ok(Some(jpeg))
+    }
+
+    fn image(&mut self, place: usize, kind: Kind) -> Result<Option<Image>> {
+        let Self { dataset, config, gpu, targets, .. } = self;
+        let Some(view) = dataset.views.get(place) else { return Ok(None) };
+        let image = match kind {
+            Kind::Photograph => view.loaded()?.map(std::borrow::Cow::into_owned),
+            Kind::Reference => view.loaded_reference()?.map(std::borrow::Cow::into_owned),
+            Kind::Target if config.tone.curve == ToneCurve::None => None,
+            Kind::Target => {
+                if targets.is_none() {
+                    let opened = match gpu.take() {
+                        Some(own) => own,
+                        None => Gpu::new(&config.device.parse()?)?,
+                    };
+                    *targets = Some(TestTargets::new(&opened, &config.tone, dataset)?);
+                    *gpu = Some(opened);
+                }
+                targets.as_mut().map_or(Ok(None), |targets| targets.of(view))?
+            }
+        };
+        Ok(image.map(|image| view.upright(image)))
+    }
+}

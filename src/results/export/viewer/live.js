@@ -1,0 +1,83 @@
+// Follows a training: asks the page's server for progress, and for the model when it has changed.
+
+const ASK_EVERY = 1000;  // milliseconds
+
+async function asked(path) {
+  const response = await fetch(path, { cache: 'no-store' });
+  if (!response.ok) throw new Error(`${path}: ${response.status}`);
+  return response;
+}
+
+function duration(seconds) {
+  const minutes = Math.floor(seconds / 60);
+  if (minutes >= 60) return `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
+  return minutes ? `${minutes} min` : `${Math.ceil(seconds)} s`;
+}
+
+// The progress on one line.
+function summary(state) {
+  const { phase, step, steps, loss, gaussians, milliseconds, heldOut = [], modelStep, problem } = state;
+  const parts = [];
+  if (phase !== 'model') parts.push(phase === 'training' && !step ? 'starting' : phase);
+  if (step) parts.push(`step ${step}${steps ? ` of at most ${steps}` : ''}`);
+  if (loss !== null && loss !== undefined) parts.push(`loss ${loss.toFixed(4)}`);
+  if (gaussians) parts.push(`${gaussians} Gaussians`);
+  if (heldOut.length) parts.push(`held-out views ${heldOut.at(-1)[1].toFixed(2)} dB`);
+  if (phase === 'training' && milliseconds) {
+    parts.push(`${milliseconds.toFixed(0)} ms a step`);
+    if (steps > step) parts.push(`at most ${duration((steps - step) * milliseconds / 1000)} left`);
+  }
+  if (modelStep) parts.push(`the model of step ${modelStep}`);
+  if (problem) parts.push(problem);
+  return parts.join(' · ');
+}
+
+// The scores of the held-out views as a curve.
+function plot(heldOut) {
+  const [steps, scores] = [0, 1].map((k) => heldOut.map((score) => score[k]));
+  const scaled = (values, size) => {
+    const [least, most] = [Math.min(...values), Math.max(...values)];
+    return values.map((value) => (value - least) / (most - least || 1) * size);
+  };
+  const [x, y] = [scaled(steps, 120), scaled(scores, 22)];
+  element('line').setAttribute('points', x.map((value, k) => `${value},${23 - y[k]}`).join(' '));
+}
+
+// Shows every model that comes; returns once the first is shown.
+async function follow(show) {
+  element('live').hidden = false;
+  let version = 0, isPaused = false;
+  const order = async (what) => { await fetch(`do/${what}`, { method: 'POST' }); await look(); };
+  element('pause').addEventListener('click', () => order(isPaused ? 'resume' : 'pause'));
+  for (const what of ['save', 'stop']) element(what).addEventListener('click', () => order(what));
+
+  async function look() {
+    const state = await (await asked('state')).json();
+    isPaused = state.phase === 'paused';
+    element('progress').textContent = summary(state);
+    element('controls').hidden = !state.canControl;
+    element('pause').textContent = isPaused ? 'Continue' : 'Pause';
+    plot(state.heldOut ?? []);
+    if (state.model !== version) {
+      show(await (await asked('model')).arrayBuffer());
+      version = state.model;
+      document.documentElement.dataset.version = String(version);
+    }
+  }
+  async function again() {
+    try {
+      if (!document.hidden) await look();
+    } catch (error) {
+      element('progress').textContent = 'the program that serves this page has ended or cannot be reached; the last model is shown';
+      element('controls').hidden = true;
+    }
+    setTimeout(again, ASK_EVERY);
+  }
+  await look();
+  if (!version) say('Waiting for the first model …');
+  while (!version) {
+    await new Promise((done) => setTimeout(done, ASK_EVERY));
+    await look();
+  }
+  setTimeout(again, ASK_EVERY);
+}

@@ -1,0 +1,265 @@
+//! The live page of `view` and `train --view`, asked as a browser asks and as an attacker does.
+
+use std::fs;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::path::Path;
+use std::process::{Child, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use crate::common::command::{command, refused, succeed};
+use crate::fixture;
+
+/// A command that serves a page, until it is dropped.
+struct Serving {
+    process: Child,
+    address: SocketAddr,
+    token: String,
+}
+
+impl Drop for Serving {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+impl Serving {
+    fn start(arguments: &str) -> Self {
+        let mut process =
+            command(arguments).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
+        let mut lines = BufReader::new(process.stderr.take().unwrap()).lines().map(Result::unwrap);
+        let line = lines.find(|line| line.contains("http://")).expect("no address is printed");
+        let url = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();
+        let (address, token) = url["http://".len()..].split_once('/').unwrap();
+        let serving = Self {
+            process,
+            address: address.parse().unwrap(),
+            token: token.trim_end_matches('/').to_owned(),
+        };
+        // What it writes later must not block it.
+        std::thread::spawn(move || lines.for_each(drop));
+        serving
+    }
+
+    /// Status and body of the answer.
+    fn ask(&self, method: &str, path: &str) -> (u16, Vec<u8>) {
+        self.ask_raw(method, &format!("/{}/{path}", self.token))
+    }
+
+    fn ask_raw(&self, method: &str, path: &str) -> (u16, Vec<u8>) {
+        let request = format!(
+            "{method} {path} HTTP/1.1\r\nHost: {}\r\nConnection: close\r\nContent-Length: 0\r\n\r\n",
+            self.address
+        );
+        let answer = self.exchange(request.as_bytes()).unwrap();
+        let end = answer.windows(4).position(|bytes| bytes == b"\r\n\r\n").expect("no head");
+        let head = std::str::from_utf8(&answer[..end]).unwrap();
+        assert!(head.contains("no-store") && head.contains("default-src 'none'"), "{head}");
+        (head[9..12].parse().unwrap(), answer[end + 4..].to_vec())
+    }
+
+    fn exchange(&self, request: &[u8]) -> std::io::Result<Vec<u8>> {
+        let mut stream = TcpStream::connect(self.address)?;
+        stream.set_read_timeout(Some(Duration::from_secs(60)))?;
+        stream.write_all(request)?;
+        let mut answer = vec![];
+        stream.read_to_end(&mut answer)?;
+        Ok(answer)
+    }
+
+    fn state(&self) -> Value {
+        let (status, body) = self.ask("GET", "state");
+        assert_eq!(status, 200);
+        serde_json::from_slice(&body).unwrap()
+    }
+
+    /// The first state for which `holds`.
+    fn until(&self, what: &str, holds: impl Fn(&Value) -> bool) -> Value {
+        let begin = Instant::now();
+        loop {
+            let state = self.state();
+            if holds(&state) {
+                return state;
+            }
+            assert!(begin.elapsed() < Duration::from_secs(120), "never {what}: {state}");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+
+    /// The most memory that the process has used, in KiB.
+    #[cfg(target_os = "linux")]
+    fn peak_memory(&self) -> u64 {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.process.id())).unwrap();
+        let line = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse().unwrap()
+    }
+}
+
+const LONG: &str = "--steps 20000 --seed 3 --sh-degree 1 --curve ap3 --model plain --progress none";
+
+#[test]
+fn the_page_of_a_run_shows_model_photographs_and_targets() {
+    let serving = Serving::start(&format!("view {} --listen 0", fixture().run()));
+    let (status, page) = serving.ask("GET", "");
+    let page = String::from_utf8(page).unwrap();
+    assert!(status == 200 && page.contains("picture/0/photograph"), "{page}");
+    let state = serving.state();
+    assert_eq!(
+        (&state["phase"], &state["step"], &state["model"]),
+        (&"finished".into(), &40.into(), &1.into())
+    );
+    assert_eq!(state["canControl"], false);
+    let (_, model) = serving.ask("GET", "model");
+    assert_eq!(u64::from(u32::from_le_bytes(*model.first_chunk().unwrap())), state["gaussians"]);
+    for kind in ["photograph", "target", "reference"] {
+        let (status, jpeg) = serving.ask("GET", &format!("picture/0/{kind}"));
+        assert!(status == 200 && jpeg.starts_with(&[0xff, 0xd8]), "{kind}: {status}");
+    }
+    for (method, path) in [
+        ("GET", "picture/9/photograph"),
+        ("GET", "picture/0/secret"),
+        ("GET", "picture/-1/photograph"),
+        ("GET", "../run/config.toml"),
+        ("GET", "picture/..%2f..%2fconfig.toml/photograph"),
+        ("POST", "do/stop"),
+        ("GET", "do/stop"),
+        ("DELETE", "model"),
+    ] {
+        assert_eq!(serving.ask(method, path).0, 404, "{method} {path}");
+    }
+}
+
+#[test]
+fn a_page_follows_a_model_file_and_a_dataset() {
+    let folder = tempfile::tempdir().unwrap();
+    let model = folder.path().join("model.ply");
+    fs::copy(fixture().path("run/model.ply"), &model).unwrap();
+    let serving = Serving::start(&format!("view {} --listen 0", model.display()));
+    assert_eq!(serving.until("a model", |state| state["model"] == 1)["phase"], "model");
+    fs::remove_file(&model).unwrap();
+    let gone = serving.until("a problem", |state| !state["problem"].is_null());
+    assert!(gone["problem"].as_str().unwrap().contains("is gone"), "{gone}");
+    assert_eq!(serving.ask("GET", "model").0, 200);
+
+    let serving = Serving::start(&format!("view {} --listen 0", fixture().set()));
+    let state = serving.until("points", |state| state["model"] == 1);
+    assert_eq!(state["phase"], "model");
+    assert_eq!(serving.ask("GET", "picture/1/target").0, 200);
+}
+
+#[test]
+fn a_training_is_paused_saved_and_stopped_from_its_page() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().join("run");
+    let set = fixture().set();
+    let mut serving =
+        Serving::start(&format!("train {set} --out {} {LONG} --view 127.0.0.1:0", run.display()));
+    let first = serving.until("a model", |state| state["model"].as_u64() > Some(0));
+    assert_eq!((&first["phase"], &first["canControl"]), (&"training".into(), &true.into()));
+    assert!(first["modelStep"].is_u64(), "{first}");
+    assert_eq!(serving.ask("POST", "do/pause").0, 200);
+    let mut paused = serving.until("paused", |state| state["phase"] == "paused");
+    // The steps under way are done.
+    loop {
+        std::thread::sleep(Duration::from_millis(500));
+        let again = serving.state();
+        if again["step"] == paused["step"] {
+            break;
+        }
+        paused = again;
+    }
+    assert!(!run.join("checkpoint.safetensors").exists());
+    assert_eq!(serving.ask("POST", "do/save").0, 200);
+    let begin = Instant::now();
+    while !run.join("model.ply").exists() {
+        assert!(begin.elapsed() < Duration::from_secs(60), "no checkpoint");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    assert_eq!(serving.ask("POST", "do/resume").0, 200);
+    serving.until("more steps", |state| state["step"].as_u64() > paused["step"].as_u64());
+    assert_eq!(serving.ask("POST", "do/stop").0, 200);
+    assert_eq!(serving.process.wait().unwrap().code(), Some(130));
+    assert!(run.join("checkpoint.safetensors").exists());
+}
+
+/// Holds connections that say nothing, half a request or nonsense, or read nothing of what they ask for.
+fn attack(serving: &Serving) -> Vec<TcpStream> {
+    let token = &serving.token;
+    let requests = [
+        Vec::new(),
+        b"GET ".to_vec(),
+        format!("GET /{token}/model HTTP/1.1\r\nHost: x\r\n\r\n").into_bytes(),
+        [b'x'; 40_000].to_vec(),
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03".to_vec(),
+        b"POST /x HTTP/1.1\r\nContent-Length: 999999999999\r\n\r\nx".to_vec(),
+        b"GET / HTTP/1.1\r\nTransfer-Encoding: chunked\r\nContent-Length: 4\r\n\r\nffffffffffffffff\r\n".to_vec(),
+    ];
+    let one = |index: usize| {
+        let mut stream = TcpStream::connect(serving.address).ok()?;
+        // The server may have closed it already.
+        let _ = stream.write_all(&requests[index % requests.len()]);
+        Some(stream)
+    };
+    (0..1000).filter_map(one).collect()
+}
+
+#[test]
+fn hostile_clients_change_no_bit_of_a_training_and_hold_little_memory() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = fixture().set();
+    let train = |name: &str| {
+        let out = folder.path().join(name);
+        (
+            format!(
+                "train {set} --out {} --steps 600 --seed 3 --sh-degree 1 --curve ap3 --model plain",
+                out.display()
+            ),
+            out,
+        )
+    };
+    let (alone, unwatched) = train("alone");
+    succeed(&alone);
+    let (arguments, watched) = train("watched");
+    let mut serving = Serving::start(&format!("{arguments} --progress none --view 0"));
+    serving.until("a model", |state| state["model"].as_u64() > Some(0));
+    #[cfg(target_os = "linux")]
+    let before = serving.peak_memory();
+    let held = attack(&serving);
+    assert!(held.len() > 100, "{} connections", held.len());
+    #[cfg(target_os = "linux")]
+    assert!(
+        serving.peak_memory() < before + (64 << 10),
+        "{before} KiB grew to {}",
+        serving.peak_memory()
+    );
+    drop(held);
+    for path in
+        ["/", "/state", "/../../etc/passwd", "/00000000000000000000000000000000/state", "//"]
+    {
+        // The training may end in between.
+        if TcpStream::connect(serving.address).is_ok() {
+            assert_eq!(serving.ask_raw("GET", path).0, 404, "{path}");
+        }
+    }
+    assert!(serving.process.wait().unwrap().success());
+    let model = |run: &Path| fs::read(run.join("model.ply")).unwrap();
+    assert!(model(&unwatched) == model(&watched), "watching changed the model");
+}
+
+#[test]
+fn an_address_in_use_and_a_path_that_is_nothing_are_refused() {
+    let serving = Serving::start(&format!("view {} --listen 0", fixture().run()));
+    let port = serving.address.port();
+    refused(
+        &format!("view {} --listen {port}", fixture().run()),
+        2,
+        &[&port.to_string(), "in use", "another port"],
+    );
+    refused("view nowhere", 3, &["nowhere", "does not exist", "run directory"]);
+    refused(&format!("view {} --listen here", fixture().run()), 2, &["here", "127.0.0.1:7007"]);
+    let empty = tempfile::tempdir().unwrap();
+    refused(&format!("view {}", empty.path().display()), 3, &["transforms"]);
+}
