@@ -59,21 +59,26 @@ impl Default for RenderSettings {
 /// The tile of a GPU, as in 3DGS, and that of a CPU, whose subgroups are narrow: measured on lavapipe.
 const GPU_TILE: [u32; 2] = [16, 16];
 const CPU_TILE: [u32; 2] = [16, 8];
-/// More channels than these take a smaller tile on a CPU, whose registers no longer hold the state of a larger one.
-const CPU_TILE_CHANNELS: usize = 5;
+/// More channels than these take a smaller tile on a CPU and with narrow subgroups, whose registers no longer hold the
+/// state of a larger one.
+const TILE_CHANNELS: usize = 5;
 const CPU_SMALL_TILE: [u32; 2] = [8, 8];
 
 /// Subgroups of fewer lanes share the tile: alone, each would spill half of its state (compiled by Mesa 25 for Arc).
 const WIDE_SUBGROUP: u32 = 32;
-const NARROW_GPU_TILE: Tile = Tile { size: [16, 16], subgroups: 4 };
+const SHARED_GPU_TILE: [u32; 2] = [16, 16];
 /// The same where subgroups do not stay converged.
 const SMALL_GPU_TILE: [u32; 2] = [8, 8];
 
-fn gpu_tile(properties: &Properties) -> Tile {
+fn gpu_tile(properties: &Properties, channels: usize) -> Tile {
+    let divisor = if channels > TILE_CHANNELS { 2 } else { 1 };
+    let of =
+        |[width, height]: [u32; 2], subgroups| Tile { size: [width, height / divisor], subgroups };
+    let shared = of(SHARED_GPU_TILE, 4);
     match properties.subgroup_size {
         WIDE_SUBGROUP.. => GPU_TILE.into(),
-        _ if properties.suits_tile(NARROW_GPU_TILE) => NARROW_GPU_TILE,
-        _ => SMALL_GPU_TILE.into(),
+        _ if properties.suits_tile(shared) => shared,
+        _ => of(SMALL_GPU_TILE, 1),
     }
 }
 
@@ -86,8 +91,8 @@ impl RenderSettings {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn tile_on(&self, gpu: &Gpu) -> Result<Tile> {
         let built_in = match self.channels() {
-            _ if !gpu.properties().is_cpu => gpu_tile(gpu.properties()),
-            0..=CPU_TILE_CHANNELS => CPU_TILE.into(),
+            _ if !gpu.properties().is_cpu => gpu_tile(gpu.properties(), self.channels()),
+            0..=TILE_CHANNELS => CPU_TILE.into(),
             _ => CPU_SMALL_TILE.into(),
         };
         let tile = self.tile.or_else(|| gpu.tuned_tile(self.channels())).unwrap_or(built_in);
