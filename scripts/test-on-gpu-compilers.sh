@@ -35,7 +35,7 @@ printf '{"file_format_version": "1.0.0", "ICD": {"library_path": "%s", "api_vers
 
 # run ARCHITECTURE COMMAND..: on the null device with the compiler of the architecture.
 run() {
-    local architecture=$1 root=$work/trixie program driver shim='' own=() set=()
+    local architecture=$1 root=$work/trixie-amd64 program driver shim='' own=() set=()
     shift
     case $architecture in
         navi21 | vega20) root='' driver=radeon set=(RADV_FORCE_FAMILY="${architecture^^}") ;;
