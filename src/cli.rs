@@ -19,6 +19,7 @@ pub mod completions;
 pub mod demo;
 pub mod diagnose;
 pub mod doctor;
+mod driver;
 pub mod eval;
 pub mod export;
 mod help;

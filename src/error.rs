@@ -53,6 +53,30 @@ pub enum Error {
         /// The feature, extension or limit, by its Vulkan name.
         feature: String,
     },
+    /// The device computes something else than what the kernels rely on.
+    #[error("{device} fails the self-test: {what}; {remedy}, or pick another device with --device")]
+    SelfTest {
+        /// The device's name, with the driver.
+        device: String,
+        /// The first check that failed.
+        what: String,
+        /// What may help.
+        remedy: String,
+    },
+    /// The driver refuses to compile a kernel, or crashes.
+    #[error(
+        "{device} {problem} kernel `{kernel}`; update the driver, or pick another device with --device{remedy}"
+    )]
+    Kernel {
+        /// The device's name, with the driver.
+        device: String,
+        /// Completes the sentence: "refuses (ERROR_UNKNOWN)".
+        problem: String,
+        /// The kernel with its constants.
+        kernel: String,
+        /// What else may help.
+        remedy: String,
+    },
     /// A buffer does not fit into device memory.
     #[error(
         "out of device memory: buffer `{buffer}` needs {bytes} bytes; lower max_gaussians, patch_pixels \
@@ -193,6 +217,8 @@ impl Error {
             Self::Input { .. } => 3,
             Self::NoDevice(_)
             | Self::MissingFeature { .. }
+            | Self::SelfTest { .. }
+            | Self::Kernel { .. }
             | Self::OutOfMemory { .. }
             | Self::BufferTooLarge { .. }
             | Self::DeviceLost { .. }

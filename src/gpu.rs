@@ -29,6 +29,7 @@ mod kernel;
 mod lent;
 mod limits;
 mod memory;
+mod parts;
 mod pci;
 mod pipeline;
 mod reconvergence;
@@ -36,6 +37,7 @@ mod recorder;
 mod requirements;
 mod ring;
 mod slice;
+mod spirv;
 mod statistics;
 mod subgroups;
 mod submission;
@@ -62,6 +64,7 @@ pub use check::{CheckReport, CheckedPass, Difference, Tolerance};
 pub use choice::DeviceChoice;
 pub(crate) use choice::SchedulerVariables;
 pub use cooperative::CooperativeMatrix;
+pub(crate) use device::cache_folder;
 #[cfg(feature = "capi")]
 pub(crate) use device::check_physical_device;
 pub use device_report::{DeviceLimits, DeviceReport, RequirementReport, devices};
@@ -71,6 +74,7 @@ pub use kernel::{Binding, Bound, Interface, Kernel, Recordable};
 #[cfg(feature = "check")]
 pub use kernel::{OnHost, Reference};
 pub use lent::{HostAllocation, HostDevice, HostFrame, MemoryFunctions, QueueLock};
+pub(crate) use limits::WORKGROUP;
 pub use memory::MemoryBudget;
 pub use pci::PciAddress;
 pub use pipeline::Pipeline;
@@ -105,8 +109,10 @@ pub struct Properties {
     pub subgroup_size: u32,
     /// Kernels can require that subgroup size.
     pub subgroup_size_is_selectable: bool,
-    /// Bytes that one storage buffer binding can span.
+    /// Bytes that one storage buffer binding can span, within one buffer.
     pub max_storage_buffer_range: u64,
+    /// Bytes of the largest buffer: the lesser of `maxBufferSize` and `maxMemoryAllocationSize`.
+    pub max_buffer_size: u64,
     /// Workgroups of a dispatch along one dimension.
     pub max_workgroups: u32,
     /// Loop iterations, summed over all loops, after which an invocation silently leaves its loops.
@@ -174,6 +180,7 @@ struct Shared {
 struct Recorded {
     dispatches: AtomicU64,
     barriers: AtomicU64,
+    submits: AtomicU64,
 }
 
 /// The queue is held while a submission is recorded, so that timeline values are known in advance.
@@ -384,7 +391,7 @@ mod tests {
 
     #[test]
     fn a_lost_device_names_its_submission() {
-        let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+        let gpu = Gpu::open(&DeviceChoice::Best).unwrap();
         let lost = || gpu.shared.error("vkQueueSubmit2", vk::Result::ERROR_DEVICE_LOST).to_string();
         assert!(lost().contains("`vkQueueSubmit2`"), "{}", lost());
         gpu.run("the first", |_| Ok(())).unwrap();

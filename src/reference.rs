@@ -7,6 +7,7 @@
 #![expect(clippy::needless_range_loop, reason = "keeps each line comparable to the shader")]
 
 mod adam;
+mod adam_gaussian;
 mod adam_rest;
 pub mod blend_backward;
 pub mod blend_forward;
@@ -78,12 +79,14 @@ pub mod rotation;
 pub mod rounding;
 mod scan_downsweep;
 mod scan_upsweep;
+mod self_test;
 pub mod sh;
 mod sort_downsweep;
-mod sort_spine;
 mod sort_upsweep;
 pub mod splat;
 pub mod ssim;
+mod ssim_backward;
+mod ssim_forward;
 mod structure_l1;
 
 use glam::UVec2;

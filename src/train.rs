@@ -44,7 +44,7 @@ use crate::gpu::CheckReport;
 use crate::gpu::{Gpu, PassTime, Recorder};
 use crate::loss::Term;
 use crate::photographs::dataset::{Dataset, Fingerprint};
-use crate::splats::optimizer::{Adam, FiniteCheck, LearningRates};
+use crate::splats::optimizer::{Adam, FiniteCheck, GaussianStep, LearningRates};
 use crate::splats::render::{Damping, Gradients, RenderOptions, Renderer};
 use crate::splats::scene::Gaussians;
 use crate::{Error, Result, splats};
@@ -340,8 +340,15 @@ impl Trainer {
         )?;
         supervision.regularise((gpu, pass), model, renderer, slot)?;
         let rates = schedule.learning_rates(step, self.extent).scaled(cooldown_factor);
-        let (degree, status) = (options.sh_degree, renderer.status());
-        model.update((gpu, pass), &optimizer.adam, step, &rates, degree, status)?;
+        let status = renderer.status();
+        let own = GaussianStep {
+            step,
+            rates: &rates,
+            sh_degrees: [model.shape().sh_degree, options.sh_degree],
+            camera: renderer.camera_of(&supervision.views.viewpoint(view)),
+            status,
+        };
+        model.update((gpu, pass), &optimizer.adam, own, renderer.gradient_kind())?;
         supervision.update(pass, &optimizer.adam, step, cooldown_factor, status)
     }
 

@@ -1,7 +1,14 @@
 // Real spherical harmonics to degree 3, in the order and with the signs that splat viewers use. The viewer of exported
 // pages includes this file, too: it is also valid GLSL ES 3.00.
 
+#ifdef GL_ES
+#define PRECISE_OUT out
+#else
+#define PRECISE_OUT precise out
+#endif
+
 const uint MAX_SH_DEGREE = 3u;
+const uint MAX_COEFFICIENTS = 16u;
 
 const float SH_C0 = 0.28209479177387814;  // 1 / (2 sqrt(pi)): the constant basis function
 const float SH_C1 = 0.4886025119029199;
@@ -15,8 +22,8 @@ const float SH_C3[7] = float[](
 
 uint sh_count(uint degree) { return (degree + 1u) * (degree + 1u); }
 
-// The basis in the unit direction d; entries above `degree` are zero.
-void sh_basis(uint degree, vec3 d, out float basis[16]) {
+// The basis in the unit direction d; entries above `degree` are zero. `precise`: every kernel computes the same bits.
+void sh_basis(uint degree, vec3 d, PRECISE_OUT float basis[16]) {
     for (uint k = 0u; k < 16u; k++) basis[k] = 0.0;
     float x = d.x, y = d.y, z = d.z;
     basis[0] = SH_C0;

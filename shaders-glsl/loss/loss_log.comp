@@ -1,12 +1,10 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
-#include "status.glsl"
 
 //! The means of two loss terms from their partial sums, into the step's slot of the log.
 //!
-//! One subgroup, in a fixed order. A term that is NaN or infinite sets a sticky flag in the status word, so that later
-//! steps of the recording change nothing. Reference: `src/reference/loss_log.rs`.
+//! One subgroup, in a fixed order. Reference: `src/reference/loss_log.rs`.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -25,22 +23,12 @@ layout(binding = 2) writeonly buffer Log            { float log[]; };       // (
 layout(binding = 3) writeonly buffer Statuses       { uint statuses[]; };   // (slots,), status[0] after the step
 layout(binding = 4)           buffer Status         { uint status[]; };
 
-bool is_finite(float x) { return (floatBitsToUint(x) & 0x7f800000u) != 0x7f800000u; }
+#include "log_row.glsl"
 
 void main() {
-    float first = 0.0;
-    for (uint i = gl_LocalInvocationID.x; i < partial_counts.x; i += SUBGROUP_SIZE) first += first_partials[i];
-    float second = 0.0;
-    for (uint i = gl_LocalInvocationID.x; i < partial_counts.y; i += SUBGROUP_SIZE) second += second_partials[i];
-    first = subgroupAdd(first) * mean_scales.x;
-    second = subgroupAdd(second) * mean_scales.y;
-    if (subgroupElect()) {
-        if (partial_counts.x > 0) log[slot * term_count + terms.x] = first;
-        if (partial_counts.y > 0) log[slot * term_count + terms.y] = second;
-        uint word = status[0];
-        if (!is_finite(first) || !is_finite(second)) word |= STATUS_NOT_FINITE;
-        status[0] = word;
-        status[3] = word;
-        statuses[slot] = word;
-    }
+    vec2 sums = vec2(0.0);
+    ADD_PARTIALS(first_partials, partial_counts.x, sums.x)
+    ADD_PARTIALS(second_partials, partial_counts.y, sums.y)
+    vec2 means = vec2(subgroupAdd(sums.x), subgroupAdd(sums.y)) * mean_scales;
+    if (subgroupElect()) write_row(means, greaterThan(partial_counts, uvec2(0)));
 }

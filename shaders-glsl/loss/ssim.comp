@@ -19,7 +19,8 @@
 //! of the run, where windows are incomplete and have no outputs. A loaded row is blurred along x in registers and
 //! added, weighted by the taps along y, to the moments of the rows in reach; those RADIUS rows above are then complete,
 //! their derivatives are blurred in the same way, and the gradient 2 RADIUS rows above is complete. No barrier is
-//! needed, and no intermediate image is written.
+//! needed, and no intermediate image is written. That suits a CPU; on a GPU, whose registers do not hold the state of
+//! both blurs, `ssim_forward` and `ssim_backward` are used instead.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -43,21 +44,13 @@ layout(binding = 2)           buffer DRender      { vec4 d_render[]; };        /
 layout(binding = 3) writeonly buffer L1Partials   { float l1_partials[]; };    // one per workgroup: sum of |a - b|
 layout(binding = 4) writeonly buffer SsimPartials { float ssim_partials[]; };  // one per workgroup: sum of S
 
-const float C1 = 0.0001;  // (0.01 L)^2, L = 1
-const float C2 = 0.0009;  // (0.03 L)^2
+#include "ssim_window.glsl"
 
-const int RADIUS = 5;                  // of the window, pixels
-const uint PENDING = 2 * RADIUS;       // rows of outputs in reach, other than the completed one
 const uint REACH = COLUMNS + PENDING;  // columns that the windows of a lane see
 // Columns at an end of a subgroup's run without complete windows of windows.
 const uint HALO = (2 * RADIUS + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
 const uint OUTPUTS = SUBGROUP_SIZE * COLUMNS - 2 * HALO;
 const uint QUADS = (COLUMNS + 7 - ALIGNMENT) / 4;  // vectors of four that contain COLUMNS at any offset
-
-// exp(-d^2 / (2 sigma^2)) / sum for d = 0..RADIUS.
-const float TAPS[RADIUS + 1] =
-    float[](0.2660117248617943, 0.21300553771125366, 0.1093606895097, 0.03600077212843082, 0.007598758135239184,
-        0.0010283800844791099);
 
 // The blurred moments, in the order of the arrays below; SSIM only needs the sum of the squares.
 const uint A = 0, B = 1, SQUARES = 2, PRODUCT = 3, MOMENTS = 4;
@@ -85,11 +78,6 @@ Strip strip_of(uint workgroup) {
 bool has_output(Strip strip, uint column) {
     uint in_run = gl_SubgroupInvocationID * COLUMNS + column;
     return in_run - HALO < OUTPUTS && uint(strip.x) + column < width;
-}
-
-// Whether a pixel is in the loss region, which may be the whole view.
-bool is_inside(uint x, uint y) {
-    return x >= loss_begin.x && x < loss_end.x && y >= loss_begin.y && y < loss_end.y;
 }
 
 bool is_aligned() {
@@ -167,20 +155,6 @@ float march(inout float pending[PENDING], float value) {
     return complete;
 }
 
-// S at one pixel and its three derivatives.
-float ssim(float moments[MOMENTS], out vec3 d_moments) {
-    float a = moments[A], b = moments[B];
-    float a1 = 2.0 * a * b + C1;
-    float a2 = 2.0 * (moments[PRODUCT] - a * b) + C2;
-    float b1 = a * a + b * b + C1;
-    // Variances are not negative: only cancellation of large bright values reaches the floor.
-    float b2 = max(moments[SQUARES] - (a * a + b * b), 0.0) + C2;
-    float scale = 1.0 / (b1 * b2);
-    float s = a1 * a2 * scale;
-    d_moments = vec3(2.0 * (b * (a2 - a1) * scale - a * s * (1.0 / b1 - 1.0 / b2)), -s / b2, 2.0 * a1 * scale);
-    return s;
-}
-
 void main() {
     Strip strip = strip_of(WORKGROUP_INDEX);
     if (strip.channel >= 3) return;
@@ -213,7 +187,7 @@ void main() {
             [[unroll]] for (uint m = 0; m < MOMENTS; ++m) moments[m] = march(pending[m][x], blur(row[m], x));
             bool counts = is_inside(uint(strip.x) + x, uint(complete));
             vec3 d_moments;
-            float s = ssim(moments, d_moments);
+            float s = ssim(vec4(moments[A], moments[B], moments[SQUARES], moments[PRODUCT]), d_moments);
             [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) own[m][x] = counts ? d_moments[m] : 0.0;
             bool is_own = complete >= strip.y && complete < strip.end && has_output(strip, x);
             ssim_sum += counts && is_own ? s : 0.0;
@@ -228,10 +202,8 @@ void main() {
         [[unroll]] for (uint x = 0; x < COLUMNS; ++x) {
             float d[DERIVATIVES];
             [[unroll]] for (uint m = 0; m < DERIVATIVES; ++m) d[m] = march(d_pending[m][x], blur(d_row[m], x));
-            // A value outside all windows has no gradient, even if it is NaN.
-            float d_ssim = d[0] + (d[1] == 0.0 ? 0.0 : 2.0 * a[x] * d[1]) + b[x] * d[2];
             float difference = is_inside(uint(strip.x) + x, uint(done)) ? a[x] - b[x] : 0.0;
-            gradient[x] = l1_scale * sign(difference) - ssim_scale * d_ssim;
+            gradient[x] = l1_scale * sign(difference) - ssim_scale * d_ssim(a[x], b[x], vec3(d[0], d[1], d[2]));
             l1_sum += done >= strip.y && has_output(strip, x) ? abs(difference) : 0.0;
         }
         if (done >= strip.y) store_row(strip, plane + uint(done) * width + uint(strip.x), gradient);

@@ -96,6 +96,8 @@ fn code(error: &Error) -> NspResult {
         Error::Disagrees { .. } => NSP_ERROR_INTERNAL,
         Error::NoDevice(_)
         | Error::MissingFeature { .. }
+        | Error::SelfTest { .. }
+        | Error::Kernel { .. }
         | Error::BufferTooLarge { .. }
         | Error::TileLimit { .. } => NSP_ERROR_DEVICE,
     }

@@ -15,7 +15,7 @@ use std::time::Duration;
 use anyhow::Result;
 use serde_json::{Map, Value, json};
 
-use super::{finish, table};
+use super::{driver, finish, table};
 use crate::Error;
 use crate::ceilings::Ceiling;
 use crate::gpu::{CheckReport, DeviceChoice, Gpu, PassTime};
@@ -108,7 +108,7 @@ pub fn run(args: &BenchArgs) -> Result<()> {
                     --warm at most 60";
         return Err(Error::Usage(rule.to_owned()).into());
     }
-    let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
+    let gpu = driver::open(&args.device.clone().unwrap_or_default())?;
     let bench = Bench { gpu, repeats: args.repeats };
     if args.tune {
         let is_sized = args.width.is_some() || args.height.is_some();

@@ -7,7 +7,7 @@ use anyhow::Result;
 use serde_json::{Value, json};
 
 use super::train::TrainOptions;
-use super::{finish, table, word};
+use super::{driver, finish, table, word};
 use crate::gpu::{CheckReport, CheckedPass, DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::train::Trainer;
@@ -38,7 +38,7 @@ pub fn run(args: &CheckArgs) -> Result<()> {
     // Full resolution from the first step on.
     config.schedule.resolution_steps = [0, 0];
     let steps = steps.min(config.steps);
-    let gpu = Gpu::new(&config.device.parse::<DeviceChoice>()?)?;
+    let gpu = driver::open(&config.device.parse::<DeviceChoice>()?)?;
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;
     let (trainer, mut report) = gpu.checked(|| Trainer::new(&gpu, config, &dataset));
     let mut trainer = trainer?;

@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 use serde::Serialize;
 
-use super::{finish, table, word, words};
+use super::{driver, finish, table, word, words};
 use crate::Error;
 use crate::base::output::{check_writable, write_whole};
-use crate::gpu::{DeviceChoice, Gpu};
+use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::{Dataset, PixelOrientation};
 use crate::photographs::white_balance::WhiteBalance;
 use crate::results::diagnosis;
@@ -101,7 +101,7 @@ pub fn run(args: &DiagnoseArgs) -> Result<()> {
     args.report.iter().chain(&args.plan).try_for_each(|path| check_writable(path))?;
     config.white_balance.clone_from(&args.white_balance);
     config.orientation = args.orientation.unwrap_or_default();
-    let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
+    let gpu = driver::open(&args.device.clone().unwrap_or_default())?;
     let options = diagnosed(&config);
     let (dataset, mut diagnosis) = Diagnosis::load(&config.dataset, &options)?;
     let run = args.run.as_deref().map(|run| holes(run, args)).transpose()?;

@@ -10,7 +10,8 @@ use serde::Serialize;
 use super::finish;
 use crate::Error;
 use crate::gpu::{
-    CooperativeMatrix, DeviceChoice, DeviceReport, SUBGROUP_VARIABLE, SchedulerVariables, devices,
+    CooperativeMatrix, DeviceChoice, DeviceReport, Gpu, SUBGROUP_VARIABLE, SchedulerVariables,
+    devices,
 };
 use crate::photographs::pose::how_to_install;
 
@@ -20,6 +21,9 @@ pub struct DoctorArgs {
     /// Print JSON instead of text
     #[arg(long)]
     pub json: bool,
+    /// Compile every kernel on the device with this index, and print each before
+    #[arg(long, hide = true, value_name = "INDEX")]
+    pub compile: Option<usize>,
 }
 
 /// What `--json` prints.
@@ -41,19 +45,29 @@ struct Listed<'a> {
     report: &'a DeviceReport,
     /// The names of unmet requirements.
     missing: Vec<&'static str>,
+    /// `passed`, or the problem; null for a device that lacks a requirement.
+    self_test: Option<String>,
 }
 
 /// Prints the report.
 ///
 /// # Errors
-/// There is no Vulkan, no device meets every requirement, or a scheduler's variables name none; the list is printed
-/// nevertheless.
+/// There is no Vulkan, no device meets every requirement and passes the self-test, or a scheduler's variables name none;
+/// the list is printed nevertheless.
 pub fn run(args: &DoctorArgs) -> Result<()> {
+    if let Some(index) = args.compile {
+        return compile(index);
+    }
     let devices = devices()?;
+    let mut tested: Vec<_> = devices.iter().enumerate().map(self_tested).collect();
     let picked = SchedulerVariables::of_this_process().pick(&DeviceChoice::Best, &devices);
     let reason = picked.as_ref().ok().and_then(|picked| picked.reason.clone());
+    let self_tests: Vec<_> = tested.iter().map(described).collect();
     let checked = picked.and_then(|picked| match devices[picked.index].missing() {
-        None => Ok(picked.index),
+        None => match tested[picked.index].take() {
+            Some(Err(error)) => Err(error),
+            _ => Ok(picked.index),
+        },
         Some(feature) => {
             let (device, feature) = (devices[picked.index].name.clone(), feature.to_owned());
             Err(Error::MissingFeature { device, feature })
@@ -64,16 +78,41 @@ pub fn run(args: &DoctorArgs) -> Result<()> {
         PROGRAMS.iter().map(|(name, _)| (*name, on_path(name))).collect();
     let verdict = verdict(chosen.map(|index| &devices[index]), reason.as_deref());
     let text = if args.json {
-        let listed =
-            |report| Listed { report, missing: DeviceReport::all_missing(report).collect() };
-        let devices = devices.iter().map(listed).collect();
+        let listed = |(report, self_test)| Listed {
+            report,
+            missing: DeviceReport::all_missing(report).collect(),
+            self_test,
+        };
+        let devices = devices.iter().zip(self_tests).map(listed).collect();
         serde_json::to_string_pretty(&Output { devices, chosen, reason, programs, verdict })?
     } else {
-        table(&devices) + &program_lines(&programs) + &verdict
+        table(&devices, &self_tests) + &program_lines(&programs) + &verdict
     };
     writeln!(std::io::stdout().lock(), "{}", text.trim_end())?;
     checked?;
     if args.json { Ok(()) } else { finish("", "nightsplat demo, or nightsplat diagnose photos") }
+}
+
+/// Opens a device that meets the requirements, which tests it.
+fn self_tested((index, device): (usize, &DeviceReport)) -> Option<crate::Result<()>> {
+    device.missing().is_none().then(|| Gpu::open(&DeviceChoice::Index(index))?.self_test())
+}
+
+fn described(tested: &Option<crate::Result<()>>) -> Option<String> {
+    let tested = tested.as_ref()?;
+    Some(tested.as_ref().map_or_else(ToString::to_string, |()| "passed".to_owned()))
+}
+
+/// Compiles every kernel. A driver that crashes ends the process, and the last line names the kernel.
+fn compile(index: usize) -> Result<()> {
+    let mut printed = Ok(());
+    let mut print = |kernel: &str| {
+        let mut out = std::io::stdout().lock();
+        printed = writeln!(out, "{kernel}").and_then(|()| out.flush());
+    };
+    print("self_test");
+    Gpu::new(&DeviceChoice::Index(index))?.compile_all(print)?;
+    Ok(printed?)
 }
 
 /// Programs that commands run, and for what.
@@ -108,9 +147,12 @@ fn verdict(chosen: Option<&DeviceReport>, reason: Option<&str>) -> String {
     format!("ready: trains on {name}{reason}{speed}; --device selects another")
 }
 
-fn table(devices: &[DeviceReport]) -> String {
+/// What the self-test is about.
+const SELF_TEST: &str = "subgroups, memory and functions do what the kernels rely on";
+
+fn table(devices: &[DeviceReport], self_tests: &[Option<String>]) -> String {
     let mut text = String::new();
-    for (index, device) in devices.iter().enumerate() {
+    for (index, (device, self_test)) in devices.iter().zip(self_tests).enumerate() {
         let DeviceReport { name, kind, api_version, uuid, pci, subgroup_size, memory, .. } = device;
         let others = device.subgroup_sizes.iter().filter(|size| *size != subgroup_size);
         let others = others.map(ToString::to_string).collect::<Vec<_>>().join(", ");
@@ -130,6 +172,11 @@ fn table(devices: &[DeviceReport]) -> String {
         for requirement in requirements {
             let met = if requirement.met { "yes" } else { "no" };
             text += &format!("   {met:3}  {:width$}  {}\n", requirement.name, requirement.why);
+        }
+        if let Some(found) = self_test {
+            let met = if found == "passed" { "yes" } else { "no" };
+            let why = if found == "passed" { SELF_TEST } else { found };
+            text += &format!("   {met:3}  {:width$}  {why}\n", "self-test");
         }
         // Optional.
         text += &match device.cooperative_matrix {
@@ -155,6 +202,9 @@ mod tests {
             kind: "discrete",
             api_version: "1.3.0".to_owned(),
             vendor: 1,
+            device: 2,
+            driver: "beads 1.0".to_owned(),
+            driver_version: 1,
             uuid: "00-11".to_owned(),
             pci: is_recent.then_some("65:1.2".parse().unwrap()),
             subgroup_size: 32,
@@ -169,7 +219,10 @@ mod tests {
     #[test]
     fn the_table_says_what_each_device_is_and_lacks_and_the_verdict_which_is_used() {
         let devices = [device("Abacus", false), device("Babbage", true), device("Curta", true)];
-        let text = table(&devices);
+        let passed = || Some("passed".to_owned());
+        let text = table(&devices, &[None, passed(), Some("exp is wrong".to_owned())]);
+        assert!(text.contains("   yes  self-test   subgroups"), "{text}");
+        assert!(text.contains("   no   self-test   exp is wrong\n"), "{text}");
         assert!(text.starts_with(
             "0  Abacus\n   discrete, Vulkan 1.3.0, subgroups of 32, 1.5 GiB\n   uuid:00-11\n"
         ));

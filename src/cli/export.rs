@@ -8,7 +8,7 @@ use anyhow::Result;
 use clap::ValueEnum;
 use glam::DVec3;
 
-use super::{finish, word};
+use super::{driver, finish, word};
 use crate::base::output::{check_writable, is_same_file, write_whole};
 use crate::camera::frame::relative_to;
 use crate::gpu::{DeviceChoice, Gpu};
@@ -248,8 +248,8 @@ fn page(
             frame = dataset.frame();
         }
         let device = || match &args.device {
-            Some(device) => Gpu::new(device),
-            None => Gpu::new(&config.device.parse()?),
+            Some(device) => driver::open(device),
+            None => driver::open(&config.device.parse()?),
         };
         let targets = targets(&config, &dataset, device)?;
         let bookmarks = bookmarks(args, gaussians.origin, &dataset, targets, |_| Ok(None))?;

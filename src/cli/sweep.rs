@@ -34,7 +34,7 @@ use self::point::{ADAPTIVE, Axis, OFFSET, PARTS};
 use self::rows::Rows;
 pub(super) use self::run::parsed;
 use self::run::{Run, absolute, difference};
-use super::{finish, progress_bar};
+use super::{driver, finish, progress_bar};
 use crate::Error;
 use crate::base::input;
 use crate::base::output::{check_writable, create_folder, write_whole};
@@ -169,7 +169,7 @@ pub(super) fn run_titled(
 }
 
 fn open(config: &TrainConfig) -> crate::Result<Gpu> {
-    Gpu::new(&config.device.parse::<DeviceChoice>()?)
+    driver::open(&config.device.parse::<DeviceChoice>()?)
 }
 
 /// The points of the grid, each checked as in `train`, and their dataset.

@@ -10,10 +10,10 @@ use anyhow::Result;
 pub(crate) use self::options::TrainOptions;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
-use super::{finish, live, signals, view, word};
+use super::{driver, finish, live, signals, view, word};
 use crate::base::output::{check_writable, printable};
 use crate::camera::frame;
-use crate::gpu::{DeviceChoice, Gpu};
+use crate::gpu::DeviceChoice;
 use crate::results::eval;
 use crate::results::run::{self, IfExists, RunDirectory, RunSummary, Session};
 use crate::results::run_facts::RunFacts;
@@ -98,7 +98,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         return print_done(args, steps);
     }
     let device = requested.settings(None)?.config()?.device;
-    let gpu = Gpu::new(&device.parse::<DeviceChoice>()?)?;
+    let gpu = driver::open(&device.parse::<DeviceChoice>()?)?;
     let planning = planning(args, file.as_deref(), is_resumed);
     let PlannedRun { config, settings, plan, dataset } = requested.planned(planning, &gpu)?;
     if args.explain {

@@ -3,10 +3,9 @@
 use std::marker::PhantomData;
 
 use ash::vk::Handle as _;
-use gpu_allocator::MemoryLocation;
 
-use super::allocated::DeviceMemory;
 use super::limits::whole_quads;
+use super::parts::Parts;
 use super::{Bound, Gpu, Properties, Slice, SliceMut};
 use crate::{Error, Result};
 
@@ -14,7 +13,7 @@ use crate::{Error, Result};
 /// `SliceMut`s that borrow it. Dropping it frees the memory once no submission uses it.
 #[derive(Debug)]
 pub struct Buffer<T> {
-    memory: DeviceMemory,
+    memory: Parts,
     len: usize,
     element: PhantomData<T>,
 }
@@ -35,7 +34,7 @@ impl<T: bytemuck::Pod> Buffer<T> {
         self.memory.name()
     }
 
-    /// The `VkBuffer`, for a host application that binds it itself.
+    /// The `VkBuffer`, for a host application that binds it itself; the first, where one cannot hold the elements.
     pub fn handle(&self) -> u64 {
         self.memory.handle().as_raw()
     }
@@ -43,7 +42,7 @@ impl<T: bytemuck::Pod> Buffer<T> {
     /// Whether it is in the memory of this device.
     #[cfg(feature = "capi")]
     pub(crate) fn is_on(&self, gpu: &Gpu) -> bool {
-        std::sync::Arc::ptr_eq(&self.memory.shared, &gpu.shared)
+        self.memory.is_on(&gpu.shared)
     }
 
     /// All of it, to read.
@@ -58,9 +57,20 @@ impl<T: bytemuck::Pod> Buffer<T> {
         SliceMut::new(&self.memory, self.len)
     }
 
-    /// All of it, for copies.
+    /// All of it, for copies of a buffer within the limit of a binding.
     pub(super) fn bound(&self) -> Bound {
         Bound { raw: self.memory.handle(), offset: 0, size: (self.len * size_of::<T>()) as u64 }
+    }
+
+    /// All of it, for copies, each of one Vulkan buffer.
+    pub(super) fn pieces(&self) -> impl Iterator<Item = Bound> {
+        self.memory.pieces(0, (self.len * size_of::<T>()) as u64)
+    }
+
+    /// Whether passes can bind windows of so many elements, from multiples of that on.
+    #[cfg(feature = "io")]
+    pub(crate) fn suits_windows(&self, window: usize) -> bool {
+        self.memory.suit((window * size_of::<T>()) as u64)
     }
 }
 
@@ -89,10 +99,11 @@ impl Gpu {
             let (buffer, device, limit) = (name.to_owned(), device.clone(), *limit);
             return Err(Error::BufferTooLarge { buffer, bytes, device, limit });
         }
-        self.uninit_in_windows(name, len)
+        self.uninit_in_windows(name, len, len)
     }
 
-    /// [`Gpu::uninit`] for a buffer of which passes only bind parts: only memory limits its length.
+    /// [`Gpu::uninit`] for a buffer of which passes only bind windows of `window` elements, from multiples of that on:
+    /// only memory limits its length.
     ///
     /// # Errors
     /// The device is out of memory.
@@ -100,9 +111,11 @@ impl Gpu {
         &self,
         name: &str,
         len: usize,
+        window: usize,
     ) -> Result<Buffer<T>> {
-        let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
-        let memory = DeviceMemory::new(&self.shared, name, bytes, MemoryLocation::GpuOnly)?;
+        let [bytes, window] =
+            [len, window].map(|len| (len as u64).saturating_mul(size_of::<T>() as u64));
+        let memory = Parts::new(&self.shared, name, bytes, window)?;
         Ok(Buffer { memory, len, element: PhantomData })
     }
 }

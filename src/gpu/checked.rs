@@ -114,7 +114,7 @@ impl Shared {
 impl Checked<'_> {
     /// Records and runs; returns the timeline value of the last submission.
     fn run(&mut self, shared: &Arc<Shared>, value: u64, record: Record<'_>) -> Result<u64> {
-        let mut recorder = Recorder::new(shared, shared.begin(self.pool)?, value, None);
+        let mut recorder = Recorder::new(shared, self.pool, value, None)?;
         recorder.observer = Some(self);
         shared.with_uploads(&mut recorder, record)?;
         if let Some(observer) = recorder.observer.take() {

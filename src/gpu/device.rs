@@ -35,37 +35,22 @@ use super::{
 use crate::{Error, Result};
 
 impl Gpu {
-    /// Opens a device. Debug builds turn on validation where the layer is installed.
-    ///
-    /// # Errors
-    /// No loader, no such device, or one that lacks a requirement.
-    ///
-    /// ```no_run
-    /// use nightsplat::{DeviceChoice, Gpu};
-    ///
-    /// let gpu = Gpu::new(&DeviceChoice::Best)?;
-    /// let squares = gpu.buffer("squares", &[0u32, 1, 4, 9])?;
-    /// assert_eq!(gpu.read(&squares)?, [0, 1, 4, 9]);
-    /// # Ok::<(), nightsplat::Error>(())
-    /// ```
-    pub fn new(choice: &DeviceChoice) -> Result<Self> {
+    /// Opens a device that is still to be tested; see [`Gpu::new`].
+    pub(crate) fn open(choice: &DeviceChoice) -> Result<Self> {
         let validate = cfg!(debug_assertions) && validation_is_installed();
-        Self::open(choice, validate, true)
+        Self::open_with(choice, validate, true)
     }
 
-    /// Opens a device with validation and synchronization validation; its tile sizes are the built-in ones.
-    ///
-    /// # Errors
-    /// As [`Gpu::new`], or the validation layer is not installed.
-    pub fn with_validation(choice: &DeviceChoice) -> Result<Self> {
+    /// Opens a device that is still to be tested; see [`Gpu::with_validation`].
+    pub(crate) fn open_validated(choice: &DeviceChoice) -> Result<Self> {
         if validation_is_installed() {
-            return Self::open(choice, true, false);
+            return Self::open_with(choice, true, false);
         }
         let package = "on Debian `apt install vulkan-validationlayers`";
         Err(Error::NoDevice(format!("the Vulkan validation layer is not installed: {package}")))
     }
 
-    fn open(choice: &DeviceChoice, validate: bool, takes_tuning: bool) -> Result<Self> {
+    fn open_with(choice: &DeviceChoice, validate: bool, takes_tuning: bool) -> Result<Self> {
         address_space::check()?;
         let mut owned = instance(validate)?;
         let opened = choose(&owned, choice).and_then(|(physical, supported)| {
@@ -362,26 +347,19 @@ fn properties(
     physical: vk::PhysicalDevice,
     supported: &Supported,
 ) -> Result<Properties> {
-    let mut driver = vk::PhysicalDeviceDriverProperties::default();
-    let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut driver);
-    // SAFETY: the chain points at a live local.
-    unsafe { instance.get_physical_device_properties2(physical, &mut properties) };
+    let (driver, driver_id) = driver_name(instance, physical);
     let limits = supported.properties.limits;
-    let text =
-        |text: Result<&CStr, _>| text.map(|t| t.to_string_lossy().into_owned()).unwrap_or_default();
     Ok(Properties {
         name: supported.device_name(),
-        driver: format!(
-            "{} {}",
-            text(driver.driver_name_as_c_str()),
-            text(driver.driver_info_as_c_str())
-        ),
+        driver,
         memory: device_memory(instance, physical),
         subgroup_size: supported.lanes()?,
         subgroup_size_is_selectable: supported.subgroups.are_selectable,
-        max_storage_buffer_range: u64::from(limits.max_storage_buffer_range),
+        max_storage_buffer_range: u64::from(limits.max_storage_buffer_range)
+            .min(supported.max_buffer_size()),
+        max_buffer_size: supported.max_buffer_size(),
         max_workgroups: max_workgroups(&limits),
-        max_loop_iterations: match driver.driver_id {
+        max_loop_iterations: match driver_id {
             vk::DriverId::MESA_LLVMPIPE => LLVMPIPE_LOOP_ITERATIONS,
             _ => u32::MAX,
         },
@@ -393,6 +371,21 @@ fn properties(
         has_push_descriptors: supported.has_push_descriptors(),
         has_pipeline_statistics: false,
     })
+}
+
+/// The driver's name and version, as the driver gives them, and its id.
+pub(super) fn driver_name(
+    instance: &ash::Instance,
+    physical: vk::PhysicalDevice,
+) -> (String, vk::DriverId) {
+    let mut driver = vk::PhysicalDeviceDriverProperties::default();
+    let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut driver);
+    // SAFETY: the chain points at a live local.
+    unsafe { instance.get_physical_device_properties2(physical, &mut properties) };
+    let text =
+        |text: Result<&CStr, _>| text.map(|t| t.to_string_lossy().into_owned()).unwrap_or_default();
+    let [name, info] = [text(driver.driver_name_as_c_str()), text(driver.driver_info_as_c_str())];
+    (format!("{name} {info}"), driver.driver_id)
 }
 
 /// Mesa's software device ends all loops of an invocation after this number of iterations in total
@@ -464,7 +457,7 @@ fn cache_path(supported: &Supported) -> Option<PathBuf> {
 }
 
 /// Our folder in the user's cache folder.
-fn cache_folder() -> Option<PathBuf> {
+pub(crate) fn cache_folder() -> Option<PathBuf> {
     let folder = std::env::var_os("XDG_CACHE_HOME")
         .map(PathBuf::from)
         .or_else(|| Some(PathBuf::from(std::env::var_os("HOME")?).join(".cache")))?;

@@ -5,6 +5,7 @@ use ash::vk;
 use super::REQUIREMENTS;
 
 use super::cooperative::{self, CooperativeMatrix};
+use super::device::driver_name;
 use super::instance::{OwnedInstance, instance, loader_error, physical_devices};
 use super::limits::max_workgroups;
 use super::pci::PciAddress;
@@ -22,6 +23,12 @@ pub struct DeviceReport {
     pub api_version: String,
     /// The PCI vendor id.
     pub vendor: u32,
+    /// The PCI device id.
+    pub device: u32,
+    /// The driver's name and version, as the driver gives them.
+    pub driver: String,
+    /// The driver's version as a number.
+    pub driver_version: u32,
     /// `VkPhysicalDeviceIDProperties::deviceUUID`, which NVIDIA's tools print after `GPU-`.
     pub uuid: String,
     /// The PCI address, where the device has one and reports it.
@@ -47,6 +54,8 @@ pub struct DeviceLimits {
     pub max_storage_buffer_range: u64,
     /// Bytes of one allocation.
     pub max_allocation: u64,
+    /// Bytes of one buffer.
+    pub max_buffer_size: u64,
     /// Workgroups of a dispatch along its first two dimensions.
     pub max_workgroups: u32,
     /// Invocations of a workgroup.
@@ -116,6 +125,9 @@ pub(super) fn report(
         },
         api_version: format!("{major}.{minor}.{patch}"),
         vendor: supported.properties.vendor_id,
+        device: supported.properties.device_id,
+        driver: driver_name(instance, physical).0,
+        driver_version: supported.properties.driver_version,
         uuid: hyphenated(&supported.uuid),
         pci: supported.pci,
         // What the variable requires of another device does not matter here.
@@ -125,6 +137,7 @@ pub(super) fn report(
         limits: DeviceLimits {
             max_storage_buffer_range: u64::from(limits.max_storage_buffer_range),
             max_allocation: supported.max_allocation,
+            max_buffer_size: supported.max_buffer,
             max_workgroups: max_workgroups(&limits),
             max_workgroup_invocations: limits.max_compute_work_group_invocations,
             max_shared_memory: limits.max_compute_shared_memory_size,

@@ -1,19 +1,21 @@
 //! Readback of buffers by submissions.
 
 use std::marker::PhantomData;
+use std::sync::Arc;
 
 use gpu_allocator::MemoryLocation;
 
 use super::allocated::DeviceMemory;
 use super::recorder::HOST_SUBMITS;
-use super::{Bound, Gpu, Recorder, Slice};
+use super::{Bound, Gpu, Recorder, Shared, Slice};
 use crate::{Error, Result};
 
 /// A copy of a buffer that a submission brings to the host.
 #[derive(Debug)]
 pub struct Download<T> {
-    host: DeviceMemory,
-    len: usize,
+    /// One copy after the other.
+    host: Vec<(DeviceMemory, u64)>,
+    shared: Arc<Shared>,
     value: u64,
     element: PhantomData<T>,
 }
@@ -46,7 +48,7 @@ impl Recorder<'_> {
         buffer: impl Into<Slice<'a, T>>,
     ) -> Result<Download<T>> {
         let buffer = buffer.into();
-        self.download_bound(buffer.name(), buffer.bound())
+        self.download_pieces(buffer.name(), buffer.pieces())
     }
 
     /// The same for a pass's binding, where the buffer itself is not at hand.
@@ -55,17 +57,27 @@ impl Recorder<'_> {
         name: &str,
         bound: Bound,
     ) -> Result<Download<T>> {
+        self.download_pieces(name, std::iter::once(bound))
+    }
+
+    fn download_pieces<T: bytemuck::Pod>(
+        &mut self,
+        name: &str,
+        pieces: impl Iterator<Item = Bound>,
+    ) -> Result<Download<T>> {
         if self.value() == HOST_SUBMITS {
             return Err(Error::Usage(format!(
                 "`{name}` cannot be downloaded where the host submits; once that is done, `Gpu::read` it"
             )));
         }
-        let host = DeviceMemory::new(self.shared(), name, bound.size, MemoryLocation::GpuToCpu)?;
-        if bound.size > 0 {
-            self.copy_raw(bound, host.bound(), bound.size);
+        let shared = Arc::clone(self.shared());
+        let mut host = vec![];
+        for piece in pieces.filter(|piece| piece.size > 0) {
+            let copy = DeviceMemory::new(&shared, name, piece.size, MemoryLocation::GpuToCpu)?;
+            self.copy_raw(piece, copy.bound(), piece.size);
+            host.push((copy, piece.size));
         }
-        let len = bound.size as usize / size_of::<T>();
-        Ok(Download { host, len, value: self.value(), element: PhantomData })
+        Ok(Download { host, shared, value: self.value(), element: PhantomData })
     }
 }
 
@@ -75,11 +87,16 @@ impl<T: bytemuck::Pod> Download<T> {
     /// # Errors
     /// The device was lost.
     pub fn wait(self) -> Result<Vec<T>> {
-        self.host.shared.wait(self.value)?;
-        let bytes = self.len * size_of::<T>();
-        let mut data = vec![T::zeroed(); self.len];
-        if let Some(mapped) = self.host.mapped() {
-            bytemuck::cast_slice_mut(&mut data).copy_from_slice(&mapped[..bytes]);
+        self.shared.wait(self.value)?;
+        let bytes: u64 = self.host.iter().map(|(_, size)| size).sum();
+        let mut data = vec![T::zeroed(); bytes as usize / size_of::<T>()];
+        let mut left = bytemuck::cast_slice_mut(&mut data);
+        for (copy, size) in &self.host {
+            let (own, after) = left.split_at_mut(*size as usize);
+            left = after;
+            if let Some(mapped) = copy.mapped() {
+                own.copy_from_slice(&mapped[..own.len()]);
+            }
         }
         Ok(data)
     }

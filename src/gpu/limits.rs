@@ -14,7 +14,7 @@ pub(super) const SUBGROUP_SIZES: RangeInclusive<u32> = 4..=128;
 pub(super) const SHARED_MEMORY: u32 = 16_384;
 
 /// Invocations of the largest workgroups.
-pub(super) const WORKGROUP: u32 = 256;
+pub(crate) const WORKGROUP: u32 = 256;
 
 /// The allocated and bound size for `bytes`: never empty, as Vulkan has no empty buffers, and whole quads, for kernels
 /// that read four values at a time.

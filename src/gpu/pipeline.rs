@@ -5,8 +5,10 @@ use std::sync::Arc;
 
 use ash::vk;
 
-use super::{Gpu, Interface, Kernel, Retired, Shared, Statistic, reconvergence, statistics};
-use crate::Result;
+use super::{
+    Gpu, Interface, Kernel, Properties, Retired, Shared, Statistic, reconvergence, spirv, statistics,
+};
+use crate::{Error, Result};
 
 /// A kernel ready to be dispatched.
 #[derive(Debug)]
@@ -43,6 +45,18 @@ impl Gpu {
         Ok(pipeline)
     }
 
+    /// Compiles a kernel, which the pipeline cache then has.
+    ///
+    /// # Errors
+    /// The driver refuses the kernel.
+    pub(crate) fn compile(
+        &self,
+        interface: &'static Interface,
+        constants: Vec<(u32, u32)>,
+    ) -> Result<()> {
+        self.objects(interface, constants).map(drop)
+    }
+
     fn objects(
         &self,
         interface: &'static Interface,
@@ -50,6 +64,10 @@ impl Gpu {
     ) -> Result<Objects> {
         let shared = &self.shared;
         let fail = |call| move |result| shared.error(call, result);
+        let name = described(interface, &constants);
+        tracing::debug!("compiles {name}");
+        #[cfg(feature = "testing")]
+        shared.faults.compile(interface.name).map_err(|result| refused(shared, &name, result))?;
         // SAFETY: every create info points at live locals, and what fails half-way is destroyed here.
         unsafe {
             let set_layout =
@@ -63,15 +81,14 @@ impl Gpu {
             };
             match raw_pipeline(shared, interface, layout, constants, Default::default()) {
                 Ok(raw) => {
-                    shared.name(raw, interface.name);
+                    shared.name(raw, &name);
                     let shared = Arc::clone(shared);
                     Ok(Objects { interface, raw, layout, set_layout, shared })
                 }
                 Err(result) => {
                     shared.device.destroy_pipeline_layout(layout, shared.callbacks());
                     shared.device.destroy_descriptor_set_layout(set_layout, shared.callbacks());
-                    tracing::error!("kernel {} was refused", interface.name);
-                    Err(shared.error("vkCreateComputePipelines", result))
+                    Err(refused(shared, &name, result))
                 }
             }
         }
@@ -98,6 +115,31 @@ impl<K: Kernel> Pipeline<K> {
             Ok(Some(all.map_err(fail("vkGetPipelineExecutableStatisticsKHR"))?))
         }
     }
+}
+
+/// The error for a kernel that the driver does not compile.
+fn refused(shared: &Shared, kernel: &str, result: vk::Result) -> Error {
+    let is_memory = [
+        vk::Result::ERROR_OUT_OF_HOST_MEMORY,
+        vk::Result::ERROR_OUT_OF_DEVICE_MEMORY,
+        vk::Result::ERROR_DEVICE_LOST,
+    ];
+    if is_memory.contains(&result) {
+        return shared.error("vkCreateComputePipelines", result);
+    }
+    let Properties { name, driver, .. } = &shared.properties;
+    Error::Kernel {
+        device: format!("{name}, {driver},"),
+        problem: format!("refuses ({result})"),
+        kernel: kernel.to_owned(),
+        remedy: String::new(),
+    }
+}
+
+/// The kernel and its constants, by their ids: `blend_forward (2=3 3=16)`.
+fn described(interface: &Interface, constants: &[(u32, u32)]) -> String {
+    let values: Vec<String> = constants.iter().map(|(id, bits)| format!("{id}={bits}")).collect();
+    format!("{} ({})", interface.name, values.join(" "))
 }
 
 /// # Safety
@@ -160,23 +202,12 @@ unsafe fn raw_pipeline(
     if let Some(id) = interface.subgroup_size_id {
         constants.push((id, shared.properties.subgroup_size));
     }
-    let entries: Vec<_> = (0u32..)
-        .zip(&constants)
-        .map(|(i, &(constant_id, _))| vk::SpecializationMapEntry {
-            constant_id,
-            offset: 4 * i,
-            size: 4,
-        })
-        .collect();
-    let data: Vec<u32> = constants.iter().map(|&(_, bits)| bits).collect();
-    let specialization =
-        vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::cast_slice(&data));
+    let code = spirv::frozen(&code, &constants);
     let mut required = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
         .required_subgroup_size(shared.properties.subgroup_size);
     let mut stage = vk::PipelineShaderStageCreateInfo::default()
         .stage(vk::ShaderStageFlags::COMPUTE)
-        .name(c"main")
-        .specialization_info(&specialization);
+        .name(c"main");
     if interface.subgroup_size_id.is_some() {
         stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
         // Where a device cannot be told the subgroup size, its only size is the one it reports.

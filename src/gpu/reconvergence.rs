@@ -6,6 +6,7 @@
 
 use ash::{khr, vk};
 
+use super::spirv::{HEADER, instructions};
 use super::supported::Supported;
 
 /// The device extension.
@@ -16,8 +17,6 @@ const NAME: &str = "SPV_KHR_subgroup_uniform_control_flow";
 const EXECUTION_MODE: u32 = 4421;
 const OP_EXTENSION: u32 = 10;
 const OP_EXECUTION_MODE: u32 = 16;
-/// Words before the first instruction.
-const HEADER: usize = 5;
 
 /// Whether the device supports the feature.
 pub(super) fn supported(
@@ -37,21 +36,14 @@ pub(super) fn supported(
 
 /// The module without the request.
 pub(super) fn unasked(code: &[u32]) -> Vec<u32> {
-    let (header, mut rest) = code.split_at(HEADER.min(code.len()));
-    let mut kept = header.to_vec();
-    while let Some(&first) = rest.first() {
-        let length = (first >> 16) as usize;
-        let (instruction, after) = rest.split_at(length.clamp(1, rest.len()));
-        if !asks(instruction) {
-            kept.extend_from_slice(instruction);
-        }
-        rest = after;
-    }
+    let mut kept = code[..HEADER.min(code.len())].to_vec();
+    let others = instructions(code).filter(|(opcode, instruction)| !asks(*opcode, instruction));
+    others.for_each(|(_, instruction)| kept.extend_from_slice(instruction));
     kept
 }
 
-fn asks(instruction: &[u32]) -> bool {
-    match instruction[0] & 0xffff {
+fn asks(opcode: u32, instruction: &[u32]) -> bool {
+    match opcode {
         OP_EXTENSION => {
             let bytes = instruction[1..].iter().flat_map(|word| word.to_le_bytes());
             bytes.take_while(|&byte| byte != 0).eq(NAME.bytes())

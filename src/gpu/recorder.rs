@@ -35,6 +35,12 @@ pub struct Recorder<'g> {
     /// What its passes bind.
     sets: Sets,
     pub(super) commands: vk::CommandBuffer,
+    /// The command buffers before that, which are full.
+    pub(super) parts: Vec<vk::CommandBuffer>,
+    /// Of the command buffers; a host has its own.
+    pool: Option<vk::CommandPool>,
+    /// Each pass has a command buffer of its own.
+    is_cut: bool,
     /// The timeline value that signals the end of this recording.
     pub(super) value: u64,
     queries: Option<vk::QueryPool>,
@@ -98,18 +104,20 @@ impl<'g> Recorder<'g> {
     /// Starts with a barrier after everything submitted before; the host reads once it is done.
     pub(super) fn new(
         shared: &'g Arc<Shared>,
-        commands: vk::CommandBuffer,
+        pool: vk::CommandPool,
         value: u64,
         queries: Option<vk::QueryPool>,
-    ) -> Self {
+    ) -> Result<Self> {
+        let commands = shared.begin(pool)?;
         let mut recorder = Self {
             value,
             queries,
+            pool: Some(pool),
             ..Self::unstarted(shared, commands, vk::PipelineStageFlags2::HOST)
         };
         recorder.barrier();
         recorder.timestamp();
-        recorder
+        Ok(recorder)
     }
 
     /// Starts with a barrier after everything before it in the host's queue, and ends with one for what the host's own
@@ -131,6 +139,9 @@ impl<'g> Recorder<'g> {
             shared,
             sets: Sets::new(shared),
             commands,
+            parts: vec![],
+            pool: None,
+            is_cut: false,
             value: HOST_SUBMITS,
             queries: None,
             labels: vec![],
@@ -139,6 +150,21 @@ impl<'g> Recorder<'g> {
             #[cfg(feature = "check")]
             observer: None,
         }
+    }
+
+    /// Submits each pass from here on by itself, which changes no result: systems reset a device whose submission takes
+    /// seconds.
+    pub(crate) fn cut_between_passes(&mut self) {
+        self.is_cut = true;
+    }
+
+    /// Continues in another command buffer. Barriers hold across command buffers of a queue.
+    fn cut(&mut self) -> Result<()> {
+        if let Some(pool) = self.pool.filter(|_| self.is_cut) {
+            let next = self.shared.begin(pool)?;
+            self.parts.push(std::mem::replace(&mut self.commands, next));
+        }
+        Ok(())
     }
 
     pub(super) fn shared(&self) -> &'g Arc<Shared> {
@@ -191,7 +217,8 @@ impl<'g> Recorder<'g> {
             self.observer = Some(observer);
             return done;
         }
-        self.record_dispatch(&pipeline.objects, words, &bound, threads)
+        self.record_dispatch(&pipeline.objects, words, &bound, threads)?;
+        self.cut()
     }
 
     pub(super) fn record_dispatch(
@@ -220,10 +247,7 @@ impl<'g> Recorder<'g> {
     /// Sets every 32-bit word of `buffer` to `word`.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn fill<T: bytemuck::Pod>(&mut self, buffer: &mut Buffer<T>, word: u32) {
-        if buffer.is_empty() {
-            return;
-        }
-        self.fill_raw(buffer.bound(), word);
+        buffer.pieces().for_each(|piece| self.fill_raw(piece, word));
     }
 
     pub(super) fn fill_raw(&mut self, Bound { raw, offset, size }: Bound, word: u32) {
@@ -261,10 +285,9 @@ impl<'g> Recorder<'g> {
     /// Copies elements from the start of `source` to `target`, as many as both hold.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn copy<T: bytemuck::Pod>(&mut self, source: &Buffer<T>, target: &mut Buffer<T>) {
-        let (source, target) = (source.bound(), target.bound());
-        let bytes = source.size.min(target.size);
-        if bytes > 0 {
-            self.copy_raw(source, target, bytes);
+        // Buffers of the same windows have the same pieces.
+        for (source, target) in source.pieces().zip(target.pieces()) {
+            self.copy_raw(source, target, source.size.min(target.size));
         }
     }
 

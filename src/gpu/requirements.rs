@@ -95,7 +95,7 @@ pub const REQUIREMENTS: &[Requirement] = &[
     Requirement {
         name: "subgroup size 4 to 128",
         why: "a ballot fits four words, a tile at most 32 rows of lanes",
-        supported: |o| SUBGROUP_SIZES.contains(&o.subgroups.own),
+        supported: |o| SUBGROUP_SIZES.contains(&o.subgroups.own) && !o.subgroups.all().is_empty(),
     },
     Requirement {
         name: "maxComputeWorkGroupInvocations >= 256",
@@ -173,6 +173,7 @@ mod tests {
             uuid: [0; 16],
             pci: None,
             max_allocation: 1 << 30,
+            max_buffer: 1 << 30,
             max_push_descriptors: 0,
             extensions: BTreeSet::new(),
             vulkan12,

@@ -5,13 +5,13 @@ use std::marker::PhantomData;
 use std::ops::Range;
 
 use super::Bound;
-use super::allocated::DeviceMemory;
+use super::parts::Parts;
 use crate::{Error, Result};
 
 /// Read-only elements of a buffer.
 #[derive(Clone, Copy, Debug)]
 pub struct Slice<'a, T> {
-    memory: &'a DeviceMemory,
+    memory: &'a Parts,
     /// The offset in the memory, in elements.
     first: usize,
     len: usize,
@@ -56,7 +56,7 @@ pub struct Slice<'a, T> {
 /// ```
 #[derive(Debug)]
 pub struct SliceMut<'a, T> {
-    memory: &'a DeviceMemory,
+    memory: &'a Parts,
     first: usize,
     len: usize,
     element: PhantomData<&'a mut T>,
@@ -67,7 +67,7 @@ const ALIGNMENT: usize = 256;
 
 impl<'a, T: bytemuck::Pod> Slice<'a, T> {
     /// The first `len` elements of the memory.
-    pub(super) fn new(memory: &'a DeviceMemory, len: usize) -> Self {
+    pub(super) fn new(memory: &'a Parts, len: usize) -> Self {
         Self { memory, first: 0, len, element: PhantomData }
     }
 
@@ -99,11 +99,16 @@ impl<'a, T: bytemuck::Pod> Slice<'a, T> {
     pub(crate) fn bound(&self) -> Bound {
         bound::<T>(self.memory, self.first, self.len)
     }
+
+    /// What copies read or write.
+    pub(super) fn pieces(&self) -> impl Iterator<Item = Bound> + use<'a, T> {
+        pieces::<T>(self.memory, self.first, self.len)
+    }
 }
 
 impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
     /// The first `len` elements of memory whose owner is mutably borrowed.
-    pub(super) fn new(memory: &'a DeviceMemory, len: usize) -> Self {
+    pub(super) fn new(memory: &'a Parts, len: usize) -> Self {
         Self { memory, first: 0, len, element: PhantomData }
     }
 
@@ -164,6 +169,11 @@ impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
     pub(crate) fn bound(&self) -> Bound {
         bound::<T>(self.memory, self.first, self.len)
     }
+
+    /// What copies read or write.
+    pub(super) fn pieces(&self) -> impl Iterator<Item = Bound> + use<'a, T> {
+        pieces::<T>(self.memory, self.first, self.len)
+    }
 }
 
 impl<'a> Slice<'a, f32> {
@@ -183,7 +193,7 @@ impl<'a> SliceMut<'a, f32> {
 }
 
 /// The offset of a range of elements, checked; `len` is the slice's.
-fn offset_of<T>(memory: &DeviceMemory, len: usize, range: &Range<usize>) -> Result<usize> {
+fn offset_of<T>(memory: &Parts, len: usize, range: &Range<usize>) -> Result<usize> {
     let name = memory.name();
     if range.start > range.end || range.end > len {
         let what =
@@ -200,10 +210,15 @@ fn offset_of<T>(memory: &DeviceMemory, len: usize, range: &Range<usize>) -> Resu
 }
 
 /// Vulkan has no empty bindings: an empty slice binds the start, where every buffer has some bytes.
-fn bound<T>(memory: &DeviceMemory, first: usize, len: usize) -> Bound {
-    let first = if len == 0 { 0 } else { first };
-    let [offset, size] = [first, len].map(|n| (n * size_of::<T>()) as u64);
-    Bound { raw: memory.handle(), offset, size }
+fn bound<T>(memory: &Parts, first: usize, len: usize) -> Bound {
+    let [first, size] = [first, len].map(|n| (n * size_of::<T>()) as u64);
+    memory.bound(first, size)
+}
+
+/// The same in pieces for copies, each of one Vulkan buffer.
+fn pieces<T>(memory: &Parts, first: usize, len: usize) -> impl Iterator<Item = Bound> + use<'_, T> {
+    let [first, size] = [first, len].map(|n| (n * size_of::<T>()) as u64);
+    memory.pieces(first, size)
 }
 
 #[cfg(test)]

@@ -208,9 +208,11 @@ impl Gpu {
             let last = shared.record_checked(queue, pool, value, label, record)?;
             return Ok((last, vec![]));
         }
-        let mut recorder = Recorder::new(shared, shared.begin(pool)?, value, queries);
+        let mut recorder = Recorder::new(shared, pool, value, queries)?;
         shared.with_uploads(&mut recorder, record)?;
         recorder.finish();
+        let parts = std::mem::take(&mut recorder.parts);
+        parts.into_iter().try_for_each(|commands| shared.enqueue(queue, commands, None))?;
         shared.submit(queue, recorder.commands, value, label)?;
         tracing::trace!(label, value, "submitted");
         Ok((value, recorder.labels))
@@ -246,32 +248,46 @@ impl Shared {
         value: u64,
         label: &str,
     ) -> Result<()> {
-        let fail = |call| move |result| self.error(call, result);
         #[cfg(feature = "testing")]
         if self.faults.loses_submission() {
             return Err(self.error("vkQueueSubmit2", vk::Result::ERROR_DEVICE_LOST));
         }
+        self.enqueue(queue, commands, Some(value))?;
+        let mut progress = lock(&self.progress);
+        progress.submitted = value;
+        progress.labels.insert(value, label.to_owned());
+        Ok(())
+    }
+
+    /// Ends a command buffer and hands it to the queue; the timeline reaches `value`, where there is one, when all up to
+    /// it are done.
+    fn enqueue(
+        &self,
+        queue: &Queue,
+        commands: vk::CommandBuffer,
+        value: Option<u64>,
+    ) -> Result<()> {
+        let fail = |call| move |result| self.error(call, result);
+        self.recorded.submits.fetch_add(1, Ordering::Relaxed);
         // SAFETY: recording.
         unsafe { self.device.end_command_buffer(commands) }.map_err(fail("vkEndCommandBuffer"))?;
         let commands = [vk::CommandBufferSubmitInfo::default().command_buffer(commands)];
-        let signal = [vk::SemaphoreSubmitInfo::default()
-            .semaphore(self.timeline)
-            .value(value)
-            .stage_mask(vk::PipelineStageFlags2::ALL_COMMANDS)];
+        let signal = value.map(|value| {
+            vk::SemaphoreSubmitInfo::default()
+                .semaphore(self.timeline)
+                .value(value)
+                .stage_mask(vk::PipelineStageFlags2::ALL_COMMANDS)
+        });
         let info = [vk::SubmitInfo2::default()
             .command_buffer_infos(&commands)
-            .signal_semaphore_infos(&signal)];
+            .signal_semaphore_infos(signal.as_slice())];
         // SAFETY: the queue is locked, the command buffer recorded and not touched again.
         let submit = || unsafe { self.device.queue_submit2(queue.raw, &info, vk::Fence::null()) };
         match &self.host {
             Some(host) => host.with_queue(queue.raw, submit),
             None => submit(),
         }
-        .map_err(fail("vkQueueSubmit2"))?;
-        let mut progress = lock(&self.progress);
-        progress.submitted = value;
-        progress.labels.insert(value, label.to_owned());
-        Ok(())
+        .map_err(fail("vkQueueSubmit2"))
     }
 }
 

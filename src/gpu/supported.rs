@@ -23,6 +23,7 @@ pub(super) struct Supported {
     pub(super) uuid: [u8; vk::UUID_SIZE],
     pub(super) pci: Option<PciAddress>,
     pub(super) max_allocation: u64,
+    pub(super) max_buffer: u64,
     pub(super) subgroups: SubgroupSizes,
     pub(super) subgroup_operations: vk::SubgroupFeatureFlags,
     pub(super) subgroup_stages: vk::ShaderStageFlags,
@@ -86,6 +87,7 @@ impl Supported {
                 function: pci.pci_function,
             }),
             max_allocation: vulkan11.max_memory_allocation_size,
+            max_buffer: vulkan13_properties.max_buffer_size,
             subgroups: SubgroupSizes {
                 own: vulkan11.subgroup_size,
                 are_selectable: vulkan13_properties
@@ -121,6 +123,11 @@ impl Supported {
 
     pub(super) fn has(&self, extension: &CStr) -> bool {
         self.extensions.contains(extension.to_string_lossy().as_ref())
+    }
+
+    /// Bytes of the largest buffer that has memory.
+    pub(super) fn max_buffer_size(&self) -> u64 {
+        self.max_allocation.min(self.max_buffer)
     }
 
     /// Whether passes push their descriptors: supported, and not disabled by the user.

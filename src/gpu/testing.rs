@@ -9,7 +9,7 @@ use std::sync::{Arc, OnceLock};
 
 use ash::vk;
 
-use super::{DeviceChoice, Gpu, Shared};
+use super::{DeviceChoice, Gpu, Interface, Properties, Shared};
 
 static GPU: OnceLock<Gpu> = OnceLock::new();
 
@@ -63,6 +63,49 @@ pub fn gpu_that_binds(bytes: u64) -> Gpu {
     open(|shared| shared.properties.max_storage_buffer_range = bytes)
 }
 
+/// Another device with validation, with these properties instead of its own.
+///
+/// # Panics
+/// As [`gpu`].
+pub fn gpu_with(adapt: impl FnOnce(&mut Properties)) -> Gpu {
+    open(|shared| adapt(&mut shared.properties))
+}
+
+/// Another device with validation, with this limit on the bytes of a buffer.
+///
+/// # Panics
+/// As [`gpu`].
+pub fn gpu_that_creates(bytes: u64) -> Gpu {
+    open(|shared| {
+        let Properties { max_storage_buffer_range, max_buffer_size, .. } = &mut shared.properties;
+        *max_buffer_size = bytes;
+        *max_storage_buffer_range = bytes.min(*max_storage_buffer_range);
+    })
+}
+
+/// Another device with validation, whose subgroups have another size than the kernels are compiled for.
+///
+/// # Panics
+/// As [`gpu`].
+pub fn gpu_that_misreports_its_subgroups() -> Gpu {
+    open(|shared| {
+        shared.properties.subgroup_size *= 2;
+        shared.properties.subgroup_size_is_selectable = false;
+    })
+}
+
+/// A kernel's module, frozen with these constants for subgroups of this size.
+pub fn frozen(
+    interface: &Interface,
+    constants: Vec<(u32, u32)>,
+    subgroup_size: u32,
+) -> std::io::Result<Vec<u32>> {
+    let code = ash::util::read_spv(&mut std::io::Cursor::new(interface.spirv))?;
+    let subgroup_size = interface.subgroup_size_id.map(|id| (id, subgroup_size));
+    let constants: Vec<_> = constants.into_iter().chain(subgroup_size).collect();
+    Ok(super::spirv::frozen(&code, &constants))
+}
+
 /// Another device with validation, with this limit on the workgroups of a dispatch along either dimension.
 ///
 /// # Panics
@@ -97,8 +140,13 @@ pub fn misuse(gpu: &Gpu) {
 
 /// The numbers of dispatches and barriers recorded for the device since it was opened.
 pub fn recorded(gpu: &Gpu) -> [u64; 2] {
-    let super::Recorded { dispatches, barriers } = &gpu.shared.recorded;
+    let super::Recorded { dispatches, barriers, .. } = &gpu.shared.recorded;
     [dispatches, barriers].map(|count| count.load(Ordering::Relaxed))
+}
+
+/// The number of command buffers submitted to the device since it was opened.
+pub fn submitted(gpu: &Gpu) -> u64 {
+    gpu.shared.recorded.submits.load(Ordering::Relaxed)
 }
 
 /// Whether what this thread submits is checked.
@@ -119,6 +167,32 @@ pub fn allocations(gpu: &Gpu) -> Vec<String> {
 /// Loses the device at the submission with this number, counted from 1 now on.
 pub fn lose_at_submission(gpu: &Gpu, number: u64) {
     gpu.shared.faults.lose_at_submission(number);
+}
+
+/// Lets this check of the self-test fail.
+pub fn plant_check(gpu: &Gpu, check: Option<u32>) {
+    gpu.shared.faults.plant_check(check);
+}
+
+/// The check of the self-test that is to fail.
+pub fn planted_check(gpu: &Gpu) -> Option<u32> {
+    gpu.shared.faults.planted_check()
+}
+
+/// While it lives, allocations and submissions are not counted, and none fails.
+#[derive(Debug)]
+pub struct PausedFaults<'a>(&'a Gpu);
+
+/// Pauses the injected faults: the self-test is no part of what is tested.
+pub fn pause_faults(gpu: &Gpu) -> PausedFaults<'_> {
+    gpu.shared.faults.pause(true);
+    PausedFaults(gpu)
+}
+
+impl Drop for PausedFaults<'_> {
+    fn drop(&mut self) {
+        self.0.shared.faults.pause(false);
+    }
 }
 
 /// A wiring defect: of the pass's parameters, `bits` of 32-bit word `word` reach the device flipped.

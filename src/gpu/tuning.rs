@@ -89,7 +89,8 @@ struct Tuning {
 }
 
 impl Properties {
-    /// Whether subgroups can share such tiles: each part has 1 to 32 rows of lanes, and all lanes fit a workgroup.
+    /// Whether subgroups can share such tiles: each part has 1 to 32 rows of lanes, all lanes fit a workgroup, and the
+    /// subgroups stay converged while others leave their loops. A software device runs one after the other.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn suits_tile(&self, tile: impl Into<Tile>) -> bool {
         let tile = tile.into();
@@ -97,7 +98,11 @@ impl Properties {
         tile.part().is_some_and(|[width, height]| {
             let pixels = u64::from(width) * u64::from(height);
             let is_workgroup = lanes * u64::from(tile.subgroups) <= u64::from(WORKGROUP);
-            pixels.is_multiple_of(lanes) && (1..=32).contains(&(pixels / lanes)) && is_workgroup
+            let keeps_subgroups = self.has_uniform_subgroup_control_flow || self.is_cpu;
+            pixels.is_multiple_of(lanes)
+                && (1..=32).contains(&(pixels / lanes))
+                && is_workgroup
+                && (tile.subgroups == 1 || keeps_subgroups)
         })
     }
 }
@@ -181,6 +186,7 @@ mod tests {
             subgroup_size: 8,
             subgroup_size_is_selectable: true,
             max_storage_buffer_range: 1 << 27,
+            max_buffer_size: 1 << 30,
             max_workgroups: 65_535,
             max_loop_iterations: u32::MAX,
             timestamp_bits: 64,
@@ -188,7 +194,7 @@ mod tests {
             is_cpu: false,
             cooperative_matrix: None,
             has_push_descriptors: true,
-            has_uniform_subgroup_control_flow: false,
+            has_uniform_subgroup_control_flow: true,
             has_pipeline_statistics: false,
         }
     }
@@ -206,6 +212,9 @@ mod tests {
         assert!(suits([16, 16], 2) && suits([16, 16], 4) && suits([16, 32], 2) && suits([8, 2], 2));
         assert!(!suits([16, 6], 4) && !suits([4, 4], 4) && !suits([16, 128], 4));
         assert!(!suits([16, 16], 0) && !suits([15, 24], 3) && !suits([16, 16], 8));
+        let diverging = Properties { has_uniform_subgroup_control_flow: false, ..properties() };
+        assert!(!diverging.suits_tile(Tile { size: [16, 16], subgroups: 2 }));
+        assert!(diverging.suits_tile([16, 16]));
         let wide = Properties { subgroup_size: 128, ..properties() };
         assert!(wide.suits_tile(Tile { size: [16, 16], subgroups: 2 }));
         assert!(!wide.suits_tile(Tile { size: [32, 16], subgroups: 4 }), "512 lanes");

@@ -4,7 +4,7 @@ use gpu_allocator::MemoryLocation;
 
 use super::allocated::DeviceMemory;
 use super::host::Upload;
-use super::{Buffer, Gpu, SliceMut};
+use super::{Bound, Buffer, Gpu, SliceMut};
 use crate::{Error, Result};
 
 impl Gpu {
@@ -22,7 +22,8 @@ impl Gpu {
     /// The device was lost.
     pub(crate) fn zeroed<T: bytemuck::Pod>(&self, buffer: Buffer<T>) -> Result<Buffer<T>> {
         if !buffer.is_empty() {
-            self.upload(buffer.name(), Upload::Fill { target: buffer.bound(), word: 0 })?;
+            let fills = buffer.pieces().map(|target| Ok(Upload::Fill { target, word: 0 }));
+            self.upload(buffer.name(), fills)?;
         }
         Ok(buffer)
     }
@@ -57,29 +58,37 @@ impl Gpu {
         if data.is_empty() {
             return Ok(());
         }
-        let bytes: &[u8] = bytemuck::cast_slice(data);
-        let mut staging = DeviceMemory::new(
-            &self.shared,
-            "staging",
-            bytes.len() as u64,
-            MemoryLocation::CpuToGpu,
-        )?;
+        let mut left: &[u8] = bytemuck::cast_slice(data);
+        let copies = buffer.pieces().map_while(|target| {
+            let size = left.len().min(target.size as usize);
+            let (bytes, after) = left.split_at(size);
+            left = after;
+            (size > 0).then(|| self.staged(target, bytes))
+        });
+        self.upload("write", copies)
+    }
+
+    /// A copy of `bytes` to the start of `target`.
+    fn staged(&self, target: Bound, bytes: &[u8]) -> Result<Upload> {
+        let size = bytes.len() as u64;
+        let location = MemoryLocation::CpuToGpu;
+        let mut staging = DeviceMemory::new(&self.shared, "staging", size, location)?;
         if let Some(mapped) = staging.mapped_mut() {
             mapped[..bytes.len()].copy_from_slice(bytes);
         }
-        let (target, bytes) = (buffer.bound(), bytes.len() as u64);
-        self.upload("write", Upload::Copy { staging, target, bytes })
+        Ok(Upload::Copy { staging, target, bytes: size })
     }
 
-    /// Makes a change of a buffer: at once, or with the next recording where a host lends the device.
-    fn upload(&self, name: &str, upload: Upload) -> Result<()> {
+    /// Makes changes of a buffer: at once, or with the next recording where a host lends the device.
+    fn upload(&self, name: &str, uploads: impl Iterator<Item = Result<Upload>>) -> Result<()> {
+        let uploads = uploads.collect::<Result<Vec<_>>>()?;
         match &self.shared.host {
             Some(host) => {
-                host.add(upload);
+                uploads.into_iter().for_each(|upload| host.add(upload));
                 Ok(())
             }
             None => self.run(name, |pass| {
-                upload.record(pass);
+                uploads.iter().for_each(|upload| upload.record(pass));
                 Ok(())
             }),
         }

@@ -4,7 +4,11 @@
 //! `a` is the render, not clamped, and `b` the image. SSIM is that of 3DGS: an 11 x 11 Gaussian window with sigma 1.5,
 //! per channel, zero padding. R_0 is compared with the target, and the tonemapper's output with the dark photograph.
 
+mod ssim;
+
 use glam::UVec2;
+
+use ssim::Ssim;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
@@ -12,7 +16,7 @@ use super::{
     no_scratch, value_count,
 };
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
-use crate::kernels::{l1, ssim};
+use crate::kernels::l1;
 use crate::{Error, Result};
 
 /// R_0 and the target.
@@ -62,49 +66,6 @@ impl Term {
     };
 }
 
-/// The layout of the SSIM kernel: columns per lane, rows per subgroup, and the alignment of its loads and stores in
-/// floats.
-#[derive(Clone, Copy, Debug)]
-struct SsimLayout {
-    columns: u32,
-    rows: u32,
-    alignment: u32,
-}
-
-impl SsimLayout {
-    /// The layouts for the device; the first that fits a view is used. On a CPU, loads and stores cost most: a subgroup
-    /// is as wide as its state fits the L1 cache, and has many rows. A GPU needs narrow strips, whose state stays in
-    /// registers.
-    fn on(gpu: &Gpu) -> Vec<Self> {
-        let properties = gpu.properties();
-        match properties.is_cpu {
-            true => vec![
-                Self { columns: 12, rows: 192, alignment: 4 },
-                Self { columns: 10, rows: 192, alignment: 1 },
-            ],
-            false => {
-                let columns = (GPU_COLUMNS / properties.subgroup_size).max(2);
-                vec![Self { columns, rows: 32, alignment: 1 }]
-            }
-        }
-    }
-
-    fn fits(self, size: UVec2) -> bool {
-        size.x.is_multiple_of(self.alignment)
-    }
-
-    /// The number of subgroups for a channel of a view of `size`, with this number of lanes each.
-    fn subgroups(self, size: UVec2, lanes: u32) -> u32 {
-        let halo = (2 * ssim::RADIUS as u32).next_multiple_of(self.alignment);
-        let outputs = lanes * self.columns - 2 * halo;
-        size.x.div_ceil(outputs) * size.y.div_ceil(self.rows)
-    }
-}
-
-/// The fewest columns that a subgroup of a GPU loads: with fewer, the share of the borders, which have no outputs, is
-/// larger.
-const GPU_COLUMNS: u32 = 64;
-
 /// The settings of a loss between images.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LossSettings {
@@ -151,13 +112,6 @@ enum Kernels {
     Ssim(Ssim),
 }
 
-#[derive(Debug)]
-struct Ssim {
-    weight: f64,
-    lanes: u32,
-    kernels: Vec<(SsimLayout, Pipeline<ssim::Kernel>)>,
-}
-
 impl Loss {
     /// Builds the kernels; [`Loss::reserve`] allocates.
     ///
@@ -173,16 +127,7 @@ impl Loss {
         }
         let subgroup_size = gpu.properties().subgroup_size;
         let kernels = if ssim_weight > 0.0 {
-            let kernel = |march| {
-                let SsimLayout { columns, rows, alignment } = march;
-                let constants = ssim::Constants { columns, rows, alignment, adds };
-                Ok((march, gpu.pipeline(&constants)?))
-            };
-            Kernels::Ssim(Ssim {
-                weight: ssim_weight,
-                lanes: subgroup_size,
-                kernels: SsimLayout::on(gpu).into_iter().map(kernel).collect::<Result<_>>()?,
-            })
+            Kernels::Ssim(Ssim::new(gpu, ssim_weight, adds)?)
         } else {
             let constants = l1::Constants { adds, ..Default::default() };
             Kernels::L1 {
@@ -213,7 +158,10 @@ impl Loss {
             self.l1_partials = self.gpu.uninit("l1_partials", workgroups)?;
             self.ssim_partials = self.gpu.uninit("ssim_partials", workgroups)?;
         }
-        Ok(())
+        match &mut self.kernels {
+            Kernels::Ssim(ssim) => ssim.reserve(&self.gpu, self.max_values),
+            Kernels::L1 { .. } => Ok(()),
+        }
     }
 
     /// Writes dL/d render, (3, H, W), to `d_render` or adds it, also outside the loss region, and writes the means of
@@ -231,7 +179,6 @@ impl Loss {
     ) -> Result<()> {
         self.check(&inputs, d_render, log)?;
         let workgroups = self.kernels.workgroups(inputs.size);
-        let threads = Threads::Workgroups([workgroups, 1, 1]);
         let [l1_partials, ssim_partials] = [&mut self.l1_partials, &mut self.ssim_partials];
         let mut ssim_count = 0;
         match &mut self.kernels {
@@ -254,12 +201,15 @@ impl Loss {
                         d_render: d_render.slice_mut(),
                         partials: l1_partials.slice_mut(),
                     },
-                    threads,
+                    Threads::Workgroups([workgroups, 1, 1]),
                 )?;
             }
             Kernels::Ssim(ssim) => {
                 ssim_count = workgroups;
-                ssim.record(pass, threads, inputs, d_render, [l1_partials, ssim_partials])?;
+                let partials = [l1_partials, ssim_partials];
+                if ssim.record(pass, inputs, d_render, partials, (self.terms, log))? {
+                    return Ok(());
+                }
             }
         }
         let scale = 1.0 / inputs.loss_region.value_count() as f32;
@@ -301,47 +251,8 @@ impl Kernels {
             Self::L1 { values_per_workgroup, .. } => {
                 value_count(size).div_ceil(*values_per_workgroup)
             }
-            Self::Ssim(ssim) => 3 * ssim.kernel(size).0.subgroups(size, ssim.lanes),
+            Self::Ssim(ssim) => ssim.workgroups(size),
         }
-    }
-}
-
-impl Ssim {
-    /// The last one fits every view.
-    fn kernel(&self, size: UVec2) -> &(SsimLayout, Pipeline<ssim::Kernel>) {
-        let last = self.kernels.len() - 1;
-        let first = self.kernels.iter().position(|(march, _)| march.fits(size));
-        &self.kernels[first.unwrap_or(last)]
-    }
-
-    fn record(
-        &self,
-        pass: &mut Recorder<'_>,
-        threads: Threads,
-        LossInputs { size, loss_region, render, target }: LossInputs<'_>,
-        d_render: &mut Buffer<f32>,
-        [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],
-    ) -> Result<()> {
-        let mean_scale = 1.0 / f64::from(loss_region.value_count());
-        pass.dispatch(
-            &self.kernel(size).1,
-            &ssim::Params {
-                width: size.x,
-                height: size.y,
-                loss_begin: loss_region.origin,
-                loss_end: loss_region.end(),
-                l1_scale: ((1.0 - self.weight) * mean_scale) as f32,
-                ssim_scale: (self.weight * mean_scale) as f32,
-            },
-            ssim::Buffers {
-                render: render.slice(),
-                target: target.slice(),
-                d_render: d_render.slice_mut(),
-                l1_partials: l1_partials.slice_mut(),
-                ssim_partials: ssim_partials.slice_mut(),
-            },
-            threads,
-        )
     }
 }
 

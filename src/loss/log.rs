@@ -1,7 +1,7 @@
 //! The log of the loss terms: one row per step, one column per term, filled on the device.
 
 use super::Term;
-use crate::gpu::{Buffer, Download, Gpu, Pipeline, Recorder, Threads};
+use crate::gpu::{Buffer, Download, Gpu, Pipeline, Recorder, SliceMut, Threads};
 use crate::kernels::loss_log;
 use crate::kernels::status::STATUS_WORDS;
 use crate::{Error, Result};
@@ -53,6 +53,16 @@ pub struct LogSlot<'a> {
     pub slot: u32,
     /// The status words; the first gets the bit `STATUS_NOT_FINITE` if a term is NaN or infinite.
     pub status: &'a mut Buffer<u32>,
+}
+
+/// The row of a step, for a kernel that writes it.
+#[derive(Debug)]
+pub(super) struct LogRow<'a> {
+    pub(super) slot: u32,
+    pub(super) term_count: u32,
+    pub(super) log: SliceMut<'a, f32>,
+    pub(super) statuses: SliceMut<'a, u32>,
+    pub(super) status: SliceMut<'a, u32>,
 }
 
 /// A term and the partial sums whose scaled sum it is; without any, its column is unchanged.
@@ -116,6 +126,17 @@ impl LogSlot<'_> {
             )));
         }
         Ok(())
+    }
+
+    /// What a kernel binds that writes the row itself: slot, columns, the log, the statuses and the status words.
+    pub(super) fn row(&mut self) -> LogRow<'_> {
+        LogRow {
+            slot: self.slot,
+            term_count: Term::all().count() as u32,
+            log: self.log.values.slice_mut(),
+            statuses: self.log.statuses.slice_mut(),
+            status: self.status.slice_mut(),
+        }
     }
 
     /// The means of two terms.

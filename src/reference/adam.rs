@@ -1,10 +1,9 @@
 use super::random::random_bits;
 use super::rounding::Rounded;
 use crate::gpu::{Reference, Tolerance};
-use crate::kernels::adam::{
-    Constants, Kernel, LOG_SCALE_MAX, LOG_SCALE_MIN, Params, Slices, Tolerances,
-};
+use crate::kernels::adam::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::adam_step::{BETA1, BETA2, EPSILON, GRADIENT_BOUND};
+use crate::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
 use crate::photographs::tone::Real;
 use crate::splats::attributes::{Attribute, planes};
 
@@ -50,12 +49,15 @@ pub(super) fn in_halves([m, v]: [f32; 2], chance: u32) -> u32 {
 
 /// The parameter and both moments after the step.
 fn updated<T: Real>(params: &Params, column: usize, before: [f32; 4]) -> [T; 3] {
-    let of = |x: f32| T::of(x.into());
     let planes = planes(params.feature_count as usize, params.column_count as usize);
     let plane = planes.iter().rposition(|(first, width)| *width > 0 && column >= *first);
     let plane = plane.unwrap_or_default();
-    let [p, m, v] = stepped::<T>([params.rates[plane], params.second_correction], before);
-    let [low, high] = [LOG_SCALE_MIN, LOG_SCALE_MAX].map(|bound| of(bound as f32));
+    bounded(plane, stepped::<T>([params.rates[plane], params.second_correction], before))
+}
+
+/// The parameter, which has bounds in the plane of the log scales, and both moments.
+pub(super) fn bounded<T: Real>(plane: usize, [p, m, v]: [T; 3]) -> [T; 3] {
+    let [low, high] = [LOG_SCALE_MIN, LOG_SCALE_MAX].map(|bound| T::of((bound as f32).into()));
     let bounded = match plane == Attribute::LogScales as usize {
         // Written so that a NaN stays one.
         true if p < low => low,

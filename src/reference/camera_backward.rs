@@ -35,7 +35,7 @@ pub fn camera_backward(
 fn inputs(params: &Params, constants: &Constants, slices: &Slices<'_>, i: usize) -> [Vec<f64>; 2] {
     const OFF: f64 = 256.0 * UNIT;
     let n = params.gaussian_count as usize;
-    let planes = Planes { count: n, feature_count: 0, sh_degree: 0 };
+    let planes = Planes { count: n, feature_count: 0, sh_degree: 0, rest_by_column: false };
     let Gaussian { mean, quat, log_scale, .. } = planes.load(slices.parameters, i);
     let camera = Camera::from(&slices.cameras[params.camera_index as usize]);
     let far = camera.center().length();

@@ -1,18 +1,20 @@
 use super::densify_scatter::copies;
+use super::gaussian::word_of_plane;
 use crate::gpu::Reference;
 use crate::kernels::densify_moments::{Constants, Kernel, Params, Slices};
 use crate::splats::attributes::planes;
 
 impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
         let [features, columns] = [params.feature_count, params.column_count].map(|n| n as usize);
         let new = [params.first_new_gaussian, params.new_gaussian_count];
         for copy in copies(n, slices.actions, slices.offsets, new) {
-            for (column, width) in planes(features, columns) {
-                for k in 0..width {
-                    let moment = slices.moments[column * n + width * copy.of + k];
-                    slices.new_moments[column * new_n + width * copy.to + k] =
+            for plane in planes(features, columns).into_iter().enumerate() {
+                let word = |n, i, k| word_of_plane(plane, constants.rest_by_column, n, i, k);
+                for k in 0..plane.1.1 {
+                    let moment = slices.moments[word(n, copy.of, k)];
+                    slices.new_moments[word(new_n, copy.to, k)] =
                         if copy.is_new { 0 } else { moment };
                 }
             }

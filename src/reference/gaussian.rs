@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use glam::{DVec3, DVec4};
 
-use crate::splats::attributes::{Attribute, PlaneCounts, column_count, planes};
+use crate::splats::attributes::{Attribute, PlaneCounts, column_count, planes, word_of};
 use crate::splats::packed_sh::PackedSh;
 
 /// A Gaussian, or the gradient of one, in f64.
@@ -34,13 +34,31 @@ pub struct Planes {
     pub feature_count: usize,
     /// The stored SH degree.
     pub sh_degree: u32,
+    /// The SH coefficients above degree 0 are stored word by word, each for all Gaussians.
+    pub rest_by_column: bool,
+}
+
+/// The index of word `k` of Gaussian `i` of `count` in a plane: its number, first column and width.
+pub(super) fn word_of_plane(
+    (number, plane): (usize, (usize, usize)),
+    rest_by_column: bool,
+    count: usize,
+    i: usize,
+    k: usize,
+) -> usize {
+    word_of(plane, rest_by_column && number == Attribute::Rest as usize, count, i, k)
 }
 
 impl Planes {
     /// The planes of this many Gaussians whose splats have this many channels: colour, and the features after it.
-    pub(super) fn of(gaussian_count: u32, channels: u32, sh_degree: u32) -> Self {
+    pub(super) fn of(
+        gaussian_count: u32,
+        channels: u32,
+        sh_degree: u32,
+        rest_by_column: bool,
+    ) -> Self {
         let feature_count = channels as usize - 3;
-        Self { count: gaussian_count as usize, feature_count, sh_degree }
+        Self { count: gaussian_count as usize, feature_count, sh_degree, rest_by_column }
     }
 
     /// Floats of the whole array.
@@ -49,25 +67,31 @@ impl Planes {
     }
 
     /// The indices of the floats of Gaussian `i`, in the order of [`Gaussian`].
-    fn places(self, i: usize) -> impl Iterator<Item = usize> {
+    pub(super) fn places(self, i: usize) -> impl Iterator<Item = usize> {
         let columns = column_count(self.feature_count, self.sh_degree);
         let planes = planes(self.feature_count, columns);
-        planes.into_iter().flat_map(move |(column, width)| {
-            let first = column * self.count + width * i;
-            first..first + width
+        planes.into_iter().enumerate().flat_map(move |plane| {
+            (0..plane.1.1).map(move |k| word_of_plane(plane, self.rest_by_column, self.count, i, k))
         })
     }
 
-    /// The array as floats; its last plane may be in halves.
-    pub(super) fn floats(self, parameters: &[f32], half_rest: bool) -> Cow<'_, [f32]> {
-        let Self { count: gaussians, feature_count: features, sh_degree } = self;
-        let columns = column_count(features, sh_degree);
-        match half_rest {
-            true => PackedSh::new(PlaneCounts { gaussians, columns, features })
-                .unpack(parameters)
-                .into(),
-            false => parameters.into(),
+    /// The array as floats, Gaussian by Gaussian, and its planes; the last one may be in halves.
+    pub(super) fn floats(self, parameters: &[f32], half_rest: bool) -> (Self, Cow<'_, [f32]>) {
+        let Self { count, feature_count: features, sh_degree, rest_by_column } = self;
+        let planes =
+            PlaneCounts { gaussians: count, columns: column_count(features, sh_degree), features };
+        let packed = PackedSh::new(planes);
+        let words = if half_rest { packed.columns() } else { planes.columns };
+        let mut by_gaussian = Cow::from(parameters);
+        if rest_by_column {
+            let rest = (planes.before_rest(), words - planes.before_rest());
+            for (i, k) in (0..count).flat_map(|i| (0..rest.1).map(move |k| (i, k))) {
+                by_gaussian.to_mut()[word_of(rest, false, count, i, k)] =
+                    parameters[word_of(rest, true, count, i, k)];
+            }
         }
+        let floats = if half_rest { packed.unpack(&by_gaussian).into() } else { by_gaussian };
+        (Self { rest_by_column: false, ..self }, floats)
     }
 
     /// Gaussian `i` of the array.

@@ -121,7 +121,12 @@ struct ProjectionInputs<'a> {
 impl<'a> ProjectionInputs<'a> {
     fn new(params: &'a Params, constants: &'a Constants, cameras: &[kernels::Camera]) -> Self {
         let Constants { channels, sh_degree, view_depths, .. } = *constants;
-        let planes = Planes::of(params.gaussian_count, channels - view_depths, sh_degree);
+        let planes = Planes::of(
+            params.gaussian_count,
+            channels - view_depths,
+            sh_degree,
+            constants.rest_by_column,
+        );
         let camera = &cameras[params.camera_index as usize];
         let (size, camera) = (camera.size, Camera::from(camera));
         Self { params, constants, size, camera, planes }
@@ -224,13 +229,13 @@ impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Slices { parameters, splats, colors, depth_keys, ids, tile_counts, cameras } = slices;
         let scene = ProjectionInputs::new(params, constants, cameras);
-        let parameters = scene.planes.floats(parameters, constants.half_rest);
+        let (planes, parameters) = scene.planes.floats(parameters, constants.half_rest);
         let stored = stored_color(constants.channels);
         for i in 0..scene.planes.count {
             ids[i] = params.first_gaussian + i as u32;
             depth_keys[i] = CULLED;
             tile_counts[i] = 0;
-            let gaussian = scene.planes.load(&parameters, i);
+            let gaussian = planes.load(&parameters, i);
             let Some(projection) = scene.project(&gaussian) else { continue };
             splats[i] = projection.stored();
             let depth = (constants.view_depths != 0).then_some(projection.depth);
@@ -249,12 +254,12 @@ impl Reference for Kernel {
     /// A Gaussian close to the culling limit may be culled; one whose ellipse is close to a tile may cover it.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let scene = ProjectionInputs::new(params, constants, slices.cameras);
-        let parameters = scene.planes.floats(slices.parameters, constants.half_rest);
+        let (planes, parameters) = scene.planes.floats(slices.parameters, constants.half_rest);
         let (n, stored) = (scene.planes.count, stored_color(constants.channels));
         let [mut splats, mut colors, mut depth_keys, mut tile_counts] =
             [8 * n, stored * n, n, n].map(|len| vec![0.0; len]);
         for i in 0..n {
-            let gaussian = scene.planes.load(&parameters, i);
+            let gaussian = planes.load(&parameters, i);
             let Some(errors) = scene.errors(&gaussian) else {
                 splats[8 * i..][..8].fill(f64::INFINITY);
                 colors[stored * i..][..stored].fill(f64::INFINITY);

@@ -14,6 +14,7 @@ use crate::kernels::project_backward::{Constants, Kernel, Params, Slices, Tolera
 use crate::kernels::shared_intersections::SHARED_INTERSECTIONS;
 use crate::kernels::splat::{DILATION, RECORD_HEAD};
 use crate::kernels::status::STATUS_GRADIENT;
+use crate::splats::attributes::{Attribute, column_count};
 
 /// The gradients that arrive at one splat.
 #[derive(Clone, Debug)]
@@ -134,7 +135,8 @@ struct ProjectionInputs<'a> {
 impl<'a> ProjectionInputs<'a> {
     fn new(params: &'a Params, constants: &'a Constants, cameras: &[kernels::Camera]) -> Self {
         let Constants { channels, sh_degree, .. } = *constants;
-        let planes = Planes::of(params.gaussian_count, channels, sh_degree);
+        let planes =
+            Planes::of(params.gaussian_count, channels, sh_degree, constants.rest_by_column);
         let camera = Camera::from(&cameras[params.camera_index as usize]);
         Self { params, constants, camera, planes }
     }
@@ -154,7 +156,23 @@ impl<'a> ProjectionInputs<'a> {
     }
 
     fn backward(&self, gaussian: &Gaussian, splat: &Splat, d_splat: &DSplat) -> Gaussian {
-        project_gaussian_backward(&self.camera, self.params.sh_degree, gaussian, splat, d_splat)
+        let degree = self.params.sh_degree;
+        let mut gradient =
+            project_gaussian_backward(&self.camera, degree, gaussian, splat, d_splat);
+        if self.constants.color_gradients {
+            let rest = &mut gradient.sh[1..];
+            rest.fill(DVec3::ZERO);
+            rest.first_mut().into_iter().for_each(|first| *first = d_splat.color);
+        }
+        gradient
+    }
+
+    /// Columns of gradients that are written; those of the colour are the first ones of their plane.
+    fn written_columns(&self) -> usize {
+        let Planes { feature_count, sh_degree, .. } = self.planes;
+        let (columns, rest) =
+            (column_count(feature_count, sh_degree), Attribute::Rest.column(feature_count));
+        if self.constants.color_gradients { columns.min(rest + 3) } else { columns }
     }
 
     /// The rounding error of a quaternion's gradient, whose terms can cancel, as for a sphere, which has no gradient:
@@ -223,18 +241,22 @@ impl Reference for Kernel {
         // From before the pass, since the device may process Gaussians in any order.
         let before = status[3];
         let scene = ProjectionInputs::new(params, constants, slices.cameras);
-        let parameters = scene.planes.floats(parameters, constants.half_rest);
-        gradients[..scene.planes.float_count()].fill(0.0);
+        let (planes, parameters) = scene.planes.floats(parameters, constants.half_rest);
+        let written = scene.written_columns() * scene.planes.count;
+        gradients[..written].fill(0.0);
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
             let record =
                 summed_record(constants.channels, intersection_ranges[i], gradient_records);
             let d_splat = scene.d_splat(colors, &values(&record), i);
-            let gaussian = scene.planes.load(&parameters, i);
+            let gaussian = planes.load(&parameters, i);
             let gradient = scene.backward(&gaussian, &Splat::from(&splats[i]), &d_splat);
             let mut is_finite = (8.0 * d_splat.color.as_vec3()).is_finite();
             scene.planes.store(&gradient, i, |at, value| {
-                gradients[at] = value as f32;
-                is_finite &= gradients[at].is_finite();
+                let value = value as f32;
+                is_finite &= value.is_finite();
+                if at < written {
+                    gradients[at] = value;
+                }
             });
             if !is_finite {
                 status[0] |= if before & !STATUS_GRADIENT == 0 { STATUS_GRADIENT } else { 0 };
@@ -250,13 +272,13 @@ impl Reference for Kernel {
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         const OFF: f64 = 256.0 * UNIT;
         let scene = ProjectionInputs::new(params, constants, slices.cameras);
-        let parameters = scene.planes.floats(slices.parameters, constants.half_rest);
-        let one = Planes { count: 1, ..scene.planes };
+        let (planes, parameters) = scene.planes.floats(slices.parameters, constants.half_rest);
+        let one = Planes { count: 1, ..planes };
         let far = scene.camera.center().length();
         let [mut gradients, mut grad_norm_sums] =
             [scene.planes.float_count(), scene.planes.count].map(|len| vec![0.0; len]);
         for i in (0..scene.planes.count).filter(|&i| slices.tile_counts[i] > 0) {
-            let gaussian = scene.planes.load(&parameters, i);
+            let gaussian = planes.load(&parameters, i);
             let splat = Splat::from(&slices.splats[i]);
             let mut inputs = vec![0.0; one.float_count()];
             one.store(&gaussian, 0, |at, value| inputs[at] = value);

@@ -5,7 +5,8 @@ use glam::UVec2;
 use super::inside;
 use super::rounding::{Rounded, UNIT, chain};
 use crate::gpu::{Reference, Tolerance};
-use crate::kernels::ssim::{C1, C2, Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::ssim::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::ssim_window::{C1, C2};
 use crate::photographs::tone::Real;
 
 /// SSIM at one pixel of one channel and its derivatives with respect to the blurred moments.
@@ -94,8 +95,23 @@ fn d_ssim<T: Real>(a: T, b: T, [mean, square, product]: [T; 3]) -> T {
     mean + own + b * product
 }
 
+/// The gradient at one pixel, from the blurred derivatives, and |a - b| where it counts.
+pub(super) fn rounded_gradient(
+    [l1_scale, ssim_scale]: [Rounded; 2],
+    a: Rounded,
+    b: Rounded,
+    d_moments: [Rounded; 3],
+    counts: bool,
+) -> [Rounded; 2] {
+    let difference = if counts { a - b } else { Rounded::default() };
+    let own = difference.value;
+    let sign = Rounded::of(if own == 0.0 { 0.0 } else { own.signum() });
+    let gradient = l1_scale * sign - ssim_scale * d_ssim(a, b, d_moments);
+    [gradient, difference.abs()]
+}
+
 /// One channel, blurred: each number is a sum of 11 sums of 11 products with rounded taps.
-fn rounded_blur(size: [usize; 2], plane: &[Rounded]) -> Vec<Rounded> {
+pub(super) fn rounded_blur(size: [usize; 2], plane: &[Rounded]) -> Vec<Rounded> {
     let blurred =
         |of: fn(&Rounded) -> f64| blur(size[0], size[1], &plane.iter().map(of).collect::<Vec<_>>());
     let values = blurred(|x| x.value);
@@ -123,10 +139,13 @@ fn outcomes(params: &Params, slices: &Slices<'_>) -> Vec<Outcome> {
     (0..3).flat_map(channel).collect()
 }
 
-fn outcomes_of_channel(params: &Params, a: &[Rounded], b: &[Rounded]) -> Vec<Outcome> {
-    let size = [params.width as usize, params.height as usize];
-    let loss_region = [params.loss_begin, params.loss_end];
-    let counts = |i: usize| inside(i, [params.width, params.height], loss_region);
+/// SSIM of every value of one channel; zero where it does not count.
+pub(super) fn rounded_ssim(
+    size: [usize; 2],
+    a: &[Rounded],
+    b: &[Rounded],
+    counts: impl Fn(usize) -> bool,
+) -> Vec<Ssim<Rounded>> {
     let moment = |of: fn(Rounded, Rounded) -> Rounded| {
         let plane: Vec<_> = a.iter().zip(b).map(|(&a, &b)| of(a, b)).collect();
         rounded_blur(size, &plane)
@@ -138,17 +157,21 @@ fn outcomes_of_channel(params: &Params, a: &[Rounded], b: &[Rounded]) -> Vec<Out
             ([0, 1].map(|m| means[m][i]), [0, 1, 2].map(|m| squares[m][i]));
         if counts(i) { ssim_of_moments(a, b, aa, bb, ab) } else { Ssim::default() }
     };
-    let map: Vec<_> = (0..a.len()).map(index).collect();
+    (0..a.len()).map(index).collect()
+}
+
+fn outcomes_of_channel(params: &Params, a: &[Rounded], b: &[Rounded]) -> Vec<Outcome> {
+    let size = [params.width as usize, params.height as usize];
+    let loss_region = [params.loss_begin, params.loss_end];
+    let counts = |i: usize| inside(i, [params.width, params.height], loss_region);
+    let map = rounded_ssim(size, a, b, counts);
     let derivatives = [0, 1, 2]
         .map(|m| rounded_blur(size, &map.iter().map(|of| of.d_moments[m]).collect::<Vec<_>>()));
-    let [l1_scale, ssim_scale] = [params.l1_scale, params.ssim_scale].map(Rounded::exact);
+    let scales = [params.l1_scale, params.ssim_scale].map(Rounded::exact);
     let outcome = |i: usize| {
-        let difference = if counts(i) { a[i] - b[i] } else { Rounded::default() };
-        let own = difference.value;
-        let sign = Rounded::of(if own == 0.0 { 0.0 } else { own.signum() });
-        let d_ssim = d_ssim(a[i], b[i], [0, 1, 2].map(|m| derivatives[m][i]));
-        let gradient = l1_scale * sign - ssim_scale * d_ssim;
-        Outcome { gradient, difference: difference.abs(), ssim: map[i].value }
+        let d = [0, 1, 2].map(|m| derivatives[m][i]);
+        let [gradient, difference] = rounded_gradient(scales, a[i], b[i], d, counts(i));
+        Outcome { gradient, difference, ssim: map[i].value }
     };
     (0..a.len()).map(outcome).collect()
 }

@@ -169,6 +169,18 @@ impl PlaneCounts {
     }
 }
 
+/// The index of word `k` of Gaussian `i` of `count` in the plane with this first column and width: Gaussian by
+/// Gaussian, or word by word, each for all Gaussians.
+pub fn word_of(
+    (column, width): (usize, usize),
+    is_by_column: bool,
+    count: usize,
+    i: usize,
+    k: usize,
+) -> usize {
+    if is_by_column { (column + k) * count + i } else { column * count + width * i + k }
+}
+
 /// First column and width of every plane, for `column_count` floats per Gaussian, of which `feature_count` are
 /// features.
 pub fn planes(feature_count: usize, column_count: usize) -> [(usize, usize); ATTRIBUTES.len()] {

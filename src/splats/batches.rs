@@ -7,8 +7,8 @@ use std::ops::Range;
 
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Slice, SliceMut};
-use crate::splats::attributes::PlaneCounts;
-use crate::splats::attributes::planes;
+use crate::splats::attributes::{Attribute, PlaneCounts, planes};
+use crate::splats::packed_sh::StorageFormat;
 
 /// The layout of planes in a buffer.
 #[derive(Clone, Copy, Debug)]
@@ -16,6 +16,33 @@ pub struct Batches {
     planes: PlaneCounts,
     /// The most Gaussians of a batch.
     size: usize,
+    rest_by_column: bool,
+}
+
+/// Whether SH coefficients above degree 0 are stored word by word, each for all Gaussians of a batch, instead of
+/// Gaussian by Gaussian. On a GPU, the lanes of a subgroup, one for each Gaussian, then access neighbouring words. A
+/// CPU accesses the words of each lane by themselves. Files have them Gaussian by Gaussian.
+pub(crate) fn rest_by_column(gpu: &Gpu) -> bool {
+    !gpu.properties().is_cpu
+}
+
+/// What the backward pass writes of the gradients of SH coefficients above degree 0.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum GradientKind {
+    /// All of them.
+    All,
+    /// That of the colour, from which Adam computes them: the first three numbers of their plane, column by column.
+    Colors,
+}
+
+impl GradientKind {
+    /// The kind for coefficients and moments of these formats. A GPU, whose memory is the limit, gets the gradients of
+    /// colours if all numbers are 32-bit floats. The rounding of shorter ones depends on every bit of a gradient, and a
+    /// CPU reads gradients four at a time.
+    pub(crate) fn on(gpu: &Gpu, formats: [StorageFormat; 2]) -> Self {
+        let are_single = formats == [StorageFormat::Single; 2];
+        if rest_by_column(gpu) && are_single { Self::Colors } else { Self::All }
+    }
 }
 
 /// Gaussians whose planes are contiguous.
@@ -39,7 +66,12 @@ impl Batches {
         // Kernels count floats in 32 bits.
         let floats = floats.min(u64::from(u32::MAX)) as usize;
         let size = (floats / planes.columns.max(1) / ALIGNMENT).max(1) * ALIGNMENT;
-        Self { planes, size }
+        Self { planes, size, rest_by_column: rest_by_column(gpu) }
+    }
+
+    /// Floats of a batch that is full.
+    pub(crate) fn window(&self) -> usize {
+        self.size * self.planes.columns
     }
 
     /// The layout of the same Gaussians with `columns` words each instead of their floats.
@@ -49,7 +81,7 @@ impl Batches {
 
     /// The batches in order; one empty batch if there are no Gaussians.
     pub fn iter(&self) -> impl Iterator<Item = Batch> + use<> {
-        let Self { planes: PlaneCounts { gaussians: count, columns, .. }, size } = *self;
+        let Self { planes: PlaneCounts { gaussians: count, columns, .. }, size, .. } = *self;
         let begins = (0..count.max(1)).step_by(size);
         begins.map(move |first| Batch { first, count: size.min(count - first), columns })
     }
@@ -70,7 +102,7 @@ impl Batches {
     /// # Errors
     /// The device is out of memory.
     pub fn uninit(&self, gpu: &Gpu, name: &str) -> Result<Buffer<f32>> {
-        gpu.uninit_in_windows(name, self.planes.total())
+        gpu.uninit_in_windows(name, self.planes.total(), self.window())
     }
 
     /// A buffer of zeroed planes.
@@ -91,10 +123,14 @@ impl Batches {
         buffer: impl Into<SliceMut<'a, f32>>,
         planes: &[f32],
     ) -> Result<()> {
-        if self.planes.gaussians <= self.size {
+        if self.is_plain() {
             return gpu.write(buffer, planes);
         }
-        let batched: Vec<f32> = self.parts().flat_map(|part| &planes[part]).copied().collect();
+        let mut batched = Vec::with_capacity(self.planes.total());
+        for Part { range, columns } in self.parts() {
+            let rows = &planes[range];
+            (0..columns).for_each(|k| batched.extend(rows.iter().skip(k).step_by(columns)));
+        }
         gpu.write(buffer, &batched)
     }
 
@@ -105,14 +141,18 @@ impl Batches {
     pub fn read<'a>(&self, gpu: &Gpu, buffer: impl Into<Slice<'a, f32>>) -> Result<Vec<f32>> {
         let mut batched = gpu.read(buffer)?;
         batched.truncate(self.planes.total());
-        if self.planes.gaussians <= self.size {
+        if self.is_plain() {
             return Ok(batched);
         }
         let mut planes = vec![0.0; batched.len()];
         let mut rest = batched.as_slice();
-        for part in self.parts() {
-            let (own, others) = rest.split_at(part.len());
-            planes[part].copy_from_slice(own);
+        for Part { range, columns } in self.parts() {
+            let (own, others) = rest.split_at(range.len());
+            let count = (range.len() / columns).max(1);
+            for (k, column) in own.chunks(count).enumerate() {
+                let rows = planes[range.clone()].iter_mut().skip(k).step_by(columns);
+                rows.zip(column).for_each(|(to, value)| *to = *value);
+            }
             rest = others;
         }
         Ok(planes)
@@ -121,25 +161,45 @@ impl Batches {
     /// The index of a float of a buffer in the planes of all Gaussians.
     pub fn place_of(&self, float: usize) -> usize {
         let mut before = 0;
-        for part in self.parts() {
-            if float < before + part.len() {
-                return part.start + float - before;
+        for Part { range, columns } in self.parts() {
+            let (own, count) = (float - before, range.len() / columns);
+            if own < range.len() {
+                return range.start + own % count * columns + own / count;
             }
-            before += part.len();
+            before += range.len();
         }
         float
     }
 
-    /// Ranges of a buffer, in order, with the corresponding ranges of the planes of all Gaussians.
-    fn parts(&self) -> impl Iterator<Item = Range<usize>> + use<> {
-        let PlaneCounts { gaussians: count, columns, features } = self.planes;
+    /// Whether the buffer has the planes as they are.
+    fn is_plain(&self) -> bool {
+        let is_whole = self.planes.gaussians <= self.size;
+        is_whole && !(self.rest_by_column && self.planes.rest() > 1)
+    }
+
+    /// The parts of a buffer, in order.
+    fn parts(&self) -> impl Iterator<Item = Part> + use<> {
+        let Self { planes: PlaneCounts { gaussians: count, columns, features }, .. } = *self;
+        let rest_by_column = self.rest_by_column;
         self.iter().flat_map(move |batch| {
-            planes(features, columns).map(|(column, width)| {
-                let begin = column * count + width * batch.first;
-                begin..begin + width * batch.count
-            })
+            planes(features, columns).into_iter().enumerate().map(
+                move |(plane, (column, width))| {
+                    let begin = column * count + width * batch.first;
+                    let is_by_column = rest_by_column && plane == Attribute::Rest as usize;
+                    let columns = if is_by_column { width.max(1) } else { 1 };
+                    Part { range: begin..begin + width * batch.count, columns }
+                },
+            )
         })
     }
+}
+
+/// A part of a buffer.
+struct Part {
+    /// The corresponding range of the planes of all Gaussians.
+    range: Range<usize>,
+    /// The columns that the part stores one after the other; 1: as in the range.
+    columns: usize,
 }
 
 impl Batch {

@@ -21,7 +21,7 @@ use crate::kernels::densify_action::{
 };
 use crate::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
 use crate::splats::attributes::PlaneCounts;
-use crate::splats::batches::Batch;
+use crate::splats::batches::{Batch, rest_by_column};
 use crate::splats::optimizer::Moments;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
@@ -187,6 +187,7 @@ impl Densifier {
             }
         }
         let conserving = settings.control == DensityControl::Conserving;
+        let rest_by_column = rest_by_column(gpu);
         let cameras = if conserving { cameras } else { &[] };
         let cameras: Vec<kernels::Camera> =
             cameras.iter().map(|camera| (&Patch::from(camera)).into()).collect();
@@ -194,10 +195,11 @@ impl Densifier {
             gpu: gpu.clone(),
             settings,
             cameras: gpu.buffer("cameras", &cameras)?,
-            score: gpu.pipeline(&densify_score::Constants::default())?,
+            score: gpu
+                .pipeline(&densify_score::Constants { rest_by_column, ..Default::default() })?,
             decide: gpu.pipeline(&densify_decide::Constants { conserving })?,
-            scatter: gpu.pipeline(&densify_scatter::Constants { conserving })?,
-            moments: gpu.pipeline(&densify_moments::Constants::default())?,
+            scatter: gpu.pipeline(&densify_scatter::Constants { conserving, rest_by_column })?,
+            moments: gpu.pipeline(&densify_moments::Constants { rest_by_column })?,
             sort: RadixSort::new(gpu, 0)?,
             scan: Scan::new(gpu, 0)?,
             scratch: Scratch::new(gpu, 0)?,
@@ -438,7 +440,11 @@ impl Densifier {
     ) -> Result<SpareBuffers> {
         let DeviceGaussians { layout, parameters, .. } = gaussians;
         let (columns, capacity) = (layout.floats().columns, capacity(count, limit));
-        let buffer = |columns| self.gpu.uninit_in_windows("planes", capacity * columns);
+        let batches = layout.batches(&self.gpu);
+        let buffer = |columns| {
+            let window = batches.with_columns(columns).window();
+            self.gpu.uninit_in_windows("planes", capacity * columns, window)
+        };
         // Parameters with halves are shorter than planes of floats, and cannot replace them.
         let (turns, words) = match layout.sh_rest {
             StorageFormat::Single => (Some(parameters), None),

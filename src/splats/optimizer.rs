@@ -11,9 +11,10 @@ pub use schedule::{LearningRates, Schedule};
 use std::sync::OnceLock;
 
 use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Slice, SliceMut, Threads};
-use crate::kernels::{adam, adam_rest};
+use crate::kernels::sh::MAX_SH_DEGREE;
+use crate::kernels::{self, adam, adam_gaussian, adam_rest};
 use crate::splats::attributes::PlaneCounts;
-use crate::splats::batches::Batch;
+use crate::splats::batches::{Batch, rest_by_column};
 use crate::splats::packed_sh::StorageFormat;
 use crate::{Error, Result};
 
@@ -179,6 +180,25 @@ pub struct Adam {
     floats: [OnceLock<Pipeline<adam::Kernel>>; 2],
     /// The kernels for packed SH coefficients.
     halves: [OnceLock<Pipeline<adam_rest::Kernel>>; 2],
+    /// The kernels for whole Gaussians, by stored SH degree.
+    gaussians: [OnceLock<Pipeline<adam_gaussian::Kernel>>; DEGREES],
+}
+
+const DEGREES: usize = MAX_SH_DEGREE as usize + 1;
+
+/// A step of Adam over whole Gaussians whose gradients are of [`GradientKind::Colors`](crate::splats::batches::GradientKind).
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct GaussianStep<'a> {
+    /// The step, from 1.
+    pub(crate) step: u64,
+    /// The learning rates.
+    pub(crate) rates: &'a LearningRates,
+    /// The SH degrees that are stored and in use.
+    pub(crate) sh_degrees: [u32; 2],
+    /// The camera of the step: its buffer and index.
+    pub(crate) camera: (&'a Buffer<kernels::Camera>, u32),
+    /// Nothing changes while its first word is nonzero.
+    pub(crate) status: &'a Buffer<u32>,
 }
 
 impl Adam {
@@ -187,9 +207,13 @@ impl Adam {
     /// # Errors
     /// The device refuses it.
     pub fn new(gpu: &Gpu) -> Result<Self> {
-        let adam =
-            Self { gpu: gpu.clone(), floats: Default::default(), halves: Default::default() };
-        adam.pipeline(&adam.floats, false, &adam::Constants { half_moments: false })?;
+        let adam = Self {
+            gpu: gpu.clone(),
+            floats: Default::default(),
+            halves: Default::default(),
+            gaussians: Default::default(),
+        };
+        adam.pipeline(&adam.floats, 0, &adam::Constants { half_moments: false })?;
         Ok(adam)
     }
 
@@ -211,7 +235,7 @@ impl Adam {
         check(step, status, [(parameters.as_slice(), len), (gradients, len)], (&moments, len))?;
         let half_moments = moments.bits() == StorageFormat::Half;
         let constants = adam::Constants { half_moments };
-        let pipeline = self.pipeline(&self.floats, half_moments, &constants)?;
+        let pipeline = self.pipeline(&self.floats, half_moments.into(), &constants)?;
         let [first_moments, second_moments, both_moments] = moments.bindings()?;
         let (uncorrected, second_correction) = corrections(step);
         pass.dispatch(
@@ -255,8 +279,9 @@ impl Adam {
         let [gaussian_count, first_column, coefficient_count] =
             [planes.gaussians, planes.before_rest(), planes.rest()].map(|n| n as u32);
         let half_moments = moments.bits() == StorageFormat::Half;
-        let constants = adam_rest::Constants { half_moments };
-        let pipeline = self.pipeline(&self.halves, half_moments, &constants)?;
+        let rest_by_column = rest_by_column(&self.gpu);
+        let constants = adam_rest::Constants { half_moments, rest_by_column };
+        let pipeline = self.pipeline(&self.halves, half_moments.into(), &constants)?;
         let [first_moments, second_moments, both_moments] = moments.bindings()?;
         let (uncorrected, second_correction) = corrections(step);
         pass.dispatch(
@@ -281,13 +306,55 @@ impl Adam {
         )
     }
 
+    /// Records a step over all columns of `planes`, of the SH degree in use.
+    ///
+    /// # Errors
+    /// Those of [`Adam::record`], or the moments are not 32-bit floats.
+    pub(crate) fn record_gaussians(
+        &self,
+        pass: &mut Recorder<'_>,
+        GaussianStep { step, rates, sh_degrees, camera, status }: GaussianStep<'_>,
+        planes: PlaneCounts,
+        AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
+    ) -> Result<()> {
+        let len = planes.total();
+        check(step, status, [(parameters.as_slice(), len), (gradients, len)], (&moments, len))?;
+        let Moments::Single { first: first_moments, second: second_moments } = moments else {
+            return Err(Error::Usage("whole Gaussians have moments of 32 bits".to_owned()));
+        };
+        let ([sh_degree, used], feature_count) = (sh_degrees, planes.features as u32);
+        let rest_by_column = rest_by_column(&self.gpu);
+        let constants = adam_gaussian::Constants { sh_degree, feature_count, rest_by_column };
+        let pipeline = self.pipeline(&self.gaussians, sh_degree as usize, &constants)?;
+        let (uncorrected, second_correction) = corrections(step);
+        pass.dispatch(
+            pipeline,
+            &adam_gaussian::Params {
+                camera_index: camera.1,
+                gaussian_count: planes.gaussians as u32,
+                sh_degree: used,
+                second_correction,
+                rates: rates.0.map(|rate| (rate / uncorrected) as f32),
+            },
+            adam_gaussian::Buffers {
+                parameters,
+                gradients,
+                first_moments,
+                second_moments,
+                status: status.slice(),
+                cameras: camera.0.slice(),
+            },
+            Threads::Exactly([planes.gaussians as u32, 1, 1]),
+        )
+    }
+
     fn pipeline<'a, K: Kernel>(
         &self,
-        pipelines: &'a [OnceLock<Pipeline<K>>; 2],
-        half_moments: bool,
+        pipelines: &'a [OnceLock<Pipeline<K>>],
+        which: usize,
         constants: &K::Constants,
     ) -> Result<&'a Pipeline<K>> {
-        let place = &pipelines[usize::from(half_moments)];
+        let place = &pipelines[which];
         if let Some(pipeline) = place.get() {
             return Ok(pipeline);
         }

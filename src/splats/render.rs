@@ -28,6 +28,7 @@ use crate::kernels::splat::MAX_CHANNELS;
 use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
+use crate::splats::batches::GradientKind;
 use crate::splats::scene::{GaussianSlice, Layout};
 use crate::splats::sort::{Count, RadixSort};
 use crate::{Error, Result};
@@ -78,6 +79,7 @@ pub struct Gradients<'a> {
 pub struct Renderer {
     gpu: Gpu,
     settings: RenderSettings,
+    gradients: GradientKind,
     tile: Tile,
     /// The most splats of one tile that the blending kernels can process.
     longest_run: u32,
@@ -163,6 +165,19 @@ impl Renderer {
         let [width, height] = self.tile.size;
         let (tile, device) = (format!("{width}x{height}"), self.gpu.properties().name.clone());
         Error::TileLimit { view, splats, tile, device, limit: self.longest_run }
+    }
+
+    /// What the backward pass writes.
+    pub(crate) fn gradient_kind(&self) -> GradientKind {
+        self.gradients
+    }
+
+    /// The camera of a recorded viewpoint: its buffer and index.
+    pub(crate) fn camera_of<'a>(
+        &'a self,
+        viewpoint: &Viewpoint<'a>,
+    ) -> (&'a Buffer<kernels::Camera>, u32) {
+        viewpoint.on_device.unwrap_or((&self.frame.camera, 0))
     }
 
     /// Clears all status flags.

@@ -1,10 +1,10 @@
 //! Exclusive scan and stable radix sort of arrays whose length is on the device.
 //!
 //! Both are reduce-then-scan: an upsweep sums partitions of consecutive items, the last of its workgroups scans the
-//! sums (the spine), and a downsweep finishes within the partitions. A decoupled look-back would need one kernel
-//! instead of two, but also forward-progress guarantees that Vulkan does not provide. One subgroup owns a partition, so
-//! no kernel waits at a barrier, and results are bit-identical on every device and in every run. A dispatch has a
-//! workgroup for every partition of the buffers' capacity; those beyond the count return at once.
+//! sums, and a downsweep finishes within the partitions. A decoupled look-back would need one kernel instead of two,
+//! but also forward-progress guarantees that Vulkan does not provide. One subgroup owns a partition, and results are
+//! bit-identical on every device and in every run. A dispatch has a subgroup for every partition of the buffers'
+//! capacity; those beyond the count return at once.
 
 mod radix;
 mod scan;

@@ -5,8 +5,9 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::loss::{LogSlot, ParameterInputs, ParameterTerms};
 use crate::splats::attributes::{PlaneCounts, planes};
+use crate::splats::batches::GradientKind;
 use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, Round};
-use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, LearningRates, Moments};
+use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, GaussianStep, Moments};
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{
     ATTRIBUTES, Attribute, DeviceGaussians, GaussianSlice, Gaussians, Layout, Shape,
@@ -107,8 +108,10 @@ impl Model {
         let new = Layout { shape: Shape { sh_degree, ..own.shape }, ..own };
         let (capacity, columns) = (own.capacity, new.floats().columns);
         // Grows one buffer after the other, keeping contents and capacity.
-        lengthen(gpu, &mut self.gaussians.parameters, capacity * new.words())?;
-        self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, capacity * columns))?;
+        let windows = [new.parameter_batches(gpu), new.batches(gpu)].map(|all| all.window());
+        lengthen(gpu, &mut self.gaussians.parameters, capacity * new.words(), windows[0])?;
+        self.planes_mut()
+            .try_for_each(|plane| lengthen(gpu, plane, capacity * columns, windows[1]))?;
         let parameters = self.gaussians.read(gpu)?;
         let batches = own.batches(gpu);
         let planes = self.planes_mut().map(|plane| batches.read(gpu, &*plane));
@@ -144,8 +147,8 @@ impl Model {
         self.gaussians.layout.capacity
     }
 
-    /// Records a step of Adam over the columns of the SH degree in use. Nothing changes while the first element of
-    /// `status` is not zero.
+    /// Records a step of Adam over the columns of the SH degree in use, the second of the step's degrees, with gradients
+    /// of this kind. Nothing changes while the first element of its status is not zero.
     ///
     /// # Errors
     /// A pass exceeds the device's launch limits.
@@ -153,24 +156,26 @@ impl Model {
         &mut self,
         (gpu, pass): (&Gpu, &mut Recorder<'_>),
         adam: &Adam,
-        step: u64,
-        rates: &LearningRates,
-        sh_degree: u32,
-        status: &Buffer<u32>,
+        own: GaussianStep<'_>,
+        kind: GradientKind,
     ) -> Result<()> {
+        let GaussianStep { step, rates, sh_degrees: [_, sh_degree], status, .. } = own;
         let Self { gaussians, moments, .. } = self;
         let layout = gaussians.layout;
         let is_half = layout.sh_rest == StorageFormat::Half;
         layout.batches(gpu).iter().try_for_each(|batch| {
             let planes = PlaneCounts { gaussians: batch.count, ..layout.floats() };
-            let columns =
-                if sh_degree == 0 || is_half { planes.before_rest() } else { planes.columns };
-            let floats = PlaneCounts { columns, ..planes };
             let mut buffers = AdamBuffers {
                 parameters: batch.rows_mut(&mut gaussians.parameters, layout.words())?,
                 gradients: batch.planes(&self.gradients)?,
                 moments: moments.of_batch(&batch)?,
             };
+            if kind == GradientKind::Colors {
+                return adam.record_gaussians(pass, own, planes, buffers);
+            }
+            let columns =
+                if sh_degree == 0 || is_half { planes.before_rest() } else { planes.columns };
+            let floats = PlaneCounts { columns, ..planes };
             adam.record(pass, step, rates, floats, buffers.reborrow(), status)?;
             if sh_degree == 0 || !is_half {
                 return Ok(());
@@ -267,10 +272,10 @@ impl Model {
     }
 }
 
-/// Grows a buffer to `len`, keeping its contents.
-fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize) -> Result<()> {
-    if buffer.len() < len {
-        let mut longer = gpu.uninit_in_windows(buffer.name(), len)?;
+/// Grows a buffer to `len` elements in such windows, keeping its contents.
+fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize, window: usize) -> Result<()> {
+    if buffer.len() < len || !buffer.suits_windows(window) {
+        let mut longer = gpu.uninit_in_windows(buffer.name(), len.max(buffer.len()), window)?;
         gpu.write(&mut longer, &gpu.read(&*buffer)?)?;
         *buffer = longer;
     }

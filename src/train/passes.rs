@@ -6,6 +6,7 @@ use crate::base::random::Stream;
 use crate::gpu::Gpu;
 use crate::loss::Losses;
 use crate::photographs::dataset::Dataset;
+use crate::splats::batches::GradientKind;
 use crate::splats::densify::Densifier;
 use crate::splats::optimizer::{Adam, FiniteCheck};
 use crate::splats::render::{RenderSettings, Renderer};
@@ -25,7 +26,11 @@ impl Kernels {
         let (rest, own) = (config.precision.rest, config.render_settings());
         let shape = Shape { sh_degree: first_sh_degree(config), ..own.shape };
         Ok(Self {
-            renderer: Renderer::new(gpu, RenderSettings { rest, shape, ..own })?,
+            renderer: Renderer::with_gradients(
+                gpu,
+                RenderSettings { rest, shape, ..own },
+                GradientKind::on(gpu, [rest, config.precision.moments]),
+            )?,
             losses: Losses::new(gpu, &config.loss())?,
             adam: Adam::new(gpu)?,
             finite: FiniteCheck::new(gpu)?,

@@ -25,6 +25,8 @@ const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 const FINITE_STEPS: u64 = 50;
 /// The most submissions in flight: one runs, one waits.
 const IN_FLIGHT: usize = 2;
+/// The passes of slower steps are submitted one by one: Windows resets a device after two seconds of one submission.
+const SLOW_STEP: Duration = Duration::from_millis(500);
 
 /// The number of steps per submission, from the time of the last one.
 #[derive(Debug)]
@@ -33,12 +35,20 @@ pub(super) struct StepBatching {
     /// A fixed number of steps, for tests.
     steps: Option<u64>,
     step: Duration,
+    /// The time of a step from which on its passes are submitted one by one.
+    slow_step: Duration,
     last_done: Instant,
 }
 
 impl Default for StepBatching {
     fn default() -> Self {
-        Self { in_flight: IN_FLIGHT, steps: None, step: SUBMISSION, last_done: Instant::now() }
+        Self {
+            in_flight: IN_FLIGHT,
+            steps: None,
+            step: SUBMISSION,
+            slow_step: SLOW_STEP,
+            last_done: Instant::now(),
+        }
     }
 }
 
@@ -47,6 +57,10 @@ impl StepBatching {
     fn steps(&self) -> u64 {
         let fitting = SUBMISSION.as_secs_f64() / self.step.as_secs_f64().max(1e-6);
         self.steps.unwrap_or(fitting as u64).clamp(1, MAX_STEPS)
+    }
+
+    fn is_slow(&self) -> bool {
+        self.step >= self.slow_step
     }
 
     /// Measures a finished submission, from when the device was free for it.
@@ -79,6 +93,12 @@ impl Trainer {
     pub fn set_batching(&mut self, in_flight: usize, steps: Option<u64>) {
         self.submissions.batching =
             StepBatching { in_flight: in_flight.max(1), steps, ..StepBatching::default() };
+    }
+
+    /// Fixes the time of a step from which on its passes are submitted one by one.
+    #[doc(hidden)]
+    pub fn set_slow_step(&mut self, slow_step: Duration) {
+        self.submissions.batching.slow_step = slow_step;
     }
 
     /// Trains up to `until`, up to the next step of density control, or for about half a second.
@@ -199,6 +219,9 @@ impl Trainer {
         let gpu = self.gpu.clone();
         let (first, mut downloads) = (*steps.start(), None);
         gpu.submit("steps", |pass| {
+            if self.submissions.batching.is_slow() {
+                pass.cut_between_passes();
+            }
             self.supervision.log.clear(pass);
             for step in steps.clone() {
                 self.record_step(pass, step, (step - first) as u32)?;

@@ -7,7 +7,7 @@ use super::networks::Networks;
 use super::{ModelConfig, TrainConfig, streams};
 use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::kernels::ssim::RADIUS;
+use crate::kernels::ssim_window::RADIUS;
 use crate::loss::{
     DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Gradient, LogSlot, Loss,
     LossInputs, LossRegion, LossSettings, Term, TermInputs,

@@ -21,8 +21,11 @@ fn json_has_every_requirement_of_every_device_and_the_choice() {
         assert_eq!(device["uuid"].as_str().map(str::len), Some(36));
         assert!(device["kind"].is_string() && device.get("pci").is_some());
         assert!(device["limits"]["max_storage_buffer_range"].as_u64() >= Some(1 << 27));
+        assert!(device["limits"]["max_buffer_size"].as_u64() >= Some(1 << 30));
+        assert!(device["driver"].is_string() && device.get("self_test").is_some());
     }
     assert_eq!(chosen["missing"].as_array().map(Vec::len), Some(0));
+    assert_eq!(chosen["self_test"], "passed");
     let mut requirements = chosen["requirements"].as_array().unwrap().iter();
     assert!(requirements.all(|requirement| requirement["met"] == true));
 }
@@ -80,4 +83,46 @@ fn without_a_loader_the_remedy_is_printed() {
     let environment = [("LD_LIBRARY_PATH", folder.path().to_str().unwrap())];
     let remedy = ["there is no Vulkan loader", "apt install libvulkan1"];
     refused_with("doctor --json", &environment, 4, &remedy);
+}
+
+#[test]
+fn a_device_that_fails_the_self_test_is_not_used_and_doctor_says_why() {
+    let planted = [("NIGHTSPLAT_FAULT", "self_test:5")];
+    let parts = ["fails the self-test: subgroupInclusiveAdd is wrong", "NIGHTSPLAT_SUBGROUP"];
+    refused_with("bench", &planted, 4, &parts);
+    let output = command("doctor --json").envs(planted).output().unwrap();
+    assert_eq!(output.status.code(), Some(4));
+    let printed: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let devices = printed["devices"].as_array().unwrap();
+    assert!(devices.iter().all(|device| device["self_test"] != "passed"), "{printed}");
+    assert!(printed["verdict"].as_str().unwrap().starts_with("not ready"));
+    let untested = [planted[0], ("NIGHTSPLAT_DEVICE_TEST", "off")];
+    let output = command("check --help").envs(untested).output().unwrap();
+    assert!(output.status.success());
+}
+
+#[test]
+fn a_kernel_that_the_driver_refuses_is_named() {
+    let planted = [("NIGHTSPLAT_FAULT", "refuse:adam")];
+    refused_with("bench", &planted, 4, &["refuses", "kernel `adam (", "update the driver"]);
+}
+
+/// Also when the command is repeated, and not once the driver is another.
+#[test]
+fn a_driver_that_crashes_costs_a_line_that_names_device_and_kernel() {
+    let cache = tempfile::tempdir().unwrap();
+    let cache = cache.path().to_str().unwrap();
+    let checking = [("XDG_CACHE_HOME", cache), ("NIGHTSPLAT_DEVICE_TEST", "always")];
+    let [crashing, sound] = [Some(("NIGHTSPLAT_FAULT", "crash:depth_boxes")), None]
+        .map(|fault| checking.into_iter().chain(fault).collect::<Vec<_>>());
+    let parts = ["crashed when it compiled kernel `depth_boxes`", "update the driver", cache];
+    refused_with("bench", &crashing, 4, &parts);
+    refused_with("bench", &sound, 4, &parts);
+    let verdict = std::fs::read_dir(format!("{cache}/nightsplat")).unwrap().map(Result::unwrap);
+    let verdict =
+        verdict.map(|file| file.path()).find(|path| path.extension().unwrap() == "driver");
+    std::fs::remove_file(verdict.unwrap()).unwrap();
+    // A driver that compiles all is asked once.
+    let refused = [&sound[..], &[("NIGHTSPLAT_FAULT", "refuse:self_test")]].concat();
+    refused_with("bench", &refused, 4, &["refuses"]);
 }

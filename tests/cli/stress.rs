@@ -244,7 +244,8 @@ fn render_error(
     let sh_degree = config.schedule.sh_degree(config.steps, config.sh_degree);
     let camera = reference::camera::Camera::from(&kernels::Camera::from(&Patch::from(camera)));
     let Gaussians { count, shape, .. } = *gaussians;
-    let planes = Planes { count, feature_count: 0, sh_degree: shape.sh_degree };
+    let planes =
+        Planes { count, feature_count: 0, sh_degree: shape.sh_degree, rest_by_column: false };
     let (near, alpha_max) = (settings.near.into(), settings.max_alpha.into());
     let project = |i| {
         let gaussian = planes.load(&gaussians.parameters, i);

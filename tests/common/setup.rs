@@ -109,7 +109,12 @@ impl Setup {
 
     pub(crate) fn planes(&self) -> Planes {
         let feature_count = self.channels() - 3;
-        Planes { count: self.count, feature_count, sh_degree: self.settings.shape.sh_degree }
+        Planes {
+            count: self.count,
+            feature_count,
+            sh_degree: self.settings.shape.sh_degree,
+            rest_by_column: false,
+        }
     }
 
     /// The camera as the references use it.

@@ -14,5 +14,6 @@ mod faults;
 mod gpu;
 mod host;
 mod images;
+mod self_test;
 mod spirv;
 mod stereo;

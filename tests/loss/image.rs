@@ -1,7 +1,9 @@
 //! L1 and SSIM of an image.
 
+use std::sync::OnceLock;
+
 use glam::UVec2;
-use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::testing::{gpu, gpu_with};
 use nightsplat::gpu::{Gpu, Reference, Threads};
 use nightsplat::kernels::{l1, ssim};
 use nightsplat::loss::{Gradient, Loss, LossInputs, LossRegion, LossSettings, Term};
@@ -64,6 +66,15 @@ fn evaluate_loss_region(
     Outcome { l1, ssim, d_render: gpu.read(&d_render).unwrap(), status: logged.status }
 }
 
+/// The kernels of a CPU and those of a GPU, on the same device.
+fn on_both_plans(test: impl Fn(&Gpu)) {
+    static PLANS: OnceLock<[Gpu; 2]> = OnceLock::new();
+    PLANS
+        .get_or_init(|| [true, false].map(|is_cpu| gpu_with(|own| own.is_cpu = is_cpu)))
+        .iter()
+        .for_each(test);
+}
+
 /// Compares the SSIM kernel with its reference: `shape` is the columns of a lane, the rows of a subgroup, and the
 /// alignment of loads and stores in floats.
 fn check_ssim(shape: [u32; 3], size: [u32; 2], loss_region: LossRegion) -> Vec<f32> {
@@ -100,6 +111,23 @@ fn check_ssim(shape: [u32; 3], size: [u32; 2], loss_region: LossRegion) -> Vec<f
 fn the_kernel_of_ssim_matches_its_reference_at_every_size() {
     for size in SIZES {
         check_ssim([16, 64, 1], size, LossRegion::whole(size.into()));
+    }
+}
+
+/// With strips of 8 rows and, in the largest view, of 9.
+#[test]
+fn both_kernels_of_a_gpu_match_their_references() {
+    let gpu = gpu_with(|own| own.is_cpu = false);
+    let whole = |size: [u32; 2]| (size, LossRegion::whole(size.into()));
+    let cases = SIZES.into_iter().chain([[120, 640]]).map(whole).chain(loss_regions());
+    for (size, loss_region) in cases {
+        let images = images(size);
+        let (outcome, report) =
+            gpu.checked(|| evaluate_loss_region(&gpu, 0.2, size, loss_region, &images));
+        report.agree().unwrap_or_else(|error| panic!("{size:?}: {error}"));
+        let kernels: Vec<_> = report.passes.iter().map(|pass| pass.kernel).collect();
+        assert_eq!(kernels, ["ssim_forward", "ssim_backward"]);
+        assert_eq!(outcome.status, 0);
     }
 }
 
@@ -254,49 +282,51 @@ fn the_kernels_match_their_references_with_a_loss_region() {
 /// The windows of the loss region extend beyond it, so the gradient is not that of the region by itself.
 #[test]
 fn l1_ignores_the_render_outside_the_loss_region_but_ssim_does_not() {
-    let gpu = gpu();
-    let (size, loss_region) =
-        ([40, 40], LossRegion { origin: UVec2::splat(15), size: UVec2::splat(10) });
-    let [render, target] = images(size);
-    let evaluate = |weight: f64, render: &[f32]| {
-        let images = [render.to_vec(), target.clone()];
-        evaluate_loss_region(&gpu, weight, size, loss_region, &images)
-    };
-    let distance = |i: usize| {
-        let axis = |at: usize| 15usize.saturating_sub(at).max(at.saturating_sub(24));
-        axis(i % 40).max(axis(i / 40 % 40))
-    };
-    let mut changed = render.clone();
-    (0..changed.len()).filter(|&i| distance(i) > 0).for_each(|i| changed[i] += 0.3);
-    let [l1, with_ssim] = [0.0, 0.3].map(|weight| evaluate(weight, &render));
-    let l1_changed = evaluate(0.0, &changed);
-    assert_eq!(l1.l1, l1_changed.l1);
-    assert_eq!(bits(&l1.d_render), bits(&l1_changed.d_render));
-    let changed = evaluate(0.3, &changed);
-    assert_eq!(with_ssim.l1, changed.l1);
-    assert_ne!(with_ssim.ssim, changed.ssim);
-    for i in 0..render.len() {
-        assert_eq!(l1.d_render[i] != 0.0, distance(i) == 0, "{i}");
-        assert_eq!(with_ssim.d_render[i] != 0.0, distance(i) <= 5, "{i}");
-    }
+    on_both_plans(|gpu| {
+        let (size, loss_region) =
+            ([40, 40], LossRegion { origin: UVec2::splat(15), size: UVec2::splat(10) });
+        let [render, target] = images(size);
+        let evaluate = |weight: f64, render: &[f32]| {
+            let images = [render.to_vec(), target.clone()];
+            evaluate_loss_region(gpu, weight, size, loss_region, &images)
+        };
+        let distance = |i: usize| {
+            let axis = |at: usize| 15usize.saturating_sub(at).max(at.saturating_sub(24));
+            axis(i % 40).max(axis(i / 40 % 40))
+        };
+        let mut changed = render.clone();
+        (0..changed.len()).filter(|&i| distance(i) > 0).for_each(|i| changed[i] += 0.3);
+        let [l1, with_ssim] = [0.0, 0.3].map(|weight| evaluate(weight, &render));
+        let l1_changed = evaluate(0.0, &changed);
+        assert_eq!(l1.l1, l1_changed.l1);
+        assert_eq!(bits(&l1.d_render), bits(&l1_changed.d_render));
+        let changed = evaluate(0.3, &changed);
+        assert_eq!(with_ssim.l1, changed.l1);
+        assert_ne!(with_ssim.ssim, changed.ssim);
+        for i in 0..render.len() {
+            assert_eq!(l1.d_render[i] != 0.0, distance(i) == 0, "{i}");
+            assert_eq!(with_ssim.d_render[i] != 0.0, distance(i) <= 5, "{i}");
+        }
+    });
 }
 
 /// A value that does not count must not affect the mean, unless a window includes it.
 #[test]
 fn a_nan_beyond_every_window_of_the_loss_region_changes_nothing() {
-    let gpu = gpu();
-    let (size, loss_region) =
-        ([40, 40], LossRegion { origin: UVec2::splat(8), size: UVec2::splat(10) });
-    let images = images(size);
-    let mut spoilt = images.clone();
-    spoilt[0][39 * 40 + 39] = f32::NAN;
-    for weight in [0.0, 0.2] {
-        let [whole, spoilt] = [&images, &spoilt]
-            .map(|images| evaluate_loss_region(&gpu, weight, size, loss_region, images));
-        assert!(whole.l1.is_finite() && spoilt.status == 0);
-        assert_eq!((spoilt.l1, spoilt.ssim), (whole.l1, whole.ssim));
-        assert!(spoilt.d_render == whole.d_render, "the gradient with SSIM of weight {weight}");
-    }
+    on_both_plans(|gpu| {
+        let (size, loss_region) =
+            ([40, 40], LossRegion { origin: UVec2::splat(8), size: UVec2::splat(10) });
+        let images = images(size);
+        let mut spoilt = images.clone();
+        spoilt[0][39 * 40 + 39] = f32::NAN;
+        for weight in [0.0, 0.2] {
+            let [whole, spoilt] = [&images, &spoilt]
+                .map(|images| evaluate_loss_region(gpu, weight, size, loss_region, images));
+            assert!(whole.l1.is_finite() && spoilt.status == 0);
+            assert_eq!((spoilt.l1, spoilt.ssim), (whole.l1, whole.ssim));
+            assert!(spoilt.d_render == whole.d_render, "the gradient with SSIM of weight {weight}");
+        }
+    });
 }
 
 #[test]
@@ -317,106 +347,117 @@ fn a_loss_region_outside_the_view_is_refused() {
 
 #[test]
 fn l1_and_ssim_agree_with_pytorch() {
-    let (gpu, torch) = (gpu(), Torch::read());
-    let images = [torch.get("image.render").to_vec(), torch.get("image.target").to_vec()];
-    let whole = LossRegion::whole([23, 19].into());
-    let evaluate = |weight: f64| evaluate_loss_region(&gpu, weight, [23, 19], whole, &images);
-    let [l1, ssim] = [0.0, 1.0].map(evaluate);
-    torch.assert_agrees("image.l1.value", &[l1.l1]);
-    torch.assert_agrees("image.l1.d_render", &l1.d_render);
-    torch.assert_agrees("image.ssim.value", &[1.0 - ssim.ssim]);
-    torch.assert_agrees("image.ssim.d_render", &ssim.d_render);
+    let torch = Torch::read();
+    on_both_plans(|gpu| {
+        let images = [torch.get("image.render").to_vec(), torch.get("image.target").to_vec()];
+        let whole = LossRegion::whole([23, 19].into());
+        let evaluate = |weight: f64| evaluate_loss_region(gpu, weight, [23, 19], whole, &images);
+        let [l1, ssim] = [0.0, 1.0].map(evaluate);
+        torch.assert_agrees("image.l1.value", &[l1.l1]);
+        torch.assert_agrees("image.l1.d_render", &l1.d_render);
+        torch.assert_agrees("image.ssim.value", &[1.0 - ssim.ssim]);
+        torch.assert_agrees("image.ssim.d_render", &ssim.d_render);
+    });
 }
 
 #[test]
 fn the_gradient_is_the_weighted_sum_of_both_gradients() {
-    let gpu = gpu();
-    for (size, loss_region) in loss_regions() {
-        let images = images(size);
-        let [l1, ssim, both] = [0.0, 1.0, 0.3]
-            .map(|weight| evaluate_loss_region(&gpu, weight, size, loss_region, &images).d_render);
-        let expected: Vec<f32> =
-            l1.iter().zip(&ssim).map(|(l1, ssim)| 0.7 * l1 + 0.3 * ssim).collect();
-        assert_close("d_render", &both, &expected, 1e-6);
-    }
+    on_both_plans(|gpu| {
+        for (size, loss_region) in loss_regions() {
+            let images = images(size);
+            let [l1, ssim, both] = [0.0, 1.0, 0.3].map(|weight| {
+                evaluate_loss_region(gpu, weight, size, loss_region, &images).d_render
+            });
+            let expected: Vec<f32> =
+                l1.iter().zip(&ssim).map(|(l1, ssim)| 0.7 * l1 + 0.3 * ssim).collect();
+            assert_close("d_render", &both, &expected, 1e-6);
+        }
+    });
 }
 
 #[test]
 fn an_image_compared_with_itself_has_no_loss() {
-    let gpu = gpu();
-    let [_, target] = images([40, 30]);
-    let outcome = evaluate(&gpu, 0.2, [40, 30], &[target.clone(), target]);
-    assert!(outcome.l1 < 1e-7, "{}", outcome.l1);
-    assert!((outcome.ssim - 1.0).abs() < 1e-6, "{}", outcome.ssim);
-    assert!(largest(&outcome.d_render) < 1e-6, "{}", largest(&outcome.d_render));
-    assert_eq!(outcome.status, 0);
+    on_both_plans(|gpu| {
+        let [_, target] = images([40, 30]);
+        let outcome = evaluate(gpu, 0.2, [40, 30], &[target.clone(), target]);
+        assert!(outcome.l1 < 1e-7, "{}", outcome.l1);
+        assert!((outcome.ssim - 1.0).abs() < 1e-6, "{}", outcome.ssim);
+        assert!(largest(&outcome.d_render) < 1e-6, "{}", largest(&outcome.d_render));
+        assert_eq!(outcome.status, 0);
+    });
 }
 
 #[test]
 fn constant_images_have_the_ssim_of_their_means_away_from_the_border() {
-    let gpu = gpu();
-    let size = [64, 48];
-    let (a, b) = (0.5f32, 0.25f32);
-    let count = (3 * size[0] * size[1]) as usize;
-    let outcome = evaluate(&gpu, 0.2, size, &[vec![a; count], vec![b; count]]);
-    assert!((outcome.l1 - 0.25).abs() < 1e-6);
-    // Zero padding changes the border; inside, variances vanish and (2ab + C1) / (a^2 + b^2 + C1) remains.
-    let inside = f64::from((2.0 * a * b + 1e-4) / (a * a + b * b + 1e-4));
-    let plane = [vec![f64::from(a); count / 3], vec![f64::from(b); count / 3]];
-    let map = ssim(size[0] as usize, size[1] as usize, &plane[0], &plane[1]);
-    assert!((map[24 * 64 + 32].value - inside).abs() < 1e-6);
-    let mean = map.iter().map(|ssim| ssim.value).sum::<f64>() / map.len() as f64;
-    assert!((f64::from(outcome.ssim) - mean).abs() < 1e-5, "{} {mean}", outcome.ssim);
+    on_both_plans(|gpu| {
+        let size = [64, 48];
+        let (a, b) = (0.5f32, 0.25f32);
+        let count = (3 * size[0] * size[1]) as usize;
+        let outcome = evaluate(gpu, 0.2, size, &[vec![a; count], vec![b; count]]);
+        assert!((outcome.l1 - 0.25).abs() < 1e-6);
+        // Zero padding changes the border; inside, variances vanish and (2ab + C1) / (a^2 + b^2 + C1) remains.
+        let inside = f64::from((2.0 * a * b + 1e-4) / (a * a + b * b + 1e-4));
+        let plane = [vec![f64::from(a); count / 3], vec![f64::from(b); count / 3]];
+        let map = ssim(size[0] as usize, size[1] as usize, &plane[0], &plane[1]);
+        assert!((map[24 * 64 + 32].value - inside).abs() < 1e-6);
+        let mean = map.iter().map(|ssim| ssim.value).sum::<f64>() / map.len() as f64;
+        assert!((f64::from(outcome.ssim) - mean).abs() < 1e-5, "{} {mean}", outcome.ssim);
+    });
 }
 
 #[test]
 fn black_images_have_a_finite_gradient() {
-    let gpu = gpu();
-    let count = 3 * 20 * 20;
-    let outcome = evaluate(&gpu, 0.5, [20, 20], &[vec![0.0; count], vec![0.0; count]]);
-    assert!((outcome.ssim - 1.0).abs() < 1e-6);
-    assert!(outcome.d_render.iter().all(|d| d.abs() < 1e-6));
+    on_both_plans(|gpu| {
+        let count = 3 * 20 * 20;
+        let outcome = evaluate(gpu, 0.5, [20, 20], &[vec![0.0; count], vec![0.0; count]]);
+        assert!((outcome.ssim - 1.0).abs() < 1e-6);
+        assert!(outcome.d_render.iter().all(|d| d.abs() < 1e-6));
+    });
 }
 
 /// Squares near 4e4 have a rounding error above C2: without the floor of the variances, the denominator becomes
 /// negative.
 #[test]
 fn a_far_too_bright_render_has_a_positive_ssim() {
-    let gpu = gpu();
-    let count = 3 * 48 * 48;
-    for brightness in [150.1f32, 170.3, 190.7, 210.9, 230.3, 250.7] {
-        let outcome = evaluate(&gpu, 1.0, [48, 48], &[vec![brightness; count], vec![0.5; count]]);
-        assert!(outcome.ssim > 0.0, "{brightness}: {}", outcome.ssim);
-        assert_eq!(outcome.status, 0);
-    }
+    on_both_plans(|gpu| {
+        let count = 3 * 48 * 48;
+        for brightness in [150.1f32, 170.3, 190.7, 210.9, 230.3, 250.7] {
+            let outcome =
+                evaluate(gpu, 1.0, [48, 48], &[vec![brightness; count], vec![0.5; count]]);
+            assert!(outcome.ssim > 0.0, "{brightness}: {}", outcome.ssim);
+            assert_eq!(outcome.status, 0);
+        }
+    });
 }
 
 #[test]
 fn a_value_that_is_not_finite_reaches_the_log_and_the_status() {
-    let gpu = gpu();
-    for (value, weight) in
-        [(f32::NAN, 0.2), (f32::NAN, 0.0), (f32::INFINITY, 0.2), (f32::NEG_INFINITY, 0.0)]
-    {
-        let [mut render, target] = images([50, 70]);
-        render[1234] = value;
-        let outcome = evaluate(&gpu, weight, [50, 70], &[render, target]);
-        assert!(!outcome.l1.is_finite(), "{value} at weight {weight}: {}", outcome.l1);
-        assert_eq!(outcome.status, NOT_FINITE);
-    }
+    on_both_plans(|gpu| {
+        for (value, weight) in
+            [(f32::NAN, 0.2), (f32::NAN, 0.0), (f32::INFINITY, 0.2), (f32::NEG_INFINITY, 0.0)]
+        {
+            let [mut render, target] = images([50, 70]);
+            render[1234] = value;
+            let outcome = evaluate(gpu, weight, [50, 70], &[render, target]);
+            assert!(!outcome.l1.is_finite(), "{value} at weight {weight}: {}", outcome.l1);
+            assert_eq!(outcome.status, NOT_FINITE);
+        }
+    });
 }
 
 #[test]
 fn the_same_step_leaves_the_same_bits() {
-    let gpu = gpu();
-    let inputs = images([131, 97]);
-    let step = || {
-        let outcome = evaluate(&gpu, 0.2, [131, 97], &inputs);
-        (outcome.l1.to_bits(), outcome.ssim.to_bits(), bits(&outcome.d_render))
-    };
-    let first = step();
-    for _ in 0..5 {
-        assert!(step() == first);
-    }
+    on_both_plans(|gpu| {
+        let inputs = images([131, 97]);
+        let step = || {
+            let outcome = evaluate(gpu, 0.2, [131, 97], &inputs);
+            (outcome.l1.to_bits(), outcome.ssim.to_bits(), bits(&outcome.d_render))
+        };
+        let first = step();
+        for _ in 0..5 {
+            assert!(step() == first);
+        }
+    });
 }
 
 #[test]
@@ -430,53 +471,56 @@ fn a_weight_outside_its_range_is_refused() {
 /// A kernel without bounds would write beyond its buffers.
 #[test]
 fn a_view_that_does_not_fit_is_refused() {
-    let gpu = gpu();
-    let image = gpu.zeros("image", 3 * 256).unwrap();
-    for (weight, size, slot) in [
-        (0.2, [17, 16], 0),
-        (0.0, [17, 16], 0),
-        (0.2, [0, 8], 0),
-        // As many values, but more subgroups than there are partial sums.
-        (0.2, [256, 1], 0),
-        (0.2, [16, 16], 3),
-        (0.2, [u32::MAX, u32::MAX], 0),
-    ] {
-        let mut loss = Loss::new(&gpu, settings(weight)).unwrap();
-        loss.reserve(UVec2::splat(16)).unwrap();
-        let mut d_render = gpu.zeros("d_render", 3 * 256).unwrap();
-        let result = log_step(&gpu, |pass, log| {
-            let size = UVec2::from_array(size);
-            let loss_region = LossRegion::whole(size);
-            let inputs = LossInputs { size, loss_region, render: &image, target: &image };
-            log.slot = slot;
-            loss.record(pass, inputs, &mut d_render, log)
-        });
-        assert!(result.is_err(), "{weight} {size:?} {slot}");
-    }
+    on_both_plans(|gpu| {
+        let image = gpu.zeros("image", 3 * 256).unwrap();
+        for (weight, size, slot) in [
+            (0.2, [17, 16], 0),
+            (0.0, [17, 16], 0),
+            (0.2, [0, 8], 0),
+            // As many values, but more subgroups than there are partial sums.
+            (0.2, [256, 1], 0),
+            (0.2, [16, 16], 3),
+            (0.2, [u32::MAX, u32::MAX], 0),
+        ] {
+            let mut loss = Loss::new(gpu, settings(weight)).unwrap();
+            loss.reserve(UVec2::splat(16)).unwrap();
+            let mut d_render = gpu.zeros("d_render", 3 * 256).unwrap();
+            let result = log_step(gpu, |pass, log| {
+                let size = UVec2::from_array(size);
+                let loss_region = LossRegion::whole(size);
+                let inputs = LossInputs { size, loss_region, render: &image, target: &image };
+                log.slot = slot;
+                loss.record(pass, inputs, &mut d_render, log)
+            });
+            assert!(result.is_err(), "{weight} {size:?} {slot}");
+        }
+    });
 }
 
 #[test]
 fn a_second_term_adds_to_the_gradient_of_the_first() {
-    let gpu = gpu();
-    for (size, weight) in [([40, 30], 0.2), ([37, 31], 0.2), ([37, 31], 0.0)] {
-        let images = images(size);
-        let first: Vec<f32> = (0..images[0].len()).map(|i| (i as f32 * 0.1).sin()).collect();
-        let own = evaluate(&gpu, weight, size, &images).d_render;
-        let size = UVec2::from_array(size);
-        let mut loss =
-            Loss::new(&gpu, LossSettings { gradient: Gradient::Added, ..settings(weight) })
-                .unwrap();
-        loss.reserve(size).unwrap();
-        let [render, target] = images.map(|image| gpu.buffer("image", &image).unwrap());
-        let mut d_render = gpu.buffer("d_render", &first).unwrap();
-        log_step(&gpu, |pass, log| {
-            let loss_region = LossRegion::whole(size);
-            let inputs = LossInputs { size, loss_region, render: &render, target: &target };
-            loss.record(pass, inputs, &mut d_render, log)
-        })
-        .unwrap();
-        let expected: Vec<f32> = first.iter().zip(own).map(|(first, own)| first + own).collect();
-        let what = format!("{size} {weight}");
-        assert_close(&what, &gpu.read(&d_render).unwrap(), &expected, 2.0 * f32::EPSILON);
-    }
+    on_both_plans(|gpu| {
+        for (size, weight) in [([40, 30], 0.2), ([37, 31], 0.2), ([37, 31], 0.0)] {
+            let images = images(size);
+            let first: Vec<f32> = (0..images[0].len()).map(|i| (i as f32 * 0.1).sin()).collect();
+            let own = evaluate(gpu, weight, size, &images).d_render;
+            let size = UVec2::from_array(size);
+            let mut loss =
+                Loss::new(gpu, LossSettings { gradient: Gradient::Added, ..settings(weight) })
+                    .unwrap();
+            loss.reserve(size).unwrap();
+            let [render, target] = images.map(|image| gpu.buffer("image", &image).unwrap());
+            let mut d_render = gpu.buffer("d_render", &first).unwrap();
+            log_step(gpu, |pass, log| {
+                let loss_region = LossRegion::whole(size);
+                let inputs = LossInputs { size, loss_region, render: &render, target: &target };
+                loss.record(pass, inputs, &mut d_render, log)
+            })
+            .unwrap();
+            let expected: Vec<f32> =
+                first.iter().zip(own).map(|(first, own)| first + own).collect();
+            let what = format!("{size} {weight}");
+            assert_close(&what, &gpu.read(&d_render).unwrap(), &expected, 2.0 * f32::EPSILON);
+        }
+    });
 }

@@ -5,7 +5,7 @@
 use glam::{DVec3, Vec3};
 
 use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::{gpu, gpu_that_binds};
+use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_that_creates, gpu_with};
 use nightsplat::photographs::dataset::Dataset;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
@@ -20,17 +20,60 @@ use crate::common::train::{advance, dataset};
 const LITTLE: u64 = 1 << 19;
 const BATCH: usize = 2176;
 
+/// A device that is taken for a GPU.
+fn little_gpu() -> Gpu {
+    gpu_with(|own| (own.is_cpu, own.max_storage_buffer_range) = (false, LITTLE))
+}
+
 #[test]
-fn planes_are_written_in_batches_and_read_back_whole() {
-    let gpu = gpu_that_binds(LITTLE);
+fn the_planes_of_a_gpu_are_written_column_by_column_and_read_back_whole() {
     let shape = Shape { sh_degree: 2, features: features(5) };
-    let columns = width(shape);
-    for (count, batches) in [(0, vec![0]), (3000, vec![3000]), (7000, vec![3264, 3264, 472])] {
+    let (columns, before_rest) = (width(shape), width(shape) - 24);
+    let gpu = little_gpu();
+    for count in [0, 1, 3000, 7000] {
         let all = Layout::new(count, shape, StorageFormat::Single).batches(&gpu);
-        assert_eq!(all.iter().map(|batch| batch.count).collect::<Vec<_>>(), batches);
         let planes: Vec<f32> = (0..count * columns).map(|i| i as f32).collect();
         let buffer = all.upload(&gpu, "planes", &planes).unwrap();
         assert_eq!(all.read(&gpu, &buffer).unwrap(), planes);
+        let stored = gpu.read(&buffer).unwrap();
+        for (float, value) in stored.iter().take(count * columns).enumerate() {
+            assert_eq!(all.place_of(float) as f32, *value);
+        }
+        // Neighbouring Gaussians of a batch have neighbouring words.
+        for batch in all.iter().filter(|batch| batch.count > 1) {
+            let own = gpu.read(batch.planes(&buffer).unwrap()).unwrap();
+            let second = &own[(before_rest + 1) * batch.count..];
+            assert_eq!(second[1] - second[0], 24.0);
+        }
+    }
+}
+
+#[test]
+fn planes_are_written_in_batches_and_read_back_whole() {
+    written_and_read_back(&gpu_that_binds(LITTLE));
+}
+
+#[test]
+fn planes_beyond_the_largest_buffer_are_written_and_read_back_whole() {
+    written_and_read_back(&gpu_that_creates(LITTLE));
+}
+
+fn written_and_read_back(gpu: &Gpu) {
+    let shape = Shape { sh_degree: 2, features: features(5) };
+    let columns = width(shape);
+    for (count, batches) in [(0, vec![0]), (3000, vec![3000]), (7000, vec![3264, 3264, 472])] {
+        let all = Layout::new(count, shape, StorageFormat::Single).batches(gpu);
+        assert_eq!(all.iter().map(|batch| batch.count).collect::<Vec<_>>(), batches);
+        let planes: Vec<f32> = (0..count * columns).map(|i| i as f32).collect();
+        let buffer = all.upload(gpu, "planes", &planes).unwrap();
+        assert_eq!(all.read(gpu, &buffer).unwrap(), planes);
+        assert!(
+            all.zeros(gpu, "zeros")
+                .and_then(|zeros| gpu.read(&zeros))
+                .unwrap()
+                .iter()
+                .all(|x| *x == 0.0)
+        );
         for (float, value) in gpu.read(&buffer).unwrap().into_iter().enumerate() {
             assert_eq!(all.place_of(float) as f32, value);
         }
@@ -69,10 +112,19 @@ fn config() -> TrainConfig {
 
 #[test]
 fn training_in_batches_gives_the_bits_of_one_batch() {
+    trains_to_the_bits_of_one_batch(&gpu_that_binds(LITTLE));
+}
+
+#[test]
+fn training_beyond_the_largest_buffer_gives_the_bits_of_one_buffer() {
+    trains_to_the_bits_of_one_batch(&gpu_that_creates(LITTLE));
+}
+
+fn trains_to_the_bits_of_one_batch(little: &Gpu) {
     let (dataset, folder) = (views(), tempfile::tempdir().unwrap());
     let new = |gpu: &Gpu| Trainer::new(gpu, config(), &dataset).unwrap();
-    let (whole, little) = (gpu(), gpu_that_binds(LITTLE));
-    let (mut expected, mut batched) = (new(&whole), new(&little));
+    let whole = &gpu();
+    let (mut expected, mut batched) = (new(whole), new(little));
     let [whole_reports, batched_reports] =
         [&mut expected, &mut batched].map(|trainer| advance(trainer, 30));
     assert!(
@@ -94,13 +146,38 @@ fn training_in_batches_gives_the_bits_of_one_batch() {
 
     // The run resumes with larger and with smaller bindings.
     let checkpoint = folder.path().join("checkpoint.safetensors");
-    for [from, to] in [[&whole, &little], [&little, &whole]] {
+    for [from, to] in [[whole, little], [little, whole]] {
         let (mut first, mut second) = (new(from), new(to));
         advance(&mut first, 22);
         first.save_checkpoint(&checkpoint).unwrap();
         second.restore(&checkpoint).unwrap();
         advance(&mut second, 30);
         assert!(second.gaussians().unwrap() == expected.gaussians().unwrap());
+    }
+}
+
+/// The layout of SH coefficients, gradients of colours in place of theirs, the number of kernels of a sort: a GPU and a
+/// CPU do the same work in other ways, with the same bits, where tile and loss are the same.
+#[test]
+fn training_as_on_a_gpu_gives_the_bits_of_training_as_on_a_cpu() {
+    let dataset = views();
+    for (rest, moments) in [
+        (StorageFormat::Single, StorageFormat::Single),
+        (StorageFormat::Half, StorageFormat::Single),
+        (StorageFormat::Single, StorageFormat::Half),
+    ] {
+        let mut config = TrainConfig { ssim_weight: 0.0, tile: Some([16, 8].into()), ..config() };
+        (config.precision.rest, config.precision.moments) = (rest, moments);
+        let train = |gpu: &Gpu| {
+            let mut trainer = Trainer::new(gpu, config.clone(), &dataset).unwrap();
+            advance(&mut trainer, 30);
+            trainer.gaussians().unwrap()
+        };
+        let expected = train(&gpu());
+        assert!(expected.shape.sh_degree == 3 && expected.count > BATCH);
+        for gpu in [gpu_with(|own| own.is_cpu = false), little_gpu()] {
+            assert!(train(&gpu) == expected, "{rest:?} {moments:?}");
+        }
     }
 }
 

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use nightsplat::Error;
 use nightsplat::base::random::Stream;
-use nightsplat::gpu::testing::{Defect, gpu, is_checked, with_defect};
+use nightsplat::gpu::testing::{Defect, gpu, gpu_with, is_checked, with_defect};
 use nightsplat::gpu::{CheckReport, Gpu};
 use nightsplat::networks::NetworkVariant;
 use nightsplat::photographs::dataset::Dataset;
@@ -16,6 +16,7 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
 use nightsplat::photographs::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
 use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 
@@ -85,8 +86,12 @@ fn assert_agrees(what: &str, report: &CheckReport) {
 
 /// Runs three checked steps, including density control; returns the kernels that ran.
 fn assert_steps_agree(name: &str, config: &TrainConfig) -> BTreeSet<String> {
-    let (gpu, dataset) = (gpu(), dataset(config));
-    let (trainer, mut all) = gpu.checked(|| Trainer::new(&gpu, config.clone(), &dataset));
+    assert_steps_agree_on(&gpu(), name, config)
+}
+
+fn assert_steps_agree_on(gpu: &Gpu, name: &str, config: &TrainConfig) -> BTreeSet<String> {
+    let dataset = dataset(config);
+    let (trainer, mut all) = gpu.checked(|| Trainer::new(gpu, config.clone(), &dataset));
     let mut trainer = trainer.unwrap();
     while trainer.steps_done() < 3 {
         let (reports, report) = trainer.check_step();
@@ -112,6 +117,24 @@ fn every_pass_of_a_step_agrees_with_its_reference_for_every_part_of_the_model() 
         (Part::Denoiser, "norm_backward"),
     ] {
         assert!(assert_steps_agree(part.name(), &config(&[part])).contains(kernel));
+    }
+}
+
+#[test]
+fn every_pass_of_a_step_of_a_gpu_agrees_with_its_reference() {
+    let gpu = gpu_with(|own| own.is_cpu = false);
+    let plain = assert_steps_agree_on(&gpu, "plain", &config(&[]));
+    for kernel in ["ssim_forward", "ssim_backward", "adam_gaussian"] {
+        assert!(plain.contains(kernel), "{kernel} is not in {plain:?}");
+    }
+    assert!(!plain.contains("adam") && !plain.contains("ssim"), "{plain:?}");
+    assert_steps_agree_on(&gpu, "features", &config(&[Part::Structure]));
+    let mut halves = config(&[]);
+    halves.precision.rest = StorageFormat::Half;
+    for moments in [StorageFormat::Single, StorageFormat::Half] {
+        halves.precision.moments = moments;
+        let kernels = assert_steps_agree_on(&gpu, "halves", &halves);
+        assert!(kernels.contains("adam_rest") && kernels.contains("adam"), "{kernels:?}");
     }
 }
 

@@ -8,7 +8,7 @@ use std::ops::Range;
 use glam::{DVec2, DVec3};
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::kernels::adam::{LOG_SCALE_MAX, LOG_SCALE_MIN};
+use nightsplat::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
 use nightsplat::photographs::tone::{Statistics, percentile};
 use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;

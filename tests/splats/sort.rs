@@ -2,9 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
-use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::testing::{gpu, gpu_with};
 use nightsplat::gpu::{Buffer, Gpu, Threads};
-use nightsplat::kernels::{scan_downsweep, scan_upsweep, sort_downsweep, sort_spine, sort_upsweep};
+use nightsplat::kernels::{scan_downsweep, scan_upsweep, sort_downsweep, sort_upsweep};
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
 
 const PARTITION: u32 = 1024;
@@ -65,12 +65,14 @@ fn assert_sorts(gpu: &Gpu, sort: &mut RadixSort, what: &str, keys: &[u32], count
 
 #[test]
 fn sorts_of_all_sizes_are_correct_and_stable() {
-    let gpu = gpu();
-    let mut sort = RadixSort::new(&gpu, 0).unwrap();
-    for size in SIZES {
-        let keys = noise(size);
-        for bits in [10, 32] {
-            assert_sorts(&gpu, &mut sort, "noise", &keys, size, bits);
+    for is_cpu in [true, false] {
+        let gpu = gpu_with(|own| own.is_cpu = is_cpu);
+        let mut sort = RadixSort::new(&gpu, 0).unwrap();
+        for size in SIZES {
+            let keys = noise(size);
+            for bits in [10, 32] {
+                assert_sorts(&gpu, &mut sort, "noise", &keys, size, bits);
+            }
         }
     }
 }
@@ -249,55 +251,45 @@ fn compare_scan_kernels(size: u32, partition_size: u32) {
 
 #[test]
 fn sort_kernels_match_their_references() {
-    for rank_by_ballot in [false, true] {
-        if rank_by_ballot || gpu().properties().subgroup_size <= 32 {
-            compare_sort_kernels(rank_by_ballot);
+    for (rank_by_ballot, subgroups) in [(false, 1), (true, 1), (true, 8), (false, 3)] {
+        let lanes = gpu().properties().subgroup_size;
+        if (rank_by_ballot || lanes <= 32) && lanes * subgroups <= 256 {
+            compare_sort_kernels(rank_by_ballot, subgroups);
         }
     }
 }
 
-fn compare_sort_kernels(rank_by_ballot: bool) {
-    let ranked = sort_downsweep::Constants { rank_by_ballot, ..Default::default() };
+fn compare_sort_kernels(rank_by_ballot: bool, subgroups: u32) {
+    let counted = sort_upsweep::Constants { subgroups, ..Default::default() };
+    let ranked = sort_downsweep::Constants { rank_by_ballot, subgroups, ..Default::default() };
     // A digit narrower than any subgroup, and the widest.
     for (size, (shift, digit_bits)) in SIZES.into_iter().flat_map(|s| [(s, (31, 1)), (s, (5, 8))]) {
         let (capacity, count_index, digits) = (size, 0, 1_u32 << digit_bits);
         let partitions = size.div_ceil(PARTITION);
-        // One workgroup more than there are partitions: it must not change anything.
-        let groups = Threads::Workgroups([partitions + 1, 1, 1]);
+        let workgroups = partitions.div_ceil(subgroups);
         // A count beyond the capacity is clamped to it.
         let (counts, keys) = (vec![size + 5], noise(size));
         let values: Vec<u32> = (0..size).map(|i| 3 * i).collect();
-        let empty_table = vec![0; (digits * partitions) as usize];
-        let no_totals = vec![0; digits as usize];
-        let upsweep = |folds_spine: u32| {
-            let (table, digit_totals, arrivals) = (empty_table.clone(), no_totals.clone(), vec![0]);
-            run_kernel!(
-                sort_upsweep,
-                sort_upsweep::Constants::default(),
-                sort_upsweep::Params { count_index, capacity, shift, digit_bits, folds_spine },
-                groups,
-                [counts, keys],
-                [table, digit_totals, arrivals]
-            )
-        };
-        let (table, digit_totals, _) = upsweep(0);
-        let (table, digit_totals) = run_kernel!(
-            sort_spine,
-            sort_spine::Constants::default(),
-            sort_spine::Params { count_index, capacity, digit_bits },
-            Threads::Workgroups([digits, 1, 1]),
-            [counts],
-            [table, digit_totals]
+        let [table, offsets, digit_begins] =
+            [digits * workgroups, digits * partitions, digits].map(|len| vec![0; len as usize]);
+        let arrivals = vec![0];
+        // One workgroup more than there are partitions: it must not change anything.
+        let (table, offsets, digit_begins, arrivals) = run_kernel!(
+            sort_upsweep,
+            counted,
+            sort_upsweep::Params { count_index, capacity, shift, digit_bits },
+            Threads::Workgroups([workgroups + 1, 1, 1]),
+            [counts, keys],
+            [table, offsets, digit_begins, arrivals]
         );
-        let folded = upsweep(1);
-        assert_eq!((&folded.0, &folded.1, folded.2), (&table, &digit_totals, vec![0]));
+        assert_eq!(arrivals, [0]);
         let (sorted_keys, sorted_values) = (vec![0; keys.len()], vec![0; keys.len()]);
         run_kernel!(
             sort_downsweep,
             ranked,
             sort_downsweep::Params { count_index, capacity, shift, digit_bits },
-            groups,
-            [counts, table, digit_totals, keys, values],
+            Threads::Workgroups([partitions + 1, 1, 1]),
+            [counts, table, offsets, digit_begins, keys, values],
             [sorted_keys, sorted_values]
         );
     }

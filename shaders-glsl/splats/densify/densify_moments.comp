@@ -3,6 +3,7 @@
 #include "kernel.glsl"
 #include "gaussian.glsl"
 #include "densify_action.glsl"
+#include "rest_layout.glsl"
 
 //! Densify moments: one thread per Gaussian writes the moments of its children to the new planes.
 //!
@@ -37,9 +38,11 @@ void main() {
         for (uint plane = 0; plane < PLANE_COUNT; ++plane) {
             uint column = plane_column(plane, feature_count, column_count);
             uint width = plane_column(plane + 1, feature_count, column_count) - column;
-            uint source = column * gaussian_count + width * i;
-            uint target = column * new_gaussian_count + width * to;
-            for (uint k = 0; k < width; ++k) new_moments[target + k] = begins ? 0 : moments[source + k];
+            for (uint k = 0; k < width; ++k) {
+                uint source = plane_word(plane, column, width, gaussian_count, i, k);
+                uint target = plane_word(plane, column, width, new_gaussian_count, to, k);
+                new_moments[target] = begins ? 0 : moments[source];
+            }
         }
     }
 }

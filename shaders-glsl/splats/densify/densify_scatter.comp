@@ -5,6 +5,7 @@
 #include "rotation.glsl"
 #include "densify_action.glsl"
 #include "random.glsl"
+#include "rest_layout.glsl"
 
 //! Densify scatter: one thread per Gaussian writes the parameters of its children to the new planes.
 //!
@@ -38,9 +39,10 @@ void copy(uint from, uint to) {
     for (uint plane = 0; plane < PLANE_COUNT; ++plane) {
         uint column = plane_column(plane, feature_count, column_count);
         uint width = plane_column(plane + 1, feature_count, column_count) - column;
-        uint source = column * gaussian_count + width * from;
-        uint target = column * new_gaussian_count + width * to;
-        for (uint k = 0; k < width; ++k) new_parameters[target + k] = parameters[source + k];
+        for (uint k = 0; k < width; ++k) {
+            uint source = plane_word(plane, column, width, gaussian_count, from, k);
+            new_parameters[plane_word(plane, column, width, new_gaussian_count, to, k)] = parameters[source];
+        }
     }
 }
 

@@ -7,6 +7,7 @@
 #include "rotation.glsl"
 #include "splat.glsl"
 #include "densify_action.glsl"
+#include "rest_layout.glsl"
 
 //! Densify score: one thread per Gaussian computes the key that orders Gaussians by their need for densification.
 //!
@@ -43,8 +44,9 @@ bool is_sound(uint i) {
     for (uint plane = 0; plane < PLANE_COUNT; ++plane) {
         uint column = plane_column(plane, feature_count, column_count);
         uint width = plane_column(plane + 1, feature_count, column_count) - column;
-        uint first = column * gaussian_count + width * i;
-        for (uint k = 0; k < width; ++k) if (!(abs(parameters[first + k]) < 3e38)) return false;
+        for (uint k = 0; k < width; ++k) {
+            if (!(abs(parameters[plane_word(plane, column, width, gaussian_count, i, k)]) < 3e38)) return false;
+        }
     }
     return true;
 }

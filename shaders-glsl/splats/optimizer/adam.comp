@@ -3,6 +3,7 @@
 #include "kernel.glsl"
 #include "gaussian.glsl"
 #include "adam_step.glsl"
+#include "log_scale.glsl"
 
 //! Adam over the planes of include/gaussian.glsl: beta 0.9 and 0.999, epsilon 1e-15.
 //!
@@ -30,11 +31,6 @@ layout(binding = 2)           buffer FirstMoments  { vec4 first_moments[]; };   
 layout(binding = 3)           buffer SecondMoments { vec4 second_moments[]; };  // as many
 layout(binding = 4)           buffer BothMoments   { uvec4 both_moments[]; };    // their bits, with half moments
 layout(binding = 5) readonly  buffer Status        { uint status[]; };
-
-// With the largest scale, the determinant of a projected covariance is finite at the near plane: (f / 0.2)^2 times its
-// square.
-const float LOG_SCALE_MIN = -30.0;
-const float LOG_SCALE_MAX = 13.0;
 
 // The learning rates of the floats at `i`.
 vec4 rates_at(uvec4 i) {

@@ -1,8 +1,10 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
+#include "gaussian.glsl"
 #include "adam_step.glsl"
 #include "half.glsl"
+#include "rest_layout.glsl"
 
 //! Adam over SH coefficients above degree 0 that are stored as 16-bit floats (include/half.glsl), otherwise as
 //! adam.comp.
@@ -37,44 +39,44 @@ vec2 halves_at(uint word, bool takes_part) {
 
 void main() {
     uint quads = (coefficient_count + 3) / 4;
-    uint i = THREAD_INDEX / max(quads, 1);
-    if (i >= gaussian_count || status[0] != 0) return;
-    uint first = 4 * (THREAD_INDEX % max(quads, 1));
+    if (THREAD_INDEX >= gaussian_count * quads || status[0] != 0) return;
+    uint i = REST_BY_COLUMN ? THREAD_INDEX % gaussian_count : THREAD_INDEX / quads;
+    uint first = 4 * (REST_BY_COLUMN ? THREAD_INDEX / gaussian_count : THREAD_INDEX % quads);
     uint count = min(coefficient_count - first, 4);
-    uint plane = first_column * gaussian_count;
-    uint at = plane + coefficient_count * i + first;
-    uint word = plane + words_of(coefficient_count) * i + first / 2;
+    uint at = rest_word(first_column, coefficient_count, gaussian_count, i, first);
+    uint word = rest_word(first_column, words_of(coefficient_count), gaussian_count, i, first / 2);
+    uint next = REST_BY_COLUMN ? gaussian_count : 1;  // from a word of a Gaussian to the next
 
     vec4 gradient = vec4(0.0);
     Moments moments = Moments(vec4(0.0), vec4(0.0));
     uvec4 both = uvec4(0);
     [[unroll]] for (uint k = 0; k < 4; ++k) {
         if (k >= count) continue;
-        gradient[k] = gradients[at + k];
+        gradient[k] = gradients[at + k * next];
         if (HALF_MOMENTS) {
-            both[k] = both_moments[at + k];
+            both[k] = both_moments[at + k * next];
         } else {
-            moments.first[k] = first_moments[at + k];
-            moments.second[k] = second_moments[at + k];
+            moments.first[k] = first_moments[at + k * next];
+            moments.second[k] = second_moments[at + k * next];
         }
     }
     if (HALF_MOMENTS) moments = from_halves(both);
     moments = updated(moments, clamp_gradient(gradient));
 
-    vec4 value = vec4(halves_at(word, true), halves_at(word + 1, count > 2));
+    vec4 value = vec4(halves_at(word, true), halves_at(word + next, count > 2));
     uvec4 chance = chance_of(value, moments, step);
     value -= adam_step(moments, vec4(rate), second_correction);
     value = rounded_by_chance(value, chance);
     parameters[word] = packHalf2x16(value.xy);
-    if (count > 2) parameters[word + 1] = packHalf2x16(value.zw);
+    if (count > 2) parameters[word + next] = packHalf2x16(value.zw);
     if (HALF_MOMENTS) both = in_halves(moments, chance);
     [[unroll]] for (uint k = 0; k < 4; ++k) {
         if (k >= count) continue;
         if (HALF_MOMENTS) {
-            both_moments[at + k] = both[k];
+            both_moments[at + k * next] = both[k];
         } else {
-            first_moments[at + k] = moments.first[k];
-            second_moments[at + k] = moments.second[k];
+            first_moments[at + k * next] = moments.first[k];
+            second_moments[at + k * next] = moments.second[k];
         }
     }
 }

@@ -31,6 +31,9 @@ layout(binding = 6) coherent  buffer Arrivals   { uint arrivals[]; };
 
 #include "last_workgroup.glsl"
 
+// Loads in flight.
+const uint AHEAD = 8;
+
 void main() {
     uint part = WORKGROUP_INDEX;
     uint lane = gl_SubgroupInvocationID;
@@ -40,26 +43,39 @@ void main() {
 
     uint sum = 0;
     uint end = gaussian_count == 0 ? 0 : partition_end(part, gaussian_count);
-    for (uint first = partition_begin(part); first < end; first += SUBGROUP_SIZE) {
-        uint rank = first + lane;
-        uint count = rank < end ? tile_counts[sorted_ids[rank]] : 0;
-        uint inclusive = subgroup_inclusive_sum(count);
-        if (rank < end) intersection_offsets[rank] = sum + inclusive - count;
-        sum += subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
+    for (uint first = partition_begin(part); first < end; first += AHEAD * SUBGROUP_SIZE) {
+        uint count[AHEAD];
+        [[unroll]] for (uint k = 0; k < AHEAD; k++) {
+            count[k] = sorted_ids[min(first + k * SUBGROUP_SIZE + lane, end - 1)];
+        }
+        [[unroll]] for (uint k = 0; k < AHEAD; k++) count[k] = tile_counts[count[k]];
+        [[unroll]] for (uint k = 0; k < AHEAD; k++) {
+            uint rank = first + k * SUBGROUP_SIZE + lane;
+            uint own = rank < end ? count[k] : 0;
+            uint inclusive = subgroup_inclusive_sum(own);
+            if (rank < end) intersection_offsets[rank] = sum + inclusive - own;
+            sum += subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
+        }
     }
     if (subgroupElect()) sums[part] = sum;
 
     if (!is_last_workgroup(partition_count)) return;
     uint total = 0;
     bool wraps = false;
-    for (uint first = 0; first < partition_count; first += SUBGROUP_SIZE) {
-        uint i = first + lane;
-        uint sum_of_part = i < partition_count ? sums[i] : 0;
-        uint inclusive = subgroupInclusiveAdd(sum_of_part);
-        if (i < partition_count) sums[i] = total + inclusive - sum_of_part;
-        uint sum_of_lanes = subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
-        total += sum_of_lanes;
-        wraps = wraps || subgroupAny(inclusive < sum_of_part) || total < sum_of_lanes;
+    for (uint first = 0; first < partition_count; first += AHEAD * SUBGROUP_SIZE) {
+        uint ahead[AHEAD];
+        [[unroll]] for (uint k = 0; k < AHEAD; k++) {
+            ahead[k] = sums[min(first + k * SUBGROUP_SIZE + lane, partition_count - 1)];
+        }
+        [[unroll]] for (uint k = 0; k < AHEAD; k++) {
+            uint i = first + k * SUBGROUP_SIZE + lane;
+            uint sum_of_part = i < partition_count ? ahead[k] : 0;
+            uint inclusive = subgroup_inclusive_sum(sum_of_part);
+            if (i < partition_count) sums[i] = total + inclusive - sum_of_part;
+            uint sum_of_lanes = subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
+            total += sum_of_lanes;
+            wraps = wraps || subgroupAny(inclusive < sum_of_part) || total < sum_of_lanes;
+        }
     }
     if (wraps) total = 0xffffffffu;
     if (subgroupElect()) {

@@ -56,7 +56,10 @@ vec3 sh_color(uint i, vec3 direction) {
     float basis[16];
     sh_basis(sh_degree, direction, basis);
     vec3 color = basis[0] * LOAD_VEC3(parameters, DC_COLUMN, gaussian_count, i);
-    for (uint k = 1; k < sh_count(sh_degree); k++) color += basis[k] * rest_coefficient(i, k);
+    // With constant bounds, the basis is in registers and the loads are issued together.
+    [[unroll]] for (uint k = 1; k < MAX_COEFFICIENTS; k++) {
+        if (k < sh_count(SH_DEGREE) && k < sh_count(sh_degree)) color += basis[k] * rest_coefficient(i, k);
+    }
     if (RAW_COLORS) return color;
     return max(color + 0.5, vec3(0.0));
 }

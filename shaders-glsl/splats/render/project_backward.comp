@@ -32,6 +32,9 @@ layout(push_constant, scalar) uniform Params {
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 5) const bool RAW_COLORS = false;
 layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in the format of include/half.glsl
+// Of the gradients of SH above degree 0, only that of the colour is written, as `adam_gaussian` reads it; it requires
+// REST_BY_COLUMN.
+layout(constant_id = 13) const bool COLOR_GRADIENTS = false;
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // planes
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
@@ -59,6 +62,12 @@ const uint FEATURE_COUNT = CHANNELS - 3;
     uint at = (column) * gaussian_count + 4 * (i); \
     gradients[at] = (v).x; gradients[at + 1] = (v).y; gradients[at + 2] = (v).z; gradients[at + 3] = (v).w; }
 
+// The place of the gradient of an SH coefficient above degree 0.
+uint rest_gradient(uint i, uint k) { return rest_word(REST_COLUMN, rest_width(), gaussian_count, i, k); }
+
+// Those that are written, of each Gaussian.
+uint written_rest() { return COLOR_GRADIENTS ? min(rest_width(), 3) : rest_width(); }
+
 // The gradient of a unit quaternion's rotation matrix.
 vec4 rotation_backward(vec4 q, mat3 d) {
     float w = q.x, x = q.y, y = q.z, z = q.w;
@@ -72,20 +81,21 @@ vec4 rotation_backward(vec4 q, mat3 d) {
 
 // Writes the gradients of the SH coefficients; returns that of the mean, through the viewing direction.
 vec3 sh_backward(uint i, vec3 offset, vec3 d_color) {
-    float small = finite_scale(length(offset));
-    offset *= small;
-    float distance = max(length(offset), 1e-12);
-    vec3 direction = offset / distance;
+    float small, distance;
+    vec3 direction = direction_of(offset, small, distance);
     float basis[16];
     vec3 basis_gradient[16];
     sh_basis(sh_degree, direction, basis);
     sh_basis_gradient(sh_degree, direction, basis_gradient);
     STORE_VEC3(DC_COLUMN, i, basis[0] * d_color);
     vec3 d_direction = vec3(0.0);
-    uint rest = (FEATURES_COLUMN + FEATURE_COUNT) * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
-    for (uint k = 1; k < sh_count(SH_DEGREE); k++, rest += 3) {
+    for (uint k = 1; k < sh_count(SH_DEGREE); k++) {
         d_direction += dot(rest_coefficient(i, k), d_color) * basis_gradient[k];
-        for (uint c = 0; c < 3; c++) gradients[rest + c] = basis[k] * d_color[c];
+        if (COLOR_GRADIENTS) continue;
+        for (uint c = 0; c < 3; c++) gradients[rest_gradient(i, 3 * (k - 1) + c)] = basis[k] * d_color[c];
+    }
+    if (COLOR_GRADIENTS) {
+        for (uint c = 0; c < written_rest(); c++) gradients[rest_gradient(i, c)] = d_color[c];
     }
     return small * ((d_direction - direction * dot(direction, d_direction)) / distance);
 }
@@ -104,8 +114,7 @@ void store_zero(uint i) {
     STORE_VEC3(DC_COLUMN, i, vec3(0.0));
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
     for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = 0.0;
-    uint rest = (FEATURES_COLUMN + FEATURE_COUNT) * gaussian_count + 3 * (sh_count(SH_DEGREE) - 1) * i;
-    for (uint k = 0; k < 3 * (sh_count(SH_DEGREE) - 1); k++) gradients[rest + k] = 0.0;
+    for (uint k = 0; k < written_rest(); k++) gradients[rest_gradient(i, k)] = 0.0;
 }
 
 void main() {
@@ -167,8 +176,8 @@ void main() {
     vec3 d_row0 = view_rotation * (scaled_axes * d.u0);
     vec3 d_row1 = view_rotation * (scaled_axes * d.u1);
     vec3 d_mean_in_view = camera_backward(mean_in_view, camera, d_mean2d, d_row0, d_row1);
-    vec3 center = -world_from_view * camera.view_from_world[3];
-    vec3 d_mean = world_from_view * d_mean_in_view + sh_backward(i, mean - center, d_color);
+    vec3 offset = offset_from_camera(mean, camera.view_from_world);
+    vec3 d_mean = world_from_view * d_mean_in_view + sh_backward(i, offset, d_color);
 
     STORE_VEC3(MEANS_COLUMN, i, d_mean);
     STORE_VEC4(QUATS_COLUMN, i, d_quat);

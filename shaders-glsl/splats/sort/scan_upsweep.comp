@@ -24,6 +24,9 @@ layout(binding = 4) coherent  buffer Arrivals { uint arrivals[]; };
 
 #include "last_workgroup.glsl"
 
+// Loads in flight.
+const uint AHEAD = 8;
+
 void main() {
     uint part = WORKGROUP_INDEX;
     uint count = min(counts[count_index], capacity);
@@ -41,12 +44,18 @@ void main() {
 
     if (!is_last_workgroup(partition_count)) return;
     uint running = 0;
-    for (uint first = 0; first < partition_count; first += SUBGROUP_SIZE) {
-        uint i = first + gl_SubgroupInvocationID;
-        uint sum_of_part = i < partition_count ? sums[i] : 0;
-        uint inclusive = subgroupInclusiveAdd(sum_of_part);
-        if (i < partition_count) sums[i] = running + inclusive - sum_of_part;
-        running += subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
+    for (uint first = 0; first < partition_count; first += AHEAD * SUBGROUP_SIZE) {
+        uint ahead[AHEAD];
+        [[unroll]] for (uint k = 0; k < AHEAD; k++) {
+            ahead[k] = sums[min(first + k * SUBGROUP_SIZE + gl_SubgroupInvocationID, partition_count - 1)];
+        }
+        [[unroll]] for (uint k = 0; k < AHEAD; k++) {
+            uint i = first + k * SUBGROUP_SIZE + gl_SubgroupInvocationID;
+            uint sum_of_part = i < partition_count ? ahead[k] : 0;
+            uint inclusive = subgroupInclusiveAdd(sum_of_part);
+            if (i < partition_count) sums[i] = running + inclusive - sum_of_part;
+            running += subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
+        }
     }
     if (subgroupElect()) total[0] = running;
 }

@@ -1,5 +1,6 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
+#extension GL_KHR_memory_scope_semantics : require
 #include "kernel.glsl"
 #include "partition.glsl"
 #include "digit.glsl"
@@ -14,6 +15,7 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 // A ballot per bit of the digit, or (up to 32 lanes) a comparison per lane: the latter takes half the time on CPUs with
 // narrow subgroups, whose ballots are loops.
 layout(constant_id = 1) const bool RANK_BY_BALLOT = true;
+layout(constant_id = 2) const uint SUBGROUPS = 1;  // partitions of a workgroup of the upsweep
 
 layout(push_constant) uniform Params {
     uint count_index;  // index in `counts` of the number of pairs
@@ -23,26 +25,33 @@ layout(push_constant) uniform Params {
 };
 
 layout(binding = 0) readonly  buffer Counts       { uint counts[]; };
-layout(binding = 1) readonly  buffer Table        { uint table[]; };         // (partitions, digits), prefix sums
-layout(binding = 2) readonly  buffer Totals       { uint digit_totals[]; };  // (digits)
-layout(binding = 3) readonly  buffer Keys         { uint keys[]; };
-layout(binding = 4) readonly  buffer Values       { uint values[]; };
-layout(binding = 5) writeonly buffer SortedKeys   { uint sorted_keys[]; };
-layout(binding = 6) writeonly buffer SortedValues { uint sorted_values[]; };
+layout(binding = 1) readonly  buffer Table        { uint table[]; };         // (workgroups, digits), prefix sums
+layout(binding = 2) readonly  buffer Offsets      { uint offsets[]; };       // (partitions, digits) in their workgroup
+layout(binding = 3) readonly  buffer Begins       { uint digit_begins[]; };  // (digits)
+layout(binding = 4) readonly  buffer Keys         { uint keys[]; };
+layout(binding = 5) readonly  buffer Values       { uint values[]; };
+layout(binding = 6) writeonly buffer SortedKeys   { uint sorted_keys[]; };
+layout(binding = 7) writeonly buffer SortedValues { uint sorted_values[]; };
 
 shared uint next_place[MAX_DIGITS];
 
+// Orders the subgroup's accesses to shared memory; those to buffers need no order, whose barriers are slower.
+void share_places() {
+    controlBarrier(gl_ScopeSubgroup, gl_ScopeSubgroup, gl_StorageSemanticsShared, gl_SemanticsAcquireRelease);
+}
+
+// A function, since the reflection of kernels cannot compare constants; drivers fold it.
+bool has_offsets() {
+    uint subgroups = SUBGROUPS;
+    return subgroups > 1;
+}
+
 void find_first_places(uint part) {
     uint digit_count = 1u << digit_bits;
-    uint running = 0;
-    for (uint first = 0; first < digit_count; first += SUBGROUP_SIZE) {
-        uint digit = first + gl_SubgroupInvocationID;
-        uint keys = digit < digit_count ? digit_totals[digit] : 0;
-        uint inclusive = subgroupInclusiveAdd(keys);
-        if (digit < digit_count) {
-            next_place[digit] = running + inclusive - keys + table[part * digit_count + digit];
-        }
-        running += subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
+    uint workgroup = part / SUBGROUPS;
+    for (uint digit = gl_SubgroupInvocationID; digit < digit_count; digit += SUBGROUP_SIZE) {
+        uint offset = has_offsets() ? offsets[(part << digit_bits) + digit] : 0;
+        next_place[digit] = digit_begins[digit] + table[(workgroup << digit_bits) + digit] + offset;
     }
 }
 
@@ -50,7 +59,8 @@ void find_first_places(uint part) {
 uvec4 lanes_of_digit(uint digit, bool holds_pair) {
     if (RANK_BY_BALLOT) {
         uvec4 lanes = subgroupBallot(holds_pair);
-        for (uint bit = 0; bit < digit_bits; ++bit) {
+        // Bits beyond the digit's are 0 in every lane.
+        [[unroll]] for (uint bit = 0; bit < MAX_DIGIT_BITS; ++bit) {
             bool is_set = (digit >> bit & 1) == 1;
             uvec4 set = subgroupBallot(is_set);
             lanes &= is_set ? set : ~set;
@@ -70,24 +80,29 @@ void main() {
     uint count = min(counts[count_index], capacity);
     if (part >= partitions_of(count)) return;
 
-    find_first_places(part);
-    subgroupBarrier();
-
     uint end = partition_end(part, count);
-    for (uint first = partition_begin(part); first < end; first += SUBGROUP_SIZE) {
-        uint i = first + gl_SubgroupInvocationID;
+    uint i = partition_begin(part) + gl_SubgroupInvocationID;
+    // The pair of the next turn is loaded while that of this turn is ranked.
+    uint next_key = keys[min(i, end - 1)], next_value = values[min(i, end - 1)];
+    find_first_places(part);
+    share_places();
+
+    for (uint first = partition_begin(part); first < end; first += SUBGROUP_SIZE, i += SUBGROUP_SIZE) {
         bool holds_pair = i < end;
-        uint key = holds_pair ? keys[i] : 0;
+        uint key = next_key, value = next_value;
+        uint next = min(i + SUBGROUP_SIZE, end - 1);
+        next_key = keys[next];
+        next_value = values[next];
         uint digit = digit_of(key, shift, digit_bits);
         uvec4 lanes = lanes_of_digit(digit, holds_pair);
         uint rank = subgroupBallotExclusiveBitCount(lanes);
         uint place = next_place[digit] + rank;
-        subgroupBarrier();
+        share_places();
         if (holds_pair) {
             sorted_keys[place] = key;
-            sorted_values[place] = values[i];
+            sorted_values[place] = value;
             if (rank + 1 == subgroupBallotBitCount(lanes)) next_place[digit] = place + 1;
         }
-        subgroupBarrier();
+        share_places();
     }
 }

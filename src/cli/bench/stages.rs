@@ -108,7 +108,7 @@ pub(super) fn of_kernels(times: &[PassTime], names: &[&str]) -> f64 {
 pub(super) fn time(bench: &Bench, trainers: &mut Trainers) -> Result<Stages> {
     let steps = repeated(bench, || trainers.plain.profile_step())?;
     let of_step = |names: &[&str]| median(steps.iter().map(|t| of_kernels(t, names)).collect());
-    let loss_kernels = ["ssim", "loss_log"];
+    let loss_kernels = ["ssim", "ssim_forward", "ssim_backward", "loss_log"];
     let mut photograph = BenchPhotograph::new(&bench.gpu)?;
     let times = repeated(bench, || photograph.profile(&bench.gpu))?;
     let full_hd = median(times.iter().map(|times| total(times)).collect());

@@ -12,7 +12,7 @@ use serde::Serialize;
 use self::page::Page;
 use self::photographs::{Listed, listed};
 use crate::base::output::{check_writable, create_folder, printable};
-use crate::cli::{ImageFormat, finish, progress_bar, table, word, words};
+use crate::cli::{ImageFormat, driver, finish, progress_bar, table, word, words};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
 use crate::photographs::image::{ColourCounts, Image, Mask, Orientation};
@@ -248,7 +248,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     args.out.iter().chain(&args.report).try_for_each(|path| check_writable(path))?;
     let photographs = listed(args)?;
     args.out.iter().try_for_each(|out| create_folder(out))?;
-    let gpu = Gpu::new(&args.device.clone().unwrap_or_default())?;
+    let gpu = driver::open(&args.device.clone().unwrap_or_default())?;
     let mut set =
         CurveOnSet::new(&gpu, settings.clone(), &photographs, (&args.input, args.invert_masks))?;
     let mut page = args.report.as_ref().map(|_| Page::new(&gpu, args, &photographs)).transpose()?;

@@ -18,8 +18,9 @@ const TILES_PER_GAUSSIAN: u32 = 6;
 const SHOWN_TILES_PER_GAUSSIAN: u32 = 16;
 const LEAST_SHOWN_INTERSECTIONS: u32 = 1 << 20;
 
-/// Depth ranks whose tiles one subgroup counts. Small, because `emit` sums the counts before a rank within them.
-pub(super) const RANKS_PER_PARTITION: u32 = 256;
+/// Depth ranks whose tiles one subgroup counts. With more, fewer subgroups would share the loads; with fewer, the last
+/// one would have more sums to add up.
+pub(super) const RANKS_PER_PARTITION: u32 = 1024;
 
 /// The decoded status words.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -11,6 +11,7 @@ use crate::gpu::{Gpu, Pipeline, Tile};
 use crate::kernels::{
     blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
+use crate::splats::batches::{GradientKind, rest_by_column};
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::Shape;
 use crate::splats::sort::RadixSort;
@@ -21,12 +22,24 @@ impl Renderer {
     /// # Errors
     /// The driver refuses a kernel, or the tile does not suit the device.
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
+        Self::with_gradients(gpu, settings, GradientKind::All)
+    }
+
+    /// [`Renderer::new`] whose backward pass writes such gradients.
+    ///
+    /// # Errors
+    /// Those of [`Renderer::new`].
+    pub(crate) fn with_gradients(
+        gpu: &Gpu,
+        settings: RenderSettings,
+        gradients: GradientKind,
+    ) -> Result<Self> {
         let tile = settings.tile_on(gpu)?;
         let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
         let pinhole = (CameraModel::Pinhole.number(), false);
-        let projections = Projections::new(gpu, &settings, tile.size, pinhole)?;
+        let projections = Projections::new(gpu, &settings, tile.size, pinhole, gradients)?;
         let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         let blend_backward = match settings.purpose {
@@ -47,6 +60,7 @@ impl Renderer {
         Ok(Self {
             gpu: gpu.clone(),
             settings,
+            gradients,
             tile,
             longest_run: longest_run(gpu),
             projections: BTreeMap::from([(pinhole, projections)]),
@@ -73,7 +87,8 @@ impl Renderer {
     pub(super) fn build_projections(&mut self, model: u32, view_depths: bool) -> Result<()> {
         let key = (model, view_depths);
         if !self.projections.contains_key(&key) {
-            let own = Projections::new(&self.gpu, &self.settings, self.tile.size, key)?;
+            let (settings, tile) = (&self.settings, self.tile.size);
+            let own = Projections::new(&self.gpu, settings, tile, key, self.gradients)?;
             self.projections.insert(key, own);
         }
         Ok(())
@@ -98,7 +113,8 @@ impl Renderer {
         let shape = Shape { sh_degree, ..self.settings.shape };
         let settings = RenderSettings { shape, ..self.settings };
         let own = |&key: &(u32, bool)| {
-            Ok((key, Projections::new(&self.gpu, &settings, self.tile.size, key)?))
+            let (tile, gradients) = (self.tile.size, self.gradients);
+            Ok((key, Projections::new(&self.gpu, &settings, tile, key, gradients)?))
         };
         self.projections = self.projections.keys().map(own).collect::<Result<_>>()?;
         self.settings = settings;
@@ -120,11 +136,14 @@ impl Projections {
         settings: &RenderSettings,
         [tile_width, tile_height]: [u32; 2],
         (camera_model, has_depths): (u32, bool),
+        gradients: GradientKind,
     ) -> Result<Self> {
+        let color_gradients = gradients == GradientKind::Colors;
         let (view_depths, alpha_max) = (u32::from(has_depths), settings.max_alpha);
         let channels = settings.channels() as u32 + view_depths;
         let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
         let half_rest = settings.rest == StorageFormat::Half;
+        let rest_by_column = rest_by_column(gpu);
         macro_rules! pipeline {
             ($kernel:ident $(, $own:ident)*) => {
                 gpu.pipeline(&$kernel::Constants {
@@ -135,13 +154,15 @@ impl Projections {
                     sh_degree,
                     raw_colors,
                     half_rest,
+                    rest_by_column,
                     camera_model,
                     $($own,)*
                 })?
             };
         }
         let has_gradients = settings.purpose == Purpose::Train && !has_depths;
-        let backward = if has_gradients { Some(pipeline!(project_backward)) } else { None };
+        let backward =
+            if has_gradients { Some(pipeline!(project_backward, color_gradients)) } else { None };
         Ok(Self { forward: pipeline!(project, view_depths), backward })
     }
 }

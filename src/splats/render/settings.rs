@@ -1,6 +1,6 @@
 //! The settings of a renderer, and the tile that suits a device.
 
-use crate::gpu::{Gpu, Tile};
+use crate::gpu::{Gpu, Properties, Tile};
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{Features, Shape};
 use crate::{Error, Result};
@@ -63,6 +63,20 @@ const CPU_TILE: [u32; 2] = [16, 8];
 const CPU_TILE_CHANNELS: usize = 5;
 const CPU_SMALL_TILE: [u32; 2] = [8, 8];
 
+/// Subgroups of fewer lanes share the tile: alone, each would spill half of its state (compiled by Mesa 25 for Arc).
+const WIDE_SUBGROUP: u32 = 32;
+const NARROW_GPU_TILE: Tile = Tile { size: [16, 16], subgroups: 4 };
+/// The same where subgroups do not stay converged.
+const SMALL_GPU_TILE: [u32; 2] = [8, 8];
+
+fn gpu_tile(properties: &Properties) -> Tile {
+    match properties.subgroup_size {
+        WIDE_SUBGROUP.. => GPU_TILE.into(),
+        _ if properties.suits_tile(NARROW_GPU_TILE) => NARROW_GPU_TILE,
+        _ => SMALL_GPU_TILE.into(),
+    }
+}
+
 impl RenderSettings {
     /// The tile on this device, in pixels: that of these settings, else the one that was measured to be the fastest
     /// (`Gpu::tuned_tile`), else the default for such devices.
@@ -72,11 +86,11 @@ impl RenderSettings {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn tile_on(&self, gpu: &Gpu) -> Result<Tile> {
         let built_in = match self.channels() {
-            _ if !gpu.properties().is_cpu => GPU_TILE,
-            0..=CPU_TILE_CHANNELS => CPU_TILE,
-            _ => CPU_SMALL_TILE,
+            _ if !gpu.properties().is_cpu => gpu_tile(gpu.properties()),
+            0..=CPU_TILE_CHANNELS => CPU_TILE.into(),
+            _ => CPU_SMALL_TILE.into(),
         };
-        let tile = self.tile.or_else(|| gpu.tuned_tile(self.channels())).unwrap_or(built_in.into());
+        let tile = self.tile.or_else(|| gpu.tuned_tile(self.channels())).unwrap_or(built_in);
         if gpu.properties().suits_tile(tile) {
             return Ok(tile);
         }

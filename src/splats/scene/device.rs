@@ -87,7 +87,8 @@ impl DeviceGaussians {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn uninit(gpu: &Gpu, layout: Layout) -> Result<Self> {
         let len = layout.capacity.max(layout.count) * layout.words();
-        let parameters = gpu.uninit_in_windows("parameters", len)?;
+        let window = layout.parameter_batches(gpu).window();
+        let parameters = gpu.uninit_in_windows("parameters", len, window)?;
         Ok(Self { layout, parameters, origin: DVec3::ZERO })
     }
 

@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use super::{Count, common_len};
 use crate::Result;
-use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads, WORKGROUP};
 use crate::kernels::digit::MAX_DIGIT_BITS;
-use crate::kernels::{sort_downsweep, sort_spine, sort_upsweep};
+use crate::kernels::{sort_downsweep, sort_upsweep};
 
 /// A stable sort of (key, value) pairs of `u32`, ascending by key.
 #[derive(Debug)]
@@ -14,8 +14,8 @@ pub struct RadixSort {
     gpu: Gpu,
     kernels: Arc<Kernels>,
     partition_size: u32,
-    /// With more partitions, the spine is a separate pass.
-    folded_partitions: u32,
+    /// Partitions of a workgroup of the upsweep.
+    subgroups: u32,
     /// Workgroups of an upsweep that are done; 0 between upsweeps.
     arrivals: Buffer<u32>,
     scratch: Scratch,
@@ -25,14 +25,12 @@ pub struct RadixSort {
 #[derive(Debug)]
 struct Kernels {
     upsweep: Pipeline<sort_upsweep::Kernel>,
-    spine: Pipeline<sort_spine::Kernel>,
     downsweep: Pipeline<sort_downsweep::Kernel>,
 }
 
-/// Up to this number of partitions, one subgroup scans them faster than a pass of its own would. A CPU has no idle
-/// lanes that would do so at the same time.
-const FOLDED_PARTITIONS_ON_A_GPU: u32 = 16;
-const FOLDED_PARTITIONS_ON_A_CPU: u32 = 1024;
+/// The most subgroups of a workgroup of the upsweep on a GPU, where the last workgroup scans the counts of all with as
+/// many threads. On a CPU, a barrier between subgroups costs more than that saves.
+const SUBGROUPS_ON_A_GPU: u32 = 8;
 
 /// Scratch memory of a sort.
 #[derive(Debug)]
@@ -40,10 +38,12 @@ struct Scratch {
     /// Each pass writes the pairs here; then these and the caller's buffers are swapped.
     keys: Buffer<u32>,
     values: Buffer<u32>,
-    /// (partitions, digits)
+    /// (workgroups, digits)
     table: Buffer<u32>,
+    /// (partitions, digits); none where a workgroup has one partition.
+    offsets: Buffer<u32>,
     /// (digits)
-    digit_totals: Buffer<u32>,
+    digit_begins: Buffer<u32>,
 }
 
 impl RadixSort {
@@ -58,23 +58,27 @@ impl RadixSort {
     /// The device is out of memory or lost.
     pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self> {
         let partition_size = sort_upsweep::Constants::default().partition_size;
-        let rank_by_ballot = gpu.properties().subgroup_size > MAX_DIGIT_BITS;
+        let subgroup_size = gpu.properties().subgroup_size;
+        let rank_by_ballot = subgroup_size > MAX_DIGIT_BITS;
+        let subgroups = if gpu.properties().is_cpu {
+            1
+        } else {
+            SUBGROUPS_ON_A_GPU.min(WORKGROUP / subgroup_size)
+        };
         Ok(Self {
             gpu: gpu.clone(),
             kernels: Arc::new(Kernels {
-                upsweep: gpu.pipeline(&sort_upsweep::Constants { partition_size })?,
-                spine: gpu.pipeline(&sort_spine::Constants { partition_size })?,
-                downsweep: gpu
-                    .pipeline(&sort_downsweep::Constants { partition_size, rank_by_ballot })?,
+                upsweep: gpu.pipeline(&sort_upsweep::Constants { partition_size, subgroups })?,
+                downsweep: gpu.pipeline(&sort_downsweep::Constants {
+                    partition_size,
+                    rank_by_ballot,
+                    subgroups,
+                })?,
             }),
             partition_size,
-            folded_partitions: if gpu.properties().is_cpu {
-                FOLDED_PARTITIONS_ON_A_CPU
-            } else {
-                FOLDED_PARTITIONS_ON_A_GPU
-            },
+            subgroups,
             arrivals: gpu.zeros("sort_arrivals", 1)?,
-            scratch: Scratch::new(gpu, capacity, partition_size)?,
+            scratch: Scratch::new(gpu, capacity, [partition_size, subgroups])?,
         })
     }
 
@@ -87,7 +91,7 @@ impl RadixSort {
             gpu: self.gpu.clone(),
             kernels: Arc::clone(&self.kernels),
             arrivals: self.gpu.zeros("sort_arrivals", 1)?,
-            scratch: Scratch::new(&self.gpu, 0, self.partition_size)?,
+            scratch: Scratch::new(&self.gpu, 0, [self.partition_size, self.subgroups])?,
             ..*self
         })
     }
@@ -99,7 +103,8 @@ impl RadixSort {
     pub(crate) fn reserve(&mut self, capacity: usize) -> Result<()> {
         if self.scratch.keys.len() != capacity {
             let capacity = common_len("sort", &[capacity])?;
-            self.scratch = Scratch::new(&self.gpu, capacity, self.partition_size)?;
+            let shape = [self.partition_size, self.subgroups];
+            self.scratch = Scratch::new(&self.gpu, capacity, shape)?;
         }
         Ok(())
     }
@@ -141,48 +146,31 @@ impl RadixSort {
         digit_bits: u32,
     ) -> Result<()> {
         let capacity = common_len("sort", &[keys.len(), values.len()])?;
-        let Scratch { keys: sorted_keys, values: sorted_values, table, digit_totals } =
+        let Scratch { keys: sorted_keys, values: sorted_values, table, offsets, digit_begins } =
             &mut self.scratch;
         let arrivals = &mut self.arrivals;
         let partitions = capacity.div_ceil(self.partition_size);
-        let folds_spine = partitions <= self.folded_partitions;
         pass.dispatch(
             &self.kernels.upsweep,
-            &sort_upsweep::Params {
-                count_index,
-                capacity,
-                shift,
-                digit_bits,
-                folds_spine: folds_spine.into(),
-            },
+            &sort_upsweep::Params { count_index, capacity, shift, digit_bits },
             sort_upsweep::Buffers {
                 counts: counts.slice(),
                 keys: keys.slice(),
                 table: table.slice_mut(),
-                digit_totals: digit_totals.slice_mut(),
+                offsets: offsets.slice_mut(),
+                digit_begins: digit_begins.slice_mut(),
                 arrivals: arrivals.slice_mut(),
             },
-            Threads::Workgroups([partitions, 1, 1]),
+            Threads::Workgroups([partitions.div_ceil(self.subgroups), 1, 1]),
         )?;
-        if !folds_spine {
-            pass.dispatch(
-                &self.kernels.spine,
-                &sort_spine::Params { count_index, capacity, digit_bits },
-                sort_spine::Buffers {
-                    counts: counts.slice(),
-                    table: table.slice_mut(),
-                    digit_totals: digit_totals.slice_mut(),
-                },
-                Threads::Workgroups([1 << digit_bits, 1, 1]),
-            )?;
-        }
         pass.dispatch(
             &self.kernels.downsweep,
             &sort_downsweep::Params { count_index, capacity, shift, digit_bits },
             sort_downsweep::Buffers {
                 counts: counts.slice(),
                 table: table.slice(),
-                digit_totals: digit_totals.slice(),
+                offsets: offsets.slice(),
+                digit_begins: digit_begins.slice(),
                 keys: keys.slice(),
                 values: values.slice(),
                 sorted_keys: sorted_keys.slice_mut(),
@@ -194,13 +182,16 @@ impl RadixSort {
 }
 
 impl Scratch {
-    fn new(gpu: &Gpu, capacity: u32, partition_size: u32) -> Result<Self> {
-        let partitions = capacity.div_ceil(partition_size) as usize;
+    fn new(gpu: &Gpu, capacity: u32, [partition_size, subgroups]: [u32; 2]) -> Result<Self> {
+        let partitions = capacity.div_ceil(partition_size);
+        let rows = |count: u32| (count as usize) << MAX_DIGIT_BITS;
         Ok(Self {
             keys: gpu.uninit("sort_keys", capacity as usize)?,
             values: gpu.uninit("sort_values", capacity as usize)?,
-            table: gpu.uninit("sort_table", partitions << MAX_DIGIT_BITS)?,
-            digit_totals: gpu.uninit("sort_digit_totals", 1 << MAX_DIGIT_BITS)?,
+            table: gpu.uninit("sort_table", rows(partitions.div_ceil(subgroups)))?,
+            offsets: gpu
+                .uninit("sort_offsets", if subgroups > 1 { rows(partitions) } else { 0 })?,
+            digit_begins: gpu.uninit("sort_digit_begins", rows(1))?,
         })
     }
 }

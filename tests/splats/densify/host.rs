@@ -277,7 +277,11 @@ impl Host {
             offsets: &offsets,
             new_parameters: &mut new_parameters,
         };
-        densify_scatter::Kernel::run(&params, &densify_scatter::Constants { conserving }, slices);
+        densify_scatter::Kernel::run(
+            &params,
+            &densify_scatter::Constants { conserving, rest_by_column: false },
+            slices,
+        );
         let carry = |moments: &[f32]| {
             let mut new_moments = vec![0.0_f32; count * COLUMNS];
             let params = densify_moments::Params {

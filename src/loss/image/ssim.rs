@@ -1,0 +1,234 @@
+//! The kernels of SSIM: one on a CPU, two on a GPU.
+
+use glam::UVec2;
+
+use super::super::Term;
+use super::super::log::{LogRow, LogSlot};
+use super::LossInputs;
+use crate::Result;
+use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
+use crate::kernels::ssim_window::RADIUS;
+use crate::kernels::{ssim, ssim_backward, ssim_forward};
+
+/// The gradient of L1 + SSIM, and their partial sums or, where the last kernel writes it, their row of the log.
+#[derive(Debug)]
+pub(super) struct Ssim {
+    /// w, above 0.
+    weight: f64,
+    lanes: u32,
+    kernels: Kernels,
+}
+
+/// The kernels for the device. On a CPU, loads and stores cost most, and the state of both blurs fits the L1 cache. On
+/// a GPU it would take most registers of a processor, so that too few subgroups would be left to hide latencies.
+#[derive(Debug)]
+enum Kernels {
+    /// The first layout that fits a view is used; the last one fits every view.
+    One(Vec<(Layout, Pipeline<ssim::Kernel>)>),
+    Two {
+        forward: Pipeline<ssim_forward::Kernel>,
+        backward: Pipeline<ssim_backward::Kernel>,
+        /// (3, H, W) each: the derivatives with respect to E\[a\], E\[aa\] and E\[ab\].
+        derivatives: [Buffer<f32>; 3],
+        /// Workgroups of `backward` that are done; 0 between steps.
+        arrivals: Buffer<u32>,
+    },
+}
+
+/// The layout of the one kernel: columns per lane, rows per subgroup, and the alignment of its loads and stores in
+/// floats. A subgroup is as wide as its state fits the cache, and has many rows.
+#[derive(Clone, Copy, Debug)]
+struct Layout {
+    columns: u32,
+    rows: u32,
+    alignment: u32,
+}
+
+const LAYOUTS: [Layout; 2] = [
+    Layout { columns: 12, rows: 192, alignment: 4 },
+    Layout { columns: 10, rows: 192, alignment: 1 },
+];
+
+/// The subgroups that occupy the largest GPUs: 24 on each of some 130 multiprocessors. With more, each would have fewer
+/// rows, and the rows above and below that it loads would be a larger share.
+const SUBGROUPS: u64 = 3072;
+/// The fewest and the most rows of a subgroup.
+const ROWS: [u64; 2] = [8, 128];
+
+impl Layout {
+    fn fits(self, size: UVec2) -> bool {
+        size.x.is_multiple_of(self.alignment)
+    }
+
+    /// The number of subgroups for a channel of a view of `size`, with this number of lanes each.
+    fn subgroups(self, size: UVec2, lanes: u32) -> u32 {
+        let halo = (2 * RADIUS as u32).next_multiple_of(self.alignment);
+        let outputs = lanes * self.columns - 2 * halo;
+        size.x.div_ceil(outputs) * size.y.div_ceil(self.rows)
+    }
+}
+
+/// The rows of a subgroup of a GPU.
+fn rows(size: UVec2, lanes: u32) -> u32 {
+    let columns = u64::from(3 * size.x.div_ceil(lanes));
+    (columns * u64::from(size.y) / SUBGROUPS).clamp(ROWS[0], ROWS[1]) as u32
+}
+
+fn layout_of(
+    kernels: &[(Layout, Pipeline<ssim::Kernel>)],
+    size: UVec2,
+) -> &(Layout, Pipeline<ssim::Kernel>) {
+    let first = kernels.iter().position(|(layout, _)| layout.fits(size));
+    &kernels[first.unwrap_or(kernels.len() - 1)]
+}
+
+impl Ssim {
+    /// Builds the kernels; `adds`: the gradient is added to that of earlier terms.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel.
+    pub(super) fn new(gpu: &Gpu, weight: f64, adds: bool) -> Result<Self> {
+        let kernel = |layout| {
+            let Layout { columns, rows, alignment } = layout;
+            Ok((layout, gpu.pipeline(&ssim::Constants { columns, rows, alignment, adds })?))
+        };
+        let kernels = match gpu.properties().is_cpu {
+            true => Kernels::One(LAYOUTS.into_iter().map(kernel).collect::<Result<_>>()?),
+            false => Kernels::Two {
+                forward: gpu.pipeline(&ssim_forward::Constants::default())?,
+                backward: gpu.pipeline(&ssim_backward::Constants { adds })?,
+                derivatives: [
+                    gpu.uninit("d_mean", 0)?,
+                    gpu.uninit("d_square", 0)?,
+                    gpu.uninit("d_product", 0)?,
+                ],
+                arrivals: gpu.zeros("ssim_arrivals", 1)?,
+            },
+        };
+        Ok(Self { weight, lanes: gpu.properties().subgroup_size, kernels })
+    }
+
+    /// Allocates scratch memory for views of up to `values` values; it never shrinks.
+    ///
+    /// # Errors
+    /// The device is out of memory.
+    pub(super) fn reserve(&mut self, gpu: &Gpu, values: u32) -> Result<()> {
+        let Kernels::Two { derivatives, .. } = &mut self.kernels else { return Ok(()) };
+        for buffer in derivatives.iter_mut().filter(|buffer| buffer.len() < values as usize) {
+            *buffer = gpu.uninit(buffer.name(), values as usize)?;
+        }
+        Ok(())
+    }
+
+    /// Subgroups, one per workgroup, and so the partial sums of a view.
+    pub(super) fn workgroups(&self, size: UVec2) -> u32 {
+        3 * match &self.kernels {
+            Kernels::One(kernels) => layout_of(kernels, size).0.subgroups(size, self.lanes),
+            Kernels::Two { .. } => {
+                size.x.div_ceil(self.lanes) * size.y.div_ceil(rows(size, self.lanes))
+            }
+        }
+    }
+
+    /// Returns whether both terms are in the log already.
+    ///
+    /// # Errors
+    /// A pass exceeds what the device can launch.
+    pub(super) fn record(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        LossInputs { size, loss_region, render, target }: LossInputs<'_>,
+        d_render: &mut Buffer<f32>,
+        [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],
+        (terms, log): ([Term; 2], &mut LogSlot<'_>),
+    ) -> Result<bool> {
+        let strips = self.workgroups(size);
+        let threads = Threads::Workgroups([strips, 1, 1]);
+        let mean_scale = 1.0 / f64::from(loss_region.value_count());
+        let l1_scale = ((1.0 - self.weight) * mean_scale) as f32;
+        let ssim_scale = (self.weight * mean_scale) as f32;
+        let (UVec2 { x: width, y: height }, rows) = (size, rows(size, self.lanes));
+        let (loss_begin, loss_end) = (loss_region.origin, loss_region.end());
+        let (forward, backward, [d_mean, d_square, d_product], arrivals) = match &mut self.kernels {
+            Kernels::One(kernels) => {
+                pass.dispatch(
+                    &layout_of(kernels, size).1,
+                    &ssim::Params { width, height, loss_begin, loss_end, l1_scale, ssim_scale },
+                    ssim::Buffers {
+                        render: render.slice(),
+                        target: target.slice(),
+                        d_render: d_render.slice_mut(),
+                        l1_partials: l1_partials.slice_mut(),
+                        ssim_partials: ssim_partials.slice_mut(),
+                    },
+                    threads,
+                )?;
+                return Ok(false);
+            }
+            Kernels::Two { forward, backward, derivatives, arrivals } => {
+                (forward, backward, derivatives, arrivals)
+            }
+        };
+        pass.dispatch(
+            forward,
+            &ssim_forward::Params { width, height, rows, loss_begin, loss_end },
+            ssim_forward::Buffers {
+                render: render.slice(),
+                target: target.slice(),
+                d_mean: d_mean.slice_mut(),
+                d_square: d_square.slice_mut(),
+                d_product: d_product.slice_mut(),
+                partials: ssim_partials.slice_mut(),
+            },
+            threads,
+        )?;
+        let LogRow { slot, term_count, log, statuses, status } = log.row();
+        pass.dispatch(
+            backward,
+            &ssim_backward::Params {
+                width,
+                height,
+                rows,
+                loss_begin,
+                loss_end,
+                l1_scale,
+                ssim_scale,
+                mean_scale: mean_scale as f32,
+                strips,
+                slot,
+                term_count,
+                terms: terms.map(|term| term.index() as u32).into(),
+            },
+            ssim_backward::Buffers {
+                render: render.slice(),
+                target: target.slice(),
+                d_mean: d_mean.slice(),
+                d_square: d_square.slice(),
+                d_product: d_product.slice(),
+                d_render: d_render.slice_mut(),
+                l1_partials: l1_partials.slice_mut(),
+                ssim_partials: ssim_partials.slice(),
+                log,
+                statuses,
+                status,
+                arrivals: arrivals.slice_mut(),
+            },
+            threads,
+        )?;
+        Ok(true)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_larger_view_has_longer_strips_on_a_gpu() {
+        let rows = |width, height| rows(UVec2::new(width, height), 32);
+        assert_eq!(
+            [rows(1, 1), rows(500, 375), rows(1920, 1080), rows(8000, 6000)],
+            [8, 8, 63, 128]
+        );
+    }
+}
