@@ -53,10 +53,10 @@ run() {
         shift
         own=("$libraries"/ld-linux-*.so.2 --library-path "$libraries" ${shim:+--preload "$root/$shim.so"} "$program")
     fi
-    # No layer, no cache that has the results of before, and no tiles but the built-in ones.
+    # No layer, no cache that has the results of before, no tiles but the built-in ones, and no test of the results.
     env "${set[@]}" NULL_DEVICE_DRIVER="$libraries/libvulkan_$driver.so" VK_DRIVER_FILES="$work/null-device.json" \
         VK_ICD_FILENAMES="$work/null-device.json" VK_LAYER_PATH=/nonexistent XDG_CACHE_HOME="$work/cache" \
-        MESA_SHADER_CACHE_DISABLE=true NIGHTSPLAT_TUNE=off "${own[@]}" "$@"
+        MESA_SHADER_CACHE_DISABLE=true NIGHTSPLAT_TUNE=off NIGHTSPLAT_DEVICE_TEST=off "${own[@]}" "$@"
 }
 
 # Compiles what the bench uses, and what else training does; the matrices of the half precision only some devices have.
