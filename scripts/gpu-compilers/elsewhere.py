@@ -5,10 +5,12 @@
 
 STATISTICS is the file of NIGHTSPLAT_STATISTICS, and KERNELS the folder of NULL_DEVICE_KERNELS, of the same run: both
 have a line for each pipeline, in the same order. COMMAND is compile.c, built and run for that driver. A kernel that it
-does not compile within MOST_SECONDS is named on standard error, and its line has no numbers.
+does not compile within MOST_SECONDS of the processor is named on standard error, and its line has no numbers.
 """
 
 import json
+import resource
+import signal
 import subprocess
 import sys
 
@@ -22,13 +24,19 @@ NUMBERS = {
 }
 
 
+def limit():
+    resource.setrlimit(resource.RLIMIT_CPU, (MOST_SECONDS, MOST_SECONDS))
+
+
 def compiled(command, folder, line):
     """The device, and the statistics of a kernel. An emulator that crashes is tried again."""
     for _ in range(ATTEMPTS):
-        done = subprocess.run(command, cwd=folder, input=line, capture_output=True, text=True, timeout=MOST_SECONDS)
-        said = done.stdout.splitlines()
-        if len(said) == 2:
-            return json.loads(said[0]), json.loads(said[1])
+        done = subprocess.run(command, cwd=folder, input=line, capture_output=True, text=True, preexec_fn=limit)
+        printed = done.stdout.splitlines()
+        if len(printed) == 2:
+            return json.loads(printed[0]), json.loads(printed[1])
+        if done.returncode in (-signal.SIGKILL, -signal.SIGXCPU):
+            raise RuntimeError(f"{MOST_SECONDS} s do not suffice")
     raise RuntimeError(f"exit code {done.returncode}")
 
 
@@ -43,7 +51,7 @@ def main():
         try:
             device, told = compiled(command, folder, line)
             numbers = {name: sum(told[part] for part in parts) for name, parts in NUMBERS.items()}
-        except (RuntimeError, subprocess.TimeoutExpired) as problem:
+        except RuntimeError as problem:
             print(f"{known['kernel']} ({known['constants']}): {problem}", file=sys.stderr)
         lines.append({name: known[name] for name in ("subgroup_size", "kernel", "constants")} | numbers)
     for line in lines:
