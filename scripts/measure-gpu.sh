@@ -28,7 +28,8 @@
 #     growth.txt        how time and memory grow
 #
 # Variables and their defaults. pack: PROFILE=release, TESTS (the test targets; all). run: TIME=570 (seconds), and
-# BENCH, TUNE, MANY, SMALL, STEPS, CHECKED, EQUAL, LOM (arguments of the steps).
+# BENCH, TUNE, MANY, SMALL, CHECKED, LOM (arguments of the steps), STEPS=512 (of the steady ones), EQUAL=300 (of the
+# runs that must be equal).
 set -euo pipefail
 
 MAX_BYTES=64000000
@@ -189,7 +190,7 @@ equal() {
     local name=$1 run=$work/runs/$1
     shift
     step "$name" hashes.log 20 \
-        "$work/nightsplat" train "$work"/scene/* --out "$run" --preset lom --curve ap3 $EQUAL "$@"
+        "$work/nightsplat" train "$work"/scene/* --out "$run" --preset lom --curve ap3 --steps "$EQUAL" "$@"
     if [ -e "$run/model.ply" ]; then
         echo "$(sha256sum < "$run/model.ply" | cut -c 1-16) $name" >> "$out/hashes.txt"
     fi
@@ -231,11 +232,12 @@ members() {
 
 # Ten lines of results.
 results() {
-    local copy hashes small many name ms
+    local copy hashes small many name ms file
     copy=$(members bench.json ceilings | sed -n 's/copy_gb_per_s //p')
     small=$(members steady-small.json steady) many=$(members steady-many.json steady)
     hashes=$(cut -d ' ' -f 1 "$out/hashes.txt" 2> /dev/null | sort -u | grep -c . || true)
-    echo "device: $(value bench.json device), $(value bench.json driver)"
+    for file in bench.json many.json checked.json; do [ -z "$(value "$file" device)" ] || break; done
+    echo "device: $(value "$file" device), $(value "$file" driver)"
     echo "ceilings: $(members bench.json ceilings | tr '\n' ' ')"
     echo "step, ms: 20 000 at 512x384: $(value bench.json step_ms)"
     echo "step, ms: 50 000 at 500x375: $(tr '\n' ' ' <<< "$small")"
@@ -245,10 +247,11 @@ results() {
             '$1 == name { printf "%s %.3f ms, %.0f %% of the copy; ", name, ms, copy > 0 ? 100 * $2 / copy : 0 }'
     done
     echo
-    echo "tiles: $(tr -d ' \n' < "$work/tiles.json" 2> /dev/null | sed 's/.*"tiles"://')"
+    echo "tiles: $(cat "$work/tiles.json" 2> /dev/null | tr -d ' \n' | sed 's/.*"tiles"://')"
     echo "$(value checked.json passes); largest error / bound: $(members checked.json errors | head -n 1)"
-    echo "disagreeing: $(sed -n '/"disagreeing": \[/,/\]/p' "$out/checked.json" 2> /dev/null | tr -d ' \n')"
-    echo "models of $(grep -c . "$out/hashes.txt" 2> /dev/null || true) equal runs: $hashes different"
+    echo "$(awk '/"disagreeing": \[/ { on = 1 } on { print } on && /\]/ { exit }' "$out/checked.json" 2> /dev/null |
+        tr -d ' \n')"
+    echo "models: $(grep -c . "$out/hashes.txt" 2> /dev/null || true) runs, $hashes distinct"
     echo "validation: $(grep -c 'Validation Error\|SYNC-HAZARD' "$out/validation.txt" 2> /dev/null || true) messages;" \
         "tests: $(tail -n 1 "$out/tests.txt" 2> /dev/null || true)"
 }
@@ -260,12 +263,12 @@ run() {
         shift
         local little='--gaussians 500 --width 128 --height 96 --repeats 1'
         : "${BENCH:=$little}" "${SMALL:=$little}" "${CHECKED:=$little}" "${MANY:=$little}" "${TUNE:=$little}"
-        : "${STEPS:=4}" "${EQUAL:=--steps 10 --downscale 8}" "${LOM:=--steps 10 --downscale 8}"
+        : "${STEPS:=4}" "${EQUAL:=10}" "${LOM:=--steps 10 --downscale 8}"
     fi
     local size many=${MANY:---gaussians 1000000 --width 1920 --height 1080}
     local small=${SMALL:---gaussians 50000 --width 500 --height 375} warm=2
     [ -z "$software" ] || warm=0
-    : "${TUNE:=--gaussians 100000}" "${STEPS:=512}" "${EQUAL:=--steps 300}"
+    : "${TUNE:=--gaussians 100000}" "${STEPS:=512}" "${EQUAL:=300}"
     end=$((SECONDS + ${TIME:-570}))
     mkdir -p "$1"
     out=$(realpath "$1") work=$(mktemp -d) placed=() clocks=
@@ -292,7 +295,7 @@ run() {
 
     # What counts most comes first.
     NIGHTSPLAT_STATISTICS=$out/pipelines.jsonl step pipelines pipelines.log 30 \
-        "$nightsplat" bench --unchecked --repeats 1 --json ${BENCH:-}
+        "$nightsplat" bench --unchecked --json ${BENCH:-}
     step bench bench.json 30 "$nightsplat" bench --unchecked --json --ceilings --warm $warm ${BENCH:-}
     step many many.json 30 "$nightsplat" bench --unchecked --json --warm $warm $many
     NIGHTSPLAT_TUNE=$work/tiles.json step tune tune.json 100 "$nightsplat" bench --tune --json $TUNE
@@ -315,7 +318,7 @@ run() {
     VK_INSTANCE_LAYERS=VK_LAYER_KHRONOS_validation \
         VK_LAYER_ENABLES=VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT \
         step validation validation.txt 20 "$nightsplat" train "$work"/scene/* --out "$work/runs/validated" \
-        --preset lom --curve ap3 $EQUAL --steps 2
+        --preset lom --curve ap3 --steps 2
     NIGHTSPLAT_TUNE=off run_tests 120
     [ -z "${GSPLAT:-}" ] || PYTHONPATH=$GSPLAT step gsplat gsplat.json 50 \
         python3 "$work/source/scripts/gsplat-rasteriser.py" --ply "$work/bench.ply"

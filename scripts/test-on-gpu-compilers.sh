@@ -6,7 +6,7 @@
 #
 # Without an architecture: navi21 and vega20, 32 and 64 lanes, by the RADV that is installed. By the drivers that
 # scripts/gpu-compilers/drivers.sh unpacks: navi31 and gfx1201 (AMD), sm80 and sm90 (NVIDIA), dg2-8, dg2-16 and dg2-32
-# (Intel, of which the number is the lanes).
+# (Intel, of which the number is the lanes), and adreno730 (Qualcomm, by an emulated processor, which takes minutes).
 #
 # A refused kernel and a new spill are failures, and so is a kernel that is not in the list, or no longer compiled; a
 # tenth more instructions is a warning. --write writes the lists. NIGHTSPLAT is the command (default: the dev build).
@@ -35,7 +35,7 @@ printf '{"file_format_version": "1.0.0", "ICD": {"library_path": "%s", "api_vers
 
 # run ARCHITECTURE COMMAND..: on the null device with the compiler of the architecture.
 run() {
-    local architecture=$1 root=$work/trixie program driver shim='' own=() set=()
+    local architecture=$1 root=$work/trixie-amd64 program driver shim='' own=() set=()
     shift
     case $architecture in
         navi21 | vega20) root='' driver=radeon set=(RADV_FORCE_FAMILY="${architecture^^}") ;;
@@ -69,6 +69,24 @@ compile() {
     esac
 }
 
+# The kernels of another device with 64 lanes, by Turnip, whose drivers are for another processor.
+compile_elsewhere() {
+    local root=$work/trixie-arm64 libraries=$work/trixie-arm64/usr/lib/aarch64-linux-gnu kernels=$work/kernels
+    scripts/gpu-compilers/drivers.sh arm64 || return
+    aarch64-linux-gnu-gcc -O1 -idirafter /usr/include -o "$work/compile-arm64" scripts/gpu-compilers/compile.c \
+        "$libraries/libvulkan.so.1" -Wl,--allow-shlib-undefined || return
+    printf '{"file_format_version": "1.0.0", "ICD": {"library_path": "%s", "api_version": "1.3.0"}}\n' \
+        "$libraries/libvulkan_freedreno.so" > "$work/freedreno.json"
+    rm -rf "$kernels"
+    mkdir "$kernels"
+    local lines=$NIGHTSPLAT_STATISTICS
+    NIGHTSPLAT_STATISTICS=$kernels/lines NULL_DEVICE_KERNELS=$kernels compile vega20 || return
+    scripts/gpu-compilers/elsewhere.py "$kernels/lines" "$kernels" qemu-aarch64-static \
+        -E LD_PRELOAD="$root/freedreno.so" -E FD_GPU_ID=730 -E VK_DRIVER_FILES="$work/freedreno.json" \
+        -E MESA_SHADER_CACHE_DISABLE=true "$libraries/ld-linux-aarch64.so.1" --library-path "$libraries" \
+        "$work/compile-arm64" > "$lines"
+}
+
 if [ ! -e "$work/set/masks" ]; then
     rm -rf "$work/set"
     "$nightsplat" synth "$work/set" --views 3 --width 64 --height 48 > /dev/null
@@ -79,7 +97,9 @@ status=0
 for architecture in "$@"; do
     statistics=$work/$architecture.jsonl
     rm -f "$statistics"
-    if ! NIGHTSPLAT_STATISTICS=$statistics compile "$architecture" > "$work/$architecture.log" 2>&1; then
+    compile=compile
+    [ "$architecture" != adreno730 ] || compile=compile_elsewhere
+    if ! NIGHTSPLAT_STATISTICS=$statistics "$compile" "$architecture" > "$work/$architecture.log" 2>&1; then
         tail -n 5 "$work/$architecture.log"
         echo "failed: $architecture: the kernels do not compile"
         status=1

@@ -1,12 +1,16 @@
 #!/usr/bin/env bash
-# Unpacks Mesa's Vulkan drivers of Debian 13 into target/gpu-compilers/trixie, with what they link to, and builds next
-# to them what stands in for the kernel drivers of NVIDIA's and Intel's GPUs: drm-shim, from the same version of Mesa's
-# source. Nothing is installed, and root is not needed. On Debian this takes `apt install gcc dpkg-dev libdrm-dev
+# Unpacks Mesa's Vulkan drivers of Debian 13 into target/gpu-compilers/trixie-amd64, with what they link to, and builds
+# next to them what stands in for the kernel drivers of NVIDIA's and Intel's GPUs: drm-shim, from the same version of
+# Mesa's source. Nothing is installed, and root is not needed. On Debian this takes `apt install gcc dpkg-dev libdrm-dev
 # pkg-config python3-mako xz-utils`.
+#
+# With the argument arm64: the drivers for that processor, and what stands in for Qualcomm's; `apt install
+# qemu-user-static gcc-aarch64-linux-gnu libc6-dev-arm64-cross`.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 suite=trixie
-root=$PWD/target/gpu-compilers/$suite
+processor=${1:-amd64}
+root=$PWD/target/gpu-compilers/$suite-$processor
 [ ! -e "$root/complete" ] || exit 0
 rm -rf "$root"
 mkdir -p "$root"/{apt,source}
@@ -23,7 +27,7 @@ apt() {
     apt-get -qq -o Dir::Etc::SourceList="$root/apt/sources.list" -o Dir::Etc::SourceParts="$root/apt/none" \
         -o Dir::State="$root/apt" -o Dir::State::Lists="$root/apt/lists" -o Dir::State::Status="$root/apt/status" \
         -o Dir::Cache="$root/apt" -o Debug::NoLocking=1 -o APT::Sandbox::User="$(id -un)" \
-        -o APT::Install-Recommends=0 "$@"
+        -o APT::Install-Recommends=0 -o APT::Architecture="$processor" -o APT::Architectures="$processor" "$@"
 }
 apt update
 apt --yes --download-only install mesa-vulkan-drivers libvulkan1 > /dev/null
@@ -55,7 +59,7 @@ of_chip="OF_CHIP(ga100,ga102,gh100,ad102)=($chip>=0x190?ad102:$chip>=0x180?gh100
 
 # shim NAME SOURCE..: with the parts of Mesa that both need.
 shim() {
-    local name=$1 define defines=() util=() has
+    local name=$1 compiler=gcc libdrm=-ldrm define defines=() util=() has
     shift
     for has in PTHREAD STRUCT_TIMESPEC FUNC_ATTRIBUTE_PACKED FUNC_ATTRIBUTE_CONST FUNC_ATTRIBUTE_WARN_UNUSED_RESULT \
         __BUILTIN_EXPECT __BUILTIN_UNREACHABLE ENDIAN_H LINUX_FUTEX_H DLADDR DL_ITERATE_PHDR SECURE_GETENV \
@@ -69,11 +73,20 @@ shim() {
         u_call_once u_debug u_printf u_process vma; do
         util+=("src/util/$has.c")
     done
-    gcc -O1 -w -fPIC -shared -fvisibility=hidden "${defines[@]}" -Isrc -Iinclude -Iinclude/drm-uapi -Isrc/intel \
-        -Isrc/intel/common -Isrc/intel/dev -Isrc/intel/dev/i915 -Isrc/util $(pkg-config --cflags libdrm) -Wl,-z,defs \
-        -o "$root/$name.so" src/drm-shim/{device,drm_shim}.c src/c11/impl/{threads_posix,time}.c "${util[@]}" "$@" \
-        -ldrm -ldl -lpthread -lm
+    if [ "$processor" = arm64 ]; then
+        compiler=aarch64-linux-gnu-gcc libdrm=$root/usr/lib/aarch64-linux-gnu/libdrm.so.2
+    fi
+    "$compiler" -O1 -w -fPIC -shared -fvisibility=hidden "${defines[@]}" -Isrc -Iinclude -Iinclude/drm-uapi \
+        -Isrc/intel -Isrc/intel/common -Isrc/intel/dev -Isrc/intel/dev/i915 -Isrc/util $(pkg-config --cflags libdrm) \
+        -Wl,-z,defs -o "$root/$name.so" src/drm-shim/{device,drm_shim}.c src/c11/impl/{threads_posix,time}.c \
+        "${util[@]}" "$@" "$libdrm" -ldl -lpthread -lm
 }
+if [ "$processor" = arm64 ]; then
+    shim freedreno src/freedreno/drm-shim/freedreno_noop.c
+    rm -rf "$root"/{apt,source}
+    touch "$root/complete"
+    exit 0
+fi
 shim nouveau src/nouveau/drm-shim/nouveau_noop.c
 intel=src/intel/dev
 shim intel src/intel/tools/intel_noop_drm_shim.c $intel/intel_{device_info,device_info_serialize_gen}.c \

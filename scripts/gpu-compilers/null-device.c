@@ -3,7 +3,9 @@
 // a submission is done at once. So a program runs to its end while the real driver compiles all of its pipelines.
 //
 // NULL_DEVICE_DRIVER is the path of the real driver, which must be able to open its device: Mesa's can, by
-// RADV_FORCE_FAMILY or with a kernel interface that is preloaded.
+// RADV_FORCE_FAMILY or with a kernel interface that is preloaded. Each pipeline whose statistics are asked for is
+// written to the folder NULL_DEVICE_KERNELS, if that is set: N.spv, and a line of the file `list` with N.spv, the
+// required subgroup size, and its specialization constants as id=bits.
 
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -191,6 +193,71 @@ static VkResult query_results(VkDevice device, VkQueryPool pool, uint32_t first,
 }
 
 // ---------------------------------------------------------------------------
+// Pipelines for other compilers. A module is written when its pipeline is created, from a copy of its code.
+
+static PFN_vkCreateShaderModule real_create_module;
+static PFN_vkCreateComputePipelines real_create_pipelines;
+static struct {
+    VkShaderModule module;
+    size_t size;
+    void *code;
+} latest[64];
+static unsigned modules;
+
+static VkResult create_module(VkDevice device, const VkShaderModuleCreateInfo *info,
+                              const VkAllocationCallbacks *callbacks, VkShaderModule *module) {
+    VkResult result = real_create_module(device, info, callbacks, module);
+    unsigned at = __atomic_fetch_add(&modules, 1, __ATOMIC_RELAXED) % (sizeof latest / sizeof *latest);
+    if (result == VK_SUCCESS && getenv("NULL_DEVICE_KERNELS")) {
+        latest[at].module = *module;
+        latest[at].size = info->codeSize;
+        latest[at].code = realloc(latest[at].code, info->codeSize);
+        memcpy(latest[at].code, info->pCode, info->codeSize);
+    }
+    return result;
+}
+
+static void write_pipeline(const char *folder, const VkPipelineShaderStageCreateInfo *stage) {
+    static unsigned number;
+    char path[4096];
+    snprintf(path, sizeof path, "%s/%u.spv", folder, number);
+    FILE *file = fopen(path, "wb");
+    for (size_t i = 0; file && i < sizeof latest / sizeof *latest; i++)
+        if (latest[i].module == stage->module) {
+            rewind(file);
+            fwrite(latest[i].code, 1, latest[i].size, file);
+        }
+    if (file) fclose(file);
+    snprintf(path, sizeof path, "%s/list", folder);
+    FILE *list = fopen(path, "a");
+    if (!list) return;
+    uint32_t lanes = 0;
+    for (const VkBaseInStructure *next = stage->pNext; next; next = next->pNext)
+        if (next->sType == VK_STRUCTURE_TYPE_PIPELINE_SHADER_STAGE_REQUIRED_SUBGROUP_SIZE_CREATE_INFO)
+            lanes = ((const VkPipelineShaderStageRequiredSubgroupSizeCreateInfo *)next)->requiredSubgroupSize;
+    // A device of one size is not told it.
+    if (!lanes && stage->flags & VK_PIPELINE_SHADER_STAGE_CREATE_REQUIRE_FULL_SUBGROUPS_BIT) lanes = 64;
+    fprintf(list, "%u.spv %u", number++, lanes);
+    const VkSpecializationInfo *constants = stage->pSpecializationInfo;
+    for (uint32_t i = 0; constants && i < constants->mapEntryCount; i++) {
+        uint32_t bits;
+        memcpy(&bits, (const char *)constants->pData + constants->pMapEntries[i].offset, sizeof bits);
+        fprintf(list, " %u=%u", constants->pMapEntries[i].constantID, bits);
+    }
+    fprintf(list, "\n");
+    fclose(list);
+}
+
+static VkResult create_pipelines(VkDevice device, VkPipelineCache cache, uint32_t count,
+                                 const VkComputePipelineCreateInfo *infos, const VkAllocationCallbacks *callbacks,
+                                 VkPipeline *pipelines) {
+    const char *folder = getenv("NULL_DEVICE_KERNELS");
+    for (uint32_t i = 0; folder && i < count; i++)
+        if (infos[i].flags & VK_PIPELINE_CREATE_CAPTURE_STATISTICS_BIT_KHR) write_pipeline(folder, &infos[i].stage);
+    return real_create_pipelines(device, cache, count, infos, callbacks, pipelines);
+}
+
+// ---------------------------------------------------------------------------
 // The functions
 
 static PFN_vkVoidFunction device_proc(VkDevice device, const char *name);
@@ -201,6 +268,8 @@ static const struct {
 } OURS[] = {
 #define FUNCTION(name, function) {"vk" #name, (PFN_vkVoidFunction)function}
     FUNCTION(GetDeviceProcAddr, device_proc),
+    FUNCTION(CreateShaderModule, create_module),
+    FUNCTION(CreateComputePipelines, create_pipelines),
     FUNCTION(GetPhysicalDeviceMemoryProperties, memory_properties),
     FUNCTION(GetPhysicalDeviceMemoryProperties2, memory_properties2),
     FUNCTION(AllocateMemory, allocate),
@@ -244,6 +313,10 @@ static PFN_vkVoidFunction ours(const char *name, PFN_vkVoidFunction real) {
             if (OURS[i].function == (PFN_vkVoidFunction)device_proc) real_device_proc = (PFN_vkGetDeviceProcAddr)real;
             if (OURS[i].function == (PFN_vkVoidFunction)memory_properties2)
                 real_memory_properties2 = (PFN_vkGetPhysicalDeviceMemoryProperties2)real;
+            if (OURS[i].function == (PFN_vkVoidFunction)create_module)
+                real_create_module = (PFN_vkCreateShaderModule)real;
+            if (OURS[i].function == (PFN_vkVoidFunction)create_pipelines)
+                real_create_pipelines = (PFN_vkCreateComputePipelines)real;
             return OURS[i].function;
         }
     }

@@ -27,9 +27,9 @@ use steady::Steady;
 
 /// Check a training step against the CPU references, then time its kernels and stages.
 ///
-/// The scene is synthetic and always the same. A disagreement is an error once everything is printed. With --tune, times
-/// the rasteriser with every tile size that the device supports, and stores the fastest in the user's cache folder, where
-/// training finds it unless `NIGHTSPLAT_TUNE=off`.
+/// The scene is synthetic and always the same. A disagreement is an error once everything is printed. With --tune,
+/// times the rasteriser with every tile size that the device supports, and stores the fastest in the user's cache
+/// folder, where training finds it unless `NIGHTSPLAT_TUNE=off`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct BenchArgs {
     /// Print JSON instead of tables

@@ -19,6 +19,7 @@ mod doctor;
 mod live;
 mod progress;
 mod refusals;
+mod statistics;
 mod stress;
 mod sweep;
 mod tone_command;
