@@ -23,7 +23,7 @@ const SHOWN: usize = 12;
 /// Cameras whose poses differ by more, relative to their distance from the origin, are of different datasets.
 const POSE_ERROR: f64 = 1e-6;
 
-/// What of a run is compared.
+/// A run that is compared.
 #[derive(Debug)]
 struct Compared {
     name: String,

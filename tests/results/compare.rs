@@ -12,9 +12,9 @@ fn runs_of_one_dataset_are_compared_and_runs_of_two_are_refused() {
     succeed(&place.train("a", "--steps 10"));
     succeed(&place.train("b", "--steps 40"));
     let page = path("page.html");
-    let said = succeed(&format!("compare {} {} --report {page}", path("a"), path("b")));
+    let stdout = succeed(&format!("compare {} {} --report {page}", path("a"), path("b")));
     for part in ["PSNR of a, dB", "b gains", "steps: 10 | 40"] {
-        assert!(said.contains(part), "no `{part}` in: {said}");
+        assert!(stdout.contains(part), "no `{part}` in: {stdout}");
     }
     let html = fs::read_to_string(&page).unwrap();
     assert!(html.contains("Comparison of a, b") && html.contains("data:image/png"));
@@ -69,9 +69,9 @@ fn a_sweep_over_two_datasets_writes_the_table_that_papers_print() {
         path("other"),
         path("sweep")
     );
-    let said = succeed(&sweep);
+    let stdout = succeed(&sweep);
     let table = fs::read_to_string(place.path("sweep/scenes.md")).unwrap();
-    assert!(said.contains("| PSNR / SSIM | set | other | mean |"), "{said}");
+    assert!(stdout.contains("| PSNR / SSIM | set | other | mean |"), "{stdout}");
     assert_eq!(table.lines().count(), 4, "{table}");
     let csv = fs::read_to_string(place.path("sweep/scenes.csv")).unwrap();
     assert_eq!(csv.lines().count(), 7, "{csv}");

@@ -117,8 +117,8 @@ fn a_crop_keeps_what_is_inside_and_a_merge_puts_both_halves_together() {
         path("right.ply"),
         path("both.ply")
     );
-    let said = succeed(&merge);
-    assert!(said.contains(&format!("{} Gaussians added to {}", right.count, left.count)), "{said}");
+    let stdout = succeed(&merge);
+    assert!(stdout.contains(&format!("{} Gaussians added to {}", right.count, left.count)), "{stdout}");
     let both = Model::load(place.path("both.ply")).unwrap();
     let [whole, joined] = [&model, &both].map(|model| render(model, &camera(DQuat::IDENTITY)));
     let error = difference(&whole, &joined);
@@ -234,11 +234,11 @@ fn a_table_of_cameras_in_metres_scales_a_model_and_cameras_crop_it_wherever_it_i
     let edit = |options: &str, out: &str| {
         run(&format!("edit {} {options} --out {}", path("run"), path(out)), 0)
     };
-    let (said, _) = edit(&format!("--scale {}", path("metres.csv")), "metres.ply");
+    let (stdout, _) = edit(&format!("--scale {}", path("metres.csv")), "metres.ply");
     let own = ply::load(place.path("run/model.ply")).unwrap();
     let metres = ply::load(place.path("metres.ply")).unwrap();
     for (own, metres) in own.means().iter().zip(metres.means()) {
-        assert!((*own * 2.5).distance(*metres) < 1e-4, "{said}: {own} {metres}");
+        assert!((*own * 2.5).distance(*metres) < 1e-4, "{stdout}: {own} {metres}");
     }
     // Distances of the table are those of the dataset, whatever the model was scaled by before.
     edit(&format!("--scale 7 --scale {}", path("metres.csv")), "again.ply");

@@ -52,14 +52,14 @@ fn planted_floaters_are_removed_and_a_clean_model_keeps_its_gaussians() {
     succeed(&place.train("run", "--steps 400"));
     let clean = ply::load(place.path("run/model.ply")).unwrap();
 
-    let said = succeed(&format!("edit {} --floaters --out {}", path("run"), path("clean.ply")));
+    let stdout = succeed(&format!("edit {} --floaters --out {}", path("run"), path("clean.ply")));
     let kept = ply::load(place.path("clean.ply")).unwrap();
-    assert!(kept.count * 100 >= clean.count * 99, "{said}");
-    let psnr = |said: &str, after: &str| -> f64 {
-        let (before, _) = said.split_once(after).unwrap();
+    assert!(kept.count * 100 >= clean.count * 99, "{stdout}");
+    let psnr = |stdout: &str, after: &str| -> f64 {
+        let (before, _) = stdout.split_once(after).unwrap();
         before.split([' ', '(']).rfind(|word| word.parse::<f64>().is_ok()).unwrap().parse().unwrap()
     };
-    let own = psnr(&said, " dB before");
+    let own = psnr(&stdout, " dB before");
 
     // The same run with floaters in its model.
     let listing = fs::read_to_string(place.path("set/transforms_train.json")).unwrap();
@@ -72,19 +72,19 @@ fn planted_floaters_are_removed_and_a_clean_model_keeps_its_gaussians() {
         path("both.ply")
     ));
     fs::copy(place.path("both.ply"), place.path("run/model.ply")).unwrap();
-    let said = succeed(&format!("edit {} --floaters --out {}", path("run"), path("found.ply")));
+    let stdout = succeed(&format!("edit {} --floaters --out {}", path("run"), path("found.ply")));
     let found = ply::load(place.path("found.ply")).unwrap();
     let place_of = |mean: &Vec3| mean.to_array().map(f32::to_bits);
     let left: BTreeSet<[u32; 3]> = found.means().iter().map(place_of).collect();
     let missed = planted.means().iter().filter(|mean| left.contains(&place_of(mean))).count();
-    assert!(missed <= 5, "{missed} of 100: {said}");
-    assert!(found.count * 100 >= clean.count * 99, "{said}");
-    let (with, without) = (psnr(&said, " dB before"), psnr(&said, " dB after"));
-    assert!(with < own - 1.0 && without >= own - 0.02, "{own}: {said}");
+    assert!(missed <= 5, "{missed} of 100: {stdout}");
+    assert!(found.count * 100 >= clean.count * 99, "{stdout}");
+    let (with, without) = (psnr(&stdout, " dB before"), psnr(&stdout, " dB after"));
+    assert!(with < own - 1.0 && without >= own - 0.02, "{own}: {stdout}");
 
     // Wherever the model is.
     let moved = "--rotate 1,2,3:40 --scale 3 --move 5,0,0 --floaters";
-    let said = succeed(&format!("edit {} {moved} --out {}", path("run"), path("moved.ply")));
+    let stdout = succeed(&format!("edit {} {moved} --out {}", path("run"), path("moved.ply")));
     let moved = ply::load(place.path("moved.ply")).unwrap();
-    assert!(moved.count.abs_diff(found.count) <= 2, "{said}");
+    assert!(moved.count.abs_diff(found.count) <= 2, "{stdout}");
 }
