@@ -147,17 +147,17 @@ mod tests {
             has_uniform_subgroup_control_flow: true,
             ..Properties::of_a_test()
         };
-        assert_eq!(gpu_tile(&gpu, Some(500 * 375)), shared);
-        assert_eq!(gpu_tile(&gpu, Some(1920 * 1080)), [16, 16].into());
-        assert_eq!(gpu_tile(&gpu, None), [16, 16].into());
+        assert_eq!(gpu_tile(&gpu, 3, Some(500 * 375)), shared);
+        assert_eq!(gpu_tile(&gpu, 3, Some(1920 * 1080)), [16, 16].into());
+        assert_eq!(gpu_tile(&gpu, 3, None), [16, 16].into());
         // A part would have fewer pixels than a subgroup has lanes.
         let wide = Properties { subgroup_size: 128, ..gpu.clone() };
-        assert_eq!(gpu_tile(&wide, Some(500 * 375)), [16, 16].into());
+        assert_eq!(gpu_tile(&wide, 3, Some(500 * 375)), [16, 16].into());
         let parting = Properties { has_uniform_subgroup_control_flow: false, ..gpu.clone() };
-        assert_eq!(gpu_tile(&parting, Some(500 * 375)), [16, 16].into());
+        assert_eq!(gpu_tile(&parting, 3, Some(500 * 375)), [16, 16].into());
         let narrow = Properties { subgroup_size: 16, ..gpu };
-        assert_eq!(gpu_tile(&narrow, None), shared);
+        assert_eq!(gpu_tile(&narrow, 3, None), shared);
         let both = Properties { subgroup_size: 16, ..parting };
-        assert_eq!(gpu_tile(&both, None), [8, 8].into());
+        assert_eq!(gpu_tile(&both, 3, None), [8, 8].into());
     }
 }
