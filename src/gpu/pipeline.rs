@@ -6,7 +6,8 @@ use std::sync::Arc;
 use ash::vk;
 
 use super::{
-    Gpu, Interface, Kernel, Properties, Retired, Shared, Statistic, reconvergence, spirv, statistics,
+    Gpu, Interface, Kernel, Properties, Retired, Shared, Statistic, reconvergence, spirv,
+    statistics,
 };
 use crate::{Error, Result};
 
