@@ -4,11 +4,11 @@
 #include "kernel.glsl"
 
 //! The gradient of (1 - w) mean|a - b| + w (1 - mean SSIM) with respect to a render a, from the derivatives that
-//! `ssim_forward` writes, and the means of |a - b| and SSIM into the step's slot of the log: the second of two passes that
-//! together are `ssim` and `loss_log`.
+//! `ssim_forward` writes, and the means of |a - b| and SSIM into the step's slot of the log: the second of two passes
+//! that together are `ssim` and `loss_log`.
 //!
-//! A subgroup blurs the derivatives of a strip (include/ssim_strip.glsl). The last one to finish adds up the partial sums
-//! of all, in a fixed order. The first term of a step writes the gradient,
+//! A subgroup blurs the derivatives of a strip (include/ssim_strip.glsl). The last one to finish adds up the partial
+//! sums of all, in a fixed order. The first term of a step writes the gradient,
 //! the others add to it. Reference: `src/reference/ssim_backward.rs`.
 
 layout(local_size_x_id = 100) in;

@@ -186,7 +186,7 @@ pub struct Adam {
 
 const DEGREES: usize = MAX_SH_DEGREE as usize + 1;
 
-/// A step of Adam over whole Gaussians whose gradients are of [`GradientKind::Colors`](crate::splats::batches::GradientKind).
+/// A step of Adam over whole Gaussians, whose gradients above SH degree 0 are those of colours.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct GaussianStep<'a> {
     /// The step, from 1.

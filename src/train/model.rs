@@ -147,8 +147,8 @@ impl Model {
         self.gaussians.layout.capacity
     }
 
-    /// Records a step of Adam over the columns of the SH degree in use, the second of the step's degrees, with gradients
-    /// of this kind. Nothing changes while the first element of its status is not zero.
+    /// Records a step of Adam over the columns of the SH degree in use, the second of the step's degrees, with
+    /// gradients of this kind. Nothing changes while the first element of its status is not zero.
     ///
     /// # Errors
     /// A pass exceeds the device's launch limits.

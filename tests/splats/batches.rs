@@ -107,6 +107,7 @@ fn config() -> TrainConfig {
     config.density.gradient_threshold = 1e-6;
     // Small Gaussians, which intersect few tiles: a binding holds the intersections of all of them on each device.
     config.start.scale = 0.1;
+    config.tile = Some([16, 16].into());
     config
 }
 
@@ -166,7 +167,7 @@ fn training_as_on_a_gpu_gives_the_bits_of_training_as_on_a_cpu() {
         (StorageFormat::Half, StorageFormat::Single),
         (StorageFormat::Single, StorageFormat::Half),
     ] {
-        let mut config = TrainConfig { ssim_weight: 0.0, tile: Some([16, 8].into()), ..config() };
+        let mut config = TrainConfig { ssim_weight: 0.0, ..config() };
         (config.precision.rest, config.precision.moments) = (rest, moments);
         let train = |gpu: &Gpu| {
             let mut trainer = Trainer::new(gpu, config.clone(), &dataset).unwrap();
