@@ -35,8 +35,10 @@ pub(crate) fn compile(out_dir: &Path) {
     let names: Vec<&String> = names.iter().collect();
     let names = format!("/// Every kernel, by name.\npub const NAMES: &[&str] = &{names:?};\n");
     let all = format!(
-        "/// Every kernel and the bits of its default constants.
-pub const ALL: &[(&gpu::Interface, fn() -> Vec<(u32, u32)>)] = &[\n{all}];\n"
+        "/// The ids of a kernel's constants and the bits of their defaults.
+pub type Defaults = fn() -> Vec<(u32, u32)>;
+/// Every kernel.
+pub const ALL: &[(&gpu::Interface, Defaults)] = &[\n{all}];\n"
     );
     let kernels = structs.write(&text) + &glsl::include_modules() + &names + &all + &kernels;
     fs::write(out_dir.join("kernels.rs"), kernels).expect("OUT_DIR is ours");

@@ -7,7 +7,8 @@ Trains a small synthetic set, opens the page from disk at the size of its views 
 more for every view. Turns the background grey by its key and black again by its control: grey must show where the
 model is empty, and not where it is opaque. Shows the other layers, and the difference to a photograph; touches move the
 camera. Opens the page of a training under way: a new model must be shown within two seconds of its checkpoint, and the
-page pauses, continues and stops the training. No console message may appear. Then opens the page in a browser without
+page pauses, continues and stops the training. Edits the model in the page: `edit` with the saved list, rendered, must be
+the page's picture, and so must a keyframe, rendered by `render --path`. No console message may appear. Then opens the page in a browser without
 WebGL, which it must report. Needs Python and Chromium, which it controls by the DevTools protocol through a pipe;
 without Chromium it prints `not run`.
 """
@@ -219,11 +220,11 @@ MEAN = """(() => {
 BOX = "(() => { const b = canvas.getBoundingClientRect(); return [b.x, b.y, b.width, b.height]; })()"
 
 
-def select(browser, control, value):
+def select(browser, control, value, event="change"):
     browser.evaluate(f"""(() => {{
       const control = document.getElementById('{control}');
       if (control.type === 'checkbox') control.checked = {json.dumps(value)}; else control.value = {json.dumps(value)};
-      control.dispatchEvent(new Event('change'));
+      control.dispatchEvent(new Event('{event}'));
     }})()""")
     browser.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done())))")
     browser.settle()
@@ -266,6 +267,51 @@ def touch(browser):
     browser.settle()
     is_right = browser.evaluate(free) and browser.evaluate(MEAN) != before
     print(f"{'ok' if is_right else 'BAD':3} touch moves the camera")
+    return is_right
+
+
+def psnr(browser, picture):
+    """Of the canvas against an image file, dB."""
+    png = "data:image/png;base64," + base64.b64encode(picture.read_bytes()).decode()
+    return browser.evaluate(COMPARE.replace("PNG", png))
+
+
+def drag(browser, *places):
+    """Drags the mouse between places on the canvas, as shares of its size."""
+    box = browser.evaluate(BOX)
+    kinds = ["mousePressed"] + ["mouseMoved"] * (len(places) - 1)
+    for kind, (x, y) in zip(kinds, places):
+        at = {"x": box[0] + x * box[2], "y": box[1] + y * box[3]}
+        browser.call("Input.dispatchMouseEvent", type=kind, button="left", buttons=1, clickCount=1, **at)
+    browser.call("Input.dispatchMouseEvent", type="mouseReleased", button="left", clickCount=1, **at)
+    browser.settle()
+
+
+def edits(browser, run, page, folder, size):
+    """What is edited in the page is what `edit` makes of the saved list, and a saved keyframe is what `render` shows."""
+    browser.open(page.as_uri())
+    browser.fit_canvas(*size)
+    before = browser.evaluate(MEAN)
+    select(browser, "tool", "brush", "input")
+    drag(browser, (0.7, 0.4), (0.8, 0.5), (0.9, 0.6))
+    select(browser, "tool", "sphere", "input")
+    select(browser, "sizeX", "0.4", "input")
+    browser.evaluate("document.getElementById('apply').click()")
+    browser.evaluate("document.getElementById('keyframe').click()")
+    browser.settle()
+    found = browser.evaluate("document.getElementById('edits').textContent")
+    (folder / "edits.json").write_text(browser.evaluate("JSON.stringify(nightsplat.edits())"))
+    (folder / "path.json").write_text(browser.evaluate("JSON.stringify(nightsplat.path())"))
+    edited = folder / "edited.ply"
+    run("edit", folder / "run", "--edits", folder / "edits.json", "--out", edited)
+    run("render", edited, "--dataset", folder / f"set-{SIZES[0][0]}", "--split", "test", "--out", folder / "edited")
+    view = sorted((folder / "edited").rglob("*.png"))[0]
+    options = ["--path", folder / "path.json", "--frames", 1, "--size", f"{size[0]}x{size[1]}"]
+    run("render", folder / "edited.ply", "--dataset", folder / f"set-{SIZES[0][0]}", *options, "--out", folder / "frames")
+    frame = sorted((folder / "frames").rglob("*.png"))[0]
+    of_view, of_path, after = psnr(browser, view), psnr(browser, frame), browser.evaluate(MEAN)
+    is_right = min(of_view, of_path) >= ENOUGH and after != before and "delete, crop" in found
+    print(f"{'ok' if is_right else 'BAD':3} edits: {of_view:.1f} dB, keyframe: {of_path:.1f} dB; {found}")
     return is_right
 
 
@@ -338,10 +384,9 @@ def main():
                     if browser.open(page.as_uri(), view) != "true":
                         raise RuntimeError(browser.evaluate("document.getElementById('message').textContent"))
                     browser.fit_canvas(width, height)
-                    png = "data:image/png;base64," + base64.b64encode(picture.read_bytes()).decode()
-                    psnr = browser.evaluate(COMPARE.replace('PNG', png))
-                    print(f"{'ok' if psnr >= ENOUGH else 'BAD':3} {psnr:5.1f} dB  {picture.stem} at {width}x{height}")
-                    failed += psnr < ENOUGH
+                    found = psnr(browser, picture)
+                    print(f"{'ok' if found >= ENOUGH else 'BAD':3} {found:5.1f} dB  {picture.stem} at {width}x{height}")
+                    failed += found < ENOUGH
                 if not pictures:
                     raise RuntimeError(f"no renders in {renders}")
             seen = browser.evaluate(GREY)
@@ -353,9 +398,8 @@ def main():
             browser.open(page.as_uri())
             failed += not layers(browser)
             failed += not touch(browser)
+            failed += not edits(browser, run, page, folder, SIZES[0])
             failed += bool(browser.complaints)
-            for size in SIZES:
-                browser.fit_canvas(*size)
             print(f"{'BAD' if browser.complaints else 'ok':3} console: {browser.complaints or 'nothing'}")
             failed += live(browser, nightsplat, trained, folder / "live")
         with Browser(program, NO_GL, folder / "profile-without") as browser:

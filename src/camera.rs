@@ -6,6 +6,8 @@
 mod axes;
 #[cfg(feature = "io")]
 pub mod frame;
+#[cfg(feature = "io")]
+mod keyframes;
 mod model;
 mod patch;
 mod path;
@@ -16,9 +18,11 @@ mod rigid;
 use glam::{DAffine3, DMat3, DVec2, DVec3, Vec2Swizzles as _};
 
 #[cfg(feature = "io")]
-pub(crate) use axes::upwards;
+pub(crate) use axes::{enclosing_sphere, upwards};
 #[cfg(feature = "io")]
 pub use frame::TrainingFrame;
+#[cfg(feature = "cli")]
+pub(crate) use keyframes::{Easing, FramePath, PathOptions};
 pub use model::{CameraModel, KannalaBrandt};
 pub use patch::Patch;
 pub use path::CameraPath;

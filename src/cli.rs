@@ -15,11 +15,13 @@ use crate::train::settings::setting;
 
 pub mod bench;
 pub mod check;
+pub mod compare;
 pub mod completions;
 pub mod demo;
 pub mod diagnose;
 pub mod doctor;
 mod driver;
+pub mod edit;
 pub mod eval;
 pub mod export;
 mod help;
@@ -58,9 +60,11 @@ const EXAMPLES: &str = "Start with:
   nightsplat diagnose photos                        what they are, and what their model needs
   nightsplat train photos --out run                 train from a folder of dark photographs
   nightsplat eval run --save-images                 score it where there are references
+  nightsplat compare run1 run2 --report page.html   runs side by side
   nightsplat render run --split all --out pictures  see the model from every camera
   nightsplat export run --format html                   a page with the splat to fly through
   nightsplat view run                               the same while it trains, in a browser
+  nightsplat edit run --floaters --out clean.ply    crop, clean, transform and merge models
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
   nightsplat sweep photos --out s --table presets   what time and memory buy
 
@@ -81,9 +85,11 @@ enum Command {
     Diagnose(diagnose::DiagnoseArgs),
     Pose(pose::PoseArgs),
     Eval(eval::EvalArgs),
+    Compare(compare::CompareArgs),
     Render(render::RenderArgs),
     Export(export::ExportArgs),
     View(view::ViewArgs),
+    Edit(edit::EditArgs),
     Tone(tone::ToneArgs),
     Sweep(Box<sweep::SweepArgs>),
     #[command(hide = true)]
@@ -125,9 +131,11 @@ impl Cli {
             Command::Diagnose(args) => diagnose::run(&args),
             Command::Pose(args) => pose::run(&args),
             Command::Eval(args) => eval::run(&args),
+            Command::Compare(args) => compare::run(&args),
             Command::Render(args) => render::run(&args),
             Command::Export(args) => export::run(&args),
             Command::View(args) => view::run(&args),
+            Command::Edit(args) => edit::run(&args),
             Command::Tone(args) => tone::run(&args),
             Command::Sweep(args) => sweep::run(&args),
             Command::Synth(args) => synth::run(args),

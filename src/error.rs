@@ -70,7 +70,7 @@ pub enum Error {
     Kernel {
         /// The device's name, with the driver.
         device: String,
-        /// Completes the sentence: "refuses (ERROR_UNKNOWN)".
+        /// Completes the sentence: "refuses (`ERROR_UNKNOWN`)".
         problem: String,
         /// The kernel with its constants.
         kernel: String,

@@ -173,6 +173,8 @@ mod reference;
 #[cfg(all(not(feature = "testing"), feature = "io"))]
 mod results;
 #[cfg(not(feature = "testing"))]
+mod self_test;
+#[cfg(not(feature = "testing"))]
 mod splats;
 #[cfg(all(not(feature = "testing"), feature = "io"))]
 mod train;

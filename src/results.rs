@@ -6,6 +6,8 @@
 //! - [`run`]: a training run, its events and its directory
 //! - [`run_facts`]: the summary of a run before its first step
 //! - [`report`]: tables and plots in one self-contained page
+//! - [`colour_map`]: numbers as colours
+//! - [`comparison`]: runs on one dataset, view by view
 //! - [`diagnosis`]: a diagnosis of photographs as a table and a page
 //! - [`evaluation`]: scores as a table, and the page of a run
 //! - [`models`]: model files and run directories, read
@@ -13,8 +15,12 @@
 //! - [`view_exposures`]: renders at the exposure of their targets
 //! - [`video`]: frames as a video
 //! - [`export`]: a model in other formats
+//! - [`edit`]: changes of a model
 
+pub mod colour_map;
+pub mod comparison;
 pub mod diagnosis;
+pub mod edit;
 pub mod eval;
 pub mod evaluation;
 pub mod export;

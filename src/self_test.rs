@@ -10,8 +10,8 @@ use crate::kernels::self_test::{
 };
 use crate::{Error, Result};
 
-/// The variable that is `off` where devices are opened untested, and `always` where the command compiles every kernel in
-/// a process of its own before it opens a software device too.
+/// The variable that is `off` where devices are opened untested, and `always` where the command compiles every kernel
+/// in a process of its own before it opens a software device too.
 pub(crate) const TEST_VARIABLE: &str = "NIGHTSPLAT_DEVICE_TEST";
 
 /// Numbers of each function.

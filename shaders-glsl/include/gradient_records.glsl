@@ -1,4 +1,14 @@
-// Sums of gradient records, for a kernel that declares `gradient_records` and has SUBGROUP_SIZE lanes.
+// Sums of gradient records, for a kernel that declares `gradient_records` and has SUBGROUP_SIZE lanes, and the gradients
+// of a splat from the moments of dL/dsigma that are first in a record.
+
+vec2 mean2d_gradient(vec3 conic, vec2 moments_x_y) {
+    return vec2(dot(conic.xy, moments_x_y), dot(conic.yz, moments_x_y));
+}
+
+vec3 conic_gradient(vec3 moments_xx_xy_yy) { return vec3(0.5, 1.0, 0.5) * moments_xx_xy_yy; }
+
+// sigma is the logarithm of the opacity, sign reversed, up to a term without it.
+float opacity_gradient(float opacity, float moment) { return -moment / opacity; }
 
 // The record of the Gaussian with these slots, summed in slot order.
 //

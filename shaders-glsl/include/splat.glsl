@@ -14,7 +14,8 @@ layout(constant_id = 1) const float ALPHA_MAX = 0.99;
 const uint MAX_CHANNELS = 11;
 // Values per pixel: RGB first.
 layout(constant_id = 2) const uint CHANNELS = 3;
-// Values of a gradient record before its channels: mean2d 2, conic 3, opacity 1.
+// Values of a gradient record before its channels: the moments 1, x, y, xx, xy, yy of dL/dsigma over the pixels, with
+// offsets from pixel to mean. The gradients of mean2d, conic and opacity are multiples of them.
 const uint RECORD_HEAD = 6;
 const uint RECORD = RECORD_HEAD + CHANNELS;
 // The vectors of four floats of a record and of a splat's values, filled up with zeros: a device loads sixteen bytes at
@@ -33,9 +34,16 @@ struct ProjectedSplat {
     float opacity;      // after the sigmoid
 };
 
-// Exponent of the Gaussian at an offset from its mean, sign reversed: alpha = opacity exp(-sigma).
-float splat_sigma(vec3 conic, vec2 d) {
-    precise float sigma = 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
+// The exponent of the Gaussian, sign reversed, along a column of pixels that is `x` from its mean: the coefficients of a
+// polynomial in y. alpha = opacity exp(-sigma), sigma = (conic.x x x + conic.z y y) / 2 + conic.y x y.
+vec3 sigma_in_column(vec3 conic, float x) {
+    precise vec3 by_power = vec3(0.5 * conic.x * x * x, conic.y * x, 0.5 * conic.z);
+    return by_power;
+}
+
+// The exponent at `y` from the mean. Both passes round it alike, and so blend the same splats.
+float sigma_at(vec3 by_power, float y) {
+    precise float sigma = fma(fma(by_power.z, y, by_power.y), y, by_power.x);
     return sigma;
 }
 

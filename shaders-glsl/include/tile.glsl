@@ -19,6 +19,8 @@ layout(constant_id = 6) const bool SKIPS_GROUPS = true;
 
 const uint PART_HEIGHT = TILE_HEIGHT / SUBGROUPS_PER_TILE;
 const uint GROUPS = TILE_WIDTH * PART_HEIGHT / SUBGROUP_SIZE;
+// The columns of pixels in which a lane has pixels: group g has column g % COLUMNS.
+const uint COLUMNS = (TILE_WIDTH + SUBGROUP_SIZE - 1) / SUBGROUP_SIZE;
 
 // The splats of a batch that one iteration of the loop blends: some devices limit the iterations of an invocation.
 layout(constant_id = 7) const uint SPLATS_PER_TURN = 1;

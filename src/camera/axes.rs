@@ -63,6 +63,20 @@ pub(super) fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
     is_definite.then(|| matrix.inverse() * (vector / poses.len() as f64))
 }
 
+/// The sphere that contains the cameras: around the point nearest to their axes if at least three quarters of them
+/// face it, else around their mean. The radius is 0 if they all stand in one place.
+#[cfg(feature = "io")]
+pub(crate) fn enclosing_sphere(poses: &[Camera]) -> (DVec3, f64) {
+    let faces = |target: DVec3| {
+        let facing = poses.iter().filter(|pose| forward(pose).dot(target - pose.center()) > 0.0);
+        4 * facing.count() >= 3 * poses.len()
+    };
+    let focus = nearest_to_axes(poses).filter(|&focus| faces(focus));
+    let center = focus.unwrap_or_else(|| mean(poses.iter().map(Camera::center)));
+    let distances = poses.iter().map(|pose| pose.center().distance(center));
+    (center, distances.fold(0.0, f64::max))
+}
+
 #[cfg(test)]
 mod tests {
     use glam::{DAffine3, DQuat};

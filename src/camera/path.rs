@@ -213,7 +213,7 @@ fn spiral(poses: &[Camera], up: DVec3, frames: usize) -> Vec<DAffine3> {
 }
 
 /// World to view for a camera at `center` that looks at `target`, with `up` upwards.
-fn looking(center: DVec3, target: DVec3, up: DVec3) -> DAffine3 {
+pub(super) fn looking(center: DVec3, target: DVec3, up: DVec3) -> DAffine3 {
     let forward = (target - center).normalize_or(DVec3::Z);
     let right = forward.cross(up).try_normalize();
     let right = right.unwrap_or_else(|| forward.any_orthonormal_vector());

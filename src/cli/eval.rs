@@ -35,6 +35,9 @@ pub struct EvalArgs {
     /// Dataset, if it moved since training [default: the run's]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
+    /// Folder of reference images that were found since, under the names of the photographs
+    #[arg(long, value_name = "DIR")]
+    pub reference: Option<PathBuf>,
     /// Add LPIPS, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)
     #[arg(long, value_name = "WEIGHTS")]
     pub lpips: Option<PathBuf>,
@@ -78,7 +81,9 @@ impl From<LpipsRange> for Range {
 pub fn run(args: &EvalArgs) -> Result<()> {
     args.report.iter().try_for_each(|path| check_writable(path))?;
     let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer } =
-        FinishedRun::open(&args.run, args.dataset.as_deref(), args.device.as_ref())?;
+        FinishedRun::open_with(&args.run, args.dataset.as_deref(), args.device.as_ref(), |own| {
+            own.reference = args.reference.clone().or(own.reference.take());
+        })?;
     let load = |weights| Lpips::load(&gpu, weights, args.lpips_range.into());
     let lpips = args.lpips.as_ref().map(load).transpose()?;
     let measure = lpips.as_ref().map(Lpips::measure);

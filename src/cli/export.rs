@@ -15,6 +15,7 @@ use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::photographs::tone::ToneCurve;
+use crate::results::edit::fingerprint;
 use crate::results::export::page::{Bookmark, Page, Picture, moved};
 use crate::results::export::{Format, Provenance, spz};
 use crate::results::finished_run::{FinishedRun, config_of_file, is_model, needs_photographs};
@@ -257,8 +258,9 @@ fn page(
     };
     let near = provenance.facts.near.or(config.facts(&frame).near);
     let near = near.unwrap_or_else(|| RenderSettings::default().near).into();
+    let (origin, fingerprint) = (gaussians.origin, Some(fingerprint(gaussians)));
     let gaussians = Some(gaussians);
-    Ok(Page { title, gaussians, provenance, bookmarks, near, up }.html()?)
+    Ok(Page { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up }.html()?)
 }
 
 /// What makes the targets of views that have a photograph and no reference image, where there are such views and a

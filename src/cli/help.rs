@@ -12,7 +12,7 @@ const COMMON: [(&str, &str); 8] = [
     ("sweep", "out curves presets seeds grid table steps downscale jobs dry-run"),
     ("check", "json steps curve parts downscale device"),
     ("pose", "out matcher fps camera-model colmap overwrite device"),
-    ("render", "out split path frames video layer format dataset device"),
+    ("render", "out split path frames video size layer format dataset device"),
     ("apply", "out curve gain brightness reference report compare format json device"),
     ("fit", "normal family out cross-validate plot profile json"),
     ("diagnose", "report plan run preset steps downscale json device"),
@@ -22,8 +22,8 @@ const COMMON: [(&str, &str); 8] = [
 const GROUPS: [(&str, &str); 6] = [
     (
         "Photographs",
-        "images orientation reference white-balance downscale max-resolution patch-pixels test-every invert-masks \
-         undistort",
+        "images exclude exclude-file orientation reference white-balance downscale max-resolution patch-pixels test-every \
+         invert-masks undistort",
     ),
     ("Tone curve", "curve profile gain brightness colour theta exposure exposures"),
     (

@@ -1,23 +1,26 @@
 //! `nightsplat render`: renders a run from the cameras of its dataset or along a path through them.
 
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use anyhow::Result;
-use glam::DVec3;
 
+mod shots;
+
+use self::shots::{Shot, shots};
 use super::words::Words;
 use super::{ImageFormat, finish, progress_bar, word};
 use crate::Error;
 use crate::base::output::{check_writable, create_folder, printable};
-use crate::camera::{Camera, CameraPath};
+use crate::camera::Easing;
 use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::{Dataset, Split, View};
-use crate::photographs::image::{Image, Orientation};
+use crate::photographs::image::Image;
+use crate::results::colour_map;
 use crate::results::eval::RenderLayer;
 use crate::results::finished_run::FinishedRun;
 use crate::results::video;
 use crate::results::view_exposures::ViewExposures;
-use crate::train::TrainConfig;
 
 /// Render a run from the cameras of its dataset, or along a path through them.
 ///
@@ -30,16 +33,36 @@ pub struct RenderArgs {
     /// Cameras of this split of the dataset
     #[arg(long, value_enum, required_unless_present = "path", conflicts_with = "path")]
     pub split: Option<SplitChoice>,
-    /// Camera path instead of the dataset's cameras
-    #[arg(long, value_enum)]
+    /// Camera path instead of the dataset's cameras: auto, orbit, arc, spiral or interpolate; or a file with keyframes
+    /// (docs/guide.md) or a camera path of nerfstudio
+    ///
+    /// auto: whichever of the others stays where the cameras are. orbit: a circle around the point nearest to all
+    /// optical axes; arc: the part of it that the cameras cover, there and back; spiral: two turns about the mean
+    /// camera, for photographs from one side; interpolate: a smooth path through all training cameras by name.
+    #[arg(long, value_name = "PATH|FILE")]
     pub path: Option<PathChoice>,
-    /// Frames of the path
-    #[arg(long, value_name = "N", default_value_t = 120, requires = "path")]
+    /// Frames of the path [default: 120, or those of the file]
+    #[arg(long, value_name = "N", requires = "path")]
     #[arg(value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
-    pub frames: u32,
-    /// Frames per second of the video
-    #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u16).range(1..=1000))]
-    pub fps: u16,
+    pub frames: Option<u32>,
+    /// Frames per second of the video [default: 30, or those of the file]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1000))]
+    pub fps: Option<u16>,
+    /// How time runs along the keyframes of a file [default: the file's, else linear]
+    #[arg(long, value_enum, requires = "path")]
+    pub easing: Option<EasingChoice>,
+    /// Lead from the last keyframe of a file back to the first
+    #[arg(long = "loop", requires = "path")]
+    pub is_loop: bool,
+    /// Size of the images in pixels; the vertical field of view stays [default: the cameras', or the file's]
+    #[arg(long, value_name = "WxH")]
+    pub size: Option<Size>,
+    /// Vertical field of view, degrees, of pinhole cameras
+    #[arg(long, value_name = "DEGREES")]
+    pub fov: Option<f64>,
+    /// Background: black, white, grey, R,G,B from 0 to 1, or #rrggbb
+    #[arg(long, value_name = "COLOUR", default_value = "black")]
+    pub background: Background,
     /// Also write a video, with ffmpeg, or an animated PNG for FILE.png
     #[arg(long, value_name = "FILE")]
     pub video: Option<PathBuf>,
@@ -49,10 +72,14 @@ pub struct RenderArgs {
     /// Dataset, if it moved since training [default: the run's]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
-    /// Layer: rgb, denoised, depth, structure, illumination or noise; depth is scaled to the range of each view, but
-    /// in EXR [default: denoised with a denoiser, else rgb]
+    /// Layer: rgb, denoised, depth, normal, alpha, transmittance; of a model that has it: depth-feature, structure,
+    /// illumination, noise. Depth is the median depth, in colours from near (violet) to far (yellow) in PNG, in world
+    /// units in EXR [default: denoised with a denoiser, else rgb]
     #[arg(long, value_parser = Words::<RenderLayer>::new(RenderLayer::ALL.map(RenderLayer::name)))]
     pub layer: Option<RenderLayer>,
+    /// Depths at the ends of the colours, in world units [default: of each image its own]
+    #[arg(long, value_name = "NEAR,FAR")]
+    pub depth_range: Option<DepthRange>,
     /// Render each training view at the exposure of its target, not at the model's
     #[arg(long)]
     pub view_exposure: bool,
@@ -67,44 +94,119 @@ pub struct RenderArgs {
 const EXAMPLES: &str = "Examples:
   nightsplat render run --split test --out pictures
   nightsplat render run --path auto --frames 180 --out frames --video flight.mp4
-  nightsplat render run --path interpolate --out frames --video moving.png";
+  nightsplat render run --path interpolate --out frames --video moving.png
+  nightsplat render run --path keyframes.json --size 1280x720 --out frames --video film.mp4
+  nightsplat render run --split test --layer depth --out depths";
 
 /// A camera path on the command line.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PathChoice {
-    /// Orbit, arc, spiral or interpolate, whichever stays where the cameras are
+    /// The one that stays where the cameras are.
     Auto,
-    /// Circle around the point nearest to all optical axes
-    Orbit,
-    /// The part of the orbit that the cameras cover, there and back
-    Arc,
-    /// Two turns about the mean camera, for photographs from one side
-    Spiral,
-    /// Smooth path through all training cameras by name
-    Interpolate,
+    /// A path by name.
+    Named(crate::camera::CameraPath),
+    /// A file.
+    File(PathBuf),
 }
 
-impl PathChoice {
-    /// The path around the up direction; logs the choice of `auto`.
-    fn path(self, poses: &[Camera], up: DVec3) -> CameraPath {
-        match self {
-            Self::Auto => {
-                let path = CameraPath::suited_about(poses, up);
-                let reason = match path {
-                    CameraPath::Orbit => "an orbit: the cameras surround the scene",
-                    CameraPath::Arc => "an arc: the cameras cover a part of the circle",
-                    CameraPath::Spiral => "a spiral: the cameras look in parallel",
-                    CameraPath::Interpolate => "through all cameras: they look outwards",
-                };
-                tracing::info!("the path is {reason}");
-                path
+impl FromStr for PathChoice {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        use crate::camera::CameraPath;
+        Ok(match text {
+            "auto" => Self::Auto,
+            "orbit" => Self::Named(CameraPath::Orbit),
+            "arc" => Self::Named(CameraPath::Arc),
+            "spiral" => Self::Named(CameraPath::Spiral),
+            "interpolate" => Self::Named(CameraPath::Interpolate),
+            file if Path::new(file).is_file() => Self::File(file.into()),
+            _ => {
+                return Err(
+                    "is neither auto, orbit, arc, spiral, interpolate, nor a file".to_owned()
+                );
             }
-            Self::Orbit => CameraPath::Orbit,
-            Self::Arc => CameraPath::Arc,
-            Self::Spiral => CameraPath::Spiral,
-            Self::Interpolate => CameraPath::Interpolate,
+        })
+    }
+}
+
+/// How time runs along a path on the command line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum EasingChoice {
+    /// At the speed of the keyframes
+    Linear,
+    /// Slow at the first and at the last keyframe
+    Smooth,
+}
+
+impl From<EasingChoice> for Easing {
+    fn from(choice: EasingChoice) -> Self {
+        match choice {
+            EasingChoice::Linear => Self::Linear,
+            EasingChoice::Smooth => Self::Smooth,
         }
     }
+}
+
+/// Width and height in pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Size(pub [u32; 2]);
+
+impl FromStr for Size {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let sides = text.split_once(['x', 'X', ',']);
+        let side = |text: &str| text.parse().ok().filter(|side| (1..=65_536).contains(side));
+        let size = sides.and_then(|(width, height)| Some([side(width)?, side(height)?]));
+        size.map(Self).ok_or_else(|| "is not WIDTHxHEIGHT, such as 1280x720".to_owned())
+    }
+}
+
+/// A colour, display-referred.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Background(pub [f32; 3]);
+
+impl FromStr for Background {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let hex = |digits: &str| {
+            let number = u32::from_str_radix(digits, 16).ok().filter(|_| digits.len() == 6)?;
+            Some([16, 8, 0].map(|shift| (number >> shift & 255) as f32 / 255.0))
+        };
+        let color = match text {
+            "black" => Some([0.0; 3]),
+            "white" => Some([1.0; 3]),
+            "grey" | "gray" => Some([0.5; 3]),
+            _ => match text.strip_prefix('#') {
+                Some(digits) => hex(digits),
+                None => numbers(text).filter(|all| all.iter().all(|own| (0.0..=1.0).contains(own))),
+            },
+        };
+        color.map(Self).ok_or_else(|| {
+            "is no colour: black, white, grey, R,G,B from 0 to 1, or #rrggbb".to_owned()
+        })
+    }
+}
+
+/// Depths at the ends of the colours.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DepthRange(pub [f32; 2]);
+
+impl FromStr for DepthRange {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let ends = numbers(text).filter(|[near, far]: &[f32; 2]| near < far);
+        ends.map(Self).ok_or_else(|| "is not NEAR,FAR, two numbers, the nearer first".to_owned())
+    }
+}
+
+/// This many finite numbers, separated by commas.
+fn numbers<const N: usize>(text: &str) -> Option<[f32; N]> {
+    let all: Option<Vec<f32>> = text.split(',').map(|own| own.trim().parse().ok()).collect();
+    all?.try_into().ok().filter(|all: &[f32; N]| all.iter().all(|own| own.is_finite()))
 }
 
 /// The views to render.
@@ -128,15 +230,6 @@ impl SplitChoice {
     }
 }
 
-/// An image to render.
-struct Shot {
-    /// File name without extension.
-    name: String,
-    camera: Camera,
-    /// How its image is rotated for display.
-    orientation: Orientation,
-}
-
 /// Renders the views or the path.
 ///
 /// # Errors
@@ -149,11 +242,17 @@ pub fn run(args: &RenderArgs) -> Result<()> {
             format!("--video {} requires PNG frames; leave out --format exr", video.display());
         return Err(Error::Usage(problem).into());
     }
+    if let Some(fov) = args.fov.filter(|fov| !(*fov > 0.0 && *fov < 180.0)) {
+        let problem =
+            format!("--fov {fov} is no field of view; it is above 0 and below 180 degrees");
+        return Err(Error::Usage(problem).into());
+    }
     args.video.iter().chain([out]).try_for_each(|path| check_writable(path))?;
     let FinishedRun { config, dataset, mut model_renderer, .. } =
         FinishedRun::open(run, args.dataset.as_deref(), device.as_ref())?;
     let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
-    let shots = shots(args, &config, &dataset)?;
+    let (shots, fps) = shots(args, &config, &dataset)?;
+    model_renderer.set_background(args.background.0);
     make_folder(out, &dataset, run)?;
     let bar = progress_bar(shots.len());
     for Shot { name, camera, orientation } in &shots {
@@ -171,7 +270,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
             Some(layer) if layer.is_color() => color(model_renderer.layer(camera, *layer)?)?,
             Some(layer) => {
                 let numbers = model_renderer.layer(camera, *layer)?.turned(*orientation);
-                save_numbers(numbers, *layer, *format, &path)?;
+                save_numbers(args, numbers, *layer, &path)?;
             }
         }
         bar.inc(1);
@@ -180,7 +279,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     let mut wrote = format!("{} images to {}", shots.len(), out.display());
     if let Some(video) = &args.video {
         let files: Vec<PathBuf> = shots.iter().map(|shot| file(out, &shot.name, *format)).collect();
-        video::make(video, out, &files, args.fps)?;
+        video::make(video, out, &files, fps)?;
         wrote += &format!(", {}", video.display());
     }
     finish(&wrote, &format!("nightsplat export {} --format html", word(run)))
@@ -190,51 +289,34 @@ fn file(folder: &Path, name: &str, format: ImageFormat) -> PathBuf {
     folder.join(format!("{name}.{}", format.extension()))
 }
 
-/// The images to render.
-fn shots(args: &RenderArgs, config: &TrainConfig, dataset: &Dataset) -> crate::Result<Vec<Shot>> {
-    let Some(path) = args.path else {
-        let includes = |view: &&View| args.split.is_none_or(|split| split.includes(view));
-        let views = dataset.views.iter().filter(includes);
-        let shot = |view: &View| {
-            let View { name, camera, orientation, .. } = view;
-            Shot { name: name.clone(), camera: *camera, orientation: *orientation }
-        };
-        let shots: Vec<Shot> = views.map(shot).collect();
-        if shots.is_empty() {
-            let problem = "has no view of that split; try --split all";
-            return Err(Error::input(&dataset.root, problem));
-        }
-        return Ok(shots);
-    };
-    let poses: Vec<Camera> = dataset.train_views().map(View::upright_camera).collect();
-    let up = config.up.and_then(|up| DVec3::from_array(up).try_normalize());
-    let up = up.unwrap_or_else(|| dataset.up());
-    let cameras = path.path(&poses, up).cameras_about(&poses, up, args.frames as usize)?;
-    // A mirrored photograph shows a mirrored world.
-    let first = dataset.train_views().next().map(|view| view.orientation.mirror());
-    let orientation = first.unwrap_or_default();
-    // Numbered as ffmpeg expects.
-    let shot = |(index, camera)| Shot { name: format!("{index:05}"), camera, orientation };
-    Ok((0..).zip(cameras).map(shot).collect())
-}
-
 /// Saves a layer that is not colour; EXR keeps the values.
 fn save_numbers(
+    args: &RenderArgs,
     mut image: Image,
     layer: RenderLayer,
-    format: ImageFormat,
     path: &Path,
 ) -> crate::Result<()> {
-    if format == ImageFormat::Exr {
+    if args.format == ImageFormat::Exr {
         return image.save_exr_as_stored(path);
     }
-    if layer == RenderLayer::Depth {
-        let least = image.data.iter().copied().fold(f32::INFINITY, f32::min);
-        let largest = image.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-        let scale = 1.0 / (largest - least).max(f32::MIN_POSITIVE);
-        image.data.iter_mut().for_each(|value| *value = (*value - least) * scale);
+    match layer {
+        RenderLayer::Depth | RenderLayer::DepthFeature => {
+            let plane = &image.data[..image.pixel_count()];
+            let range = args.depth_range.map(|range| range.0).or_else(|| colour_map::range(plane));
+            image = colour_map::mapped(&image, range.unwrap_or_default());
+        }
+        RenderLayer::Normal => {
+            let is_seen = |normal: [f32; 3]| normal != [0.0; 3];
+            let pixels = image.pixel_count();
+            for pixel in 0..pixels {
+                let normal = [0, 1, 2].map(|plane| image.data[plane * pixels + pixel]);
+                let shown = normal.map(|part| if is_seen(normal) { 0.5 + 0.5 * part } else { 0.0 });
+                (0..3).for_each(|plane| image.data[plane * pixels + pixel] = shown[plane]);
+            }
+        }
+        _ => {}
     }
-    image.save_png8(path)
+    args.format.save(&image, path)
 }
 
 /// Creates the folder unless it lies in the dataset, where renders would replace photographs of the same names. The run

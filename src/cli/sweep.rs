@@ -19,6 +19,8 @@ mod point;
 mod rows;
 mod run;
 mod runner;
+mod scenes;
+mod scores;
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -34,6 +36,8 @@ use self::point::{ADAPTIVE, Axis, OFFSET, PARTS};
 use self::rows::Rows;
 pub(super) use self::run::parsed;
 use self::run::{Run, absolute, difference};
+use self::runner::Failure;
+use super::eval::LpipsRange;
 use super::{driver, finish, progress_bar};
 use crate::Error;
 use crate::base::input;
@@ -55,6 +59,9 @@ use crate::train::{Part, TrainConfig, diagnosed};
 pub struct SweepArgs {
     /// Dataset, as for `train`
     pub dataset: PathBuf,
+    /// More datasets: each is swept in its own folder of OUT, and OUT/scenes.md has a column for each and their mean
+    #[arg(value_name = "DATASET")]
+    pub more: Vec<PathBuf>,
     /// Folder for the run directories, index.html, costs.html and tables as CSV
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -67,6 +74,12 @@ pub struct SweepArgs {
     /// Print JSON instead of tables
     #[arg(long)]
     pub json: bool,
+    /// Add LPIPS to the tables, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)
+    #[arg(long, value_name = "WEIGHTS")]
+    pub lpips: Option<PathBuf>,
+    /// Input range of the LPIPS network; scores of different ranges or networks do not compare
+    #[arg(long, value_name = "RANGE", value_enum, default_value_t, requires = "lpips")]
+    pub lpips_range: LpipsRange,
     /// Named grid; lists replace its lists or add to them
     #[arg(long, value_enum, help_heading = GRID)]
     table: Option<Grid>,
@@ -92,6 +105,7 @@ const EXAMPLES: &str = "A LIST is comma-separated. Examples:
   nightsplat sweep photos --out sweep --curves all --downscale 4 --steps 300
   nightsplat sweep photos --out parts --table parts --seeds 1,2,3
   nightsplat sweep photos --out presets --table presets --eval-every 50
+  nightsplat sweep lom/buu lom/chair --out lom --curves ap3,ase --lpips lpips-alex.safetensors
   nightsplat sweep photos --out density --grid density.gradient_threshold=1e-4,2e-4 --jobs 2";
 
 /// Trains the unfinished points and writes the results.
@@ -99,6 +113,9 @@ const EXAMPLES: &str = "A LIST is comma-separated. Examples:
 /// # Errors
 /// Before training, an invalid grid, option or dataset, or a folder with another sweep; after it, failed points.
 pub fn run(args: &SweepArgs) -> Result<()> {
+    if !args.more.is_empty() {
+        return scenes::run(args);
+    }
     let dataset = args.dataset.display();
     run_titled(args, &format!("Sweep of {dataset}"), &[], &[])
 }
@@ -110,6 +127,21 @@ pub(super) fn run_titled(
     intro: &[String],
     links: &[[String; 2]],
 ) -> Result<()> {
+    let Some((rows, failures)) = swept(args, title, intro, links)? else { return Ok(()) };
+    if let Some(failure) = failures.first() {
+        let (failed, all) = (failures.len(), rows.runs);
+        anyhow::bail!("{failed} of {all} points failed; the first: {}", failure.reason);
+    }
+    Ok(())
+}
+
+/// Trains the unfinished points and writes and prints the results; `None` after a dry run.
+fn swept(
+    args: &SweepArgs,
+    title: &str,
+    intro: &[String],
+    links: &[[String; 2]],
+) -> Result<Option<(Rows, Vec<Failure>)>> {
     check_writable(&args.out)?;
     let (runs, dataset) = plan(args)?;
     let mut left = vec![];
@@ -128,11 +160,14 @@ pub(super) fn run_titled(
         for run in left {
             writeln!(out, "{}", run.command_line()?)?;
         }
-        return Ok(());
+        return Ok(None);
     }
     let bar = progress_bar(left.len());
     let failures = runner::train(&left, args.jobs.into(), &bar, (&args.out, runs.len()))?;
 
+    if let Some(weights) = &args.lpips {
+        scores::add_lpips(&runs, &open(first)?, weights, args.lpips_range.into())?;
+    }
     let rows = Rows::new(&runs, args.table.and_then(Grid::baseline));
     let settings = settings(&runs, &rows.seeds, &args.options.shared);
     let leaderboard = Leaderboard {
@@ -161,11 +196,7 @@ pub(super) fn run_titled(
         let out = args.out.display();
         finish(&format!("{out}/index.html, {out}/costs.html"), &format!("open {out}/index.html"))?;
     }
-    if let Some(failure) = failures.first() {
-        let (failed, all) = (failures.len(), runs.len());
-        anyhow::bail!("{failed} of {all} points failed; the first: {}", failure.reason);
-    }
-    Ok(())
+    Ok(Some((rows, failures)))
 }
 
 fn open(config: &TrainConfig) -> crate::Result<Gpu> {

@@ -127,7 +127,8 @@ fn of_dataset(path: &Path, feed: Feed, pictures: Pictures, facts: &Facts) -> Res
         facts: *facts,
         ..Default::default()
     };
-    page(path, feed, Some(pictures), (bookmarks, up, provenance))
+    let origin = pictures.origin();
+    page(path, feed, Some(pictures), (bookmarks, up, provenance), origin)
 }
 
 /// The page of a model alone, which is seen from outside, with -y up.
@@ -135,7 +136,8 @@ fn of_model(path: &Path, feed: Feed, gaussians: &Gaussians, facts: &Facts) -> Re
     let bookmark =
         Bookmark { name: "overview".to_owned(), camera: overview(gaussians), pictures: vec![] };
     let provenance = Provenance { facts: *facts, ..Provenance::default() };
-    page(path, feed, None, (vec![bookmark], DVec3::NEG_Y, provenance))
+    let shown = (vec![bookmark], DVec3::NEG_Y, provenance);
+    page(path, feed, None, shown, gaussians.origin)
 }
 
 fn page(
@@ -143,10 +145,13 @@ fn page(
     feed: Feed,
     pictures: Option<Pictures>,
     (bookmarks, up, provenance): (Vec<Bookmark>, DVec3, Provenance),
+    origin: DVec3,
 ) -> Result<Arc<Site>> {
     let title = path.display().to_string();
     let near = provenance.facts.near.unwrap_or_else(|| RenderSettings::default().near).into();
-    let html = Page { title, gaussians: None, provenance, bookmarks, near, up }.html()?;
+    let page =
+        Page { title, gaussians: None, provenance, bookmarks, origin, fingerprint: None, near, up };
+    let html = page.html()?;
     Ok(Arc::new(Site { html: html.into(), feed, pictures: pictures.map(Mutex::new) }))
 }
 

@@ -67,7 +67,7 @@ impl<T: bytemuck::Pod> Buffer<T> {
         self.memory.pieces(0, (self.len * size_of::<T>()) as u64)
     }
 
-    /// Whether passes can bind windows of so many elements, from multiples of that on.
+    /// Whether passes can bind windows of this number of elements, from multiples of it on.
     #[cfg(feature = "io")]
     pub(crate) fn suits_windows(&self, window: usize) -> bool {
         self.memory.suit((window * size_of::<T>()) as u64)

@@ -15,7 +15,7 @@ use super::checked::Checks;
 use super::choice::SelectedDevice;
 use super::cooperative;
 use super::descriptors::Descriptors;
-use super::device_report::{device_memory, report};
+use super::device_report::{device_memory, driver_name, report};
 #[cfg(feature = "testing")]
 use super::faults::Faults;
 use super::host::Host;
@@ -371,21 +371,6 @@ fn properties(
         has_push_descriptors: supported.has_push_descriptors(),
         has_pipeline_statistics: false,
     })
-}
-
-/// The driver's name and version, as the driver gives them, and its id.
-pub(super) fn driver_name(
-    instance: &ash::Instance,
-    physical: vk::PhysicalDevice,
-) -> (String, vk::DriverId) {
-    let mut driver = vk::PhysicalDeviceDriverProperties::default();
-    let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut driver);
-    // SAFETY: the chain points at a live local.
-    unsafe { instance.get_physical_device_properties2(physical, &mut properties) };
-    let text =
-        |text: Result<&CStr, _>| text.map(|t| t.to_string_lossy().into_owned()).unwrap_or_default();
-    let [name, info] = [text(driver.driver_name_as_c_str()), text(driver.driver_info_as_c_str())];
-    (format!("{name} {info}"), driver.driver_id)
 }
 
 /// Mesa's software device ends all loops of an invocation after this number of iterations in total

@@ -1,11 +1,12 @@
 //! The report of `doctor` on every device.
 
+use std::ffi::CStr;
+
 use ash::vk;
 
 use super::REQUIREMENTS;
 
 use super::cooperative::{self, CooperativeMatrix};
-use super::device::driver_name;
 use super::instance::{OwnedInstance, instance, loader_error, physical_devices};
 use super::limits::max_workgroups;
 use super::pci::PciAddress;
@@ -158,6 +159,21 @@ pub(super) fn device_memory(instance: &ash::Instance, physical: vk::PhysicalDevi
     let heaps = memory.memory_heaps_as_slice().iter();
     let local = heaps.filter(|heap| heap.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL));
     local.map(|heap| heap.size).sum()
+}
+
+/// The driver's name and version, as the driver gives them, and its id.
+pub(super) fn driver_name(
+    instance: &ash::Instance,
+    physical: vk::PhysicalDevice,
+) -> (String, vk::DriverId) {
+    let mut driver = vk::PhysicalDeviceDriverProperties::default();
+    let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut driver);
+    // SAFETY: the chain points at a live local.
+    unsafe { instance.get_physical_device_properties2(physical, &mut properties) };
+    let text =
+        |text: Result<&CStr, _>| text.map(|t| t.to_string_lossy().into_owned()).unwrap_or_default();
+    let [name, info] = [text(driver.driver_name_as_c_str()), text(driver.driver_info_as_c_str())];
+    (format!("{name} {info}"), driver.driver_id)
 }
 
 /// A UUID in its usual form.

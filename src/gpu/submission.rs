@@ -259,8 +259,8 @@ impl Shared {
         Ok(())
     }
 
-    /// Ends a command buffer and hands it to the queue; the timeline reaches `value`, where there is one, when all up to
-    /// it are done.
+    /// Ends a command buffer and hands it to the queue; the timeline reaches `value`, where there is one, when all up
+    /// to it are done.
     fn enqueue(
         &self,
         queue: &Queue,

@@ -89,17 +89,21 @@ struct Tuning {
 }
 
 impl Properties {
-    /// Whether subgroups can share such tiles: each part has 1 to 32 rows of lanes, all lanes fit a workgroup, and the
-    /// subgroups stay converged while others leave their loops. A software device runs one after the other.
+    /// Whether subgroups can share such tiles: each part has 1 to 32 rows of lanes, lanes fill rows of pixels or the
+    /// reverse, all lanes fit a workgroup, and the subgroups stay converged while others leave their loops. A software
+    /// device runs one after the other.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn suits_tile(&self, tile: impl Into<Tile>) -> bool {
         let tile = tile.into();
         let lanes = u64::from(self.subgroup_size);
         tile.part().is_some_and(|[width, height]| {
+            let lanes_fill_rows = lanes.is_multiple_of(width.max(1).into());
+            let rows_fill_lanes = u64::from(width).is_multiple_of(lanes);
             let pixels = u64::from(width) * u64::from(height);
             let is_workgroup = lanes * u64::from(tile.subgroups) <= u64::from(WORKGROUP);
             let keeps_subgroups = self.has_uniform_subgroup_control_flow || self.is_cpu;
-            pixels.is_multiple_of(lanes)
+            (lanes_fill_rows || rows_fill_lanes)
+                && pixels.is_multiple_of(lanes)
                 && (1..=32).contains(&(pixels / lanes))
                 && is_workgroup
                 && (tile.subgroups == 1 || keeps_subgroups)
@@ -175,11 +179,10 @@ fn tiles(bytes: &[u8], properties: &Properties) -> Result<Vec<TunedTile>, String
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn properties() -> Properties {
-        Properties {
+impl Properties {
+    /// Those of a device that is not there.
+    pub(crate) fn of_a_test() -> Self {
+        Self {
             name: "Abacus 3000".to_owned(),
             driver: "beads 1.0".to_owned(),
             memory: 0,
@@ -198,12 +201,25 @@ mod tests {
             has_pipeline_statistics: false,
         }
     }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn properties() -> Properties {
+        Properties::of_a_test()
+    }
 
     #[test]
     fn a_tile_has_1_to_32_rows_of_lanes() {
         let suits = |size: [u32; 2]| properties().suits_tile(size);
         assert!(suits([8, 1]) && suits([16, 16]) && suits([32, 8]));
         assert!(!suits([0, 8]) && !suits([3, 3]) && !suits([32, 16]) && !suits([u32::MAX; 2]));
+        assert!(
+            suits([24, 8]) && suits([4, 8]) && !suits([12, 8]),
+            "lanes begin in the middle of a row"
+        );
     }
 
     #[test]

@@ -9,6 +9,7 @@ mod borders;
 mod colmap;
 mod dark_references;
 mod depth;
+pub(crate) mod exclude;
 mod fingerprint;
 mod layout;
 mod listed;
@@ -298,6 +299,7 @@ impl Dataset {
             list(&layout, options.images.as_deref(), &files)?;
         log_split(&layout.root, &frames, options);
         split(&layout.root, &mut frames, options.test_every, &files)?;
+        exclude::exclude(&layout.root, &mut frames, &options.exclude)?;
 
         let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
         let gains = white_balance_gains(&layout.root, &sources, options)?;
@@ -403,6 +405,7 @@ impl Dataset {
         let Listing { mut frames, mut skipped, remarks, .. } =
             list(&layout, options.images.as_deref(), &files)?;
         split(&layout.root, &mut frames, options.test_every, &files)?;
+        exclude::exclude(&layout.root, &mut frames, &options.exclude)?;
         let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
         let photograph = |source: Source| {
             let Source { name, split, input, reference, mask, .. } = source;

@@ -10,8 +10,8 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::blend_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::RECORD_HEAD;
 
-/// Adds the gradients of one pixel with the values `render` and the gradient `d_render` to `gradient_records` (splats,
-/// record): those of mean2d, conic and opacity, from the first `shaping` channels, and those of the colours.
+/// Adds what one pixel with the values `render` and the gradient `d_render` contributes to `gradient_records` (splats,
+/// record): the moments of dL/dsigma, from the first `shaping` channels, and the gradients of the colours.
 #[expect(clippy::too_many_arguments, reason = "a pixel, its splats and its gradients")]
 pub fn blend_pixel_backward(
     splats: &[Splat],
@@ -26,7 +26,7 @@ pub fn blend_pixel_backward(
     let (channels, head) = (render.len(), RECORD_HEAD as usize);
     let mut light = render.to_vec();
     for fragment in fragments(splats, pixel, alpha_max).0 {
-        let Splat { conic, opacity, .. } = splats[fragment.index];
+        let opacity = splats[fragment.index].opacity;
         let record = &mut gradient_records[(head + channels) * fragment.index..][..head + channels];
         let weight = fragment.alpha * fragment.before;
         let mut d_alpha = 0.0;
@@ -42,12 +42,12 @@ pub fn blend_pixel_backward(
         if opacity * fragment.falloff <= alpha_max {
             let d = fragment.d;
             let d_sigma = -fragment.alpha * d_alpha;
-            record[0] += d_sigma * (conic.x * d.x + conic.y * d.y);
-            record[1] += d_sigma * (conic.y * d.x + conic.z * d.y);
-            record[2] += d_sigma * 0.5 * d.x * d.x;
-            record[3] += d_sigma * d.x * d.y;
-            record[4] += d_sigma * 0.5 * d.y * d.y;
-            record[5] += fragment.falloff * d_alpha;
+            record[0] += d_sigma;
+            record[1] += d_sigma * d.x;
+            record[2] += d_sigma * d.y;
+            record[3] += d_sigma * d.x * d.x;
+            record[4] += d_sigma * d.x * d.y;
+            record[5] += d_sigma * d.y * d.y;
         }
     }
 }
@@ -120,7 +120,6 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
     // Every sum is over the pixels of the tile.
     let own = (chain(tile.element_product() as usize) + 64.0) * UNIT;
     for &(fragment, alpha_error) in &model.fragments {
-        let Splat { conic, .. } = list.splats[fragment.index];
         let bound = &mut bounds[(head + channels) * fragment.index..][..head + channels];
         let color = &list.colors[channels * fragment.index..][..channels];
         let share: f64 = (0..shaping).map(|c| fragment.before * color[c].abs() * d(c)).sum();
@@ -130,12 +129,12 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
         let d_sigma = fragment.alpha * d_alpha;
         // An offset has the rounding error of a tile's extent.
         let offset = fragment.d.abs() + 1.0;
-        bound[0] += d_sigma * (conic.x * offset.x + conic.y.abs() * offset.y);
-        bound[1] += d_sigma * (conic.y.abs() * offset.x + conic.z * offset.y);
-        bound[2] += d_sigma * 0.5 * offset.x * offset.x;
-        bound[3] += d_sigma * offset.x * offset.y;
-        bound[4] += d_sigma * 0.5 * offset.y * offset.y;
-        bound[5] += d_alpha * fragment.falloff;
+        bound[0] += d_sigma;
+        bound[1] += d_sigma * offset.x;
+        bound[2] += d_sigma * offset.y;
+        bound[3] += d_sigma * offset.x * offset.x;
+        bound[4] += d_sigma * offset.x * offset.y;
+        bound[5] += d_sigma * offset.y * offset.y;
         let weight = fragment.alpha * fragment.before;
         (0..channels).for_each(|c| bound[head + c] += weight * (relative + model.error) * d(c));
     }

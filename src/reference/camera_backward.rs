@@ -4,9 +4,10 @@ use glam::{DMat3, DVec2, DVec3, DVec4};
 
 use super::camera::Camera;
 use super::gaussian::{Gaussian, Planes};
-use super::project_backward::{conic_backward, summed_record};
+use super::project_backward::{conic_backward, splat_gradient, summed_record};
 use super::rotation::{rotation, unit_quat};
 use super::rounding::{UNIT, sensitivity};
+use super::splat::Splat;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::camera::CAMERA_WIDTH;
 use crate::kernels::camera_backward::{Constants, Kernel, Params, Slices, Tolerances};
@@ -30,8 +31,8 @@ pub fn camera_backward(
     camera.gradient(point, camera.rotation * d_mean, d_mean2d, d_rows)
 }
 
-/// The inputs of Gaussian `i` with their error bounds: mean, rotation, scales, conic, the gradients of the mean, of the
-/// splat's mean and of its conic.
+/// The inputs of Gaussian `i` with their error bounds: mean, rotation, scales, conic, the gradient of the mean, the
+/// moments of the splat.
 fn inputs(params: &Params, constants: &Constants, slices: &Slices<'_>, i: usize) -> [Vec<f64>; 2] {
     const OFF: f64 = 256.0 * UNIT;
     let n = params.gaussian_count as usize;
@@ -48,7 +49,7 @@ fn inputs(params: &Params, constants: &Constants, slices: &Slices<'_>, i: usize)
     let conic = slices.splats[i].conic.as_dvec3().to_array();
     let d_mean = (0..3).map(|axis| f64::from(slices.gradients[3 * i + axis]));
     let exact = conic.into_iter().chain(d_mean);
-    let summed = record[..5].iter().map(|sum| (sum.value, sum.error));
+    let summed = record[..6].iter().map(|sum| (sum.value, sum.error));
     for (value, error) in exact.map(|value| (value, 0.0)).chain(summed) {
         values.push(value);
         errors.push(OFF * value.abs() + error);
@@ -66,8 +67,9 @@ fn share(camera: &Camera, inputs: &[f64]) -> Vec<f64> {
         features: vec![],
         sh: vec![],
     };
-    let d_splat = (DVec2::from_slice(&inputs[16..]), vector(18));
-    camera_backward(camera, &gaussian, vector(13), vector(10), d_splat).to_vec()
+    let splat = Splat { mean2d: DVec2::ZERO, conic: vector(10), opacity: 1.0 };
+    let (d_mean2d, d_conic, _) = splat_gradient(&splat, &inputs[16..]);
+    camera_backward(camera, &gaussian, vector(13), splat.conic, (d_mean2d, d_conic)).to_vec()
 }
 
 impl Reference for Kernel {

@@ -31,6 +31,14 @@ pub struct DSplat {
     pub features: Vec<f64>,
 }
 
+/// The gradients of a splat's mean, conic and opacity from the moments of dL/dsigma that are first in its record.
+pub fn splat_gradient(splat: &Splat, record: &[f64]) -> (DVec2, DVec3, f64) {
+    let [a, b, c] = splat.conic.to_array();
+    let &[moment, x, y, xx, xy, yy, ..] = record else { panic!("a record has six moments") };
+    let mean2d = DVec2::new(a * x + b * y, b * x + c * y);
+    (mean2d, DVec3::new(0.5 * xx, xy, 0.5 * yy), -moment / splat.opacity)
+}
+
 /// The gradients of a Gaussian's attributes from those of its splat.
 pub fn project_gaussian_backward(
     camera: &Camera,
@@ -142,14 +150,15 @@ impl<'a> ProjectionInputs<'a> {
     }
 
     /// The gradients in the `record` of Gaussian `i`; clamped colours have none.
-    fn d_splat(&self, colors: &[f32], record: &[f64], i: usize) -> DSplat {
+    fn d_splat(&self, splat: &Splat, colors: &[f32], record: &[f64], i: usize) -> DSplat {
+        let (mean2d, conic, opacity) = splat_gradient(splat, record);
         let color = &colors[stored_color(self.constants.channels) * i..];
         let is_free = |c: usize| self.constants.raw_colors || color[c] > 0.0;
         let passes = |c: usize| if is_free(c) { record[HEAD + c] } else { 0.0 };
         DSplat {
-            mean2d: DVec2::from_slice(record),
-            conic: DVec3::from_slice(&record[2..]),
-            opacity: record[5],
+            mean2d,
+            conic,
+            opacity,
             color: DVec3::from_array([0, 1, 2].map(passes)),
             features: record[HEAD + 3..].to_vec(),
         }
@@ -247,9 +256,10 @@ impl Reference for Kernel {
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
             let record =
                 summed_record(constants.channels, intersection_ranges[i], gradient_records);
-            let d_splat = scene.d_splat(colors, &values(&record), i);
+            let splat = Splat::from(&splats[i]);
+            let d_splat = scene.d_splat(&splat, colors, &values(&record), i);
             let gaussian = planes.load(&parameters, i);
-            let gradient = scene.backward(&gaussian, &Splat::from(&splats[i]), &d_splat);
+            let gradient = scene.backward(&gaussian, &splat, &d_splat);
             let mut is_finite = (8.0 * d_splat.color.as_vec3()).is_finite();
             scene.planes.store(&gradient, i, |at, value| {
                 let value = value as f32;
@@ -305,14 +315,14 @@ impl Reference for Kernel {
                 let (own, rest) = inputs.split_at(one.float_count());
                 let splat = Splat { conic: DVec3::from_slice(rest), ..splat };
                 let (gaussian, d_splat) =
-                    (one.load(own, 0), scene.d_splat(slices.colors, &rest[3..], i));
+                    (one.load(own, 0), scene.d_splat(&splat, slices.colors, &rest[3..], i));
                 let gradient = scene.backward(&gaussian, &splat, &d_splat);
                 let mut numbers = vec![0.0; one.float_count() + 1];
                 one.store(&gradient, 0, |at, value| numbers[at] = value);
                 numbers[one.float_count()] = scene.damped_norm(&gaussian, &d_splat);
                 numbers
             });
-            let d_splat = scene.d_splat(slices.colors, &values(&record), i);
+            let d_splat = scene.d_splat(&splat, slices.colors, &values(&record), i);
             let gradient = scene.backward(&gaussian, &splat, &d_splat);
             scene.planes.store(&gradient, i, |at, value| gradients[at] = OFF * value.abs());
             let mut moved = one.load(&bounds, 0);

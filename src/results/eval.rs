@@ -3,7 +3,6 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::str::FromStr;
 
 use serde_json::{Map, Value, json};
 
@@ -17,12 +16,15 @@ use crate::photographs::metrics::{self, Scores};
 use crate::photographs::tone::{SceneTone, ToneCurve, ToneSettings};
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
-use crate::splats::scene::{DeviceGaussians, Feature, Shape};
+use crate::splats::scene::{DeviceGaussians, Shape};
 use crate::train::{Networks, Rendered, TestTargets, TrainConfig};
 use crate::{Error, Result};
 
+mod layers;
 mod transmittance;
 
+use layers::Normals;
+pub use layers::RenderLayer;
 pub use transmittance::{
     MAX_RESIDUAL_TRANSMITTANCE, ResidualTransmittance, hole_warning, warn_of_holes,
 };
@@ -215,11 +217,15 @@ impl ScoredImages<'_> {
 /// A finished model on the device, ready to render.
 #[derive(Debug)]
 pub struct ModelRenderer {
+    gpu: Gpu,
     gaussians: DeviceGaussians,
     renderer: Renderer,
     networks: Option<Networks>,
     /// The training frame, in which the Gaussians are.
     frame: TrainingFrame,
+    background: [f32; 3],
+    /// Made for the first render of normals.
+    normals: Option<Normals>,
 }
 
 impl ModelRenderer {
@@ -242,14 +248,22 @@ impl ModelRenderer {
             ..model.render_settings()
         };
         Ok(Self {
+            gpu: gpu.clone(),
             frame,
+            background: [0.0; 3],
+            normals: None,
             gaussians: model.gaussians.to_frame(&frame).upload(gpu)?,
             renderer: Renderer::new(gpu, settings)?,
             networks,
         })
     }
 
-    /// Renders a view over a black background.
+    /// Renders over this colour, display-referred, from now on; black is the default.
+    pub(crate) fn set_background(&mut self, background: [f32; 3]) {
+        self.background = background;
+    }
+
+    /// Renders a view over the background.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -257,7 +271,7 @@ impl ModelRenderer {
         self.render_camera(&view.camera)
     }
 
-    /// Renders a camera in the dataset's world over a black background.
+    /// Renders a camera in the dataset's world over the background.
     ///
     /// # Errors
     /// The device is out of memory or lost.
@@ -267,103 +281,12 @@ impl ModelRenderer {
         Rendered::new(&mut self.renderer, &self.gaussians, camera, &options, networks)
     }
 
-    /// Renders one layer; a feature of one channel is repeated in all three.
-    ///
-    /// # Errors
-    /// The model has no such layer, or the device is out of memory or lost.
-    pub fn layer(&mut self, camera: &Camera, layer: RenderLayer) -> Result<Image> {
-        let lacks =
-            || Error::Usage(format!("the model has no {}; {}", layer.name(), self.layers()));
-        let feature = match layer {
-            RenderLayer::Rgb => return Ok(self.render_camera(camera)?.colors),
-            RenderLayer::Denoised => {
-                let lacks = lacks();
-                return self.render_camera(camera)?.denoised.ok_or(lacks);
-            }
-            RenderLayer::Depth => Feature::Depth,
-            RenderLayer::Structure => Feature::Structure,
-            RenderLayer::Illumination => Feature::Illumination,
-            RenderLayer::Noise => Feature::Noise,
-        };
-        let planes = self.shape().features.channels_of(feature).ok_or_else(lacks)?;
-        let Camera { width, height, .. } = *camera;
-        let pixels = width as usize * height as usize;
-        let (camera, options) = (&self.frame.camera(camera), self.options());
-        self.renderer.reserve(self.gaussians.layout.count, [camera])?;
-        let channels = self.renderer.render_channels(&self.gaussians, camera, &options)?;
-        let plane = |c: usize| {
-            let plane = planes.start + c.min(planes.len() - 1);
-            channels[plane * pixels..][..pixels].iter().copied()
-        };
-        Ok(Image { width, height, data: (0..3).flat_map(plane).collect() })
-    }
-
-    /// The layers that the model has, for a message.
-    fn layers(&self) -> String {
-        let denoised = self.networks.as_ref().is_some_and(Networks::has_denoiser);
-        let features = self.shape().features.specs().map(|spec| spec.name);
-        let names: Vec<&str> =
-            ["rgb"].into_iter().chain(denoised.then_some("denoised")).chain(features).collect();
-        format!("it has {}", names.join(", "))
-    }
-
     fn options(&self) -> RenderOptions {
-        RenderOptions { sh_degree: self.shape().sh_degree, background: [0.0; 3] }
+        RenderOptions { sh_degree: self.shape().sh_degree, background: self.background }
     }
 
     fn shape(&self) -> Shape {
         self.gaussians.layout.shape
-    }
-}
-
-/// The images that can be rendered from a model.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum RenderLayer {
-    /// R_0, the Gaussians' colours.
-    Rgb,
-    /// R_K, the output of the denoiser.
-    Denoised,
-    /// The depth feature, in its own units.
-    Depth,
-    /// The structure feature.
-    Structure,
-    /// The illumination feature.
-    Illumination,
-    /// The noise feature.
-    Noise,
-}
-
-impl RenderLayer {
-    /// Every layer.
-    pub const ALL: [Self; 6] =
-        [Self::Rgb, Self::Denoised, Self::Depth, Self::Structure, Self::Illumination, Self::Noise];
-
-    /// The name on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Rgb => "rgb",
-            Self::Denoised => "denoised",
-            Self::Depth => "depth",
-            Self::Structure => "structure",
-            Self::Illumination => "illumination",
-            Self::Noise => "noise",
-        }
-    }
-
-    /// Whether its values are sRGB-encoded colours.
-    pub(crate) fn is_color(self) -> bool {
-        matches!(self, Self::Rgb | Self::Denoised)
-    }
-}
-
-impl FromStr for RenderLayer {
-    type Err = Error;
-
-    fn from_str(name: &str) -> Result<Self> {
-        Self::ALL.into_iter().find(|layer| layer.name() == name).ok_or_else(|| {
-            let names = Self::ALL.map(Self::name).join(", ");
-            Error::Usage(format!("unknown layer `{name}`; the layers are {names}"))
-        })
     }
 }
 

@@ -132,7 +132,12 @@ pub struct Provenance {
     pub rotation: DQuat,
     /// Settings that a renderer requires; the origin is that of the Gaussians.
     pub facts: Facts,
+    /// The edit lists that were applied, each on one line.
+    pub edits: Vec<String>,
 }
+
+/// The key of an edit list in a file's header.
+pub(crate) const EDITS: &str = "edits";
 
 /// The program's name and version in files.
 pub const GENERATOR: &str = concat!("nightsplat ", env!("CARGO_PKG_VERSION"));
@@ -140,7 +145,7 @@ pub const GENERATOR: &str = concat!("nightsplat ", env!("CARGO_PKG_VERSION"));
 impl Provenance {
     /// Lines for a header.
     pub fn lines(&self) -> Vec<String> {
-        let Self { dataset, curve, exposure, .. } = self;
+        let Self { dataset, curve, exposure, edits, .. } = self;
         let lines = [
             ("generator", GENERATOR),
             ("dataset", dataset),
@@ -150,7 +155,8 @@ impl Provenance {
         let line = |(key, value): (&str, &str)| {
             format!("{key}: {}", value.replace(char::is_control, " ").trim())
         };
-        lines.into_iter().filter(|(_, value)| !value.is_empty()).map(line).collect()
+        let edits = edits.iter().map(|list| (EDITS, list.as_str()));
+        lines.into_iter().chain(edits).filter(|(_, value)| !value.is_empty()).map(line).collect()
     }
 }
 

@@ -47,7 +47,7 @@ impl FinishedRun {
         change: impl FnOnce(&mut TrainConfig),
     ) -> Result<Self> {
         if is_model(folder) {
-            return Self::open_model(folder, dataset, device);
+            return Self::open_model(folder, dataset, device, change);
         }
         let mut config = run::load_config(folder)?;
         if let Some(dataset) = dataset {
@@ -93,10 +93,12 @@ impl FinishedRun {
         path: &Path,
         dataset: Option<&Path>,
         device: Option<&DeviceChoice>,
+        change: impl FnOnce(&mut TrainConfig),
     ) -> Result<Self> {
         let dataset = dataset.ok_or_else(|| needs_photographs(path))?;
         let (gaussians, facts) = models::read(path)?;
         let mut config = config_of_file(&gaussians, &facts, Some(dataset));
+        change(&mut config);
         let gpu = Gpu::new(device.unwrap_or(&DeviceChoice::Best))?;
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
         let frame = dataset.frame();

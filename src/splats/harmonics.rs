@@ -85,3 +85,42 @@ impl HarmonicRotation {
         }
     }
 }
+
+#[cfg(all(test, feature = "io"))]
+mod tests {
+    use glam::DQuat;
+    use nalgebra::{DMatrix, DVector};
+
+    use super::*;
+
+    /// Another way to the same coefficients: those that fit the colours of the rotated directions by least squares.
+    #[test]
+    fn rotated_coefficients_are_those_that_fit_rotated_colours_by_least_squares() {
+        let rotation = DQuat::from_axis_angle(DVec3::new(1.0, 2.0, -0.5).normalize(), 0.646);
+        let directions: Vec<DVec3> = (0..60_u32)
+            .map(|k| {
+                // A spiral of even steps in z covers the sphere.
+                let z = 1.0 - (2.0 * f64::from(k) + 1.0) / 60.0;
+                let (sin, cos) = (2.4 * f64::from(k)).sin_cos();
+                let ring = (1.0 - z * z).sqrt();
+                DVec3::new(ring * cos, ring * sin, z)
+            })
+            .collect();
+        let own: Vec<f64> = (0..15).map(|k| ((k * k % 7) as f64 - 3.0) / 5.0).collect();
+        let color = |direction: &DVec3| {
+            let basis = sh_basis(3, rotation.inverse() * *direction);
+            own.iter().zip(&basis[1..]).map(|(c, b)| c * b).sum::<f64>()
+        };
+        let colors = DVector::from_iterator(60, directions.iter().map(color));
+        let basis = |row: usize, column: usize| sh_basis(3, directions[row])[column + 1];
+        let matrix = DMatrix::from_fn(60, 15, basis);
+        let expected = matrix.svd(true, true).solve(&colors, 1e-12).unwrap();
+
+        let mut turned: Vec<glam::Vec3> =
+            own.iter().map(|value| glam::Vec3::splat(*value as f32)).collect();
+        HarmonicRotation::new(DMat3::from_quat(rotation)).turn(&mut turned);
+        for (turned, expected) in turned.iter().zip(&expected) {
+            assert!((f64::from(turned.x) - expected).abs() < 2e-7, "{turned} {expected}");
+        }
+    }
+}

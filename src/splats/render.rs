@@ -11,7 +11,11 @@
 mod buffers;
 mod cameras;
 mod capacity;
+#[cfg(feature = "io")]
+mod depths;
 mod draw;
+#[cfg(feature = "io")]
+mod gradients;
 mod images;
 mod limits;
 mod pipelines;
@@ -41,6 +45,8 @@ pub use cameras::CameraGradient;
 pub use cameras::{Viewpoint, Viewpoints};
 pub use draw::Drawn;
 use draw::HostTargets;
+#[cfg(feature = "io")]
+pub(crate) use gradients::ViewGradients;
 use pipelines::Projections;
 pub use settings::{Purpose, RenderSettings};
 pub use target::{DepthConvention, DepthKind, SceneDepth, Target};
@@ -118,6 +124,12 @@ impl Renderer {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn intersections(&self) -> Result<u32> {
         Ok(self.gpu.read(&self.frame.counts)?[0])
+    }
+
+    /// The settings that it was made with.
+    #[cfg(feature = "io")]
+    pub(crate) fn settings(&self) -> &RenderSettings {
+        &self.settings
     }
 
     /// The last render, planar (channels, H, W): RGB, then the features.

@@ -3,9 +3,9 @@
 use std::fmt;
 use std::ops::Range;
 
-use glam::{DMat3, DQuat, DVec3, Vec3};
-use rayon::prelude::*;
+use glam::{DQuat, DVec3, Vec3};
 
+mod change;
 mod device;
 mod facts;
 mod features;
@@ -19,7 +19,6 @@ pub mod ply;
 use crate::camera::TrainingFrame;
 pub use crate::splats::attributes::{ATTRIBUTES, Attribute, PlaneCounts, rest_coefficients};
 use crate::splats::attributes::{column_count, planes};
-use crate::splats::harmonics::HarmonicRotation;
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
 pub use facts::Facts;
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};
@@ -159,26 +158,6 @@ impl Gaussians {
         other
     }
 
-    /// Removes the Gaussians whose `keep` is false; the others keep their order.
-    #[cfg(feature = "io")]
-    pub(crate) fn retain(&mut self, keep: &[bool]) {
-        let kept = keep.iter().filter(|keep| **keep).count();
-        if kept == self.count {
-            return;
-        }
-        let mut to = 0;
-        for spec in &ATTRIBUTES {
-            let (column, width) = self.columns(spec.attribute);
-            for (index, _) in keep.iter().enumerate().filter(|(_, keep)| **keep) {
-                let from = column * self.count + index * width;
-                self.parameters.copy_within(from..from + width, to);
-                to += width;
-            }
-        }
-        self.parameters.truncate(to);
-        self.count = kept;
-    }
-
     /// The lowest SH degree that includes all nonzero coefficients.
     pub(crate) fn sh_degree_in_use(&self) -> u32 {
         let own = rest_coefficients(self.shape.sh_degree);
@@ -206,23 +185,7 @@ impl Gaussians {
     /// another `up` by `DQuat::from_rotation_arc(up, DVec3::NEG_Y)` first.
     pub fn rotated(&self, rotation: DQuat) -> Self {
         let mut rotated = self.clone();
-        rotated.origin = rotation * self.origin;
-        for mean in rotated.means_mut() {
-            *mean = (rotation * mean.as_dvec3()).as_vec3();
-        }
-        for quat in rotated.quats_mut() {
-            let [w, x, y, z] = quat.map(f64::from);
-            let DQuat { x, y, z, w } = rotation * DQuat::from_xyzw(x, y, z, w);
-            *quat = [w, x, y, z].map(|part| part as f32);
-        }
-        let coefficients = rest_coefficients(self.shape.sh_degree);
-        if coefficients > 0 {
-            let harmonics = HarmonicRotation::new(DMat3::from_quat(rotation));
-            rotated
-                .rest_mut()
-                .par_chunks_exact_mut(coefficients)
-                .for_each(|rest| harmonics.turn(rest));
-        }
+        rotated.rotate(rotation);
         rotated
     }
 

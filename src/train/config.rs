@@ -104,6 +104,9 @@ pub struct TrainConfig {
     /// Use every Nth view by name as a test view, instead of the dataset's split; 0: no test views.
     test_every: Option<usize> = None, "the dataset's split, else every 8th"
         => Rule::COUNT, in "views", "--test-every N";
+    /// Patterns of photographs to leave out, by name or by path as listed: `*`, `?` and `[abc]` match. Others keep their
+    /// split.
+    exclude: Vec<String> = vec![] => Rule::List(0, 1_000_000, &PATTERN);
     /// Memory for photographs on the device and on the host, such as 4G; the rest is kept on disk, which takes time but
     /// changes no result.
     cache: Option<CacheSize> = None, "a quarter of each memory" => MEMORY, in "bytes", "--cache SIZE";
@@ -184,6 +187,12 @@ const MEMORY: Rule =
 
 const WHITE_BALANCE: Rule =
     Rule::Text(WhiteBalance::FORM, |text| text.parse::<WhiteBalance>().is_ok());
+
+/// A pattern of photographs' names.
+const PATTERN: Rule = Rule::Text(
+    "a pattern of file names, such as IMG_01*.jpg",
+    crate::photographs::dataset::exclude::is_pattern,
+);
 
 const MINUTES: Rule = Rule::from_to(0.0, 1e9);
 
@@ -272,6 +281,7 @@ impl TrainConfig {
             downscale: self.downscale,
             max_resolution: self.max_resolution,
             test_every: self.test_every,
+            exclude: self.exclude.clone(),
             keep: CacheSize::on_host(self.cache, self.max_ram),
             images: self.images.clone(),
             orientation: self.orientation,

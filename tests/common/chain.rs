@@ -7,7 +7,7 @@ use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::camera::Camera;
 use nightsplat::reference::camera_backward::camera_backward;
 use nightsplat::reference::project::{Projection, project_gaussian};
-use nightsplat::reference::project_backward::{DSplat, project_gaussian_backward};
+use nightsplat::reference::project_backward::{DSplat, project_gaussian_backward, splat_gradient};
 use nightsplat::reference::splat::Splat;
 use nightsplat::splats::render::CameraGradient;
 
@@ -148,8 +148,8 @@ impl<'a> Chain<'a> {
         }
         let planes = self.setup.planes();
         for (j, &i) in ids.iter().enumerate() {
-            let d_splat =
-                self.d_splat(&gradient_records[record * j..][..record], &colors[channels * j..]);
+            let (own, color) = (&gradient_records[record * j..][..record], &colors[channels * j..]);
+            let d_splat = self.d_splat(&splats[j], own, color);
             let gaussian = planes.load(parameters, i);
             let degree = self.setup.options.sh_degree;
             let d = project_gaussian_backward(&camera, degree, &gaussian, &splats[j], &d_splat);
@@ -166,13 +166,14 @@ impl<'a> Chain<'a> {
     }
 
     /// The gradients of a splat; clamped colours have none.
-    fn d_splat(&self, record: &[f64], color: &[f64]) -> DSplat {
+    fn d_splat(&self, splat: &Splat, record: &[f64], color: &[f64]) -> DSplat {
+        let (mean2d, conic, opacity) = splat_gradient(splat, record);
         let is_free = |c: usize| self.setup.settings.raw_colors || color[c] > 0.0;
         let passes = |c: usize| if is_free(c) { record[RECORD_HEAD as usize + c] } else { 0.0 };
         DSplat {
-            mean2d: DVec2::from_slice(record),
-            conic: DVec3::from_slice(&record[2..]),
-            opacity: record[5],
+            mean2d,
+            conic,
+            opacity,
             color: DVec3::from_array([0, 1, 2].map(passes)),
             features: record[9..].to_vec(),
         }

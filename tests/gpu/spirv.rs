@@ -9,6 +9,8 @@ use nightsplat::gpu::{Interface, Kernel as _, REQUIREMENTS};
 use nightsplat::kernels::splat::MAX_CHANNELS;
 use nightsplat::kernels::{ALL, blend_backward, blend_forward};
 
+use crate::common::not_run;
+
 // Opcodes and enumerants of the SPIR-V specification.
 const OP_EXECUTION_MODE: u32 = 16;
 const OP_TYPE_VECTOR: u32 = 23;
@@ -76,12 +78,10 @@ fn validated(module: &[u32]) -> std::io::Result<Output> {
 fn every_frozen_kernel_is_valid() {
     for (interface, module) in all() {
         let Ok(output) = validated(&module) else {
-            eprintln!(
-                "not run: every_frozen_kernel_is_valid ({}:{}): there is no spirv-val",
-                file!(),
-                line!()
+            return not_run(
+                "spirv-val",
+                "there is no spirv-val (on Debian `apt install spirv-tools`)",
             );
-            return;
         };
         let printed =
             String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();

@@ -5,12 +5,16 @@
 #[path = "../common/mod.rs"]
 mod common;
 
+mod compare;
 mod determinism;
+mod edit;
 mod export;
+mod floaters;
 mod injected;
 mod lost_work;
 mod model_files;
 mod profile;
+mod rendered;
 mod report;
 mod run;
 mod turned;

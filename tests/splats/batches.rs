@@ -100,7 +100,7 @@ fn views() -> Dataset {
 /// The steps include density control and a growing SH degree.
 fn config() -> TrainConfig {
     let mut config =
-        TrainConfig { steps: 30, max_gaussians: 5200, random_points: 4200, ..TrainConfig::bare() };
+        TrainConfig { steps: 30, max_gaussians: 4700, random_points: 4200, ..TrainConfig::bare() };
     (config.schedule.densify_after, config.schedule.densify_interval) = (4, 5);
     config.schedule.densify_before = 25;
     config.schedule.sh_degree_interval = 7;

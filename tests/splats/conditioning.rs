@@ -22,7 +22,7 @@ use nightsplat::splats::optimizer::{Adam, AdamBuffers, LearningRates, Moments};
 use crate::common::setup::Setup;
 use crate::common::{Random, widen};
 
-/// Numbers in a record of three channels: mean2d, conic, opacity, colour.
+/// Numbers in a record of three channels: six moments, colour.
 const RECORD: usize = 9;
 /// The same as stored, with zeros.
 const STORED_RECORD: usize = 12;

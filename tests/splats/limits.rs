@@ -8,7 +8,7 @@ use std::collections::HashSet;
 
 use glam::{DVec2, DVec3, UVec2, Vec2, Vec3};
 use nightsplat::camera::Patch;
-use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::testing::{gpu, gpu_with};
 use nightsplat::gpu::{Threads, Tile};
 use nightsplat::kernels::status::STATUS_TILE_LIMIT;
 use nightsplat::kernels::{
@@ -415,4 +415,23 @@ fn a_tile_that_does_not_suit_the_device_is_refused_in_one_line_and_other_tiles_r
         setup.settings.tile = Some(tile.into());
         setup.render();
     }
+}
+
+/// With fewer lanes each has the state of more pixels.
+#[test]
+fn narrow_subgroups_of_a_gpu_share_a_tile_where_they_stay_converged() {
+    let tile = |lanes, stays_converged, channels| {
+        let gpu = gpu_with(|properties| {
+            properties.is_cpu = false;
+            properties.subgroup_size = lanes;
+            properties.has_uniform_subgroup_control_flow = stays_converged;
+        });
+        let shape = Shape { sh_degree: 0, features: features(channels) };
+        RenderSettings { shape, ..RenderSettings::default() }.tile_on(&gpu).unwrap()
+    };
+    assert_eq!(tile(8, true, 3), Tile { size: [16, 16], subgroups: 4 });
+    assert_eq!(tile(8, true, 11), Tile { size: [16, 8], subgroups: 4 });
+    assert_eq!(tile(8, false, 3), Tile::from([8, 8]));
+    assert_eq!(tile(8, false, 11), Tile::from([8, 4]));
+    assert_eq!(tile(32, false, 11), Tile::from([16, 16]));
 }

@@ -50,7 +50,7 @@ fn an_overflow_renders_nothing_and_keeps_its_flag() {
     gpu().write(rendered.renderer.render_and_status().1, &[flags, 7]).unwrap();
     rendered.renderer.set_intersection_capacity(total).unwrap();
     rendered.forward();
-    assert_eq!(gpu().read(rendered.renderer.status()).unwrap(), [flags, total, 0]);
+    assert_eq!(gpu().read(rendered.renderer.status()).unwrap(), [flags, total, 0, flags]);
 }
 
 /// A Gaussian in the middle of the view of [`Setup::new`], a few pixels wide.

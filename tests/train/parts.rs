@@ -336,6 +336,8 @@ fn a_run_with_networks_is_saved_scored_and_rendered_layer_by_layer() {
         ("rgb", "png"),
         ("denoised", "png"),
         ("depth", "png"),
+        ("normal", "png"),
+        ("depth-feature", "png"),
         ("structure", "exr"),
         ("illumination", "png"),
         ("noise", "exr"),
@@ -363,7 +365,7 @@ fn a_missing_layer_is_named_with_the_available_ones() {
     let at = run.display();
     succeed(&format!("train {set} --out {at} --parts structure {SMALL}"));
     let render = format!("render {at} --split test --out {at}/out --layer denoised");
-    refused(&render, 2, &["no denoised", "rgb, structure"]);
+    refused(&render, 2, &["no denoised", "it has rgb, depth, normal", "transmittance, structure"]);
 
     let config = run.join("config.toml");
     let text = std::fs::read_to_string(&config).unwrap();

@@ -188,14 +188,14 @@ fn the_passes_of_a_slow_step_are_submitted_one_by_one_and_no_bit_changes() {
         let submits = submitted(&gpu) - before;
         (submits, trainer.gaussians().unwrap())
     };
-    let (few, whole) = run(Duration::MAX);
-    let (many, cut) = run(Duration::ZERO);
-    assert!(many >= few + 10 * STEPS, "{many} and {few} submissions");
+    let (at_once, whole) = run(Duration::MAX);
+    let (one_by_one, cut) = run(Duration::ZERO);
+    assert!(one_by_one >= at_once + 10 * STEPS, "{one_by_one} and {at_once} submissions");
     assert_eq!(cut, whole);
 }
 
 #[test]
-fn a_plain_step_is_at_most_18_dispatches_and_16_barriers_on_a_cpu_and_on_a_gpu() {
+fn a_plain_step_is_at_most_18_dispatches_and_17_barriers_on_a_cpu_and_on_a_gpu() {
     let with_all_coefficients = |rest| {
         let mut config = config();
         config.schedule.sh_degree_interval = 1;
@@ -204,7 +204,7 @@ fn a_plain_step_is_at_most_18_dispatches_and_16_barriers_on_a_cpu_and_on_a_gpu()
     };
     // Separate devices: other tests would add to their counts.
     let cpu = Gpu::new(&DeviceChoice::Best).unwrap();
-    for (gpu, most) in [(cpu, [18, 16]), (gpu_with(|own| own.is_cpu = false), [18, 16])] {
+    for (gpu, most) in [(cpu, [18, 16]), (gpu_with(|own| own.is_cpu = false), [18, 17])] {
         for (bits, more) in [(StorageFormat::Single, 0), (StorageFormat::Half, 1)] {
             let recorded = recorded_for_a_step(&gpu, with_all_coefficients(bits));
             let [dispatches, barriers] = recorded;

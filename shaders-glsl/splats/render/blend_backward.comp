@@ -5,15 +5,15 @@
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "splat.glsl"
 #include "tile.glsl"
-#include "subgroup_sum.glsl"
+#include "record_sums.glsl"
 
-//! Blend backward: a tile's subgroups, most often one, record the gradient of every intersection in its slot.
+//! Blend backward: a tile's subgroups, most often one, write the gradient record of every intersection to its slot.
 //!
 //! Walks front to back again, as the forward pass did, with the light still to come, L_i = sum_{k >= i} c_k alpha_k
 //! T_k + T background, which starts as the render itself: dC / dalpha_i = (c_i T_i - L_i) / (1 - alpha_i). Of both,
-//! the product with dL/dC is all that is needed: one number a pixel, however many channels. No atomics: a slot is
-//! written by the one tile it belongs to, and the sums over a tile's parts and over a Gaussian's slots come in a
-//! fixed order.
+//! the product with dL/dC is all that is needed: one number a pixel, however many channels. The gradients of the ellipse
+//! are multiples of moments, sums of dL/dsigma times powers of the offset. No atomics: a slot is written by the one tile
+//! it belongs to, and the sums over a tile's parts and over a Gaussian's slots come in a fixed order.
 
 // This many channels, from the first, move and shape the splats; of the others only the colours learn.
 layout(constant_id = 8) const uint SHAPING_CHANNELS = 3;
@@ -27,11 +27,14 @@ layout(binding = 3) readonly  buffer Splats  { ProjectedSplat splats[]; };
 layout(binding = 4) readonly  buffer Colors  { vec4 colors[]; };  // (Gaussians, COLOR_VECTORS)
 layout(binding = 5) readonly  buffer Render  { float render[]; };    // (CHANNELS, H, W)
 layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNELS, H, W)
-// (slots, RECORD_VECTORS): mean2d 2, conic 3, opacity 1, colour CHANNELS, zeros
+// (slots, RECORD_VECTORS): moments of dL/dsigma 6, gradients of the colour CHANNELS, zeros
 layout(binding = 7) writeonly buffer GradientRecords { vec4 gradient_records[]; };
 
-// What every part but the first adds to the records of a batch; a tile of one part has room for one that is not used.
-shared float shares[(SUBGROUPS_PER_TILE - 1 + 1 / SUBGROUPS_PER_TILE) * RECORD * SUBGROUP_SIZE];
+// The splats that a subgroup loads at once: one a lane; at most 32 where parts add their records in shared memory.
+const uint BATCH = SUBGROUP_SIZE / (1 + (1 - 1 / SUBGROUPS_PER_TILE) * ((SUBGROUP_SIZE - 1) / 32));
+const uint RECORD_FLOATS = 4 * RECORD_VECTORS;
+// (parts, BATCH, RECORD_FLOATS): the records of a batch; without use where a tile has one part.
+shared float shares[(SUBGROUPS_PER_TILE - 1 / SUBGROUPS_PER_TILE) * BATCH * RECORD_FLOATS + 1];
 shared uint are_alive[SUBGROUPS_PER_TILE];
 
 // Whether any lane of any part says so; every lane has to ask.
@@ -71,12 +74,12 @@ void main() [[subgroup_uniform_control_flow]] {
 
     uvec2 range = tile_ranges[tile];
     uint first = range.x;
-    for (; first < range.y; first += SUBGROUP_SIZE) {
+    for (; first < range.y; first += BATCH) {
         bool alive = false;
         [[unroll]] for (uint g = 0; g < GROUPS; g++) alive = alive || transmittance[g] > 0.0;
         if (!tile_any(alive)) break;
 
-        uint batch = min(SUBGROUP_SIZE, range.y - first);
+        uint batch = min(BATCH, range.y - first);
         uint slot = sorted_intersections[first + min(lane, batch - 1)];
         uint id = gaussian_ids[slot];
         ProjectedSplat mine = splats[id];
@@ -84,103 +87,98 @@ void main() [[subgroup_uniform_control_flow]] {
         [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) my_color[k] = colors[COLOR_VECTORS * id + k];
         uint my_groups = splat_groups(mine, origin);
         if (lane >= batch) mine.opacity = 0.0;
-        vec2 my_d_mean2d = vec2(0.0);
-        vec3 my_d_conic = vec3(0.0);
-        float my_d_opacity = 0.0;
-        float my_d_color[CHANNELS];
-        [[unroll]] for (uint c = 0; c < CHANNELS; c++) my_d_color[c] = 0.0;
 
         // Tested at its end: a processor's driver runs a loop tested at its head once more, with every lane off.
         for (uint turn = 0; true;) {
             [[unroll]] for (uint k = 0; k < SPLATS_PER_TURN; k++) {
                 uint j = turn + k;
                 uint groups = subgroupShuffle(my_groups, j);
+                float record[RECORD_SPACE];
+                [[unroll]] for (uint i = 0; i < RECORD_SPACE; i++) record[i] = 0.0;
                 // What misses all of the part leaves nothing to sum.
-                if (SKIPS_GROUPS && groups == 0) continue;
-                vec2 offset = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
-                vec3 conic = subgroupShuffle(mine.conic, j);
-                float opacity = subgroupShuffle(mine.opacity, j);
-                float splat_color[CHANNELS];
-                [[unroll]] for (uint c = 0; c < CHANNELS; c++)
-                    splat_color[c] = subgroupShuffle(my_color[c / 4][c % 4], j);
-                // Moments of dL/dsigma over the pixels: what every gradient of the ellipse is made of.
-                float moment = 0.0;
-                vec2 moment_x_y = vec2(0.0);
-                vec3 moment_xx_xy_yy = vec3(0.0);
-                float d_color[CHANNELS];
-                [[unroll]] for (uint c = 0; c < CHANNELS; c++) d_color[c] = 0.0;
-
-                [[unroll]] for (uint g = 0; g < GROUPS; g++) {
-                    if ((groups >> g & 1) == 0) continue;
-                    vec2 d = offset - vec2(group_offset(g));
-                    float sigma = splat_sigma(conic, d);
-                    float falloff = exp(-sigma);
-                    float alpha = min(ALPHA_MAX, opacity * falloff);
-                    float before = transmittance[g];
-                    bool counts = sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0;
-                    // What does not count has alpha 0: the lanes never part.
-                    alpha = counts ? alpha : 0.0;
-                    float after = before * (1.0 - alpha);
-                    bool is_done = after < TRANSMITTANCE_MIN;
-                    transmittance[g] = is_done ? 0.0 : after;
-                    float weight = is_done ? 0.0 : alpha * before;
-                    float shade = 0.0;
-                    [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                        d_color[c] += weight * d_pixel[g][c];
-                        if (c < SHAPING_CHANNELS) shade += splat_color[c] * d_pixel[g][c];
+                if ((SKIPS_GROUPS ? groups : ~0u) != 0) {
+                    vec2 offset = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
+                    vec3 conic = subgroupShuffle(mine.conic, j);
+                    float opacity = subgroupShuffle(mine.opacity, j);
+                    float splat_color[CHANNELS];
+                    [[unroll]] for (uint c = 0; c < CHANNELS; c++)
+                        splat_color[c] = subgroupShuffle(my_color[c / 4][c % 4], j);
+                    vec3 sigma_by_power[COLUMNS];
+                    vec3 moments[COLUMNS];  // 1, y, yy
+                    [[unroll]] for (uint i = 0; i < COLUMNS; i++) {
+                        sigma_by_power[i] = sigma_in_column(conic, offset.x - float(group_offset(i).x));
+                        moments[i] = vec3(0.0);
                     }
-                    float d_alpha = before * shade - light[g];
-                    light[g] -= weight * shade;
-                    // At the cap alpha no longer depends on the splat.
-                    bool is_free = !is_done && opacity * falloff <= ALPHA_MAX;
-                    d_alpha = is_free ? d_alpha / (1.0 - alpha) : 0.0;
-                    float d_sigma = -alpha * d_alpha;
-                    vec2 first_moment = d_sigma * d;
-                    moment += d_sigma;
-                    moment_x_y += first_moment;
-                    moment_xx_xy_yy += first_moment.xxy * d.xyy;
+
+                    // Choices are between names, both computed: a compiler makes branches of others.
+                    [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                        if ((groups >> g & 1) == 0) continue;
+                        float y = offset.y - float(group_offset(g).y);
+                        float sigma = sigma_at(sigma_by_power[g % COLUMNS], y);
+                        float free_alpha = opacity * exp(-sigma);
+                        float alpha = min(ALPHA_MAX, free_alpha);
+                        bool counts = all(bvec2(sigma >= 0.0, alpha >= ALPHA_MIN));
+                        // What does not count has alpha 0: the lanes never part.
+                        alpha = counts ? alpha : 0.0;
+                        float before = transmittance[g];
+                        float after = before * (1.0 - alpha);
+                        bool is_done = after < TRANSMITTANCE_MIN;
+                        transmittance[g] = is_done ? 0.0 : after;
+                        float weight = alpha * before;
+                        weight = is_done ? 0.0 : weight;
+                        float shade = 0.0;
+                        [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
+                            record[RECORD_HEAD + c] += weight * d_pixel[g][c];
+                            if (c < SHAPING_CHANNELS) shade += splat_color[c] * d_pixel[g][c];
+                        }
+                        // -alpha dL/dalpha; at the cap alpha no longer depends on the splat.
+                        float d_sigma = alpha * (light[g] - before * shade) / (1.0 - alpha);
+                        bool is_free = !any(bvec2(is_done, free_alpha > ALPHA_MAX));
+                        d_sigma = is_free ? d_sigma : 0.0;
+                        light[g] -= weight * shade;
+                        float d_sigma_y = d_sigma * y;
+                        moments[g % COLUMNS] += vec3(d_sigma, d_sigma_y, d_sigma_y * y);
+                    }
+                    [[unroll]] for (uint i = 0; i < COLUMNS; i++) {
+                        float x = offset.x - float(group_offset(i).x);
+                        float moment_x = x * moments[i].x;
+                        record[0] += moments[i].x;
+                        record[1] += moment_x;
+                        record[2] += moments[i].y;
+                        record[3] += x * moment_x;
+                        record[4] += x * moments[i].y;
+                        record[5] += moments[i].z;
+                    }
+                    sum_record(record);
                 }
-                moment = subgroup_sum(moment);
-                moment_x_y = vec2(subgroup_sum(moment_x_y.x), subgroup_sum(moment_x_y.y));
-                [[unroll]] for (uint i = 0; i < 3; i++) moment_xx_xy_yy[i] = subgroup_sum(moment_xx_xy_yy[i]);
-                if (lane == j) {
-                    my_d_mean2d = vec2(dot(conic.xy, moment_x_y), dot(conic.yz, moment_x_y));
-                    my_d_conic = vec3(0.5, 1.0, 0.5) * moment_xx_xy_yy;
-                    // dL/dsigma = -opacity falloff dL/dalpha below the cap.
-                    my_d_opacity = -moment / opacity;
-                }
-                [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                    float sum = subgroup_sum(d_color[c]);
-                    if (lane == j) my_d_color[c] = sum;
+                uint record_slot = subgroupShuffle(slot, j);
+                [[unroll]] for (uint i = 0; i < RECORD_FLOATS; i += SUBGROUP_SIZE) {
+                    uint value = i + lane;
+                    bool is_own = value < RECORD_FLOATS && j < batch;
+                    if (is_own && tile_is_shared())
+                        shares[(gl_SubgroupID * BATCH + j) * RECORD_FLOATS + value] = record[i / SUBGROUP_SIZE];
+                    else if (is_own)
+                        gradient_records[RECORD_VECTORS * record_slot + value / 4][value % 4] =
+                            record[i / SUBGROUP_SIZE];
                 }
             }
             turn += SPLATS_PER_TURN;
             if (turn >= batch) break;
         }
-        float record[4 * RECORD_VECTORS];
-        [[unroll]] for (uint k = 0; k < 4 * RECORD_VECTORS; k++) record[k] = 0.0;
-        record[0] = my_d_mean2d.x;
-        record[1] = my_d_mean2d.y;
-        record[2] = my_d_conic.x;
-        record[3] = my_d_conic.y;
-        record[4] = my_d_conic.z;
-        record[5] = my_d_opacity;
-        [[unroll]] for (uint c = 0; c < CHANNELS; c++) record[RECORD_HEAD + c] = my_d_color[c];
         if (tile_is_shared()) {
-            if (gl_SubgroupID > 0) {
-                uint share = (gl_SubgroupID - 1) * RECORD * SUBGROUP_SIZE + lane;
-                [[unroll]] for (uint k = 0; k < RECORD; k++) shares[share + k * SUBGROUP_SIZE] = record[k];
-            }
             barrier();
-        }
-        if (gl_SubgroupID == 0 && lane < batch) {
-            for (uint part = 1; part < SUBGROUPS_PER_TILE; part++) {
-                uint share = (part - 1) * RECORD * SUBGROUP_SIZE + lane;
-                [[unroll]] for (uint k = 0; k < RECORD; k++) record[k] += shares[share + k * SUBGROUP_SIZE];
+            // The sums, in the order of the parts. Unrolled: some devices limit the iterations of an invocation.
+            [[unroll]] for (uint k = 0; k < BATCH * RECORD_FLOATS; k += SUBGROUP_SIZE * SUBGROUPS_PER_TILE) {
+                uint i = k + gl_LocalInvocationIndex;
+                if (i < batch * RECORD_FLOATS) {
+                    float sum = 0.0;
+                    [[unroll]] for (uint part = 0; part < SUBGROUPS_PER_TILE; part++)
+                        sum += shares[part * BATCH * RECORD_FLOATS + i];
+                    uint value = i % RECORD_FLOATS;
+                    uint at = RECORD_VECTORS * sorted_intersections[first + i / RECORD_FLOATS] + value / 4;
+                    gradient_records[at][value % 4] = sum;
+                }
             }
-            [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++)
-                gradient_records[RECORD_VECTORS * slot + k] =
-                    vec4(record[4 * k], record[4 * k + 1], record[4 * k + 2], record[4 * k + 3]);
         }
     }
     // After a tile that is done every gradient is zero.

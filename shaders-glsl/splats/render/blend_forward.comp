@@ -89,21 +89,25 @@ void main() [[subgroup_uniform_control_flow]] {
             [[unroll]] for (uint k = 0; k < SPLATS_PER_TURN; k++) {
                 uint j = turn + k;
                 uint groups = subgroupShuffle(my_groups, j);
-                vec2 d = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
+                vec2 offset = subgroupShuffle(mine.mean2d, j) - (vec2(first_pixel) + 0.5);
                 vec3 conic = subgroupShuffle(mine.conic, j);
                 float opacity = subgroupShuffle(mine.opacity, j);
                 float splat_color[CHANNELS];
                 [[unroll]] for (uint c = 0; c < CHANNELS; c++)
                     splat_color[c] = subgroupShuffle(my_color[c / 4][c % 4], j);
+                vec3 sigma_by_power[COLUMNS];
+                [[unroll]] for (uint k = 0; k < COLUMNS; k++)
+                    sigma_by_power[k] = sigma_in_column(conic, offset.x - float(group_offset(k).x));
 
+                // Choices are between names, both computed: a compiler makes branches of others.
                 [[unroll]] for (uint g = 0; g < GROUPS; g++) {
                     if ((groups >> g & 1) == 0) continue;
-                    float sigma = splat_sigma(conic, d - vec2(group_offset(g)));
+                    float sigma = sigma_at(sigma_by_power[g % COLUMNS], offset.y - float(group_offset(g).y));
                     float alpha = min(ALPHA_MAX, opacity * exp(-sigma));
-                    float before = transmittance[g];
-                    bool counts = sigma >= 0.0 && alpha >= ALPHA_MIN && before > 0.0;
+                    bool counts = all(bvec2(sigma >= 0.0, alpha >= ALPHA_MIN));
                     // What does not count is composited with alpha 0: the lanes never part.
                     alpha = counts ? alpha : 0.0;
+                    float before = transmittance[g];
                     float after = before * (1.0 - alpha);
                     bool is_done = after < TRANSMITTANCE_MIN;
                     if (VIEW_DEPTHS != 0) {
@@ -111,8 +115,9 @@ void main() [[subgroup_uniform_control_flow]] {
                         is_done = is_done || depth > limit[g];
                         if (before > 0.5 && after <= 0.5 && !is_done) median[g] = depth;
                     }
-                    transmittance[g] = is_done ? -abs(before) : after;
-                    float weight = is_done ? 0.0 : alpha * before;
+                    float last = -abs(before), weight = alpha * before;
+                    transmittance[g] = is_done ? last : after;
+                    weight = is_done ? 0.0 : weight;
                     [[unroll]] for (uint c = 0; c < CHANNELS; c++) color[g][c] += weight * splat_color[c];
                 }
             }

@@ -51,8 +51,9 @@ void main() {
     [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) {
         [[unroll]] for (uint c = 0; c < 4; c++) record[4 * k + c] = sum[k][c];
     }
-    vec2 d_mean2d = vec2(record[0], record[1]);
-    vec3 d_conic = vec3(record[2], record[3], record[4]);
+    vec3 conic = splats[i].conic;
+    vec2 d_mean2d = mean2d_gradient(conic, vec2(record[1], record[2]));
+    vec3 d_conic = conic_gradient(vec3(record[3], record[4], record[5]));
 
     Camera camera = cameras[camera_index];
     mat3 view_rotation = mat3(camera.view_from_world);
@@ -63,7 +64,7 @@ void main() {
     for (uint k = 0; k < 3; k++) view_axes[k] *= scale[k];
     Jacobian jacobian = camera_jacobian(mean_in_view, camera);
     vec3 row0 = jacobian.scale.x * jacobian.row0, row1 = jacobian.scale.y * jacobian.row1;
-    ConicGradient d = conic_backward(splats[i].conic, row0 * view_axes, row1 * view_axes, d_conic);
+    ConicGradient d = conic_backward(conic, row0 * view_axes, row1 * view_axes, d_conic);
     vec3 d_row0 = view_axes * d.u0, d_row1 = view_axes * d.u1;
     vec3 d_mean_in_view = camera_backward(mean_in_view, camera, d_mean2d, d_row0, d_row1);
 

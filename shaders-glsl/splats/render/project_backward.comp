@@ -132,9 +132,9 @@ void main() {
     [[unroll]] for (uint k = 0; k < RECORD_VECTORS; k++) {
         [[unroll]] for (uint c = 0; c < 4; c++) record[4 * k + c] = sum[k][c];
     }
-    vec2 d_mean2d = vec2(record[0], record[1]);
-    vec3 d_conic = vec3(record[2], record[3], record[4]);
-    float d_opacity = record[5];
+    vec2 d_mean2d = mean2d_gradient(splat.conic, vec2(record[1], record[2]));
+    vec3 d_conic = conic_gradient(vec3(record[3], record[4], record[5]));
+    float d_opacity = opacity_gradient(splat.opacity, record[0]);
     vec3 color = colors[COLOR_VECTORS * i].rgb, d_color;
     for (uint c = 0; c < 3; c++) {
         // A colour clamped at zero passes nothing on.

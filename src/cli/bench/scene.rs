@@ -88,7 +88,10 @@ fn config() -> TrainConfig {
 /// The device is out of memory or lost.
 pub fn plain(gpu: &Gpu, scene: &BenchScene) -> Result<Trainer> {
     let dataset = scene.dataset();
-    let mut trainer = Trainer::from_gaussians(gpu, config(), &dataset, &scene.gaussians)?;
+    let mut config = config();
+    let Camera { width, height, .. } = scene.camera;
+    config.tile = Some(config.render_settings().tile_for(gpu, std::iter::once([width, height]))?);
+    let mut trainer = Trainer::from_gaussians(gpu, config, &dataset, &scene.gaussians)?;
     while trainer.steps_done() < 3 {
         trainer.advance(3)?;
     }

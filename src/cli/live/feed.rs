@@ -11,6 +11,7 @@ use hyper::body::Bytes;
 use serde_json::{Value, json};
 
 use crate::Stop;
+use crate::results::edit::fingerprint;
 use crate::results::export::page::packed;
 use crate::results::models;
 use crate::results::run::{Event, Requests, RunTail};
@@ -54,6 +55,8 @@ struct State {
     step: Option<u64>,
     /// Time and length of the file that it was read from.
     file: Option<(SystemTime, u64)>,
+    /// The checksum by which edit lists name a model file; `None` of a model that is no file, or not sent whole.
+    fingerprint: Option<String>,
     /// Why the newest model cannot be shown, on one line.
     problem: Option<String>,
     /// When the next snapshot may be requested.
@@ -129,6 +132,7 @@ impl Feed {
         }
         told["model"] = state.version.into();
         told["modelStep"] = state.step.into();
+        told["fingerprint"] = state.fingerprint.clone().into();
         told["canControl"] = self.requests.is_some().into();
         told["problem"] = state.problem.clone().into();
         state.told = Some((now, told.clone()));
@@ -161,7 +165,11 @@ impl Feed {
     fn reread(&self, path: &Path, state: &mut State) {
         let from = if let Source::Run(run) = &self.source { run } else { path };
         match models::read(from) {
-            Ok((gaussians, _)) => state.show(&gaussians, None),
+            Ok((gaussians, _)) => {
+                state.show(&gaussians, None);
+                let is_whole = gaussians.count <= MOST_GAUSSIANS;
+                state.fingerprint = is_whole.then(|| fingerprint(&gaussians));
+            }
             Err(error) => state.problem = Some(error.to_string()),
         }
     }
@@ -235,7 +243,8 @@ mod tests {
             feed.state()
         };
         model(&[1.0]).save(&path).unwrap();
-        assert_eq!(state()["model"], 1);
+        let shown = state();
+        assert_eq!((shown["model"].as_u64(), shown["fingerprint"].is_string()), (Some(1), true));
         let first = feed.model().unwrap();
         assert_eq!(state()["model"], 1);
         model(&[1.0, 2.0]).save(&path).unwrap();

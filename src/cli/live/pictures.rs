@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 
+use glam::DVec3;
 use hyper::body::Bytes;
 
 use crate::Result;
@@ -58,10 +59,15 @@ impl Pictures {
         &self.dataset
     }
 
+    /// The world position that the coordinates of models and bookmarks are relative to.
+    pub(in crate::cli) fn origin(&self) -> DVec3 {
+        self.config.frame.unwrap_or_else(|| self.dataset.frame()).file_origin()
+    }
+
     /// The cameras of all views, for a model whose origin is that of the dataset's training frame, and the addresses of
     /// their images.
     pub(in crate::cli) fn bookmarks(&self) -> Vec<Bookmark> {
-        let origin = self.config.frame.unwrap_or_else(|| self.dataset.frame()).file_origin();
+        let origin = self.origin();
         let bookmark = |(place, view): (usize, &View)| {
             let kinds = KINDS.iter().filter(|(_, kind)| self.has(view, *kind));
             let picture = |(name, _): &(&str, Kind)| {

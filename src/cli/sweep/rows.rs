@@ -18,6 +18,8 @@ pub(super) struct Rows {
     pub(super) scores: Vec<String>,
     /// All seeds.
     pub(super) seeds: Vec<String>,
+    /// The number of runs, finished or not.
+    pub(super) runs: usize,
     /// Axis and value of the baseline.
     baseline: Option<(&'static str, &'static str)>,
 }
@@ -58,7 +60,7 @@ impl Rows {
             }
             row.metrics.push(metrics);
         }
-        Self::of(rows, scores, seeds, baseline)
+        Self { runs: runs.len(), ..Self::of(rows, scores, seeds, baseline) }
     }
 
     /// Sorts the rows.
@@ -71,7 +73,7 @@ impl Rows {
         // Stable, so that equal rows keep the order of the grid.
         let psnr = |row: &Row| row.score("psnr").unwrap_or(f64::NEG_INFINITY);
         rows.sort_by(|a, b| psnr(b).total_cmp(&psnr(a)));
-        Self { keys: differing(&rows), rows, scores, seeds, baseline }
+        Self { keys: differing(&rows), rows, scores, seeds, runs: 0, baseline }
     }
 
     pub(super) fn has_seeds(&self) -> bool {

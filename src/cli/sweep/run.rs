@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::point::{PRESET, Point};
+use super::scores;
 use crate::cli::quoted;
 use crate::cli::train::TrainArgs;
 use crate::gpu::Gpu;
@@ -77,10 +78,11 @@ impl Run {
         Ok(self.metrics().is_some())
     }
 
-    /// `metrics.json`, if the run is finished.
+    /// `metrics.json`, with the scores that were measured later, if the run is finished.
     pub(super) fn metrics(&self) -> Option<serde_json::Value> {
         let text = std::fs::read(self.folder.join("metrics.json")).ok()?;
-        serde_json::from_slice(&text).ok()
+        let metrics = serde_json::from_slice(&text).ok()?;
+        Some(scores::added(&self.folder, metrics))
     }
 
     /// Renders a view with the model of the finished run.

@@ -9,6 +9,7 @@ use toml::{Table, Value};
 
 use crate::base::settings::{Rule, Setting};
 use crate::cli::words::{self, Words};
+use crate::photographs::dataset::exclude;
 use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneSettings};
 use crate::train::diagnose::Plan;
 use crate::train::settings::SETTINGS;
@@ -47,6 +48,12 @@ struct SeveralSettings {
     /// Set any key of config.toml, such as tone.alpha=0.1; repeatable, overrides everything else
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Leave out photographs by name or path, with `*`, `?` and `[abc]`; repeatable
+    #[arg(long, value_name = "GLOB")]
+    exclude: Vec<String>,
+    /// Leave out the photographs that a file names or matches, one a line
+    #[arg(long, value_name = "FILE")]
+    exclude_file: Option<PathBuf>,
     /// plain: 3DGS; lita: all parts of LITA-GS, with L1 alone on R_0 [default: plain]
     #[arg(long, value_parser = Words::<ModelName>::new(["plain", "lita"]))]
     model: Option<ModelName>,
@@ -211,6 +218,7 @@ impl TrainOptions {
             .to_str()
             .ok_or_else(|| Error::input(dataset, "is not Unicode; move it to a path that is"))?;
         options.push("dataset", dataset.into(), Origin::Option("argument"))?;
+        several.push_excluded(options)?;
         several.push_tone(options)?;
         several.push_parts(options)?;
         if self.gives("exposure.start") {
@@ -234,6 +242,18 @@ impl TrainOptions {
 }
 
 impl SeveralSettings {
+    fn push_excluded(&self, options: &mut SettingsLayer) -> Result<()> {
+        let mut patterns = self.exclude.clone();
+        if let Some(file) = &self.exclude_file {
+            patterns.extend(exclude::patterns_of(file)?);
+        }
+        if patterns.is_empty() {
+            return Ok(());
+        }
+        let patterns: Vec<Value> = patterns.into_iter().map(Value::String).collect();
+        options.push("exclude", Value::Array(patterns), Origin::Option("--exclude"))
+    }
+
     fn push_tone(&self, options: &mut SettingsLayer) -> Result<()> {
         let from_file = match (&self.curve, &self.profile) {
             (_, Some(file)) => Some((ToneSettings::of_profile(Profile::load(file)?), "--profile")),

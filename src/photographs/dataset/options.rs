@@ -23,6 +23,8 @@ pub struct LoadOptions {
     /// Every Nth view by name is held out, instead of the dataset's split; 0: none. `None`: the dataset's own split,
     /// else every eighth.
     pub test_every: Option<usize>,
+    /// Patterns of the names of photographs that are left out; the others keep their split.
+    pub exclude: Vec<String>,
     /// Bytes that the decoded training photographs may take: if they exceed this, none is kept, and each is decoded
     /// again on every use. `None`: no limit.
     pub keep: Option<u64>,
@@ -80,6 +82,7 @@ impl Default for LoadOptions {
             downscale: 1.0,
             max_resolution: 0,
             test_every: None,
+            exclude: vec![],
             keep: None,
             images: None,
             orientation: PixelOrientation::Auto,

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use super::exclude::exclude;
 use super::layout::Layout;
 use super::listed::Listing;
 use super::listing::list;
@@ -27,6 +28,7 @@ impl Dataset {
         let Listing { mut frames, mut skipped, .. } =
             list(&layout, options.images.as_deref(), &files)?;
         split(root, &mut frames, options.test_every, &files)?;
+        exclude(root, &mut frames, &options.exclude)?;
         let mut hasher = Hasher::default();
         hasher.write(READING);
         for source in sources(root, &frames, options, &files, &mut skipped) {

@@ -19,8 +19,12 @@ use crate::splats::scene::Gaussians;
 use crate::{Error, Result};
 
 /// The scripts of the page, in one scope.
-const VIEWER: [&str; 3] =
-    [include_str!("viewer/draw.js"), include_str!("viewer/live.js"), include_str!("viewer/fly.js")];
+const VIEWER: [&str; 4] = [
+    include_str!("viewer/draw.js"),
+    include_str!("viewer/live.js"),
+    include_str!("viewer/edit.js"),
+    include_str!("viewer/fly.js"),
+];
 
 /// A bookmark: a camera and images of its view.
 #[derive(Clone, Debug)]
@@ -53,6 +57,10 @@ pub struct Page<'a> {
     pub provenance: Provenance,
     /// The page opens at the first.
     pub bookmarks: Vec<Bookmark>,
+    /// The world position that the coordinates of the Gaussians are relative to.
+    pub origin: DVec3,
+    /// The checksum of the model by which edit lists name it; `None`: the page edits nothing, or its server knows it.
+    pub fingerprint: Option<String>,
     /// Near plane, in the coordinates of the Gaussians.
     pub near: f64,
     /// The up direction, a unit vector in the coordinates of the Gaussians.
@@ -65,7 +73,7 @@ impl Page<'_> {
     /// # Errors
     /// [`Error::Usage`] for a bookmark that is not a pinhole camera.
     pub fn html(&self) -> Result<String> {
-        let Self { title, gaussians, provenance, bookmarks, near, up } = self;
+        let Self { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up } = self;
         let other = bookmarks.iter().find(|own| own.camera.model != CameraModel::Pinhole);
         if let Some(Bookmark { name, .. }) = other {
             return Err(Error::Usage(format!(
@@ -76,6 +84,8 @@ impl Page<'_> {
             "generator": GENERATOR,
             "provenance": provenance.lines(),
             "isLive": gaussians.is_none(),
+            "model": fingerprint,
+            "origin": origin.to_array(),
             "near": near,
             "up": up.to_array(),
             "views": bookmarks.iter().map(view).collect::<Vec<_>>(),
@@ -196,6 +206,8 @@ mod tests {
             gaussians: Some(&gaussians),
             provenance: Provenance { dataset: evil.to_owned(), ..Provenance::default() },
             bookmarks: vec![Bookmark { name: evil.to_owned(), camera, pictures: vec![picture] }],
+            origin: DVec3::ZERO,
+            fingerprint: None,
             near: 0.2,
             up: DVec3::NEG_Y,
         };

@@ -2,7 +2,7 @@
 
 use glam::UVec2;
 
-use super::{RenderOptions, RenderSettings, Renderer, Status};
+use super::{DepthChannel, RenderOptions, RenderSettings, Renderer, Status};
 use crate::Result;
 use crate::camera::{Camera, Patch};
 use crate::photographs::image::Image;
@@ -107,7 +107,7 @@ impl Renderer {
         patch: &Patch,
     ) -> Result<u32> {
         let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
-        Ok(self.try_render(gaussians, patch, &options)?.intersections)
+        Ok(self.try_render(gaussians, patch, &options, None)?.intersections)
     }
 
     /// Renders once and returns the status; all flags are cleared.
@@ -116,16 +116,49 @@ impl Renderer {
         gaussians: GaussianSlice<'_>,
         patch: &Patch,
         options: &RenderOptions,
+        depths: Option<DepthChannel>,
     ) -> Result<Status> {
         let (gpu, mut status) = (self.gpu.clone(), None);
         gpu.run("render", |pass| {
-            self.forward(pass, gaussians, *patch, options)?;
+            self.record_forward(pass, gaussians, *patch, options, depths, None)?;
             status = Some(pass.download(&self.frame.status)?);
             self.clear_status(pass);
             Ok(())
         })?;
         let words = status.map_or_else(|| Ok(vec![]), |status| status.wait())?;
         Ok(Status::from_words(&words))
+    }
+
+    /// Renders a patch on the device, and grows the memory as it needs. Returns the patch's halves instead where the
+    /// device cannot bind all its intersections.
+    ///
+    /// # Errors
+    /// As [`Renderer::render_image`].
+    pub(super) fn render_or_halve(
+        &mut self,
+        gaussians: GaussianSlice<'_>,
+        patch: &Patch,
+        options: &RenderOptions,
+        depths: Option<DepthChannel>,
+    ) -> Result<Option<[Patch; 2]>> {
+        loop {
+            let status = self.try_render(gaussians, patch, options, depths)?;
+            if status.splats_per_tile > 0 {
+                let UVec2 { x: width, y: height } = patch.size;
+                return Err(self.too_many_splats(
+                    format!("a {width}x{height} render"),
+                    status.splats_per_tile,
+                ));
+            }
+            if !status.overflowed {
+                return Ok(None);
+            }
+            let is_too_much = status.intersections > self.max_intersections();
+            if let Some(halves) = patch.halves().filter(|_| is_too_much) {
+                return Ok(Some(halves));
+            }
+            self.grow(status.intersections)?;
+        }
     }
 
     /// All channels of one patch, then its [`Renderer::transmittances`], (channels + 1, h, w); in two halves where the
@@ -140,24 +173,14 @@ impl Renderer {
         options: &RenderOptions,
     ) -> Result<Vec<f32>> {
         let gaussians = gaussians.into();
-        loop {
-            let status = self.try_render(gaussians, patch, options)?;
-            if status.splats_per_tile > 0 {
-                let UVec2 { x: width, y: height } = patch.size;
-                return Err(self.too_many_splats(
-                    format!("a {width}x{height} render"),
-                    status.splats_per_tile,
-                ));
-            }
-            if !status.overflowed {
-                break;
-            }
-            let is_too_much = status.intersections > self.max_intersections();
-            if let Some(halves) = patch.halves().filter(|_| is_too_much) {
-                return self.render_parts(gaussians, patch, &halves, options);
-            }
-            self.grow(status.intersections)?;
+        if let Some(halves) = self.render_or_halve(gaussians, patch, options, None)? {
+            return self.render_parts(gaussians, patch, &halves, options);
         }
+        self.read_planes(patch)
+    }
+
+    /// The planes of the patch that was rendered last.
+    pub(super) fn read_planes(&self, patch: &Patch) -> Result<Vec<f32>> {
         let mut planes = self.gpu.read(&self.frame.render)?;
         planes.truncate(self.settings.channels() * patch.pixel_count());
         let transmittances = self.gpu.read(&self.frame.transmittances)?;

@@ -31,18 +31,19 @@ impl RenderSettings {
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
     }
 
-    /// The tile for views of these sizes: that of [`RenderSettings::tile_on`], or a multiple of its height where the
-    /// settings name none and a view would have too many tiles.
+    /// The tile for views of these sizes: that of [`RenderSettings::tile_up_to`] the largest, or a multiple of its
+    /// height where the settings name none and a view would have too many tiles.
     ///
     /// # Errors
-    /// As [`RenderSettings::tile_on`].
+    /// As [`RenderSettings::tile_up_to`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn tile_for(
         &self,
         gpu: &Gpu,
         sizes: impl Iterator<Item = [u32; 2]> + Clone,
     ) -> Result<Tile> {
-        let mut tile = self.tile_on(gpu)?;
+        let pixels = |[width, height]: [u32; 2]| u64::from(width) * u64::from(height);
+        let mut tile = self.tile_up_to(gpu, sizes.clone().map(pixels).max())?;
         let count = |[width, height]: [u32; 2], tile: Tile| {
             width.div_ceil(tile.size[0]) as usize * height.div_ceil(tile.size[1]) as usize
         };

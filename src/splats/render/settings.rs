@@ -59,35 +59,51 @@ impl Default for RenderSettings {
 /// The tile of a GPU, as in 3DGS, and that of a CPU, whose subgroups are narrow: measured on lavapipe.
 const GPU_TILE: [u32; 2] = [16, 16];
 const CPU_TILE: [u32; 2] = [16, 8];
-/// More channels than these take a smaller tile on a CPU, whose registers no longer hold the state of a larger one.
-const CPU_TILE_CHANNELS: usize = 5;
+/// More channels than these take a smaller tile on a CPU and with narrow subgroups, whose registers no longer hold the
+/// state of a larger one.
+const TILE_CHANNELS: usize = 5;
 const CPU_SMALL_TILE: [u32; 2] = [8, 8];
-
-/// Subgroups of fewer lanes share the tile: alone, each would spill half of its state (compiled by Mesa 25 for Arc).
+/// Views of at most this many pixels have fewer tiles than a GPU has room for subgroups: there, several share a tile.
+const SMALL_VIEW: u64 = 1 << 20;
+/// So do subgroups of fewer lanes: alone, each would spill half of its state (compiled by Mesa 25 for Arc).
 const WIDE_SUBGROUP: u32 = 32;
-const NARROW_GPU_TILE: Tile = Tile { size: [16, 16], subgroups: 4 };
-/// The same where subgroups do not stay converged.
+/// The tile of narrow subgroups that do not stay converged.
 const SMALL_GPU_TILE: [u32; 2] = [8, 8];
 
-fn gpu_tile(properties: &Properties) -> Tile {
-    match properties.subgroup_size {
-        WIDE_SUBGROUP.. => GPU_TILE.into(),
-        _ if properties.suits_tile(NARROW_GPU_TILE) => NARROW_GPU_TILE,
-        _ => SMALL_GPU_TILE.into(),
+/// The tile of a GPU for views of up to `pixels` pixels; `None`: of any size.
+fn gpu_tile(properties: &Properties, channels: usize, pixels: Option<u64>) -> Tile {
+    let is_small = pixels.is_some_and(|pixels| pixels <= SMALL_VIEW);
+    let is_narrow = properties.subgroup_size < WIDE_SUBGROUP;
+    let divisor = if is_narrow && channels > TILE_CHANNELS { 2 } else { 1 };
+    let of =
+        |[width, height]: [u32; 2], subgroups| Tile { size: [width, height / divisor], subgroups };
+    let shared = of(GPU_TILE, 4);
+    match properties.suits_tile(shared) {
+        true if is_small || is_narrow => shared,
+        false if is_narrow => of(SMALL_GPU_TILE, 1),
+        _ => GPU_TILE.into(),
     }
 }
 
 impl RenderSettings {
+    /// [`RenderSettings::tile_up_to`] for views of any size.
+    ///
+    /// # Errors
+    /// As [`RenderSettings::tile_up_to`].
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn tile_on(&self, gpu: &Gpu) -> Result<Tile> {
+        self.tile_up_to(gpu, None)
+    }
+
     /// The tile on this device, in pixels: that of these settings, else the one that was measured to be the fastest
-    /// (`Gpu::tuned_tile`), else the default for such devices.
+    /// (`Gpu::tuned_tile`), else the default for such devices and views of up to `pixels` pixels.
     ///
     /// # Errors
     /// A subgroup's part has no whole number of rows of lanes, or more than 32.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn tile_on(&self, gpu: &Gpu) -> Result<Tile> {
+    pub(super) fn tile_up_to(&self, gpu: &Gpu, pixels: Option<u64>) -> Result<Tile> {
         let built_in = match self.channels() {
-            _ if !gpu.properties().is_cpu => gpu_tile(gpu.properties()),
-            0..=CPU_TILE_CHANNELS => CPU_TILE.into(),
+            _ if !gpu.properties().is_cpu => gpu_tile(gpu.properties(), self.channels(), pixels),
+            0..=TILE_CHANNELS => CPU_TILE.into(),
             _ => CPU_SMALL_TILE.into(),
         };
         let tile = self.tile.or_else(|| gpu.tuned_tile(self.channels())).unwrap_or(built_in);
@@ -116,5 +132,32 @@ impl RenderSettings {
         let observing =
             if self.detach_geometry { 3 * (u32::from(noise) + u32::from(illumination)) } else { 0 };
         self.channels() as u32 - observing
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn subgroups_share_the_tiles_of_small_views_on_a_gpu_that_keeps_them_together() {
+        let shared = Tile { size: [16, 16], subgroups: 4 };
+        let gpu = Properties {
+            subgroup_size: 32,
+            has_uniform_subgroup_control_flow: true,
+            ..Properties::of_a_test()
+        };
+        assert_eq!(gpu_tile(&gpu, 3, Some(500 * 375)), shared);
+        assert_eq!(gpu_tile(&gpu, 3, Some(1920 * 1080)), [16, 16].into());
+        assert_eq!(gpu_tile(&gpu, 3, None), [16, 16].into());
+        // A part would have fewer pixels than a subgroup has lanes.
+        let wide = Properties { subgroup_size: 128, ..gpu.clone() };
+        assert_eq!(gpu_tile(&wide, 3, Some(500 * 375)), [16, 16].into());
+        let parting = Properties { has_uniform_subgroup_control_flow: false, ..gpu.clone() };
+        assert_eq!(gpu_tile(&parting, 3, Some(500 * 375)), [16, 16].into());
+        let narrow = Properties { subgroup_size: 16, ..gpu };
+        assert_eq!(gpu_tile(&narrow, 3, None), shared);
+        let both = Properties { subgroup_size: 16, ..parting };
+        assert_eq!(gpu_tile(&both, 3, None), [8, 8].into());
     }
 }

@@ -192,7 +192,7 @@ function renderer(gl, changed) {
   };
 
   // The order that is drawn, the one that is wanted, and the Gaussians of the model.
-  let drawn = { key: '', length: 0 }, wanted = '', count = 0, version = 0;
+  let drawn = { key: '', length: 0 }, wanted = '', count = 0, version = 0, model = null, important = null;
   const sort = sorter(({ key, order }) => {
     gl.bindBuffer(gl.ARRAY_BUFFER, ids);
     gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
@@ -202,16 +202,25 @@ function renderer(gl, changed) {
 
   // Shows another model: in the old order, where it has as many Gaussians, until it is sorted.
   function load(buffer) {
-    const model = opened(buffer), data = geometry(model);
+    model = opened(buffer);
+    const data = geometry(model);
     geometryTexture(data);
     harmonicsTexture(harmonics(model));
     gl.useProgram(built);
     gl.uniform1ui(uniform('degree'), model.degree);
     drawn = { key: '', length: drawn.length <= model.count ? drawn.length : 0 };
-    [count, wanted] = [model.count, ''];
+    important = byImportance(data, model.count);
+    restrict(null);
+    return model.count;
+  }
+
+  // Draws the Gaussians whose `keep` is not 0; null: all.
+  function restrict(keep) {
+    const shown = keep ? important.filter((i) => keep[i]) : important;
+    [count, wanted] = [shown.length, ''];
     version++;
-    sort.load(model.means, byImportance(data, count));
-    return count;
+    sort.load(model.means, shown);
+    changed();
   }
 
   // Draws at most a share of the Gaussians, the most important ones. Returns whether all that is asked for is drawn.
@@ -250,7 +259,7 @@ function renderer(gl, changed) {
     return values;
   }
 
-  return { load, draw, sumsAt: fine && sumsAt, layers: fine ? LAYERS : LAYERS.slice(0, 1) };
+  return { load, restrict, draw, sumsAt: fine && sumsAt, layers: fine ? LAYERS : LAYERS.slice(0, 1) };
 }
 
 // Shows the sums: colours as they are, quantities in colours from blue (0) to red (1).

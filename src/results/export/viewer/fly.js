@@ -21,6 +21,18 @@ function matrix({ right, down, forward, eye }) {
   return [...columns, -dot(right, eye), -dot(down, eye), -dot(forward, eye)];
 }
 
+// The rotation (w, x, y, z) that maps the axes of the camera to the world.
+function quaternion({ right, down, forward }) {
+  const diagonal = [right[0], down[1], forward[2]];
+  const largest = [1 + diagonal[0] + diagonal[1] + diagonal[2], ...diagonal.map((v, k) => 1 + 2 * v - diagonal[0] - diagonal[1] - diagonal[2])];
+  const [wx, wy, wz] = [down[2] - forward[1], forward[0] - right[2], right[1] - down[0]];
+  const [xy, xz, yz] = [down[0] + right[1], forward[0] + right[2], forward[1] + down[2]];
+  const rows = [[largest[0], wx, wy, wz], [wx, largest[1], xy, xz], [wy, xy, largest[2], yz], [wz, xz, yz, largest[3]]];
+  // The row with the largest element divides by no small number.
+  const row = rows[largest.indexOf(Math.max(...largest))], length = Math.hypot(...row);
+  return row.map((v) => v / length);
+}
+
 // The point nearest to all optical axes.
 function center(poses) {
   const a = [0, 0, 0, 0, 0, 0, 0, 0, 0], b = [0, 0, 0];
@@ -55,13 +67,13 @@ function adapted(share, milliseconds) {
 
 function start(gl) {
   const views = scene.views, poses = views.map(pose);
-  const { load, draw, sumsAt, layers } = renderer(gl, () => refresh());
+  const { load, restrict, draw, sumsAt, layers } = renderer(gl, () => refresh());
   const down = scene.up.map((value) => -value);
   let current = { ...poses[0] }, bookmark = 0, lens = views[0], target = center(poses), pending = false;
   // How much of the view its picture covers, the view's left edge and width on the page, and the last bookmark.
   let share = 0.5, across = [0, 1], last = 0;
   // The share of the Gaussians that is drawn while the camera moves: as many as the device draws in time.
-  let fraction = 1, moved = -Infinity, painted = 0, count = 0;
+  let fraction = 1, moved = -Infinity, painted = 0;
   const asked = /^#view=(\d+)$/.exec(location.hash);
   const reach = () => Math.max(Math.hypot(...add(target, current.eye, -1)), 2 * scene.near);
 
@@ -183,16 +195,48 @@ function start(gl) {
     const [found] = sumsAt(...[clientX - box.left, clientY - box.top].map((v) => Math.floor(v * ratio)));
     say(`${found} Gaussians under the cursor`);
   };
+  // What the tools of the editor ask for; places on the page are in CSS pixels from the canvas's top left.
+  const fitted = () => ({ camera: camera(), fit: placed(camera(), canvas.clientWidth, canvas.clientHeight) });
+  const projected = (point) => {
+    const { camera: { viewFromWorld: m, focal, principalPoint }, fit } = fitted();
+    const [x, y, z] = [0, 1, 2].map((k) => m[k] * point[0] + m[3 + k] * point[1] + m[6 + k] * point[2] + m[9 + k]);
+    const on = (value, k) => fit.zoom * (focal[k] * value / z + principalPoint[k]) + [fit.left, fit.top][k];
+    return [on(x, 0), on(y, 1), z];
+  };
+  const pointAt = (x, y) => {
+    const ratio = canvas.width / canvas.clientWidth, { camera: own, fit } = fitted();
+    draw(own, canvas.width, canvas.height, { grey: 0, layer: 1, share: 1, reach: reach() });
+    const [sum, , , alpha] = sumsAt(...[x, y].map((v) => Math.floor(v * ratio)));
+    refresh();
+    if (!(alpha > 0.3)) return null;
+    const depth = sum / alpha, { right, down: own_down, forward, eye } = pose(own);
+    const slope = [x - fit.left, y - fit.top].map((v, k) => (v / fit.zoom - own.principalPoint[k]) / own.focal[k]);
+    return add(add(add(eye, forward, depth), right, depth * slope[0]), own_down, depth * slope[1]);
+  };
+  const keyframe = () => {
+    const own = camera(), { eye, ...axes } = pose(own), fov = 2 * Math.atan(own.size[1] / (2 * own.focal[1]));
+    return { position: add(eye, scene.origin), rotation: quaternion(axes), fov: fov * 180 / Math.PI };
+  };
+  const edit = editor({ target: () => target, reach, projected, pointAt, keyframe }, restrict);
+  const onCanvas = ({ clientX, clientY }) => {
+    const box = canvas.getBoundingClientRect();
+    return [clientX - box.left, clientY - box.top];
+  };
   const pointers = new Map();
   let spread = 0;
   canvas.addEventListener('contextmenu', (event) => event.preventDefault());
   canvas.addEventListener('pointerdown', (event) => {
     canvas.setPointerCapture(event.pointerId);
+    if (edit.begins(...onCanvas(event))) return;
     pointers.set(event.pointerId, event);
     spread = 0;
   });
-  for (const end of ['pointerup', 'pointercancel']) canvas.addEventListener(end, (event) => pointers.delete(event.pointerId));
+  for (const end of ['pointerup', 'pointercancel']) canvas.addEventListener(end, (event) => {
+    edit.ends();
+    pointers.delete(event.pointerId);
+  });
   canvas.addEventListener('pointermove', (event) => {
+    if (edit.moves(...onCanvas(event))) return;
     const before = pointers.get(event.pointerId);
     if (!before) { countAt(event); return; }
     pointers.set(event.pointerId, event);
@@ -251,8 +295,8 @@ function start(gl) {
   reset();
   // Shows another model; the camera stays.
   return (buffer) => {
-    count = load(buffer);
-    element('count').textContent = `${count} Gaussians`;
+    element('count').textContent = `${load(buffer)} Gaussians`;
+    edit.load(buffer);
     refresh();
   };
 }

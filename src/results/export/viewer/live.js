@@ -58,6 +58,8 @@ async function follow(show) {
     element('controls').hidden = !state.canControl;
     element('pause').textContent = isPaused ? 'Continue' : 'Pause';
     plot(state.heldOut ?? []);
+    scene.model = state.fingerprint;
+    element('editor').hidden = !scene.model;
     if (state.model !== version) {
       show(await (await asked('model')).arrayBuffer());
       version = state.model;

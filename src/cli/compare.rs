@@ -1,0 +1,90 @@
+//! `nightsplat compare`: runs on one dataset, side by side.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use anyhow::Result;
+
+use super::eval::LpipsRange;
+use super::{finish, table, word};
+use crate::Error;
+use crate::base::output::{check_writable, write_whole};
+use crate::gpu::DeviceChoice;
+use crate::results::comparison::{CompareOptions, RunComparison};
+
+/// Compare runs or models on the test views of one dataset.
+///
+/// Renders the test views of each and scores them against the same images: the references or, without any, the targets
+/// of the first run. Prints a row per run and, for every view, the PSNR of the first run and the gains of the others.
+/// The page adds the settings that differ, and renders side by side, the most different views first.
+#[derive(Clone, Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct CompareArgs {
+    /// Run directories, or models with --dataset; the first is the one that others are compared with
+    #[arg(required = true, num_args = 2..)]
+    pub runs: Vec<PathBuf>,
+    /// Write a page
+    #[arg(long, value_name = "FILE.html")]
+    pub report: Option<PathBuf>,
+    /// Print JSON instead of tables
+    #[arg(long)]
+    pub json: bool,
+    /// Dataset, if it moved since training [default: the runs']
+    #[arg(long, value_name = "DIR")]
+    pub dataset: Option<PathBuf>,
+    /// Add LPIPS, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)
+    #[arg(long, value_name = "WEIGHTS")]
+    pub lpips: Option<PathBuf>,
+    /// Input range of the LPIPS network; scores of different ranges or networks do not compare
+    #[arg(long, value_name = "RANGE", value_enum, default_value_t, requires = "lpips")]
+    pub lpips_range: LpipsRange,
+    /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: each run's]
+    #[arg(long, value_name = "DEVICE")]
+    pub device: Option<DeviceChoice>,
+}
+
+const EXAMPLES: &str = "Examples:
+  nightsplat compare run1 run2 --report compare.html
+  nightsplat compare run clean.ply --dataset photos       a run and its edited model";
+
+/// Compares the runs.
+///
+/// # Errors
+/// The runs are of different datasets, one has no model, or the page cannot be written.
+pub fn run(args: &CompareArgs) -> Result<()> {
+    if args.runs.len() < 2 {
+        let problem = "compare takes two runs or more";
+        return Err(Error::Usage(problem.to_owned()).into());
+    }
+    args.report.iter().try_for_each(|path| check_writable(path))?;
+    let options = CompareOptions {
+        dataset: args.dataset.as_deref(),
+        device: args.device.as_ref(),
+        lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),
+        with_pictures: args.report.is_some(),
+    };
+    let comparison = RunComparison::of(&args.runs, &options)?;
+    let mut wrote = String::new();
+    if let Some(path) = &args.report {
+        write_whole(path, comparison.html().as_bytes())?;
+        wrote = path.display().to_string();
+    }
+    let mut out = std::io::stdout().lock();
+    if args.json {
+        return Ok(writeln!(out, "{:#}", comparison.json())?);
+    }
+    let tables = [comparison.means(), comparison.views()].map(|own| table::of(&own));
+    writeln!(out, "{}", tables.join("\n"))?;
+    for [key, values] in comparison.settings() {
+        writeln!(out, "{key}: {values}")?;
+    }
+    if let Some(label) = comparison.label() {
+        writeln!(out, "{label}")?;
+    }
+    drop(out);
+    let next = match &args.report {
+        Some(path) => format!("open {} in a browser", word(path)),
+        None => "nightsplat compare ... --report compare.html".to_owned(),
+    };
+    finish(&wrote, &next)
+}

@@ -1,0 +1,86 @@
+//! `nightsplat edit`: changes a model.
+
+mod operations;
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use anyhow::Result;
+
+use self::operations::Operations;
+use super::{finish, word};
+use crate::Error;
+use crate::base::output::{check_writable, printable};
+use crate::gpu::DeviceChoice;
+use crate::results::edit::{EditList, Editor};
+
+/// Crop, clean, transform and merge models.
+///
+/// Operations apply in the order of the command line; an option may be repeated. An edit list (--edits) applies before
+/// them. --floaters, --max-gaussians and whatever is measured from cameras use the photographs of the run, or those of
+/// --dataset; they may come after a transform.
+///
+/// The result has the operations in its header, with measured values as numbers. The same command gives the same
+/// bytes.
+#[derive(Clone, Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub struct EditArgs {
+    /// Run directory, or a model: PLY, SPZ or SOG
+    pub model: PathBuf,
+    /// Model to write or replace: .ply, .spz, .glb or .sog
+    #[arg(long, value_name = "MODEL")]
+    pub out: PathBuf,
+    #[command(flatten)]
+    operations: Operations,
+    /// Apply the edit list of this JSON file first; a list that was made for another model is refused
+    #[arg(long, value_name = "FILE")]
+    pub edits: Option<PathBuf>,
+    /// Also write the operations as an edit list, to repeat them
+    #[arg(long, value_name = "FILE")]
+    pub save_edits: Option<PathBuf>,
+    /// Dataset of a model, or that of the run if it moved
+    #[arg(long, value_name = "DIR")]
+    pub dataset: Option<PathBuf>,
+    /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the run's]
+    #[arg(long, value_name = "DEVICE")]
+    pub device: Option<DeviceChoice>,
+}
+
+const EXAMPLES: &str = "Examples:
+  nightsplat edit run --crop cameras --floaters --out clean.ply   what is between and before the cameras
+  nightsplat edit a.ply --crop 0,0,0,1.5 --out b.ply              within 1.5 of the origin
+  nightsplat edit run --up auto --scale 0,0,0:1,0,0=0.82 --out metres.ply
+  nightsplat edit run --max-gaussians 20000 --sh-degree 1 --out small.spz
+  nightsplat edit a.ply --rotate y:90 --move 2,0,0 --merge b.ply --out both.ply";
+
+/// Applies the operations and writes the model.
+///
+/// # Errors
+/// A file cannot be read or written, an operation is invalid or leaves nothing, or its dataset is missing; no file is
+/// written then.
+pub fn run(args: &EditArgs) -> Result<()> {
+    let list = args.edits.as_deref().map(EditList::load).transpose()?;
+    if list.is_none() && args.operations.is_empty() {
+        let problem = "no operation is given, such as --crop or --floaters; `nightsplat edit --help` lists them";
+        return Err(Error::Usage(problem.to_owned()).into());
+    }
+    Editor::check_output(&args.model, &args.out)?;
+    args.save_edits.iter().try_for_each(|path| check_writable(path))?;
+    let mut editor = Editor::open(&args.model, args.dataset.as_deref(), args.device.as_ref())?;
+    if let (Some(list), Some(path)) = (&list, &args.edits) {
+        editor.check_list(path, list)?;
+    }
+    let listed = list.iter().flat_map(|list| &list.edits);
+    let mut out = std::io::stdout().lock();
+    for operation in listed.chain(args.operations.iter()) {
+        writeln!(out, "{}", printable(&editor.apply(operation)?))?;
+    }
+    drop(out);
+    let mut wrote = editor.save(&args.out)?;
+    if let Some(path) = &args.save_edits {
+        editor.save_list(path)?;
+        wrote += &format!(", {}", path.display());
+    }
+    let next = format!("nightsplat export {} --format html --dataset DIR", word(&args.out));
+    finish(&wrote, &next)
+}

@@ -1,0 +1,61 @@
+//! Scores that a training does not take: LPIPS, kept beside `metrics.json` of each run.
+
+use std::path::Path;
+
+use serde_json::{Value, json};
+
+use super::run::Run;
+use crate::base::output::write_whole;
+use crate::gpu::Gpu;
+use crate::networks::lpips::{Lpips, Range};
+use crate::photographs::dataset::View;
+use crate::results::eval::{self, ScoreReference};
+use crate::results::finished_run::FinishedRun;
+use crate::{Error, Result};
+
+/// The file of a run: values by the key of their measure, as in `metrics.json`.
+pub(super) const FILE: &str = "lpips.json";
+
+/// Measures the finished runs that have no value of this network and range yet.
+///
+/// # Errors
+/// The weights or a run cannot be read, a file cannot be written, or the device is out of memory or lost.
+pub(super) fn add_lpips(runs: &[Run], gpu: &Gpu, weights: &Path, range: Range) -> Result<()> {
+    let key = Lpips::load(gpu, weights, range)?.measure().key();
+    for run in runs.iter().filter(|run| run.metrics().is_some()) {
+        let mut known = load(&run.folder);
+        if known["mean"].get(&key).is_some() {
+            continue;
+        }
+        let FinishedRun { gpu, config, dataset, mut model_renderer, .. } =
+            FinishedRun::open(&run.folder, None, None)?;
+        let lpips = Lpips::load(&gpu, weights, range)?;
+        let mut reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
+        let render = |view: &View| model_renderer.render(view);
+        let scored = eval::score_by(&mut reference, &dataset, render, |score, images| {
+            score.scores.lpips = Some(images.lpips(&gpu, &lpips)?);
+            Ok(())
+        })?;
+        eval::add_lpips(&mut known, &scored, lpips.measure());
+        let text = serde_json::to_string_pretty(&known)
+            .map_err(|error| Error::output(run.folder.join(FILE), error.to_string()))?;
+        write_whole(&run.folder.join(FILE), text.as_bytes())?;
+    }
+    Ok(())
+}
+
+/// What was measured of a run.
+fn load(folder: &Path) -> Value {
+    let text = std::fs::read(folder.join(FILE)).ok();
+    let known = text.and_then(|text| serde_json::from_slice(&text).ok());
+    known.unwrap_or_else(|| json!({ "mean": {}, "views": {} }))
+}
+
+/// Adds what was measured to the metrics of a run.
+pub(super) fn added(folder: &Path, mut metrics: Value) -> Value {
+    let known = load(folder);
+    for (key, value) in known["mean"].as_object().into_iter().flatten() {
+        metrics["mean"][key] = value.clone();
+    }
+    metrics
+}

@@ -1,0 +1,63 @@
+//! Photographs that are left out by name.
+
+use std::path::Path;
+
+use glob::Pattern;
+
+use super::listed::ListedView;
+use crate::base::input;
+use crate::photographs::image::files::stem;
+use crate::{Error, Result};
+
+/// Whether a text is a pattern.
+pub(crate) fn is_pattern(text: &str) -> bool {
+    !text.is_empty() && Pattern::new(text).is_ok()
+}
+
+/// The patterns of a file, one a line; empty lines and lines after # are skipped.
+///
+/// # Errors
+/// The file cannot be read, or a line is no pattern.
+pub(crate) fn patterns_of(path: &Path) -> Result<Vec<String>> {
+    let text = input::text(path)?;
+    let lines = (1..).zip(text.lines().map(str::trim));
+    let mut patterns = vec![];
+    for (number, line) in lines.filter(|(_, line)| !line.is_empty() && !line.starts_with('#')) {
+        if !is_pattern(line) {
+            let problem =
+                format!("line {number}: `{line}` is no pattern; `*`, `?` and `[abc]` match");
+            return Err(Error::input(path, problem));
+        }
+        patterns.push(line.to_owned());
+    }
+    Ok(patterns)
+}
+
+/// Removes the views that a pattern matches: their name, their file name, or their path as listed. Other views keep
+/// their split.
+///
+/// # Errors
+/// A pattern matches no view.
+pub(super) fn exclude(
+    root: &Path,
+    frames: &mut Vec<ListedView>,
+    patterns: &[String],
+) -> Result<()> {
+    for text in patterns {
+        // Invalid patterns are refused where they are set.
+        let Ok(pattern) = Pattern::new(text) else { continue };
+        let matches = |frame: &ListedView| {
+            let listed = frame.listed.replace('\\', "/");
+            let file = listed.rsplit('/').next().unwrap_or_default();
+            [frame.name.as_str(), stem(file), file, &listed].iter().any(|own| pattern.matches(own))
+        };
+        let before = frames.len();
+        frames.retain(|frame| !matches(frame));
+        if frames.len() == before {
+            let problem = format!("has no photograph that `{text}` matches; correct exclude");
+            return Err(Error::input(root, problem));
+        }
+        tracing::info!("{}: {} photographs match {text}", root.display(), before - frames.len());
+    }
+    Ok(())
+}

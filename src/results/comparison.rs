@@ -1,0 +1,298 @@
+//! Runs on one dataset, compared view by view.
+
+use std::path::{Path, PathBuf};
+
+use serde_json::{Value, json};
+
+use super::eval::{self, ScoreReference, ScoredImages, ViewScore};
+use super::finished_run::{FinishedRun, is_model};
+use super::report::{Best, Column, Comparison, Facts, Picture, Report, Table};
+use super::run;
+use crate::gpu::DeviceChoice;
+use crate::networks::lpips::{Lpips, Measure, Range};
+use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::image::Image;
+use crate::photographs::metrics::Scores;
+use crate::train::{TrainConfig, values};
+use crate::{Error, Result};
+
+/// Maximum width of an image, pixels.
+const PICTURE_WIDTH: u32 = 400;
+/// Maximum number of views with images, evenly spread.
+const SHOWN: usize = 12;
+/// Cameras whose poses differ by more, relative to their distance from the origin, are of different datasets.
+const POSE_ERROR: f64 = 1e-6;
+
+/// A run that is compared.
+#[derive(Debug)]
+struct Compared {
+    name: String,
+    scored: Vec<ViewScore>,
+    gaussians: usize,
+    /// `metrics.json`; null of a model.
+    metrics: Value,
+    config: Option<TrainConfig>,
+}
+
+/// Runs with their scores, and images of some views.
+#[derive(Debug)]
+pub(crate) struct RunComparison {
+    runs: Vec<Compared>,
+    measure: Option<Measure>,
+    pictures: Vec<Comparison>,
+}
+
+/// The options of a comparison.
+#[derive(Debug)]
+pub(crate) struct CompareOptions<'a> {
+    pub(crate) dataset: Option<&'a Path>,
+    pub(crate) device: Option<&'a DeviceChoice>,
+    pub(crate) lpips: Option<(&'a Path, Range)>,
+    /// Whether images are kept.
+    pub(crate) with_pictures: bool,
+}
+
+impl RunComparison {
+    /// Scores the test views of every run against the same images: the references or, without any, the targets of the
+    /// first run.
+    ///
+    /// # Errors
+    /// Those of opening a run; [`Error::Usage`] for runs of different test views.
+    pub(crate) fn of(paths: &[PathBuf], options: &CompareOptions<'_>) -> Result<Self> {
+        let names = names(paths);
+        let mut first: Option<(Dataset, ScoreReference)> = None;
+        let mut comparison = Self { runs: vec![], measure: None, pictures: vec![] };
+        for (path, name) in paths.iter().zip(names) {
+            let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer } =
+                FinishedRun::open(path, options.dataset, options.device)?;
+            if first.is_none() {
+                let reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
+                first = Some((dataset.clone(), reference));
+            }
+            let Some((known, reference)) = &mut first else { continue };
+            if let Some(difference) = difference(known, &dataset) {
+                let problem = format!(
+                    "{} and {name} are runs of different datasets: {difference}; compare runs of one",
+                    paths[0].display()
+                );
+                return Err(Error::Usage(problem));
+            }
+            let lpips = options.lpips.map(|(weights, range)| Lpips::load(&gpu, weights, range));
+            let lpips = lpips.transpose()?;
+            comparison.measure = lpips.as_ref().map(Lpips::measure);
+            let step = reference.view_count(&dataset).div_ceil(SHOWN).max(1);
+            let mut number = 0;
+            let render = |view: &View| model_renderer.render(view);
+            let pictures = &mut comparison.pictures;
+            let scored = eval::score_by(reference, &dataset, render, |score, images| {
+                let distance = lpips.as_ref().map(|lpips| images.lpips(&gpu, lpips)).transpose()?;
+                score.scores.lpips = distance;
+                if options.with_pictures && number % step == 0 {
+                    add(pictures, number / step, &name, score, images);
+                }
+                number += 1;
+                Ok(())
+            })?;
+            let is_run = !is_model(path);
+            comparison.runs.push(Compared {
+                name,
+                scored,
+                gaussians: gaussian_count,
+                metrics: if is_run { run::load_metrics(path) } else { Value::Null },
+                config: is_run.then_some(config),
+            });
+        }
+        Ok(comparison)
+    }
+
+    /// The runs with their mean scores.
+    pub(crate) fn means(&self) -> Table {
+        let column = |name: &str, digits, best| Column { name: name.to_owned(), digits, best };
+        let mut columns = vec![
+            column("PSNR, dB", 2, Best::Greatest),
+            column("channel mean", 2, Best::Greatest),
+            column("SSIM", 4, Best::Greatest),
+        ];
+        columns.extend(self.measure.map(|measure| column(&measure.title(), 4, Best::Least)));
+        columns.extend([
+            column("Gaussians", 0, Best::Unmarked),
+            column("steps", 0, Best::Unmarked),
+            column("seconds", 0, Best::Unmarked),
+        ]);
+        let row = |run: &Compared| {
+            let mean = eval::means(&run.scored).0;
+            let score = |of: fn(&Scores) -> f64| mean.as_ref().map(of);
+            let mut values = vec![
+                score(|own| own.psnr),
+                score(|own| own.psnr_channel_mean),
+                score(|own| own.ssim),
+            ];
+            values.extend(self.measure.map(|_| mean.as_ref().and_then(|mean| mean.lpips)));
+            values.extend([
+                Some(run.gaussians as f64),
+                run.metrics["steps"].as_f64(),
+                run.metrics["seconds"].as_f64(),
+            ]);
+            (run.name.clone(), values)
+        };
+        Table {
+            title: "Means over the test views".to_owned(),
+            label: "run".to_owned(),
+            columns,
+            rows: self.runs.iter().map(row).collect(),
+        }
+    }
+
+    /// The PSNR of each test view in the first run, and how much higher it is in the others.
+    pub(crate) fn views(&self) -> Table {
+        let Some((first, others)) = self.runs.split_first() else { return Table::default() };
+        let column = |name: String, best| Column { name, digits: 2, best };
+        let mut columns = vec![column(format!("PSNR of {}, dB", first.name), Best::Unmarked)];
+        let gains = others.iter().map(|run| column(format!("{} gains", run.name), Best::Unmarked));
+        columns.extend(gains);
+        let row = |(index, view): (usize, &ViewScore)| {
+            let mut values = vec![Some(view.scores.psnr)];
+            let gain = |run: &Compared| Some(run.scored.get(index)?.scores.psnr - view.scores.psnr);
+            values.extend(others.iter().map(gain));
+            (view.name.clone(), values)
+        };
+        Table {
+            title: "Test views".to_owned(),
+            label: "view".to_owned(),
+            columns,
+            rows: first.scored.iter().enumerate().map(row).collect(),
+        }
+    }
+
+    /// The settings in which the runs differ, with the value of each.
+    pub(crate) fn settings(&self) -> Vec<[String; 2]> {
+        let all: Vec<_> =
+            self.runs.iter().filter_map(|run| values(run.config.as_ref()?).ok()).collect();
+        let Some(first) = all.first().filter(|_| all.len() == self.runs.len()) else {
+            return vec![];
+        };
+        let mut keys: Vec<&String> = all.iter().flat_map(|own| own.keys()).collect();
+        keys.sort();
+        keys.dedup();
+        let differs = |key: &&String| all.iter().any(|own| own.get(*key) != first.get(*key));
+        let text = |key: &String| {
+            let value = |own: &std::collections::BTreeMap<String, toml::Value>| {
+                own.get(key).map_or_else(|| "none".to_owned(), ToString::to_string)
+            };
+            all.iter().map(value).collect::<Vec<_>>().join(" | ")
+        };
+        keys.into_iter().filter(differs).map(|key| [key.clone(), text(key)]).collect()
+    }
+
+    /// A note for readers of the scores, unless they are against reference images.
+    pub(crate) fn label(&self) -> Option<String> {
+        let label = self.runs.first().and_then(|run| eval::label(&run.scored))?;
+        Some(format!("scores are {label}; all against the targets of {}", self.runs[0].name))
+    }
+
+    pub(crate) fn json(&self) -> Value {
+        let entry = |run: &Compared| {
+            let steps = run.metrics["steps"].as_u64().unwrap_or_default();
+            let seconds = run.metrics["seconds"].as_f64();
+            let mut metrics = eval::metrics(&run.scored, seconds, run.gaussians, steps);
+            if let Some(measure) = self.measure {
+                eval::add_lpips(&mut metrics, &run.scored, measure);
+            }
+            metrics["run"] = json!(run.name);
+            metrics
+        };
+        let runs: Vec<Value> = self.runs.iter().map(entry).collect();
+        json!({ "runs": runs, "settings": self.settings() })
+    }
+
+    pub(crate) fn html(&self) -> String {
+        let names: Vec<&str> = self.runs.iter().map(|run| run.name.as_str()).collect();
+        let settings = self.settings();
+        let facts = (!settings.is_empty()).then(|| Facts {
+            title: format!("Settings that differ: {}", names.join(" | ")),
+            rows: settings,
+        });
+        // The views on which the runs differ the most come first.
+        let mut pictures = self.pictures.clone();
+        pictures.sort_by(|a, b| spread(b).total_cmp(&spread(a)));
+        Report {
+            title: format!("Comparison of {}", names.join(", ")),
+            intro: self.label().into_iter().collect(),
+            facts: facts.into_iter().collect(),
+            tables: vec![self.means(), self.views()],
+            comparisons: pictures,
+            ..Report::default()
+        }
+        .html()
+    }
+}
+
+/// The difference of the best and the worst PSNR in the captions.
+fn spread(comparison: &Comparison) -> f64 {
+    let psnr = |picture: &Picture| picture.scores.split(' ').next()?.parse::<f64>().ok();
+    let all: Vec<f64> = comparison.pictures.iter().filter_map(psnr).collect();
+    let most = all.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let least = all.iter().copied().fold(f64::INFINITY, f64::min);
+    if all.is_empty() { 0.0 } else { most - least }
+}
+
+/// Adds the render of a run to the images of a view, which the first run begins with the image of comparison.
+fn add(
+    pictures: &mut Vec<Comparison>,
+    place: usize,
+    run: &str,
+    score: &ViewScore,
+    ScoredImages { view, render, target }: &ScoredImages<'_>,
+) {
+    let picture = |caption: &str, scores: String, image: &Image| {
+        Picture::shrunk(caption, scores, &view.upright(image.clone()), PICTURE_WIDTH)
+    };
+    if pictures.len() == place {
+        let name = score.against.name().trim_end_matches('s');
+        let shown = vec![picture(name, String::new(), target)];
+        pictures.push(Comparison { title: view.name.clone(), pictures: shown });
+    }
+    let Scores { psnr, ssim, .. } = score.scores;
+    let scores = format!("{psnr:.2} dB, SSIM {ssim:.3}");
+    if let Some(own) = pictures.get_mut(place) {
+        own.pictures.push(picture(run, scores, render));
+    }
+}
+
+/// The last part of each path, or the whole path where two are alike.
+fn names(paths: &[PathBuf]) -> Vec<String> {
+    let last = |path: &PathBuf| path.file_name().unwrap_or(path.as_os_str()).to_owned();
+    let all: Vec<_> = paths.iter().map(last).collect();
+    let is_unique = |name: &std::ffi::OsString| all.iter().filter(|own| *own == name).count() == 1;
+    let name = |(path, name): (&PathBuf, &std::ffi::OsString)| match is_unique(name) {
+        true => name.to_string_lossy().into_owned(),
+        false => path.display().to_string(),
+    };
+    paths.iter().zip(&all).map(name).collect()
+}
+
+/// In what the test views of two datasets differ, in words.
+fn difference(one: &Dataset, other: &Dataset) -> Option<String> {
+    let views = |dataset: &Dataset| {
+        dataset.test_views().map(|view| (view.name.clone(), view.camera)).collect::<Vec<_>>()
+    };
+    let (own, others) = (views(one), views(other));
+    if own.len() != others.len() {
+        return Some(format!("{} test views and {}", own.len(), others.len()));
+    }
+    for ((name, camera), (other_name, other)) in own.iter().zip(&others) {
+        if name != other_name {
+            return Some(format!("test view {name} is {other_name} in the other"));
+        }
+        let [size, other_size] = [camera, other].map(|camera| [camera.width, camera.height]);
+        if size != other_size {
+            let [[a, b], [c, d]] = [size, other_size];
+            return Some(format!("test view {name} is {a}x{b} and {c}x{d} pixels"));
+        }
+        let distance = camera.center().distance(other.center());
+        if distance > POSE_ERROR * camera.center().length().max(1e-3) {
+            return Some(format!("test view {name} has another pose"));
+        }
+    }
+    None
+}

@@ -1,0 +1,48 @@
+//! The depth of a view, to the host.
+
+use super::{DepthChannel, RenderOptions, Renderer};
+use crate::Result;
+use crate::camera::{Camera, Patch};
+use crate::kernels::pack_pixels::NOTHING_SEEN;
+use crate::splats::scene::DeviceGaussians;
+
+/// The median depth, of everything in view.
+const MEDIAN: DepthChannel = DepthChannel { takes_median: true, has_limits: false };
+
+impl Renderer {
+    /// The median depth of each pixel, (H, W), world units: the depth in the view of the splat at which the
+    /// transmittance passes 1/2; infinite where it does not.
+    ///
+    /// # Errors
+    /// As [`Renderer::render_image`].
+    pub(crate) fn render_depths(
+        &mut self,
+        gaussians: &DeviceGaussians,
+        camera: &Camera,
+        options: &RenderOptions,
+    ) -> Result<Vec<f32>> {
+        self.frame.set_channels(&self.gpu, self.settings.channels() + 1)?;
+        self.reserve(gaussians.layout.count, [camera])?;
+        self.build_projections(camera.model.number(), true)?;
+        self.build_blending(true)?;
+        let whole = Patch::from(camera);
+        let mut depths = vec![f32::INFINITY; whole.pixel_count()];
+        let mut patches = self.patches(camera);
+        while let Some(patch) = patches.pop() {
+            let halves = self.render_or_halve(gaussians.slice(), &patch, options, Some(MEDIAN))?;
+            if let Some(halves) = halves {
+                patches.extend(halves);
+                continue;
+            }
+            let planes = self.gpu.read(&self.frame.render)?;
+            let own = &planes[self.settings.channels() * patch.pixel_count()..];
+            let is_seen = |depth: f32| f64::from(depth) < NOTHING_SEEN;
+            let own: Vec<f32> = own[..patch.pixel_count()]
+                .iter()
+                .map(|&depth| if is_seen(depth) { depth } else { f32::INFINITY })
+                .collect();
+            patch.paste((&patch, &own), (&whole, &mut depths));
+        }
+        Ok(depths)
+    }
+}

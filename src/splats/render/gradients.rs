@@ -1,0 +1,89 @@
+//! Gradients of a view without a training: what each Gaussian adds to it.
+
+use super::{Damping, Gradients, RenderOptions, Renderer};
+use crate::Result;
+use crate::camera::{Camera, Patch};
+use crate::gpu::{Buffer, Gpu};
+use crate::splats::batches::Batches;
+use crate::splats::scene::{Attribute, DeviceGaussians, Gaussians};
+
+/// Memory for the gradients of a set of Gaussians, and the host's sums of them.
+#[derive(Debug)]
+pub(crate) struct ViewGradients {
+    batches: Batches,
+    parameters: Buffer<f32>,
+    grad_norm_sums: Buffer<f32>,
+    visit_counts: Buffer<u32>,
+    d_render: Buffer<f32>,
+    /// The gradients of one backward pass, with the planes of the Gaussians.
+    planes: Gaussians,
+}
+
+impl ViewGradients {
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(crate) fn new(gpu: &Gpu, gaussians: &DeviceGaussians) -> Result<Self> {
+        let layout = gaussians.layout;
+        let batches = layout.batches(gpu);
+        Ok(Self {
+            parameters: batches.zeros(gpu, "gradients")?,
+            grad_norm_sums: gpu.zeros("grad_norm_sums", layout.count)?,
+            visit_counts: gpu.zeros("visit_counts", layout.count)?,
+            d_render: gpu.uninit("d_render", 0)?,
+            planes: Gaussians::zeros(layout.count, layout.shape),
+            batches,
+        })
+    }
+}
+
+impl Renderer {
+    /// Renders the view patch by patch. `d_renders` returns one or more gradients with respect to the patch's render,
+    /// (channels, h, w), from its channels and transmittance; `take` gets, for each of them in order, the gradients of
+    /// an attribute, (count, width), which add up over patches.
+    ///
+    /// # Errors
+    /// As [`Renderer::render_image`] and [`Renderer::backward`].
+    pub(crate) fn view_gradients(
+        &mut self,
+        gaussians: &DeviceGaussians,
+        camera: &Camera,
+        options: &RenderOptions,
+        (gradients, attribute): (&mut ViewGradients, Attribute),
+        mut d_renders: impl FnMut(&Patch, &[f32]) -> Vec<Vec<f32>>,
+        mut take: impl FnMut(usize, &[f32]),
+    ) -> Result<()> {
+        self.reserve(gaussians.layout.count, [camera])?;
+        let mut patches = self.patches(camera);
+        while let Some(patch) = patches.pop() {
+            if let Some(halves) = self.render_or_halve(gaussians.slice(), &patch, options, None)? {
+                patches.extend(halves);
+                continue;
+            }
+            let planes = self.read_planes(&patch)?;
+            for (index, d_render) in d_renders(&patch, &planes).iter().enumerate() {
+                gradients.d_render = self.gpu.buffer("d_render", d_render)?;
+                self.record_gradients(gaussians, &patch, options, gradients)?;
+                gradients.planes.parameters =
+                    gradients.batches.read(&self.gpu, &gradients.parameters)?;
+                take(index, &gradients.planes.parameters[gradients.planes.plane(attribute)]);
+            }
+        }
+        Ok(())
+    }
+
+    /// The backward pass of the patch that was rendered last.
+    fn record_gradients(
+        &mut self,
+        gaussians: &DeviceGaussians,
+        patch: &Patch,
+        options: &RenderOptions,
+        gradients: &mut ViewGradients,
+    ) -> Result<()> {
+        let ViewGradients { parameters, grad_norm_sums, visit_counts, d_render, .. } = gradients;
+        let outputs = Gradients { parameters, grad_norm_sums, visit_counts };
+        let damping = Damping { weight: 0.0, depth: 1.0 };
+        self.gpu.clone().run("view_gradients", |pass| {
+            self.backward(pass, gaussians, *patch, options, damping, d_render, outputs)
+        })
+    }
+}

@@ -1,0 +1,206 @@
+//! Changes of a set of Gaussians in place: transforms, removal, and joining.
+
+#[cfg(feature = "io")]
+use glam::DVec3;
+use glam::{DMat3, DQuat};
+use rayon::prelude::*;
+
+#[cfg(feature = "io")]
+use super::ATTRIBUTES;
+use super::Gaussians;
+#[cfg(feature = "io")]
+use super::neighbours::Neighbours;
+use crate::splats::harmonics::HarmonicRotation;
+use crate::splats::scene::rest_coefficients;
+
+/// A model is moved in its numbers up to this many times its size; farther, its origin is moved instead.
+const FAR: f64 = 64.0;
+
+impl Gaussians {
+    /// Rotates the world about its origin: direction `d` becomes `rotation * d`.
+    pub(crate) fn rotate(&mut self, rotation: DQuat) {
+        self.origin = rotation * self.origin;
+        for mean in self.means_mut() {
+            *mean = (rotation * mean.as_dvec3()).as_vec3();
+        }
+        for quat in self.quats_mut() {
+            let [w, x, y, z] = quat.map(f64::from);
+            let DQuat { x, y, z, w } = rotation * DQuat::from_xyzw(x, y, z, w);
+            *quat = [w, x, y, z].map(|part| part as f32);
+        }
+        let coefficients = rest_coefficients(self.shape.sh_degree);
+        if coefficients > 0 {
+            let harmonics = HarmonicRotation::new(DMat3::from_quat(rotation));
+            self.rest_mut()
+                .par_chunks_exact_mut(coefficients)
+                .for_each(|rest| harmonics.turn(rest));
+        }
+    }
+
+    /// Scales the world about its origin by a factor above 0.
+    #[cfg(feature = "io")]
+    pub(crate) fn scale(&mut self, factor: f64) {
+        self.origin *= factor;
+        for mean in self.means_mut() {
+            *mean = (mean.as_dvec3() * factor).as_vec3();
+        }
+        for scale in self.log_scales_mut() {
+            *scale = (scale.as_dvec3() + factor.ln()).as_vec3();
+        }
+    }
+
+    /// Moves the world; far moves change the origin instead of the means, which are f32.
+    #[cfg(feature = "io")]
+    pub(crate) fn translate(&mut self, by: DVec3) {
+        let mut distances: Vec<f32> = self.means().iter().map(|mean| mean.length()).collect();
+        let middle = distances.len() / 2;
+        let size = match distances.is_empty() {
+            true => 0.0,
+            false => f64::from(*distances.select_nth_unstable_by(middle, f32::total_cmp).1),
+        };
+        if self.origin != DVec3::ZERO || by.length() > FAR * size {
+            self.origin += by;
+            return;
+        }
+        for mean in self.means_mut() {
+            *mean = (mean.as_dvec3() + by).as_vec3();
+        }
+    }
+
+    /// Removes the Gaussians whose `keep` is false; the others keep their order.
+    #[cfg(feature = "io")]
+    pub(crate) fn retain(&mut self, keep: &[bool]) {
+        let kept = keep.iter().filter(|keep| **keep).count();
+        if kept == self.count {
+            return;
+        }
+        let mut to = 0;
+        for spec in &ATTRIBUTES {
+            let (column, width) = self.columns(spec.attribute);
+            for (index, _) in keep.iter().enumerate().filter(|(_, keep)| **keep) {
+                let from = column * self.count + index * width;
+                self.parameters.copy_within(from..from + width, to);
+                to += width;
+            }
+        }
+        self.parameters.truncate(to);
+        self.count = kept;
+    }
+
+    /// Appends Gaussians of the same shape; the positions of both stay where they are in the world.
+    #[cfg(feature = "io")]
+    pub(crate) fn append(&mut self, other: &Self) {
+        debug_assert_eq!(self.shape, other.shape, "planes of two shapes");
+        let offset = other.origin - self.origin;
+        let mut both = Self::zeros(self.count + other.count, self.shape);
+        both.origin = self.origin;
+        for spec in &ATTRIBUTES {
+            let plane = both.plane(spec.attribute);
+            let (first, second) =
+                both.parameters[plane].split_at_mut(self.plane(spec.attribute).len());
+            first.copy_from_slice(&self.parameters[self.plane(spec.attribute)]);
+            second.copy_from_slice(&other.parameters[other.plane(spec.attribute)]);
+        }
+        if offset != DVec3::ZERO {
+            for mean in &mut both.means_mut()[self.count..] {
+                *mean = (mean.as_dvec3() + offset).as_vec3();
+            }
+        }
+        *self = both;
+    }
+
+    /// The position of a Gaussian in the world.
+    #[cfg(feature = "io")]
+    pub(crate) fn position(&self, index: usize) -> DVec3 {
+        self.means()[index].as_dvec3() + self.origin
+    }
+
+    /// The root mean squared distance of each Gaussian to the three nearest others; infinite if there are fewer.
+    #[cfg(feature = "io")]
+    pub(crate) fn distances_to_nearest(&self) -> Vec<f64> {
+        let positions: Vec<DVec3> = self.means().iter().map(|mean| mean.as_dvec3()).collect();
+        let neighbours = Neighbours::new(positions.clone());
+        let distance = |place: &DVec3| {
+            // The nearest is the Gaussian itself.
+            let nearest = neighbours.nearest::<4>(*place);
+            (nearest[1..].iter().map(|(squared, _)| squared).sum::<f64>() / 3.0).sqrt()
+        };
+        positions.par_iter().map(distance).collect()
+    }
+
+    /// Opacities after the sigmoid.
+    #[cfg(feature = "io")]
+    pub(crate) fn opacities(&self) -> impl Iterator<Item = f64> {
+        self.raw_opacities().iter().map(|&raw| 1.0 / (1.0 + (-f64::from(raw)).exp()))
+    }
+}
+
+#[cfg(all(test, feature = "io"))]
+mod tests {
+    use super::*;
+    use crate::base::random::Stream;
+    use crate::splats::scene::{Attribute, Features, Shape, width};
+
+    fn drawn(count: usize, seed: u64) -> Gaussians {
+        let shape = Shape { sh_degree: 2, features: Features { noise: true, ..Features::NONE } };
+        let mut gaussians = Gaussians::zeros(count, shape);
+        let stream = Stream::new(seed, 0);
+        for (index, value) in (0..).zip(&mut gaussians.parameters) {
+            *value = (stream.uniform(index) * 2.0 - 1.0) as f32;
+        }
+        gaussians
+    }
+
+    /// The parameters of a Gaussian in the order of the planes.
+    fn row(gaussians: &Gaussians, index: usize) -> Vec<f32> {
+        let of = |attribute: Attribute| {
+            let (column, width) = gaussians.columns(attribute);
+            gaussians.parameters[column * gaussians.count + index * width..][..width].to_vec()
+        };
+        let row: Vec<f32> = ATTRIBUTES.iter().flat_map(|spec| of(spec.attribute)).collect();
+        assert_eq!(row.len(), width(gaussians.shape));
+        row
+    }
+
+    #[test]
+    fn those_that_are_kept_keep_their_numbers_and_order() {
+        let whole = drawn(9, 1);
+        let keep = [true, false, false, true, true, false, true, true, false];
+        let mut some = whole.clone();
+        some.retain(&keep);
+        assert_eq!(some.count, 5);
+        for (index, from) in [0, 3, 4, 6, 7].into_iter().enumerate() {
+            assert_eq!(row(&some, index), row(&whole, from), "{from}");
+        }
+        some.retain(&[false; 5]);
+        assert!(some.parameters.is_empty() && some.count == 0);
+    }
+
+    #[test]
+    fn joined_models_stay_where_they_are_in_the_world() {
+        let (mut first, mut second) = (drawn(3, 1), drawn(2, 2));
+        first.origin = DVec3::new(1e6, 0.0, -2.0);
+        second.origin = DVec3::new(1e6 + 1.0, 0.5, -2.0);
+        let (alone, other) = (first.clone(), second.clone());
+        first.append(&second);
+        assert_eq!((first.count, first.origin), (5, alone.origin));
+        for index in 0..3 {
+            assert_eq!(row(&first, index), row(&alone, index));
+        }
+        for index in 0..2 {
+            assert!(first.position(3 + index).distance(other.position(index)) < 1e-6);
+            assert_eq!(row(&first, 3 + index)[3..], row(&other, index)[3..]);
+        }
+    }
+
+    #[test]
+    fn a_far_move_keeps_the_precision_of_the_means() {
+        let mut model = drawn(5, 3);
+        let before = model.clone();
+        model.translate(DVec3::new(0.5, 0.0, 0.0));
+        assert!(model.origin == DVec3::ZERO && model.means() != before.means());
+        let mut far = before.clone();
+        far.translate(DVec3::new(5e6, 0.0, 0.25));
+        assert_eq!((far.origin, far.means()), (DVec3::new(5e6, 0.0, 0.25), before.means()));
+    }
+}

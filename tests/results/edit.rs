@@ -1,0 +1,260 @@
+//! Edits of a model: what they keep, what they refuse, and that they repeat.
+
+use std::fs;
+
+use glam::{DAffine3, DMat3, DQuat, DVec3, Vec3};
+use nightsplat::base::random::Stream;
+use nightsplat::camera::Camera;
+use nightsplat::gpu::testing::gpu;
+use nightsplat::photographs::image::Image;
+use nightsplat::splats::model::Model;
+use nightsplat::splats::render::{RenderOptions, Renderer};
+use nightsplat::splats::scene::{Gaussians, ply};
+
+use crate::common::command::{refused, run, succeed};
+use crate::common::largest;
+use crate::common::place::Place;
+
+/// A cloud of Gaussians of degree 3 around the origin.
+fn cloud(count: usize, seed: u64) -> Model {
+    let mut gaussians = Gaussians::zeros(count, 3);
+    let stream = Stream::new(seed, 11);
+    for (index, value) in (0..).zip(&mut gaussians.parameters) {
+        *value = (stream.uniform(index) * 2.0 - 1.0) as f32;
+    }
+    gaussians.log_scales_mut().iter_mut().for_each(|scale| *scale = *scale * 0.5 - 2.5);
+    gaussians.rest_mut().iter_mut().for_each(|value| *value *= 0.3);
+    gaussians.into()
+}
+
+/// The camera at a distance of 4 from the origin of a world that was turned.
+fn camera(turn: DQuat) -> Camera {
+    let pose = DAffine3::from_mat3_translation(
+        DMat3::from_quat(DQuat::from_rotation_y(0.4) * turn.inverse()),
+        DVec3::new(0.1, -0.2, 4.0),
+    );
+    Camera::perspective(pose, 0.8, [96, 72])
+}
+
+fn render(model: &Model, camera: &Camera) -> Image {
+    let gpu = gpu();
+    let on_device = model.gaussians.upload(&gpu).unwrap();
+    let mut renderer = Renderer::new(&gpu, model.render_settings()).unwrap();
+    let options =
+        RenderOptions { sh_degree: model.gaussians.shape.sh_degree, background: [0.0; 3] };
+    renderer.reserve(model.gaussians.count, [camera]).unwrap();
+    renderer.render_image(&on_device, camera, &options).unwrap()
+}
+
+fn difference(a: &Image, b: &Image) -> f32 {
+    let differences: Vec<f32> = a.data.iter().zip(&b.data).map(|(a, b)| a - b).collect();
+    largest(&differences)
+}
+
+#[test]
+fn a_model_turned_there_and_back_renders_the_same_and_turned_it_does_from_a_turned_camera() {
+    let place = Place::new();
+    let path = |name: &str| place.path(name).display().to_string();
+    let model = cloud(400, 3);
+    model.save(place.path("model.ply")).unwrap();
+    let axis = DVec3::new(1.0, 2.0, -0.5);
+    let edit = |options: &str, out: &str| {
+        succeed(&format!("edit {} {options} --out {}", path("model.ply"), path(out)));
+        Model::load(place.path(out)).unwrap()
+    };
+    let before = render(&model, &camera(DQuat::IDENTITY));
+    assert!(largest(&before.data) > 0.3, "nothing is seen");
+
+    let back = edit("--rotate 1,2,-0.5:37 --rotate 1,2,-0.5:-37", "back.ply");
+    let error = difference(&before, &render(&back, &camera(DQuat::IDENTITY)));
+    assert!(error < 1e-5, "{error}");
+
+    let turn = DQuat::from_axis_angle(axis.normalize(), 37_f64.to_radians());
+    let turned = edit("--rotate 1,2,-0.5:37", "turned.ply");
+    let error = difference(&before, &render(&turned, &camera(turn)));
+    assert!(error < 1e-5, "{error}");
+    assert!(difference(&before, &render(&turned, &camera(DQuat::IDENTITY))) > 0.1);
+
+    let moved = edit("--scale 0.25 --move 3,-1,2 --move -3,1,-2 --scale 4", "moved.ply");
+    assert_eq!(moved.near, model.near);
+    let error = difference(&before, &render(&moved, &camera(DQuat::IDENTITY)));
+    assert!(error < 1e-5, "{error}");
+    let small = edit("--scale 0.25", "small.ply");
+    assert_eq!(small.near, model.near / 4.0);
+    // From a quarter of the distance, as an up direction of its own.
+    let mut near = camera(DQuat::IDENTITY);
+    near.view_from_world.translation *= 0.25;
+    let error = difference(&before, &render(&small, &near));
+    assert!(error < 1e-5, "{error}");
+    let up = edit("--up 1,2,-0.5", "up.ply");
+    let turn = DQuat::from_rotation_arc(axis.normalize(), DVec3::NEG_Y);
+    assert!(difference(&before, &render(&up, &camera(turn))) < 1e-5);
+}
+
+#[test]
+fn a_crop_keeps_what_is_inside_and_a_merge_puts_both_halves_together() {
+    let place = Place::new();
+    let path = |name: &str| place.path(name).display().to_string();
+    let model = cloud(300, 5);
+    model.save(place.path("model.ply")).unwrap();
+    let crop = |region: &str, out: &str| {
+        succeed(&format!("edit {} --crop {region} --out {}", path("model.ply"), path(out)));
+        ply::load(place.path(out)).unwrap()
+    };
+    let left = crop("-2,-2,-2,0,2,2", "left.ply");
+    let right = crop("0,-2,-2,2,2,2", "right.ply");
+    assert!(left.count > 100 && right.count > 100);
+    assert!(left.means().iter().all(|mean| mean.x <= 0.0));
+    assert_eq!(left.count + right.count, model.gaussians.count);
+    let ball = crop("0.1,0,0,0.7", "ball.ply");
+    let inside = |mean: &&Vec3| mean.distance(Vec3::new(0.1, 0.0, 0.0)) <= 0.7;
+    let expected: Vec<Vec3> = model.gaussians.means().iter().filter(inside).copied().collect();
+    assert_eq!(ball.means(), expected);
+
+    let merge = format!(
+        "edit {} --merge {} --out {}",
+        path("left.ply"),
+        path("right.ply"),
+        path("both.ply")
+    );
+    let stdout = succeed(&merge);
+    assert!(
+        stdout.contains(&format!("{} Gaussians added to {}", right.count, left.count)),
+        "{stdout}"
+    );
+    let both = Model::load(place.path("both.ply")).unwrap();
+    let [whole, joined] = [&model, &both].map(|model| render(model, &camera(DQuat::IDENTITY)));
+    let error = difference(&whole, &joined);
+    assert!(error < 1e-5, "{error}");
+
+    let degree = format!(
+        "edit {} --sh-degree 1 --opacity-min 0.5 --out {}",
+        path("model.ply"),
+        path("less.ply")
+    );
+    succeed(&degree);
+    let less = ply::load(place.path("less.ply")).unwrap();
+    assert_eq!(less.shape.sh_degree, 1);
+    assert!(less.count < 200 && less.raw_opacities().iter().all(|raw| *raw >= 0.0));
+}
+
+#[test]
+fn an_edit_list_repeats_an_edit_of_its_model_and_is_refused_for_another() {
+    let place = Place::new();
+    let path = |name: &str| place.path(name).display().to_string();
+    cloud(200, 7).save(place.path("a.ply")).unwrap();
+    cloud(100, 8).save(place.path("b.ply")).unwrap();
+    let options = "--crop 0,0,0,1.2 --rotate 1,1,0:37 --scale 0,0,0:0,2,0=3 --move 1,0,0 --merge";
+    let edit = |options: &str, out: &str| succeed(&format!("edit {options} --out {}", path(out)));
+    let first = format!(
+        "{} {options} {} --save-edits {}",
+        path("a.ply"),
+        path("b.ply"),
+        path("edits.json")
+    );
+    edit(&first, "first.ply");
+    edit(&first, "again.ply");
+    edit(&format!("{} --edits {}", path("a.ply"), path("edits.json")), "listed.ply");
+    assert_eq!(place.read("first.ply"), place.read("again.ply"));
+    assert_eq!(place.read("first.ply"), place.read("listed.ply"));
+    let text = fs::read_to_string(place.path("edits.json")).unwrap();
+    assert!(text.contains(r#"{"scale":1.5}"#), "{text}");
+
+    // The header has the list, and a later edit keeps it.
+    edit(&format!("{} --move 0,1,0", path("first.ply")), "later.ply");
+    let later = place.read("later.ply");
+    let header = String::from_utf8_lossy(&later[..2000]);
+    let lists: Vec<&str> =
+        header.lines().filter(|line| line.starts_with("comment edits: {")).collect();
+    assert!(lists.len() == 2 && lists[0].contains("crop") && lists[1].contains("move"), "{header}");
+    assert!(!header.contains(&path("b.ply")) && lists[0].contains(r#""file":"b.ply""#), "{header}");
+
+    let list = path("edits.json");
+    let other = format!("edit {} --edits {list} --out {}", path("b.ply"), path("out.ply"));
+    refused(&other, 3, &["edits.json", "another model", "b.ply is"]);
+    // A merged model that changed since.
+    cloud(100, 9).save(place.path("b.ply")).unwrap();
+    let changed = format!("edit {} --edits {list} --out {}", path("a.ply"), path("out.ply"));
+    refused(&changed, 3, &["b.ply", "as the edit list says"]);
+    fs::write(place.path("edits.json"), text.replace("edits\": 1", "edits\": 9")).unwrap();
+    refused(&changed, 3, &["edits.json", "of version 9"]);
+    assert!(!place.path("out.ply").exists());
+}
+
+#[test]
+fn an_edit_that_leaves_nothing_or_cannot_be_written_says_so_and_writes_nothing() {
+    let place = Place::new();
+    let path = |name: &str| place.path(name).display().to_string();
+    cloud(20, 7).save(place.path("a.ply")).unwrap();
+    let out = path("out.ply");
+    let (model, set) = (path("a.ply"), path("set"));
+    for (options, code, part) in [
+        ("--crop 50,0,0,1".to_owned(), 2, "leaves none of 20 Gaussians"),
+        ("--opacity-min 0.99".to_owned(), 2, "opacity-min leaves none of 20"),
+        ("--scale 0".to_owned(), 2, "a scale of 0 is none"),
+        ("--scale nan".to_owned(), 2, "a scale of NaN is none"),
+        ("--crop nan,0,0,1".to_owned(), 2, "is not a finite number"),
+        ("--merge nowhere.ply".to_owned(), 3, "nowhere.ply"),
+        ("--crop cameras".to_owned(), 3, "--dataset"),
+        ("--floaters".to_owned(), 3, "--dataset"),
+        (format!("--scale {set}/transforms_train.json --dataset {set}"), 3, "line 2 is not a name"),
+        (String::new(), 2, "no operation is given"),
+    ] {
+        refused(&format!("edit {model} {options} --out {out}"), code, &[part]);
+    }
+    refused(&format!("edit {model} --move 1,0,0 --out {model}"), 1, &["is the model itself"]);
+    refused(&format!("edit {model} --move 1,0,0 --out {out}.txt"), 2, &["name it .ply"]);
+    let mut broken = place.read("a.ply");
+    let length = broken.len();
+    broken[length - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
+    fs::write(place.path("nan.ply"), broken).unwrap();
+    refused(
+        &format!("edit {} --move 1,0,0 --out {out}", path("nan.ply")),
+        3,
+        &["vertex 19", "NaN"],
+    );
+    let left = fs::read_dir(place.path("")).unwrap().count();
+    // The set and the two models.
+    assert_eq!(left, 3);
+}
+
+#[test]
+fn a_table_of_cameras_in_metres_scales_a_model_and_cameras_crop_it_wherever_it_is() {
+    let place = Place::new();
+    let path = |name: &str| place.path(name).display().to_string();
+    succeed(&place.train("run", "--steps 10"));
+    let set = path("set");
+    // 2.5 metres a unit, in a world of another origin.
+    let listing = fs::read_to_string(place.path("set/transforms_train.json")).unwrap();
+    let listing: serde_json::Value = serde_json::from_str(&listing).unwrap();
+    let row = |frame: &serde_json::Value| {
+        let at = |row: usize| 2.5 * frame["transform_matrix"][row][3].as_f64().unwrap() + 100.0;
+        let name = frame["file_path"].as_str().unwrap().rsplit('/').next().unwrap();
+        format!("{name},{},{},{}\n", at(0), at(1), at(2))
+    };
+    let table: String = listing["frames"].as_array().unwrap().iter().map(row).collect();
+    fs::write(place.path("metres.csv"), format!("name,x,y,z\n{table}")).unwrap();
+    let edit = |options: &str, out: &str| {
+        run(&format!("edit {} {options} --out {}", path("run"), path(out)), 0)
+    };
+    let (stdout, _) = edit(&format!("--scale {}", path("metres.csv")), "metres.ply");
+    let own = ply::load(place.path("run/model.ply")).unwrap();
+    let metres = ply::load(place.path("metres.ply")).unwrap();
+    for (own, metres) in own.means().iter().zip(metres.means()) {
+        assert!((*own * 2.5).distance(*metres) < 1e-4, "{stdout}: {own} {metres}");
+    }
+    // Distances of the table are those of the dataset, whatever the model was scaled by before.
+    edit(&format!("--scale 7 --scale {}", path("metres.csv")), "again.ply");
+    let again = ply::load(place.path("again.ply")).unwrap();
+    for (again, metres) in again.means().iter().zip(metres.means()) {
+        assert!(again.distance(*metres) < 1e-4, "{again} {metres}");
+    }
+
+    let transform = "--rotate 1,2,3:50 --scale 3 --move 1,2,3";
+    edit("--crop cameras", "cropped.ply");
+    edit(&format!("{transform} --crop cameras"), "moved.ply");
+    let [cropped, moved] =
+        ["cropped.ply", "moved.ply"].map(|name| ply::load(place.path(name)).unwrap());
+    assert!(cropped.count > 0 && cropped.count <= own.count);
+    assert_eq!(cropped.count, moved.count, "{set}");
+}

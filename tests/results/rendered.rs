@@ -1,0 +1,102 @@
+//! Layers, sizes, backgrounds and camera paths of renders.
+
+use std::fs;
+use std::path::Path;
+
+use nightsplat::photographs::image::Image;
+
+use crate::common::command::{refused, succeed};
+use crate::common::place::Place;
+
+fn image(path: &Path) -> Image {
+    Image::load(path).unwrap()
+}
+
+#[test]
+fn layers_of_any_model_are_rendered_in_colours_and_as_numbers() {
+    let place = Place::new();
+    let path = |name: &str| place.path(name).display().to_string();
+    succeed(&place.train("run", "--steps 40"));
+    let render = |options: &str, out: &str| {
+        succeed(&format!("render {} --split test {options} --out {}", path("run"), path(out)));
+        let mut files: Vec<_> =
+            fs::read_dir(place.path(out)).unwrap().map(|entry| entry.unwrap().path()).collect();
+        files.sort();
+        files.remove(0)
+    };
+    let alpha = image(&render("--layer alpha --format exr", "alpha"));
+    let light = image(&render("--layer transmittance --format exr", "light"));
+    // Both are read as colours in linear light, which 0 and 1 are not changed by.
+    assert_eq!(alpha.data.len(), light.data.len());
+    let opaque =
+        alpha.data.iter().zip(&light.data).filter(|(alpha, light)| **alpha > 0.99 && **light < 0.1);
+    assert!(opaque.count() > 100);
+    for layer in ["depth", "normal"] {
+        let shown = image(&render(&format!("--layer {layer}"), layer));
+        let distinct: std::collections::BTreeSet<u32> =
+            shown.data.iter().map(|value| value.to_bits()).collect();
+        assert!(distinct.len() > 20, "{layer}");
+    }
+    let near = image(&render("--layer depth --depth-range 0,0.001", "near"));
+    // All is farther than that: yellow, or black where nothing is seen.
+    let pixels = near.pixel_count();
+    let yellow = [253.0, 231.0, 37.0].map(|value: f32| value / 255.0);
+    for pixel in 0..pixels {
+        let own = [0, 1, 2].map(|plane| near.data[plane * pixels + pixel]);
+        assert!(
+            own == [0.0; 3] || own.iter().zip(yellow).all(|(a, b)| (a - b).abs() < 1e-3),
+            "{own:?}"
+        );
+    }
+    refused(
+        &format!("render {} --split test --layer noise --out {}", path("run"), path("noise")),
+        2,
+        &["has no noise; it has rgb, depth, normal"],
+    );
+}
+
+#[test]
+fn views_and_paths_are_rendered_at_a_size_with_a_field_of_view_over_a_background() {
+    let place = Place::new();
+    let path = |name: &str| place.path(name).display().to_string();
+    succeed(&place.train("run", "--steps 10"));
+    let render =
+        |options: &str, out: &str| format!("render {} {options} --out {}", path("run"), path(out));
+    succeed(&render("--split test --size 64x24 --fov 20", "wide"));
+    let file = fs::read_dir(place.path("wide")).unwrap().next().unwrap().unwrap().path();
+    assert_eq!([image(&file).width, image(&file).height], [64, 24]);
+
+    let keyframes = r#"{"nightsplat_path": 1, "fps": 2, "fov": 40, "size": [32, 16], "keyframes": [
+        {"time": 0, "position": [0, 0, 0], "target": [0, 0, 100]},
+        {"time": 2, "position": [0, 0, 0], "target": [100, 0, 100]}]}"#;
+    fs::write(place.path("path.json"), keyframes).unwrap();
+    let file = path("path.json");
+    succeed(&render(&format!("--path {file} --background #ff0000"), "film"));
+    assert_eq!(fs::read_dir(place.path("film")).unwrap().count(), 5);
+    assert_eq!([image(&place.path("film/00000.png")).width], [32]);
+    // Far from everything, only the background is seen.
+    let far = path("far.json");
+    fs::write(
+        place.path("far.json"),
+        keyframes.replace("[0, 0, 0]", "[0, 0, 1e5]").replace("100]", "1e7]"),
+    )
+    .unwrap();
+    succeed(&render(&format!("--path {far} --frames 1 --background 1,0,0"), "far"));
+    let far = image(&place.path("far/00000.png"));
+    assert!(far.data[..512].iter().all(|value| *value == 1.0), "no red");
+    assert!(far.data[512..].iter().all(|value| *value == 0.0));
+
+    fs::write(place.path("path.json"), keyframes.replace("path\": 1", "path\": 7")).unwrap();
+    refused(&render(&format!("--path {file}"), "no"), 3, &["path.json", "version 7"]);
+    for (options, part) in [
+        ("--path nowhere.json", "nor a file"),
+        ("--split test --size 0x4", "is not WIDTHxHEIGHT"),
+        ("--split test --fov 180", "--fov 180 is no field of view"),
+        ("--split test --background blue", "is no colour"),
+        ("--split test --depth-range 2,1", "the nearer first"),
+        ("--path orbit --loop", "--easing and --loop are of keyframes"),
+    ] {
+        refused(&render(options, "no"), 2, &[part]);
+    }
+    assert!(!place.path("no").exists());
+}
