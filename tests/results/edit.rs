@@ -118,7 +118,10 @@ fn a_crop_keeps_what_is_inside_and_a_merge_puts_both_halves_together() {
         path("both.ply")
     );
     let stdout = succeed(&merge);
-    assert!(stdout.contains(&format!("{} Gaussians added to {}", right.count, left.count)), "{stdout}");
+    assert!(
+        stdout.contains(&format!("{} Gaussians added to {}", right.count, left.count)),
+        "{stdout}"
+    );
     let both = Model::load(place.path("both.ply")).unwrap();
     let [whole, joined] = [&model, &both].map(|model| render(model, &camera(DQuat::IDENTITY)));
     let error = difference(&whole, &joined);
