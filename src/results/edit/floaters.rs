@@ -54,12 +54,15 @@ pub(super) fn found<'a>(
 ) -> Result<Found> {
     let evidence_of = |shares: &[f64]| measured(&faded(gaussians, shares)).evidence(targets);
     let mut shares = vec![1.0; gaussians.count];
-    for round in 0..FADE_ROUNDS {
+    let mut least_error = f64::INFINITY;
+    for _ in 0..FADE_ROUNDS {
         let evidence = evidence_of(&shares)?;
-        let steps: Vec<f64> = (0..shares.len()).map(|index| evidence.best_step(index)).collect();
-        if round == 0 && steps.iter().all(|step| *step <= 0.0) {
+        // Steps together overshoot where there is no more to gain.
+        if evidence.error >= least_error {
             break;
         }
+        least_error = evidence.error;
+        let steps: Vec<f64> = (0..shares.len()).map(|index| evidence.best_step(index)).collect();
         for (share, step) in shares.iter_mut().zip(steps) {
             *share = (*share * (1.0 - STEP * step)).min(1.0);
         }
