@@ -5,7 +5,7 @@
 
 Both crop, rotate, scale, move and merge the same random model of SH degree 3; every number of every Gaussian must agree.
 Needs Python and npm, which fetches splat-transform into a folder that is removed; without npm, or where it cannot fetch,
-this prints `not run`.
+this says that it is not run.
 """
 
 import array
@@ -129,17 +129,19 @@ def program():
     return next((str(path) for path in built if path.exists()), None) or sys.exit("build nightsplat first")
 
 
+def not_run(why):
+    return subprocess.call([pathlib.Path(__file__).parent / "not-run.sh", "npm", why])
+
+
 def main():
     if not shutil.which("npm"):
-        print("not run: comparing edits with splat-transform, which needs npm")
-        return
+        return not_run("comparing edits with splat-transform: there is no npm")
     nightsplat = program()
     with tempfile.TemporaryDirectory() as folder:
         folder = pathlib.Path(folder)
         install = ["npm", "install", "--no-audit", "--no-fund", "--silent", "--prefix", folder, SPLAT_TRANSFORM]
         if subprocess.run(install, check=False).returncode != 0:
-            print("not run: comparing edits with splat-transform, which npm could not fetch")
-            return
+            return not_run("comparing edits with splat-transform: npm could not fetch it")
         splat_transform = folder / "node_modules/.bin/splat-transform"
         a, b, out, other = [folder / name for name in ("a.ply", "b.ply", "ours.ply", "theirs.ply")]
         write(a, model(1))
@@ -158,4 +160,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

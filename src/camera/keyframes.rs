@@ -343,7 +343,8 @@ fn hermite(t: f64) -> [f64; 4] {
 }
 
 impl Camera {
-    /// The camera with a frame of another size and shape: the vertical field of view stays, and the principal point its share.
+    /// The camera with a frame of another size and shape: the vertical field of view stays, and the principal point its
+    /// share.
     pub(crate) fn framed(&self, [width, height]: [u32; 2]) -> Self {
         let factor = f64::from(height) / f64::from(self.height);
         let half = |camera: [u32; 2]| glam::DVec2::new(camera[0].into(), camera[1].into()) * 0.5;

@@ -22,8 +22,8 @@ const COMMON: [(&str, &str); 8] = [
 const GROUPS: [(&str, &str); 6] = [
     (
         "Photographs",
-        "images exclude exclude-file orientation reference white-balance downscale max-resolution patch-pixels test-every \
-         invert-masks undistort",
+        "images exclude exclude-file orientation reference white-balance downscale max-resolution patch-pixels \
+         test-every invert-masks undistort",
     ),
     ("Tone curve", "curve profile gain brightness colour theta exposure exposures"),
     (

@@ -23,7 +23,7 @@ mod scenes;
 mod scores;
 
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use clap::Args;
@@ -166,7 +166,9 @@ fn swept(
     let failures = runner::train(&left, args.jobs.into(), &bar, (&args.out, runs.len()))?;
 
     if let Some(weights) = &args.lpips {
-        scores::add_lpips(&runs, &open(first)?, weights, args.lpips_range.into())?;
+        let finished = runs.iter().filter(|run| run.metrics().is_some());
+        let folders: Vec<&Path> = finished.map(|run| run.folder.as_path()).collect();
+        scores::add_lpips(&folders, &open(first)?, weights, args.lpips_range.into())?;
     }
     let rows = Rows::new(&runs, args.table.and_then(Grid::baseline));
     let settings = settings(&runs, &rows.seeds, &args.options.shared);

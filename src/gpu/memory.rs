@@ -155,6 +155,7 @@ mod tests {
         let refused = gpu.uninit::<u8>("another", 1 << 20).unwrap_err();
         assert_eq!(refused.exit_code(), 4, "{refused}");
         drop(buffer);
+        gpu.free_unused();
         assert_eq!(gpu.memory_in_use(), before);
         gpu.uninit::<u8>("another", 1 << 20).unwrap();
     }

@@ -200,7 +200,9 @@ impl SceneTable {
             let mean = (scenes.len() > 1).then_some(("mean", &means));
             let own = self.scenes.iter().map(String::as_str).zip(scenes).chain(mean);
             for (scene, values) in own {
-                let numbers: Vec<String> = values.iter().map(|value| number(*value)).collect();
+                let rounded = |value: f64| (value * 1e6).round() / 1e6;
+                let numbers = values.iter().map(|value| number(value.map(rounded)));
+                let numbers: Vec<String> = numbers.collect();
                 text +=
                     &format!("{},{},{}\n", csv_field(label), csv_field(scene), numbers.join(","));
             }

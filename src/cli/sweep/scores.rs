@@ -4,7 +4,6 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
-use super::run::Run;
 use crate::base::output::write_whole;
 use crate::gpu::Gpu;
 use crate::networks::lpips::{Lpips, Range};
@@ -16,19 +15,19 @@ use crate::{Error, Result};
 /// The file of a run: values by the key of their measure, as in `metrics.json`.
 pub(super) const FILE: &str = "lpips.json";
 
-/// Measures the finished runs that have no value of this network and range yet.
+/// Measures the finished runs in these folders that have no value of this network and range yet.
 ///
 /// # Errors
 /// The weights or a run cannot be read, a file cannot be written, or the device is out of memory or lost.
-pub(super) fn add_lpips(runs: &[Run], gpu: &Gpu, weights: &Path, range: Range) -> Result<()> {
+pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range) -> Result<()> {
     let key = Lpips::load(gpu, weights, range)?.measure().key();
-    for run in runs.iter().filter(|run| run.metrics().is_some()) {
-        let mut known = load(&run.folder);
+    for run in runs {
+        let mut known = load(run);
         if known["mean"].get(&key).is_some() {
             continue;
         }
         let FinishedRun { gpu, config, dataset, mut model_renderer, .. } =
-            FinishedRun::open(&run.folder, None, None)?;
+            FinishedRun::open(run, None, None)?;
         let lpips = Lpips::load(&gpu, weights, range)?;
         let mut reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
         let render = |view: &View| model_renderer.render(view);
@@ -38,8 +37,8 @@ pub(super) fn add_lpips(runs: &[Run], gpu: &Gpu, weights: &Path, range: Range) -
         })?;
         eval::add_lpips(&mut known, &scored, lpips.measure());
         let text = serde_json::to_string_pretty(&known)
-            .map_err(|error| Error::output(run.folder.join(FILE), error.to_string()))?;
-        write_whole(&run.folder.join(FILE), text.as_bytes())?;
+            .map_err(|error| Error::output(run.join(FILE), error.to_string()))?;
+        write_whole(&run.join(FILE), text.as_bytes())?;
     }
     Ok(())
 }

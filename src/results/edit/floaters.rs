@@ -54,14 +54,16 @@ pub(super) fn found<'a>(
 ) -> Result<Found> {
     let evidence_of = |shares: &[f64]| measured(&faded(gaussians, shares)).evidence(targets);
     let mut shares = vec![1.0; gaussians.count];
-    let mut least_error = f64::INFINITY;
+    let (mut before, mut least_error) = (shares.clone(), f64::INFINITY);
     for _ in 0..FADE_ROUNDS {
         let evidence = evidence_of(&shares)?;
         // Steps together overshoot where there is no more to gain.
         if evidence.error >= least_error {
+            shares = before;
             break;
         }
         least_error = evidence.error;
+        before.clone_from(&shares);
         let steps: Vec<f64> = (0..shares.len()).map(|index| evidence.best_step(index)).collect();
         for (share, step) in shares.iter_mut().zip(steps) {
             *share = (*share * (1.0 - STEP * step)).min(1.0);
