@@ -225,6 +225,8 @@ fn hostile_clients_change_no_bit_of_a_training_and_hold_little_memory() {
     let (arguments, watched) = train("watched");
     let mut serving = Serving::start(&format!("{arguments} --progress none --view 0"));
     serving.until("a model", |state| state["model"].as_u64() > Some(0));
+    // It shall not end before the attack does.
+    assert_eq!(serving.ask("POST", "do/pause").0, 200);
     #[cfg(target_os = "linux")]
     let before = serving.peak_memory();
     let held = attack(&serving);
@@ -236,6 +238,12 @@ fn hostile_clients_change_no_bit_of_a_training_and_hold_little_memory() {
         serving.peak_memory()
     );
     drop(held);
+    let resumed =
+        || TcpStream::connect(serving.address).is_ok() && serving.ask("POST", "do/resume").0 == 200;
+    assert!((0..100).any(|_| resumed() || {
+        std::thread::sleep(Duration::from_millis(100));
+        false
+    }));
     for path in
         ["/", "/state", "/../../etc/passwd", "/00000000000000000000000000000000/state", "//"]
     {

@@ -78,10 +78,10 @@ function start(gl) {
   const reach = () => Math.max(Math.hypot(...add(target, current.eye, -1)), 2 * scene.near);
 
   const camera = () => (bookmark === null ? freed() : views[bookmark]);
-  // A free camera fills the canvas with the first view's angle.
+  // A free camera fills the canvas with the view's angle, and has square pixels.
   const freed = () => {
     const { clientWidth: w, clientHeight: h } = canvas, s = Math.min(w / lens.size[0], h / lens.size[1]);
-    return { size: [w, h], focal: lens.focal.map((f) => f * s), principalPoint: [w / 2, h / 2], viewFromWorld: matrix(current) };
+    return { size: [w, h], focal: [lens.focal[1] * s, lens.focal[1] * s], principalPoint: [w / 2, h / 2], viewFromWorld: matrix(current) };
   };
   const paint = () => {
     pending = false;
