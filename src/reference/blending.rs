@@ -63,7 +63,8 @@ impl PixelModel {
     }
 }
 
-/// An offset from the mean is rounded at the tile's corner and at the pixel; each term of sigma rounds at most four times.
+/// An offset from the mean is rounded at the tile's corner and at the pixel; each term of sigma rounds at most four
+/// times.
 fn sigma_error(splat: &Splat, d: DVec2, tile: UVec2) -> f64 {
     let conic = splat.conic;
     let terms = 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + (conic.y * d.x * d.y).abs();

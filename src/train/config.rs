@@ -104,8 +104,8 @@ pub struct TrainConfig {
     /// Use every Nth view by name as a test view, instead of the dataset's split; 0: no test views.
     test_every: Option<usize> = None, "the dataset's split, else every 8th"
         => Rule::COUNT, in "views", "--test-every N";
-    /// Patterns of photographs to leave out, by name or by path as listed: `*`, `?` and `[abc]` match. Others keep their
-    /// split.
+    /// Patterns of photographs to leave out, by name or by path as listed: `*`, `?` and `[abc]` match. Others keep
+    /// their split.
     exclude: Vec<String> = vec![] => Rule::List(0, 1_000_000, &PATTERN);
     /// Memory for photographs on the device and on the host, such as 4G; the rest is kept on disk, which takes time but
     /// changes no result.

@@ -11,9 +11,9 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //!
 //! Walks front to back again, as the forward pass did, with the light still to come, L_i = sum_{k >= i} c_k alpha_k
 //! T_k + T background, which starts as the render itself: dC / dalpha_i = (c_i T_i - L_i) / (1 - alpha_i). Of both,
-//! the product with dL/dC is all that is needed: one number a pixel, however many channels. The gradients of the ellipse
-//! are multiples of moments, sums of dL/dsigma times powers of the offset. No atomics: a slot is written by the one tile
-//! it belongs to, and the sums over a tile's parts and over a Gaussian's slots come in a fixed order.
+//! the product with dL/dC is all that is needed: one number a pixel, however many channels. The gradients of the
+//! ellipse are multiples of moments, sums of dL/dsigma times powers of the offset. No atomics: a slot is written by the
+//! one tile it belongs to, and the sums over a tile's parts and over a Gaussian's slots come in a fixed order.
 
 // This many channels, from the first, move and shape the splats; of the others only the colours learn.
 layout(constant_id = 8) const uint SHAPING_CHANNELS = 3;

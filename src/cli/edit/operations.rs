@@ -79,8 +79,8 @@ const ROWS: [Row; 10] = [
 ];
 
 const FLOATERS: &str = "floaters";
-const FLOATERS_HELP: &str = "Remove the Gaussians that the training views contradict, and those that float unseen; says \
-                             how many, and the held-out PSNR before and after";
+const FLOATERS_HELP: &str = "Remove the Gaussians that the training views contradict, and those that float unseen; \
+                             says how many, and the held-out PSNR before and after";
 
 impl Operations {
     pub(super) fn is_empty(&self) -> bool {
