@@ -270,7 +270,7 @@ fn knots(file: &Keyframes, up: DVec3) -> Result<Vec<Knot>, String> {
         })?);
         let time = keyframe.time.unwrap_or(number as f64);
         if let Some(last) = knots.last() {
-            if !(time > last.time) {
+            if time.is_nan() || time <= last.time {
                 return Err(problem("is not later than the one before"));
             }
             // Both signs are the same rotation; the nearer one gives the shorter path.

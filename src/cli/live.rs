@@ -1,7 +1,7 @@
 //! The live page: what `view` and `train --view` serve to a browser.
 //!
-//! A [`Feed`] knows the model and the progress of its training, [`Pictures`] makes images of the dataset's views, and a
-//! [`Server`] answers requests for both.
+//! A `Feed` knows the model and the progress of its training, `Pictures` makes images of the dataset's views, and a
+//! `Server` answers requests for both.
 
 mod feed;
 mod listen;

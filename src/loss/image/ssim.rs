@@ -22,6 +22,7 @@ pub(super) struct Ssim {
 /// The kernels for the device. On a CPU, loads and stores cost most, and the state of both blurs fits the L1 cache. On
 /// a GPU it would take most registers of a processor, so that too few subgroups would be left to hide latencies.
 #[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "a training has one")]
 enum Kernels {
     /// The first layout that fits a view is used; the last one fits every view.
     One(Vec<(Layout, Pipeline<ssim::Kernel>)>),

@@ -31,11 +31,11 @@ impl RenderSettings {
         (gpu.properties().max_storage_buffer_range / bytes).min(u32::MAX.into()) as usize
     }
 
-    /// The tile for views of these sizes: that of [`RenderSettings::tile_up_to`] the largest, or a multiple of its
+    /// The tile for views of these sizes: that of `RenderSettings::tile_up_to` the largest, or a multiple of its
     /// height where the settings name none and a view would have too many tiles.
     ///
     /// # Errors
-    /// As [`RenderSettings::tile_up_to`].
+    /// As `RenderSettings::tile_up_to`.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn tile_for(
         &self,

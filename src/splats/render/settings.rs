@@ -86,10 +86,10 @@ fn gpu_tile(properties: &Properties, channels: usize, pixels: Option<u64>) -> Ti
 }
 
 impl RenderSettings {
-    /// [`RenderSettings::tile_up_to`] for views of any size.
+    /// `RenderSettings::tile_up_to` for views of any size.
     ///
     /// # Errors
-    /// As [`RenderSettings::tile_up_to`].
+    /// As `RenderSettings::tile_up_to`.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn tile_on(&self, gpu: &Gpu) -> Result<Tile> {
         self.tile_up_to(gpu, None)
