@@ -76,7 +76,7 @@ shim() {
     if [ "$processor" = arm64 ]; then
         compiler=aarch64-linux-gnu-gcc libdrm=$root/usr/lib/aarch64-linux-gnu/libdrm.so.2
     fi
-    "$compiler" -O1 -w -fPIC -shared -fvisibility=hidden "${defines[@]}" -Isrc -Iinclude -Iinclude/drm-uapi \
+    "$compiler" -O1 -w -fPIC -shared -fvisibility=hidden "${defines[@]}" -I src -I include -I include/drm-uapi \
         -Isrc/intel -Isrc/intel/common -Isrc/intel/dev -Isrc/intel/dev/i915 -Isrc/util $(pkg-config --cflags libdrm) \
         -Wl,-z,defs -o "$root/$name.so" src/drm-shim/{device,drm_shim}.c src/c11/impl/{threads_posix,time}.c \
         "${util[@]}" "$@" "$libdrm" -ldl -lpthread -lm

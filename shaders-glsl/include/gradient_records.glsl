@@ -1,5 +1,5 @@
-// Sums of gradient records, for a kernel that declares `gradient_records` and has SUBGROUP_SIZE lanes, and the gradients
-// of a splat from the moments of dL/dsigma that are first in a record.
+// Sums of gradient records, for a kernel that declares `gradient_records` and has SUBGROUP_SIZE lanes, and the
+// gradients of a splat from the moments of dL/dsigma that are first in a record.
 
 vec2 mean2d_gradient(vec3 conic, vec2 moments_x_y) {
     return vec2(dot(conic.xy, moments_x_y), dot(conic.yz, moments_x_y));

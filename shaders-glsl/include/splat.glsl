@@ -34,8 +34,8 @@ struct ProjectedSplat {
     float opacity;      // after the sigmoid
 };
 
-// The exponent of the Gaussian, sign reversed, along a column of pixels that is `x` from its mean: the coefficients of a
-// polynomial in y. alpha = opacity exp(-sigma), sigma = (conic.x x x + conic.z y y) / 2 + conic.y x y.
+// The exponent of the Gaussian, sign reversed, along a column of pixels that is `x` from its mean: the coefficients of
+// a polynomial in y. alpha = opacity exp(-sigma), sigma = (conic.x x x + conic.z y y) / 2 + conic.y x y.
 vec3 sigma_in_column(vec3 conic, float x) {
     precise vec3 by_power = vec3(0.5 * conic.x * x * x, conic.y * x, 0.5 * conic.z);
     return by_power;
