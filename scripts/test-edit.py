@@ -3,9 +3,9 @@
 
     scripts/test-edit.py [NIGHTSPLAT]      (default: target/release/nightsplat, or debug)
 
-Both crop, rotate, scale, move and merge the same random model of SH degree 3; every number of every Gaussian must agree.
-Needs Python and npm, which fetches splat-transform into a folder that is removed; without npm, or where it cannot fetch,
-this says that it is not run.
+Both crop, rotate, scale, move and merge the same random model of SH degree 3; every number of every Gaussian must
+agree. Needs Python and npm, which fetches splat-transform into a folder that is removed; without npm, or where it
+cannot fetch, this says that it is not run.
 """
 
 import array

@@ -7,9 +7,9 @@ Trains a small synthetic set, opens the page from disk at the size of its views 
 more for every view. Turns the background grey by its key and black again by its control: grey must show where the
 model is empty, and not where it is opaque. Shows the other layers, and the difference to a photograph; touches move the
 camera. Opens the page of a training under way: a new model must be shown within two seconds of its checkpoint, and the
-page pauses, continues and stops the training. Edits the model in the page: `edit` with the saved list, rendered, must be
-the page's picture, and so must a keyframe, rendered by `render --path`. No console message may appear. Then opens the page in a browser without
-WebGL, which it must report. Needs Python and Chromium, which it controls by the DevTools protocol through a pipe;
+page pauses, continues and stops the training. Edits the model in the page: `edit` with the saved list, rendered, must
+be the page's picture, and so must a keyframe, rendered by `render --path`. No console message may appear. Then opens
+the page in a browser without WebGL, which it must report. Needs Python and Chromium, which it controls by the DevTools protocol through a pipe;
 without Chromium it prints `not run`.
 """
 

@@ -7,7 +7,8 @@ const uint RECORD_SPACE = RECORD_HEAD + MAX_CHANNELS + 1;
 // and so on, and zero after the last.
 //
 // In every round a lane keeps the values of even or odd indices, adds those of a partner, and gives it the others:
-// after the first round half of the values are left, and a value takes part in about one shuffle instead of one each round.
+// after the first round half of the values are left, and a value takes part in about one shuffle instead of one each
+// round.
 void sum_record(inout float values[RECORD_SPACE]) {
     [[unroll]] for (uint turn = 0; turn < 7; turn++) {
         uint bit = 1u << turn;
