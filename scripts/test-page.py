@@ -3,14 +3,14 @@
 
     scripts/test-page.py [NIGHTSPLAT]      (default: target/release/nightsplat, or debug)
 
-Trains a small synthetic set, opens the page from disk at the size of its views and at twice that, and requires 30 dB or
-more for every view. Turns the background grey by its key and black again by its control: grey must show where the
-model is empty, and not where it is opaque. Shows the other layers, and the difference to a photograph; touches move the
-camera. Opens the page of a training under way: a new model must be shown within two seconds of its checkpoint, and the
-page pauses, continues and stops the training. Edits the model in the page: `edit` with the saved list, rendered, must
-be the page's picture, and so must a keyframe, rendered by `render --path`. No console message may appear. Then opens
-the page in a browser without WebGL, which it must report. Needs Python and Chromium, which it controls by the DevTools protocol through a pipe;
-without Chromium it prints `not run`.
+Trains a small synthetic set, opens the page from disk at the size of its views and at twice that, and requires 30 dB
+or more for every view. Turns the background grey by its key and black again by its control: grey must show where the
+model is empty, and not where it is opaque. Shows the other layers, and the difference to a photograph; touches move
+the camera. Opens the page of a training under way: a new model must be shown within two seconds of its checkpoint, and
+the page pauses, continues and stops the training. Edits the model in the page: `edit` with the saved list, rendered,
+must be the page's picture, and so must a keyframe, rendered by `render --path`. No console message may appear. Then
+opens the page in a browser without WebGL, which it must report. Needs Python and Chromium, which it controls by the
+DevTools protocol through a pipe; without Chromium it prints `not run`.
 """
 
 import base64
@@ -288,7 +288,7 @@ def drag(browser, *places):
 
 
 def edits(browser, run, page, folder, size):
-    """What is edited in the page is what `edit` makes of the saved list, and a saved keyframe is what `render` shows."""
+    """What is edited in the page is what `edit` makes of the saved list; a saved keyframe is what `render` shows."""
     browser.open(page.as_uri())
     browser.fit_canvas(*size)
     before = browser.evaluate(MEAN)
@@ -313,7 +313,8 @@ def edits(browser, run, page, folder, size):
     browser.settle()
     (folder / "path.json").write_text(browser.evaluate("JSON.stringify(nightsplat.path())"))
     options = ["--path", folder / "path.json", "--frames", 1, "--size", f"{size[0]}x{size[1]}"]
-    run("render", folder / "edited.ply", "--dataset", folder / f"set-{SIZES[0][0]}", *options, "--out", folder / "frames")
+    options += ["--dataset", folder / f"set-{SIZES[0][0]}", "--out", folder / "frames"]
+    run("render", folder / "edited.ply", *options)
     frame = sorted((folder / "frames").rglob("*.png"))[0]
     of_path = psnr(browser, frame)
     is_right = min(of_view, of_path) >= ENOUGH and after != before and "delete, crop" in found
