@@ -130,6 +130,8 @@ pub struct Properties {
     pub has_uniform_subgroup_control_flow: bool,
     /// Passes push their descriptors; else they bind descriptor sets.
     pub has_push_descriptors: bool,
+    /// The driver gets specialization constants as such; else as plain constants.
+    pub driver_specializes: bool,
     /// The driver reports registers and spills of kernels; never of a device that a host lends.
     pub has_pipeline_statistics: bool,
 }

@@ -369,6 +369,8 @@ fn properties(
         cooperative_matrix: None,
         has_uniform_subgroup_control_flow: false,
         has_push_descriptors: supported.has_push_descriptors(),
+        // Its optimiser takes hours for loops over arrays whose sizes are plain constants.
+        driver_specializes: driver_id == vk::DriverId::GOOGLE_SWIFTSHADER,
         has_pipeline_statistics: false,
     })
 }

@@ -203,12 +203,25 @@ unsafe fn raw_pipeline(
     if let Some(id) = interface.subgroup_size_id {
         constants.push((id, shared.properties.subgroup_size));
     }
-    let code = spirv::frozen(&code, &constants);
+    let data: Vec<u32> = constants.iter().map(|&(_, bits)| bits).collect();
+    let entries: Vec<_> = (0u32..)
+        .zip(&constants)
+        .map(|(i, &(id, _))| vk::SpecializationMapEntry { constant_id: id, offset: 4 * i, size: 4 })
+        .collect();
+    let specialization =
+        vk::SpecializationInfo::default().map_entries(&entries).data(bytemuck::cast_slice(&data));
+    let driver_specializes = shared.properties.driver_specializes;
+    if !driver_specializes {
+        code = spirv::frozen(&code, &constants);
+    }
     let mut required = vk::PipelineShaderStageRequiredSubgroupSizeCreateInfo::default()
         .required_subgroup_size(shared.properties.subgroup_size);
     let mut stage = vk::PipelineShaderStageCreateInfo::default()
         .stage(vk::ShaderStageFlags::COMPUTE)
         .name(c"main");
+    if driver_specializes {
+        stage = stage.specialization_info(&specialization);
+    }
     if interface.subgroup_size_id.is_some() {
         stage = stage.flags(vk::PipelineShaderStageCreateFlags::REQUIRE_FULL_SUBGROUPS);
         // Where a device cannot be told the subgroup size, its only size is the one it reports.

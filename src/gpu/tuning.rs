@@ -198,6 +198,7 @@ impl Properties {
             cooperative_matrix: None,
             has_push_descriptors: true,
             has_uniform_subgroup_control_flow: true,
+            driver_specializes: false,
             has_pipeline_statistics: false,
         }
     }

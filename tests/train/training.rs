@@ -173,6 +173,18 @@ fn how_steps_are_submitted_changes_no_bit() {
     }
 }
 
+/// Some drivers do not compile kernels with plain constants, others none with specialization constants.
+#[test]
+fn who_specializes_the_kernels_changes_no_bit() {
+    let dataset = dataset();
+    let train = |gpu: &Gpu| {
+        let mut trainer = Trainer::new(gpu, config(), &dataset).unwrap();
+        advance(&mut trainer, 20);
+        trainer.gaussians().unwrap()
+    };
+    assert_eq!(train(&gpu_with(|own| own.driver_specializes = true)), train(&gpu()));
+}
+
 /// Systems reset a device whose submission takes seconds.
 #[test]
 fn the_passes_of_a_slow_step_are_submitted_one_by_one_and_no_bit_changes() {
