@@ -1,5 +1,5 @@
-//! Opens devices. A GPU's driver that is new on this machine compiles every kernel once in a process of its own: if it
-//! crashes, the command says so in a line.
+//! Opens devices. A GPU's driver that is new on this machine compiles every kernel once in a child process, so that a
+//! crash of the driver is an error with one line.
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};

@@ -40,14 +40,7 @@ pub fn blend_pixel_backward(
         }
         d_alpha /= 1.0 - fragment.alpha;
         if opacity * fragment.falloff <= alpha_max {
-            let d = fragment.d;
-            let d_sigma = -fragment.alpha * d_alpha;
-            record[0] += d_sigma;
-            record[1] += d_sigma * d.x;
-            record[2] += d_sigma * d.y;
-            record[3] += d_sigma * d.x * d.x;
-            record[4] += d_sigma * d.x * d.y;
-            record[5] += d_sigma * d.y * d.y;
+            add_moments(record, -fragment.alpha * d_alpha, fragment.d);
         }
     }
 }
@@ -57,6 +50,12 @@ struct Pixel {
     center: DVec2,
     render: Vec<f64>,
     d_render: Vec<f64>,
+}
+
+/// Adds the moments of dL/dsigma at an offset from the mean, in the order of a gradient record: 1, x, y, xx, xy, yy.
+fn add_moments(record: &mut [f64], d_sigma: f64, DVec2 { x, y }: DVec2) {
+    let powers = [1.0, x, y, x * x, x * y, y * y];
+    record.iter_mut().zip(powers).for_each(|(sum, power)| *sum += d_sigma * power);
 }
 
 /// Sums the contributions of all pixels to the records of their tile's list, and writes each record to its
@@ -129,12 +128,7 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
         let d_sigma = fragment.alpha * d_alpha;
         // An offset has the rounding error of a tile's extent.
         let offset = fragment.d.abs() + 1.0;
-        bound[0] += d_sigma;
-        bound[1] += d_sigma * offset.x;
-        bound[2] += d_sigma * offset.y;
-        bound[3] += d_sigma * offset.x * offset.x;
-        bound[4] += d_sigma * offset.x * offset.y;
-        bound[5] += d_sigma * offset.y * offset.y;
+        add_moments(bound, d_sigma, offset);
         let weight = fragment.alpha * fragment.before;
         (0..channels).for_each(|c| bound[head + c] += weight * (relative + model.error) * d(c));
     }

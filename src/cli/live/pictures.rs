@@ -7,7 +7,7 @@ use hyper::body::Bytes;
 
 use crate::Result;
 use crate::gpu::Gpu;
-use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::dataset::{Dataset, MeasuredSize, View};
 use crate::photographs::image::Image;
 use crate::photographs::tone::ToneCurve;
 use crate::results::export::page::{Bookmark, Picture, moved};
@@ -51,6 +51,8 @@ impl Pictures {
         let mut options = config.load_options();
         // The viewer has a pinhole camera.
         (options.undistort, options.load_low_test, options.keep) = (true, true, Some(0));
+        // Photographs are measured for the first target, if one is asked for.
+        options.measured = MeasuredSize::None;
         let dataset = Dataset::load(&config.dataset, &options)?;
         Ok(Self { dataset, config, gpu, targets: None, finished: VecDeque::new() })
     }
