@@ -1,7 +1,8 @@
 //! SPIR-V modules, word by word: their instructions, and freezing their specialization constants.
 //!
 //! A module is specialised here, not by the driver, since some cannot: Metal has one constant for each id and none that
-//! sizes a workgroup or an array, as have old drivers of mobile devices. What a driver gets has plain constants only.
+//! sizes a workgroup or an array, as have old drivers of mobile devices. What a driver gets has plain constants only,
+//! unless it is the one that cannot optimise those (`Properties::driver_specializes`).
 
 use std::collections::{BTreeMap, BTreeSet};
 
