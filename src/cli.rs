@@ -14,7 +14,9 @@ use crate::photographs::image::Image;
 use crate::train::settings::setting;
 
 pub mod bench;
+pub mod blocks;
 pub mod check;
+mod child;
 pub mod compare;
 pub mod completions;
 pub mod demo;
@@ -67,6 +69,7 @@ const EXAMPLES: &str = "Start with:
   nightsplat edit run --floaters --out clean.ply    crop, clean, transform and merge models
   nightsplat sweep photos --out sweep --curves all  train with every curve, and rank them
   nightsplat sweep photos --out s --table presets   what time and memory buy
+  nightsplat blocks plan photos --out city          a scene larger than the device, in blocks
 
 For developers:
   bench        time every kernel, and find the fastest tiles
@@ -92,6 +95,7 @@ enum Command {
     Edit(edit::EditArgs),
     Tone(tone::ToneArgs),
     Sweep(Box<sweep::SweepArgs>),
+    Blocks(Box<blocks::BlocksArgs>),
     #[command(hide = true)]
     Synth(synth::SynthArgs),
     Demo(demo::DemoArgs),
@@ -138,6 +142,7 @@ impl Cli {
             Command::Edit(args) => edit::run(&args),
             Command::Tone(args) => tone::run(&args),
             Command::Sweep(args) => sweep::run(&args),
+            Command::Blocks(args) => blocks::run(&args),
             Command::Synth(args) => synth::run(args),
             Command::Demo(args) => demo::run(&args),
             Command::Doctor(args) => doctor::run(&args),

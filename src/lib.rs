@@ -96,6 +96,7 @@
 //! - `loss`: the loss terms with their gradients, exposures of views, and the log
 //! - `train`: the plan of a capture, and training steps
 //! - `results`: runs and their directories, scores, reports, exports
+//! - `blocks`: scenes that outgrow a device (feature `cli`)
 //! - `capi`: the C interface (feature `capi`)
 //! - `cli`: one file per subcommand (feature `cli`)
 
@@ -111,6 +112,8 @@
 // Tests use every folder;
 #[cfg(feature = "testing")]
 pub mod base;
+#[cfg(feature = "testing")]
+pub mod blocks;
 #[cfg(feature = "testing")]
 pub mod camera;
 #[cfg(feature = "testing")]
@@ -148,6 +151,8 @@ pub mod train;
 // all others use the names below.
 #[cfg(not(feature = "testing"))]
 mod base;
+#[cfg(all(not(feature = "testing"), feature = "cli"))]
+mod blocks;
 #[cfg(not(feature = "testing"))]
 mod camera;
 #[cfg(all(not(feature = "testing"), feature = "capi"))]

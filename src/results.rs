@@ -11,6 +11,7 @@
 //! - [`diagnosis`]: a diagnosis of photographs as a table and a page
 //! - [`evaluation`]: scores as a table, and the page of a run
 //! - [`models`]: model files and run directories, read
+//! - `joined`: a model in tiles, of a scene that was trained in blocks
 //! - [`finished_run`]: a finished run or a model file, opened for rendering
 //! - [`view_exposures`]: renders at the exposure of their targets
 //! - [`video`]: frames as a video
@@ -25,6 +26,7 @@ pub mod eval;
 pub mod evaluation;
 pub mod export;
 pub mod finished_run;
+pub(crate) mod joined;
 pub mod models;
 pub mod report;
 pub mod run;

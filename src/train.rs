@@ -60,6 +60,7 @@ pub use early_stopping::{EndReason, Ended};
 use growth::Growth;
 pub use layers::{Origin, Settings, SettingsLayer, values};
 pub use measuring::TargetExposure;
+pub(crate) use measuring::law_of;
 pub use memory::MemoryEstimate;
 use model::Model;
 pub use networks::Networks;

@@ -25,13 +25,13 @@ const GROUPS: [(&str, &str); 6] = [
         "images exclude exclude-file orientation reference white-balance downscale max-resolution patch-pixels \
          test-every invert-masks undistort",
     ),
-    ("Tone curve", "curve profile gain brightness colour theta exposure exposures"),
+    ("Tone curve", "curve profile gain brightness colour theta law exposure exposures"),
     (
         "Model",
         "preset model parts sh-degree init max-gaussians density near background ssim-weight raw-colors depth \
          depth-is-disparity denoiser-stages denoiser-repeats denoiser-channels denoiser-precision denoiser-crop",
     ),
-    ("Settings", "config set plan explain seed"),
+    ("Settings", "config set frame plan explain seed"),
     (
         "Time, memory and checkpoints",
         "steps max-minutes checkpoint-every checkpoint-minutes device max-vram max-ram cache",

@@ -5,6 +5,7 @@
 //! name is a test view's reference image (`View::reference`), used only for scores and loaded only for test views.
 
 mod allowance;
+pub(crate) mod block;
 mod borders;
 mod colmap;
 mod dark_references;
@@ -53,7 +54,7 @@ pub(crate) use borders::Borders;
 pub use fingerprint::Fingerprint;
 use layout::Layout;
 use listed::{ListedView, Listing};
-use listing::{list, warn};
+use listing::{select, warn};
 pub(crate) use masks::is_beside as is_mask;
 use members::with_held_out;
 pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
@@ -61,7 +62,7 @@ pub use original::Original;
 pub(crate) use pixels::Look;
 use points::points;
 use source::Source;
-use split::{TEST_EVERY, log_split, split};
+use split::{TEST_EVERY, log_split};
 pub use turns::PixelOrientation;
 
 /// Photographs with cameras, and points of the scene they show.
@@ -295,12 +296,9 @@ impl Dataset {
         options.check()?;
         let files = Files::default();
         let layout = Layout::of(root)?;
-        let Listing { mut frames, mut skipped, remarks, clouds } =
-            list(&layout, options.images.as_deref(), &files)?;
-        log_split(&layout.root, &frames, options);
-        split(&layout.root, &mut frames, options.test_every, &files)?;
-        exclude::exclude(&layout.root, &mut frames, &options.exclude)?;
-
+        let Listing { frames, mut skipped, remarks, clouds, has_split } =
+            select(&layout, options, &files)?;
+        log_split(&layout.root, has_split, options);
         let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
         let gains = white_balance_gains(&layout.root, &sources, options)?;
         let views = pixels::load(sources, &layout, options, (look, gains), &mut skipped)?;
@@ -315,6 +313,10 @@ impl Dataset {
         warn(&remarks);
         let views = with_held_out(views, options.hold_out);
         let points = points(&layout, &views, &clouds)?;
+        let points = match &layout.block {
+            Some(block) => block.points_of(points)?,
+            None => points,
+        };
         for line in &skipped {
             tracing::warn!("skipped {line}");
         }
@@ -402,10 +404,7 @@ impl Dataset {
         options.check()?;
         let files = Files::default();
         let layout = Layout::of(root)?;
-        let Listing { mut frames, mut skipped, remarks, .. } =
-            list(&layout, options.images.as_deref(), &files)?;
-        split(&layout.root, &mut frames, options.test_every, &files)?;
-        exclude::exclude(&layout.root, &mut frames, &options.exclude)?;
+        let Listing { frames, mut skipped, remarks, .. } = select(&layout, options, &files)?;
         let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
         let photograph = |source: Source| {
             let Source { name, split, input, reference, mask, .. } = source;

@@ -25,6 +25,7 @@ mod law;
 mod mapping;
 mod profile;
 mod real;
+mod recorded;
 mod settings;
 mod statistics;
 mod table;
@@ -44,6 +45,7 @@ pub(crate) use self::profile::profiled;
 #[cfg(feature = "fit")]
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
+pub(crate) use self::recorded::ToneLaw;
 pub(crate) use self::settings::OF_CURVE;
 pub use self::settings::{GainChoice, ToneSettings};
 pub use self::statistics::{Statistics, percentile};

@@ -144,6 +144,9 @@ pub struct TrainConfig {
     /// Near plane, in units of the scene extent: the distance of the cameras from their centre, rounded to a power of
     /// two.
     near: f64 = 0.1 => Rule::from_to(1e-6, 1.0), "--near N";
+    /// The scene's extent in world units, which learning rates and density control are relative to: 1.1 times the
+    /// largest distance of a camera from their mean.
+    extent: Option<f64> = None, "found from the cameras" => Rule::POSITIVE, in "world units";
     /// The up direction in the dataset's world, for paths and exported files.
     up: Option<[f64; 3]> = None, "found from the cameras, and recorded"
         => Rule::List(3, 3, &Rule::Number(Bound::Unbounded, Bound::Unbounded));
@@ -290,10 +293,10 @@ impl TrainConfig {
             mask_borders: self.mask_borders,
             white_balance: self.white_balance.clone(),
             undistort: self.undistort,
-            measured: if self.tone.full_resolution {
-                MeasuredSize::Own
-            } else {
-                MeasuredSize::Loaded
+            measured: match &self.tone {
+                ToneSettings { law: Some(_), .. } => MeasuredSize::None,
+                ToneSettings { full_resolution: true, .. } => MeasuredSize::Own,
+                _ => MeasuredSize::Loaded,
             },
             hold_out: self.stop.views,
             depth: DepthOptions {
@@ -303,6 +306,11 @@ impl TrainConfig {
             },
             ..LoadOptions::default()
         }
+    }
+
+    /// The scene's extent, world units: as given, or that of the cameras.
+    pub(crate) fn extent_of(&self, dataset: &Dataset) -> f64 {
+        self.extent.unwrap_or_else(|| dataset.extent())
     }
 
     /// Disables the depth part, with a warning, if no training view has a depth map.

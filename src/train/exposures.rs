@@ -5,7 +5,6 @@ use std::path::Path;
 
 use super::views::Views;
 use super::{OnOff, TrainConfig, Trainer};
-use crate::camera::Camera;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, View};
 use crate::photographs::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
@@ -142,9 +141,11 @@ struct Targets<'a> {
 }
 
 impl Targets<'_> {
-    fn target(&mut self, photograph: &Image, camera: &Camera) -> Result<Image> {
-        let measured = MeasuredPhotograph::of(&photograph.data).seen_by(camera);
-        let tone_mapping = self.pseudo_gt.settings().tone_mapping(self.scene, &measured);
+    fn target(&mut self, photograph: &Image, view: &View) -> Result<Image> {
+        let tone_mapping = self.scene.recorded_mapping(&view.name)?.unwrap_or_else(|| {
+            let measured = MeasuredPhotograph::of(&photograph.data).seen_by(&view.camera);
+            self.pseudo_gt.settings().tone_mapping(self.scene, &measured)
+        });
         self.pseudo_gt.tone_mapped(photograph, &tone_mapping)
     }
 
@@ -162,7 +163,7 @@ impl Targets<'_> {
         let neutral =
             Image { data: photograph.data.iter().map(without).collect(), ..*photograph.as_ref() };
         let [neutral, own] =
-            [&neutral, &*photograph].map(|photograph| self.target(photograph, &view.camera));
+            [&neutral, &*photograph].map(|photograph| self.target(photograph, view));
         let affine = Affine::least_squares(&neutral?, &own?)?;
         // A photograph of one colour determines no affine.
         let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);

@@ -132,7 +132,7 @@ pub(super) fn densifier(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> R
     let settings = DensifySettings {
         control: config.density.control,
         gradient_threshold: config.density.gradient_threshold,
-        split_scale: config.density.split_scale * dataset.extent() * frame.scale,
+        split_scale: config.density.split_scale * config.extent_of(dataset) * frame.scale,
         min_opacity: config.density.min_opacity,
         max_gaussians: config.max_gaussians,
         near: config.render_settings().near.into(),
@@ -150,7 +150,7 @@ mod tests {
     use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
     use crate::photographs::pseudo_gt::PseudoGt;
     use crate::train::Preset;
-    use crate::train::measuring::measured;
+    use crate::train::measuring::tone_mapped;
     use crate::train::target_views::TargetViews;
 
     /// The most dB that a round may cost the training views.
@@ -162,7 +162,7 @@ mod tests {
         let dataset = Dataset::load(&config.dataset, &config.load_options()).unwrap();
         let frame = dataset.frame();
         let pseudo_gt = PseudoGt::new(&gpu, &config.tone).unwrap();
-        let (scene, _) = measured(pseudo_gt.settings(), &dataset).unwrap();
+        let (scene, _) = tone_mapped(pseudo_gt.settings(), &dataset).unwrap();
         let all = [usize::MAX; 2];
         let views = TargetViews::probes(&pseudo_gt, &dataset, &frame, &scene, all).unwrap();
         let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();

@@ -139,6 +139,12 @@ impl SettingsLayer {
         Ok(Self(values.map(|(key, value)| (key, value, Origin::Default)).collect()))
     }
 
+    /// Its keys with their values.
+    #[cfg(feature = "cli")]
+    pub(crate) fn entries(&self) -> impl Iterator<Item = (&str, &Value)> {
+        self.0.iter().map(|(key, value, _)| (key.as_str(), value))
+    }
+
     /// Whether it has a setting whose key starts with `section`.
     pub(super) fn names(&self, section: &str) -> bool {
         self.0.iter().any(|(key, ..)| key.starts_with(section))

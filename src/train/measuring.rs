@@ -9,7 +9,9 @@ use serde::Serialize;
 use crate::Result;
 use crate::photographs::dataset::{Dataset, MeasuredSize, View};
 use crate::photographs::image::Image;
-use crate::photographs::tone::{Exposure, MeasuredPhotograph, SceneTone, ToneSettings, all_black};
+use crate::photographs::tone::{
+    Exposure, MeasuredPhotograph, SceneTone, ToneLaw, ToneMapping, ToneSettings, all_black,
+};
 
 /// The exposure of the targets and of the model.
 #[derive(Clone, Debug, Serialize)]
@@ -23,11 +25,21 @@ pub struct TargetExposure {
 }
 
 impl TargetExposure {
-    pub(super) fn new(scene: Exposure, gains: BTreeMap<String, f64>) -> Self {
-        let logarithms: f64 = gains.values().map(|gain| gain.ln()).sum();
-        let model_gain = (logarithms / gains.len().max(1) as f64).exp();
+    /// The exposure of these gains; `model_gain` is the recorded one, if any.
+    pub(super) fn new(
+        scene: Exposure,
+        gains: BTreeMap<String, f64>,
+        model_gain: Option<f64>,
+    ) -> Self {
+        let model_gain = model_gain.unwrap_or_else(|| geometric_mean(gains.values().copied()));
         Self { model_gain, scene, gains }
     }
+}
+
+/// The geometric mean of gains; 1 without any.
+fn geometric_mean(gains: impl ExactSizeIterator<Item = f64>) -> f64 {
+    let count = gains.len().max(1) as f64;
+    (gains.map(f64::ln).sum::<f64>() / count).exp()
 }
 
 /// The training views that have a photograph, with their indices in the dataset.
@@ -36,11 +48,70 @@ pub(super) fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &Vi
     views.filter(|(_, view)| view.is_train() && view.has_photograph())
 }
 
+/// The scene's tone, and the tone mapping of each training photograph: measured, or read from the recorded law.
+///
+/// # Errors
+/// Every photograph is black and their exposure is needed, a photograph can no longer be read, or the law cannot be
+/// used.
+pub(super) fn tone_mapped(
+    settings: &ToneSettings,
+    dataset: &Dataset,
+) -> Result<(SceneTone, Vec<ToneMapping>)> {
+    let Some(path) = &settings.law else {
+        let (scene, measured) = measured(settings, dataset)?;
+        let mappings = measured.iter().map(|own| settings.tone_mapping(&scene, own)).collect();
+        return Ok((scene, mappings));
+    };
+    let scene = SceneTone::recorded(ToneLaw::load(path)?.check(path, settings)?);
+    let mapping = |(_, view): (usize, &View)| scene.recorded_mapping(&view.name).transpose();
+    let mappings = photographs(dataset).filter_map(mapping).collect::<Result<_>>()?;
+    Ok((scene, mappings))
+}
+
+/// The tone mapping of a photograph of the scene: as recorded, or measured.
+///
+/// # Errors
+/// The recorded law lacks the view.
+pub(super) fn tone_mapping_of(
+    settings: &ToneSettings,
+    scene: &SceneTone,
+    view: &View,
+    photograph: &Image,
+) -> Result<ToneMapping> {
+    if let Some(recorded) = scene.recorded_mapping(&view.name)? {
+        return Ok(recorded);
+    }
+    let measured = MeasuredPhotograph::of(&view.counted(photograph)).seen_by(&view.camera);
+    Ok(settings.tone_mapping(scene, &measured))
+}
+
+/// The tone law of a dataset: the mapping of every photograph for training and of every test photograph.
+///
+/// # Errors
+/// Every photograph is black and their exposure is needed, or a photograph can no longer be read.
+pub(crate) fn law_of(settings: &ToneSettings, dataset: &Dataset) -> Result<ToneLaw> {
+    let (scene, measured) = measured(settings, dataset)?;
+    let mut mappings = BTreeMap::new();
+    for ((_, view), own) in photographs(dataset).zip(&measured) {
+        mappings.insert(view.name.clone(), settings.tone_mapping(&scene, own));
+    }
+    let gains: Vec<f64> = mappings.values().filter_map(|own: &ToneMapping| own.gain).collect();
+    let is_exposed = scene.exposure.is_some() && settings.profile.is_none();
+    let model_gain = is_exposed.then(|| geometric_mean(gains.into_iter()));
+    for view in dataset.views.iter().filter(|view| !view.is_train() && view.has_photograph()) {
+        if let Some(own) = measured_of(view, settings.full_resolution)? {
+            mappings.insert(view.name.clone(), settings.tone_mapping(&scene, &own));
+        }
+    }
+    let tone = ToneSettings { law: None, ..settings.clone() };
+    Ok(ToneLaw { tone, exposure: scene.exposure, model_gain, mappings })
+}
+
 /// Measures the training photographs, together and each.
 ///
 /// # Errors
 /// Every photograph is black and their exposure is needed, or a photograph can no longer be read.
-pub(super) fn measured(
+fn measured(
     settings: &ToneSettings,
     dataset: &Dataset,
 ) -> Result<(SceneTone, Vec<MeasuredPhotograph>)> {
@@ -60,10 +131,7 @@ pub(super) fn measured(
 ///
 /// # Errors
 /// Those of [`tone_map_source`].
-pub(super) fn measured_of(
-    view: &View,
-    full_resolution: bool,
-) -> Result<Option<MeasuredPhotograph>> {
+fn measured_of(view: &View, full_resolution: bool) -> Result<Option<MeasuredPhotograph>> {
     let size = if full_resolution { MeasuredSize::Own } else { MeasuredSize::Loaded };
     let read_anew = view.original.as_ref().filter(|_| full_resolution || view.image.is_none());
     let measured = match read_anew.and_then(|original| original.measured(size)) {

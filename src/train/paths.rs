@@ -36,8 +36,9 @@ impl TrainConfig {
 
     /// The paths that are set.
     fn paths(&mut self) -> Vec<&mut PathBuf> {
-        let Self { dataset, reference, init, model, exposure, .. } = self;
-        let optional = [reference, init, &mut model.depth_folder, &mut exposure.start];
+        let Self { dataset, reference, init, tone, model, exposure, .. } = self;
+        let optional =
+            [reference, init, &mut tone.law, &mut model.depth_folder, &mut exposure.start];
         let paths = optional.into_iter().flatten().chain([dataset]);
         paths.filter(|path| !path.as_os_str().is_empty()).collect()
     }

@@ -177,7 +177,7 @@ impl Trainer {
             gpu: gpu.clone(),
             fingerprint,
             frame,
-            extent: dataset.extent() * frame.scale,
+            extent: config.extent_of(dataset) * frame.scale,
             step: 0,
             supervision,
             model: Model::upload(gpu, &gaussians, first_sh_degree(&config), &config.precision)?,

@@ -3,7 +3,7 @@
 use glam::{DVec2, UVec2};
 
 use super::Trainer;
-use super::measuring::{TargetExposure, measured, tone_map_source};
+use super::measuring::{TargetExposure, tone_map_source, tone_mapped, tone_mapping_of};
 use super::terms::NetworkTerms;
 use super::views::ImageKind;
 use crate::Result;
@@ -14,9 +14,7 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::{Image, Mask};
 use crate::photographs::metrics::psnr_of_counted;
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{
-    LuminanceHistogram, MeasuredPhotograph, SceneTone, ToneSettings, is_black,
-};
+use crate::photographs::tone::{LuminanceHistogram, SceneTone, ToneSettings, is_black};
 
 use super::rendered::Rendered;
 
@@ -144,8 +142,7 @@ fn target_of(
     photograph: &Image,
     scene: &SceneTone,
 ) -> Result<Image> {
-    let measured = MeasuredPhotograph::of(&view.counted(photograph)).seen_by(&view.camera);
-    let tone_mapping = pseudo_gt.settings().tone_mapping(scene, &measured);
+    let tone_mapping = tone_mapping_of(pseudo_gt.settings(), scene, view, photograph)?;
     let target = pseudo_gt.tone_mapped(photograph, &tone_mapping)?;
     Ok(target.resized(view.camera.width, view.camera.height))
 }
@@ -164,7 +161,7 @@ impl TestTargets {
     /// Every training photograph is black and their exposure is needed; a photograph can no longer be read; the device
     /// is out of memory or lost.
     pub fn new(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
-        let (scene, _) = measured(tone, dataset)?;
+        let (scene, _) = tone_mapped(tone, dataset)?;
         Self::in_scene(gpu, tone, &scene)
     }
 

@@ -9,7 +9,7 @@ use glam::UVec2;
 use super::TrainConfig;
 use super::cache::{Cache, CacheSize, Slot};
 use super::epochs::Epochs;
-use super::measuring::{TargetExposure, measured, photographs};
+use super::measuring::{TargetExposure, photographs, tone_mapped};
 use super::precision::Encoder;
 use crate::Result;
 use crate::camera::{Patch, TrainingFrame};
@@ -89,15 +89,15 @@ impl Views {
     ) -> Result<(Self, SceneTone, Option<TargetExposure>)> {
         let settings = pseudo_gt.settings().clone();
         let keeps_photographs = config.model.denoiser || config.model.tonemapper;
-        let (scene, measured) = measured(&settings, dataset)?;
+        let (scene, mappings) = tone_mapped(&settings, dataset)?;
         let mut encoder = Encoder::new(gpu, config.precision.photographs);
         let budget = CacheSize::on_device(config.cache, config.max_vram, gpu);
         let mut cache = Cache::new(gpu, budget, config.spool.clone());
         let mut views = vec![];
         views.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
         let (mut gains, mut curves) = (BTreeMap::new(), vec![]);
-        for (place, ((index, view), measured)) in photographs(dataset).zip(&measured).enumerate() {
-            let tone_mapping = settings.tone_mapping(&scene, measured);
+        for (place, ((index, view), tone_mapping)) in photographs(dataset).zip(mappings).enumerate()
+        {
             gains.extend(tone_mapping.gain.map(|gain| (view.name.clone(), gain)));
             curves.push(tone_mapping.parameters);
             let Some(image) = view.loaded()? else { continue };
@@ -144,7 +144,7 @@ impl Views {
         };
         // A profile determines the brightness of its targets.
         let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
-        let exposure = exposure.map(|scene| TargetExposure::new(scene, gains));
+        let exposure = exposure.map(|own| TargetExposure::new(own, gains, scene.recorded_gain()));
         Ok((views, scene, exposure))
     }
 

@@ -6,8 +6,8 @@
 
 use std::fs::{File, TryLockError};
 use std::io::Write;
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus};
+use std::path::Path;
+use std::process::{Command, ExitStatus};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use indicatif::ProgressBar;
 
 use super::run::Run;
-use crate::cli::signals;
+use crate::cli::{child, signals};
 use crate::results::run::Requests;
 use crate::{Error, Result, Stop};
 
@@ -128,7 +128,7 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
     let log = run.folder.join("log.txt");
     let mut output = File::create(&log).map_err(unusable)?;
     writeln!(output, "{}", run.command_line()?).map_err(unusable)?;
-    let mut command = Command::new(this_program().map_err(unusable)?);
+    let mut command = Command::new(child::this_program().map_err(unusable)?);
     command
         .args(&run.arguments)
         .stdin(lock.try_clone().map_err(unusable)?)
@@ -140,8 +140,8 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
         use std::os::unix::process::CommandExt;
         command.process_group(0).arg0("nightsplat");
     }
-    let mut child = command.spawn().map_err(unusable)?;
-    let status = ended(&mut child, requests).map_err(unusable)?;
+    let mut process = command.spawn().map_err(unusable)?;
+    let status = child::ended(&mut process, requests).map_err(unusable)?;
     if status.success() && run.is_finished()? {
         return Ok(Outcome::Finished);
     }
@@ -152,29 +152,6 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
     let printed = std::fs::read(&log).unwrap_or_default();
     let reason = last_words(&String::from_utf8_lossy(&printed), status);
     Err(Error::output(&run.folder, format!("{reason}; see log.txt")))
-}
-
-/// This program; on Linux the running one, even if its file was replaced, so that all points use the same version.
-fn this_program() -> std::io::Result<PathBuf> {
-    let running = Path::new("/proc/self/exe");
-    if running.exists() { Ok(running.to_owned()) } else { std::env::current_exe() }
-}
-
-/// Waits for a process, passing on a request to stop.
-fn ended(child: &mut Child, requests: &Requests) -> std::io::Result<ExitStatus> {
-    const POLL: Duration = Duration::from_millis(50);
-    let mut is_told = false;
-    loop {
-        if let Some(status) = child.try_wait()? {
-            return Ok(status);
-        }
-        if requests.stops().is_some() && !std::mem::replace(&mut is_told, true) {
-            // The standard library cannot send SIGTERM.
-            let kill = format!("kill -TERM {}", child.id());
-            Command::new("sh").args(["-c", &kill]).status()?;
-        }
-        std::thread::sleep(POLL);
-    }
 }
 
 /// The last error in a log, or else the exit status.

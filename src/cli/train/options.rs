@@ -10,7 +10,7 @@ use toml::{Table, Value};
 use crate::base::settings::{Rule, Setting};
 use crate::cli::words::{self, Words};
 use crate::photographs::dataset::exclude;
-use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneSettings};
+use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneLaw, ToneSettings};
 use crate::train::diagnose::Plan;
 use crate::train::settings::SETTINGS;
 use crate::train::{
@@ -45,6 +45,10 @@ struct SeveralSettings {
     /// TOML file with settings, such as the config.toml of a run
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// TOML file with the frame of a scene in place of what the cameras show: frame.center, frame.scale, extent, up and
+    /// near, as `nightsplat blocks plan` writes it
+    #[arg(long, value_name = "FILE")]
+    frame: Option<PathBuf>,
     /// Set any key of config.toml, such as tone.alpha=0.1; repeatable, overrides everything else
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -66,6 +70,12 @@ struct SeveralSettings {
     preset: Option<Preset>,
 }
 
+/// The options that a tone law sets.
+const OF_LAW: [&str; 6] = ["curve", "profile", "gain", "brightness", "colour", "theta"];
+
+/// What `--frame` sets.
+const OF_FRAME: [&str; 5] = ["frame.center", "frame.scale", "extent", "up", "near"];
+
 /// The options that set a single setting, with their values as text.
 #[derive(Clone, Debug, Default)]
 struct SingleSettings(Vec<(&'static Setting, String)>);
@@ -85,6 +95,7 @@ impl Args for SingleSettings {
             let arg = Arg::new(name).long(name).help(help(row));
             // The name in other trainers.
             let arg = if name == "steps" { arg.visible_alias("iterations") } else { arg };
+            let arg = if name == "law" { arg.conflicts_with_all(OF_LAW) } else { arg };
             let is_path = matches!(row.rule, Rule::Text("a path", _));
             let arg = if is_path { arg.value_hint(ValueHint::AnyPath) } else { arg };
             command.arg(match (value, row.rule) {
@@ -219,7 +230,9 @@ impl TrainOptions {
             .ok_or_else(|| Error::input(dataset, "is not Unicode; move it to a path that is"))?;
         options.push("dataset", dataset.into(), Origin::Option("argument"))?;
         several.push_excluded(options)?;
+        several.push_frame(options)?;
         several.push_tone(options)?;
+        self.push_law(options)?;
         several.push_parts(options)?;
         if self.gives("exposure.start") {
             options.push("exposure.learn", "on".into(), Origin::Option("--exposures"))?;
@@ -241,7 +254,40 @@ impl TrainOptions {
     }
 }
 
+impl TrainOptions {
+    /// The curve of the tone law, which its photographs were measured for.
+    fn push_law(&self, options: &mut SettingsLayer) -> Result<()> {
+        let law = self.single.0.iter().find(|(row, _)| row.key == "tone.law");
+        let Some((_, path)) = law else { return Ok(()) };
+        push_curve(options, ToneLaw::load(Path::new(path))?.tone, "--law")
+    }
+}
+
+/// Every setting of a curve.
+fn push_curve(
+    options: &mut SettingsLayer,
+    curve: ToneSettings,
+    option: &'static str,
+) -> Result<()> {
+    let table = Table::try_from(curve).map_err(|error| Error::Usage(error.to_string()))?;
+    table.into_iter().try_for_each(|(name, value)| {
+        options.push(&format!("tone.{name}"), value, Origin::Option(option))
+    })
+}
+
 impl SeveralSettings {
+    fn push_frame(&self, options: &mut SettingsLayer) -> Result<()> {
+        let Some(path) = &self.frame else { return Ok(()) };
+        for (key, value) in SettingsLayer::load(path)?.entries() {
+            if !OF_FRAME.contains(&key) {
+                let known = OF_FRAME.join(", ");
+                return Err(Error::input(path, format!("sets {key}; a frame has {known} only")));
+            }
+            options.push(key, value.clone(), Origin::Option("--frame"))?;
+        }
+        Ok(())
+    }
+
     fn push_excluded(&self, options: &mut SettingsLayer) -> Result<()> {
         let mut patterns = self.exclude.clone();
         if let Some(file) = &self.exclude_file {
@@ -269,11 +315,7 @@ impl SeveralSettings {
             (None, None) => None,
         };
         if let Some((settings, option)) = from_file {
-            let table =
-                Table::try_from(settings).map_err(|error| Error::Usage(error.to_string()))?;
-            return table.into_iter().try_for_each(|(name, value)| {
-                options.push(&format!("tone.{name}"), value, Origin::Option(option))
-            });
+            return push_curve(options, settings, option);
         }
         let mut say = |key: &str, value: Value| options.push(key, value, Origin::Option("--gain"));
         match self.gain {

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use super::block::Block;
 use super::{Split, colmap, transforms};
 use crate::base::tree;
 use crate::photographs::image::files::{is_hidden, photographs_in};
@@ -14,6 +15,8 @@ pub(super) struct Layout {
     pub(super) root: PathBuf,
     /// The COLMAP model that the user named, if any.
     named: Option<PathBuf>,
+    /// The part of the dataset that the user named, if any.
+    pub(super) block: Option<Block>,
 }
 
 /// Folders of COLMAP models below a dataset's root, most likely first; a folder may contain several in subfolders. The
@@ -32,17 +35,22 @@ const MODEL_FOLDERS: [&str; 8] = [
 const MOST_ABOVE: usize = 3;
 
 impl Layout {
-    /// The layout of a path that a user gives: a dataset's folder or archive, its transforms file, or its COLMAP model.
+    /// The layout of a path that a user gives: a dataset's folder or archive, its transforms file, its COLMAP model, or a
+    /// block of it.
     ///
     /// # Errors
     /// [`Error::Input`] if it is none of these, or an unreadable archive.
     pub(super) fn of(given: &Path) -> Result<Self> {
         tree::check(given)
             .map_err(|error| Error::input(given, format!("cannot be read: {error}")))?;
+        if let Some(block) = Block::at(given)? {
+            let layout = Self::of(&block.dataset)?;
+            return Ok(Self { block: Some(block), ..layout });
+        }
         let ending = given.extension().unwrap_or_default().to_ascii_lowercase();
         if tree::is_file(given) && ending == "json" {
             let root = given.parent().unwrap_or(Path::new(".")).to_owned();
-            return Ok(Self { root, named: None });
+            return Ok(Self { root, named: None, block: None });
         }
         if !tree::is_dir(given) {
             let problem = if tree::is_file(given) {
@@ -52,7 +60,7 @@ impl Layout {
             };
             return Err(Error::input(given, problem));
         }
-        let own = Self { root: given.to_owned(), named: None };
+        let own = Self { root: given.to_owned(), named: None, block: None };
         if own.has_listing() {
             return Ok(own.above_model().unwrap_or(own));
         }
@@ -105,7 +113,7 @@ impl Layout {
         let given = given.canonicalize().unwrap_or_else(|_| given.clone());
         let mut above = given.ancestors().skip(1).take(MOST_ABOVE);
         let root = above.find(|folder| has_photographs(folder))?.to_owned();
-        Some(Self { root, named: Some(given) })
+        Some(Self { root, named: Some(given), block: None })
     }
 
     /// What was found instead of a dataset, with the remedy.
@@ -116,7 +124,7 @@ impl Layout {
             return format!("holds no dataset, but {} does: name that", below.display());
         }
         let beside = root.canonicalize().ok().and_then(|root| {
-            let above = Self { root: root.parent()?.to_owned(), named: None };
+            let above = Self { root: root.parent()?.to_owned(), named: None, block: None };
             above.has_listing().then_some(above.root)
         });
         if let Some(above) = beside {
@@ -136,7 +144,8 @@ impl Layout {
     fn below(&self) -> Option<PathBuf> {
         let first = folders_in(&self.root);
         let second: Vec<PathBuf> = first.iter().flat_map(|folder| folders_in(folder)).collect();
-        let mut below = first.into_iter().chain(second).map(|root| Self { root, named: None });
+        let mut below =
+            first.into_iter().chain(second).map(|root| Self { root, named: None, block: None });
         below.find(Self::has_listing).map(|layout| layout.root)
     }
 }

@@ -38,4 +38,6 @@ pub(super) struct Listing {
     pub(super) remarks: Vec<String>,
     /// Points that the listing names.
     pub(super) clouds: Vec<Cloud>,
+    /// Whether the listing itself splits the views.
+    pub(super) has_split: bool,
 }

@@ -3,15 +3,32 @@
 use std::collections::HashMap;
 use std::path::Path;
 
+use super::exclude::exclude;
 use super::layout::{CAMERAS, Layout};
 use super::listed::{ListedView, Listing};
 use super::locate::{self, Wanted};
-use super::{colmap, names, transforms, unused};
+use super::split::split;
+use super::{LoadOptions, colmap, names, transforms, unused};
 use crate::photographs::image::files::{self, Files};
 use crate::{Error, Result};
 
+/// The views that the options select, split, by name.
+///
+/// # Errors
+/// There is no usable view, two have one name, a pattern matches none, or a block names one that is not there.
+pub(super) fn select(layout: &Layout, options: &LoadOptions, files: &Files) -> Result<Listing> {
+    let mut listing = list(layout, options.images.as_deref(), files)?;
+    split(&layout.root, &mut listing.frames, options.test_every, files)?;
+    exclude(&layout.root, &mut listing.frames, &options.exclude)?;
+    match &layout.block {
+        Some(block) => block.restrict(&mut listing.frames)?,
+        None => {}
+    }
+    Ok(listing)
+}
+
 /// The views by name, which is unique; their photographs are searched in `images` if given.
-pub(super) fn list(layout: &Layout, images: Option<&Path>, files: &Files) -> Result<Listing> {
+fn list(layout: &Layout, images: Option<&Path>, files: &Files) -> Result<Listing> {
     let root = layout.root.as_path();
     let mut listing = Listing::default();
     let listings = layout.listings();
@@ -27,6 +44,7 @@ pub(super) fn list(layout: &Layout, images: Option<&Path>, files: &Files) -> Res
             format!("has no usable view ({first}); export the cameras anew"),
         ));
     }
+    listing.has_split = listing.frames.iter().any(|frame| frame.split.is_some());
     names::disambiguate(&mut listing.frames);
     refuse_two_of_one_name(root, &listing.frames)?;
     listing.frames.sort_by(|a, b| a.name.cmp(&b.name));

@@ -63,8 +63,8 @@ pub(super) fn split(
 }
 
 /// Warns if the dataset has a split that another one replaces.
-pub(super) fn log_split(root: &Path, frames: &[ListedView], options: &LoadOptions) {
-    let own = if frames.iter().any(|frame| frame.split.is_some()) {
+pub(super) fn log_split(root: &Path, has_split: bool, options: &LoadOptions) {
+    let own = if has_split {
         Some("its transforms files")
     } else {
         Some("its test.txt").filter(|_| test_list(root).is_some())

@@ -2,11 +2,9 @@
 
 use std::path::Path;
 
-use super::exclude::exclude;
 use super::layout::Layout;
 use super::listed::Listing;
-use super::listing::list;
-use super::split::split;
+use super::listing::select;
 use super::{Dataset, LoadOptions, sources};
 use crate::Result;
 use crate::base::hash::{self, Hasher};
@@ -25,12 +23,12 @@ impl Dataset {
         let files = Files::default();
         let layout = Layout::of(root)?;
         let root = layout.root.as_path();
-        let Listing { mut frames, mut skipped, .. } =
-            list(&layout, options.images.as_deref(), &files)?;
-        split(root, &mut frames, options.test_every, &files)?;
-        exclude(root, &mut frames, &options.exclude)?;
+        let Listing { frames, mut skipped, .. } = select(&layout, options, &files)?;
         let mut hasher = Hasher::default();
         hasher.write(READING);
+        for point in layout.block.iter().flat_map(|block| &block.points) {
+            hasher.write(&point.to_le_bytes());
+        }
         for source in sources(root, &frames, options, &files, &mut skipped) {
             // The Debug output distinguishes all cameras.
             let view = format!("{} {:?} {:?}", source.name, source.split, source.lens);

@@ -23,6 +23,7 @@ use serde::Serialize;
 
 use super::histogram::LuminanceHistogram;
 use super::real::Real;
+use super::recorded::RecordedExposure;
 use crate::camera::{Camera, CameraPoses};
 
 /// The black level of [`soft`].
@@ -174,6 +175,12 @@ impl Exposure {
         Self { share: share.clamp(0.0, 1.0), around: Some(around), ..self }
     }
 
+    /// Its numbers for a file.
+    pub(super) fn recorded(&self) -> RecordedExposure {
+        let Self { gain, target, mean, spread, share, black, brightness, .. } = *self;
+        RecordedExposure { gain, target, mean, spread, share, black, brightness }
+    }
+
     /// The exposure with one gain for every photograph.
     #[must_use]
     pub fn shared(self) -> Self {
@@ -256,6 +263,13 @@ struct SerializedExposure {
     share: f64,
     black: usize,
     reason: String,
+}
+
+impl From<RecordedExposure> for Exposure {
+    fn from(recorded: RecordedExposure) -> Self {
+        let RecordedExposure { gain, target, mean, spread, share, black, brightness } = recorded;
+        Self { gain, target, mean, spread, share, black, brightness, around: None }
+    }
 }
 
 impl From<Exposure> for SerializedExposure {

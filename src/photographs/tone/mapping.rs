@@ -1,10 +1,13 @@
 //! From the measurements of a scene's photographs to the curve of each.
 
+use std::sync::Arc;
+
 use super::exposure::{Exposure, solved};
 use super::histogram::LuminanceHistogram;
 use super::law::{clamped, curve_at};
-use super::{Statistics, ToneCurve, ToneParameters, ToneSettings};
+use super::{Statistics, ToneCurve, ToneLaw, ToneParameters, ToneSettings};
 use crate::camera::Camera;
+use crate::{Error, Result};
 
 /// Minimum and maximum of a solved gain.
 const STRENGTHS: [f64; 2] = [1e-3, 1e4];
@@ -41,10 +44,35 @@ pub struct SceneTone {
     statistics: Option<Statistics>,
     /// The exposure of the targets, if it is automatic.
     pub exposure: Option<Exposure>,
+    /// The recorded mappings, if the photographs are not measured.
+    law: Option<Arc<ToneLaw>>,
+}
+
+impl SceneTone {
+    /// The scene whose photographs are mapped as recorded.
+    pub(crate) fn recorded(law: ToneLaw) -> Self {
+        Self { statistics: None, exposure: law.exposure.clone(), law: Some(Arc::new(law)) }
+    }
+
+    /// The recorded mapping of a view's photograph; `None` if photographs are measured.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] if mappings are recorded, but not that of this view.
+    pub(crate) fn recorded_mapping(&self, view: &str) -> Result<Option<ToneMapping>> {
+        let Some(law) = &self.law else { return Ok(None) };
+        let missing =
+            || Error::Usage(format!("the tone law lacks the view {view}; it is another dataset's"));
+        law.mappings.get(view).copied().map(Some).ok_or_else(missing)
+    }
+
+    /// The recorded gain at which the model renders.
+    pub(crate) fn recorded_gain(&self) -> Option<f64> {
+        self.law.as_ref()?.model_gain
+    }
 }
 
 /// How a photograph is tone-mapped to its target.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ToneMapping {
     /// The curve.
     pub parameters: ToneParameters,
@@ -70,7 +98,7 @@ impl ToneSettings {
         };
         let statistics: Vec<_> = training.iter().map(|one| one.statistics).collect();
         let statistics = Statistics::mean_of(&statistics).filter(|_| self.scene_statistics);
-        Some(SceneTone { statistics, exposure })
+        Some(SceneTone { statistics, exposure, law: None })
     }
 
     /// The tone mapping of a photograph of the scene.

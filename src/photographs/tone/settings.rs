@@ -2,6 +2,7 @@
 
 use std::any::Any;
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
@@ -57,14 +58,25 @@ pub struct ToneSettings {
     pub table: Option<Table>,
     /// The profile of [`ToneCurve::Profile`].
     pub profile: Option<Profile>,
+    /// The file with the tone mapping of every photograph, in place of measuring them.
+    pub law: Option<PathBuf>,
 }
 
 /// Largest value for the kernels, which compute in 32 bits.
 const MOST: f64 = 1e30;
 
 /// Settings that belong to a curve: choosing another curve resets them.
-pub(crate) const OF_CURVE: [&str; 8] =
-    ["gain_c", "alpha", "auto_gain", "colour", "full_resolution", "constants", "table", "profile"];
+pub(crate) const OF_CURVE: [&str; 9] = [
+    "gain_c",
+    "alpha",
+    "auto_gain",
+    "colour",
+    "full_resolution",
+    "constants",
+    "table",
+    "profile",
+    "law",
+];
 
 impl<T: Real> From<&ToneSettings> for CurveInputs<T> {
     fn from(settings: &ToneSettings) -> Self {
@@ -112,6 +124,8 @@ impl ToneSettings {
         table, "none" => Rule::Table("a table of values");
         /// The camera profile of the curve `profile`, read by --profile.
         profile, "none" => Rule::Table("a camera profile");
+        /// File with the curve of every photograph, as `nightsplat blocks plan` writes it, instead of measuring them.
+        law, "the photographs are measured" => Rule::PATH, "--law FILE";
     };
 
     /// A curve with its default constants, those of the paper for LOM; c is 3 for ASE and 1 for AP3. The automatic
@@ -135,6 +149,7 @@ impl ToneSettings {
             constants: family.defaults(),
             table: None,
             profile: None,
+            law: None,
         }
     }
 
@@ -436,6 +451,8 @@ struct SerializedToneSettings {
     table: Option<Table>,
     #[serde(skip_serializing_if = "Option::is_none")]
     profile: Option<Profile>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    law: Option<PathBuf>,
 }
 
 impl TryFrom<SerializedToneSettings> for ToneSettings {
@@ -498,6 +515,7 @@ impl TryFrom<SerializedToneSettings> for ToneSettings {
             constants,
             table: written.table,
             profile: written.profile,
+            law: written.law,
         };
         settings.check_constants()?;
         Ok(settings)
@@ -525,6 +543,7 @@ impl From<ToneSettings> for SerializedToneSettings {
             constants: Some(constants).filter(|constants| !constants.is_empty()),
             table: settings.table,
             profile: settings.profile,
+            law: settings.law,
         }
     }
 }

@@ -99,7 +99,7 @@ impl RunDirectory {
     ///
     /// # Errors
     /// Another process trains there, or it cannot be written.
-    pub(super) fn lock(path: &Path) -> Result<RunLock> {
+    pub(crate) fn lock(path: &Path) -> Result<RunLock> {
         std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
         let lock = RunLock::take(path)?;
         backup::recover(path)?;

@@ -11,6 +11,7 @@ use super::generations;
 use crate::gpu::Gpu;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::Dataset;
+use crate::results::joined::Manifest;
 use crate::splats::scene::{Features, Gaussians, ply};
 use crate::train::{ModelConfig, Networks, TrainConfig};
 use crate::{Error, Result};
@@ -60,12 +61,15 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
     serde_json::from_str::<serde_json::Value>(note).ok()?["step"].as_u64()
 }
 
-/// The trained Gaussians of a run, in the colours that viewers show.
+/// The trained Gaussians of a run, or those of the joined blocks of a scene, in the colours that viewers show.
 ///
 /// # Errors
-/// The run neither finished nor reached a checkpoint, or the file is truncated.
+/// The run neither finished nor reached a checkpoint, or a file is missing or truncated.
 pub fn load_gaussians(run: &Path) -> Result<Gaussians> {
     let path = run.join("model.ply");
+    if let Some(manifest) = Manifest::at(run)? {
+        return manifest.gaussians(run);
+    }
     if !path.is_file() {
         let problem = "has no model.ply: the run neither finished nor reached a checkpoint; train it again, or \
                        continue with --resume";

@@ -11,7 +11,7 @@ use crate::{Error, Result};
 
 /// An exclusive lock on a run directory.
 #[derive(Debug)]
-pub(super) struct RunLock {
+pub(crate) struct RunLock {
     path: PathBuf,
     /// The open file that has the lock.
     _file: File,

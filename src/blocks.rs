@@ -1,0 +1,23 @@
+//! Scenes that outgrow a device: cut into blocks, which train as ordinary runs, and joined.
+//!
+//! ```text
+//! photographs -> plan: law, frame, cells, tasks -> coarse run -> a run for each block -> join: tiles -> eval, export
+//! ```
+//!
+//! - `partition`: the cells of a scene, from its points
+//! - `sight`: which views show a cell
+//! - `budget`: the memory of a block's training
+//! - `task`: what schedulers read
+//! - `plan`: everything that is measured and decided once
+//! - `join`: the tiles of the joined model
+
+mod budget;
+mod join;
+mod partition;
+mod plan;
+mod sight;
+mod task;
+
+pub(crate) use join::join;
+pub(crate) use plan::{BlockPlan, Request, Row, plan};
+pub(crate) use task::{Task, load as load_tasks};

@@ -1,0 +1,165 @@
+//! Joins the blocks: of each, the Gaussians whose mean is in its core. One block at a time is in memory, and the blocks
+//! are taken in the order of the plan: neither who trained them nor when enters.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use sha2::{Digest, Sha256};
+
+use super::plan::{BLOCKS, PlanFile};
+use crate::base::{input, output};
+use crate::photographs::dataset::block::{Block, Cell};
+use crate::results::export::{Format, Provenance};
+use crate::results::joined::{MANIFEST, Manifest, Tile, VERSION};
+use crate::results::models;
+use crate::results::run::{self, RunDirectory, TRAINED_WITH};
+use crate::splats::scene::{Gaussians, ply};
+use crate::{Error, Result};
+
+/// The folder of the tiles at full detail.
+const TILES: &str = "model/0";
+
+/// The end of a join.
+#[derive(Clone, Debug)]
+pub(crate) struct Joined {
+    pub(crate) manifest: Manifest,
+    /// Gaussians of the blocks outside their cores, which are left out.
+    pub(crate) cropped: usize,
+}
+
+/// Joins the blocks of the plan in a folder. With `same_device`, blocks of several devices are refused; else they are
+/// recorded. `observe` is called with the name of every tile that is written.
+///
+/// # Errors
+/// The folder contains no plan, its photographs have changed, a block is missing, not done or of another plan, another
+/// process joins, or a file cannot be read or written.
+pub(crate) fn join(
+    folder: &Path,
+    same_device: bool,
+    mut observe: impl FnMut(&Tile),
+) -> Result<Joined> {
+    let plan = PlanFile::load(folder)?;
+    let _lock = RunDirectory::lock(folder)?;
+    plan.check_photographs(&run::load_config(folder)?)?;
+    let blocks = plan.blocks.iter().map(|row| checked(folder, &row.id, &plan.checksum));
+    let blocks = blocks.collect::<Result<Vec<Block>>>()?;
+    let devices = devices(folder, &blocks, same_device)?;
+    output::create_folder(&folder.join(TILES))?;
+    let mut tiles = vec![];
+    let (mut cropped, mut origin) = (0, [0.0; 3]);
+    for block in &blocks {
+        let (tile, left_out, own) = write_tile(folder, block)?;
+        observe(&tile);
+        tiles.push(tile);
+        cropped += left_out;
+        origin = own;
+    }
+    let count = tiles.iter().map(|tile| tile.count).sum();
+    let manifest =
+        Manifest { version: VERSION, plan: plan.checksum.clone(), origin, count, devices, tiles };
+    save_metrics(folder, &plan, &manifest)?;
+    let text =
+        serde_json::to_string_pretty(&manifest).map_err(|error| Error::Usage(error.to_string()))?;
+    output::write_whole(&folder.join(MANIFEST), (text + "\n").as_bytes())?;
+    Ok(Joined { manifest, cropped })
+}
+
+/// A block that is done.
+fn checked(folder: &Path, id: &str, plan: &str) -> Result<Block> {
+    let place = folder.join(BLOCKS).join(id);
+    let missing = || Error::input(&place, "is missing; plan anew, or copy it here");
+    let block = Block::at(&place)?.ok_or_else(missing)?;
+    if block.plan != plan {
+        let problem = format!("is a block of another plan ({}, not {plan}); plan anew", block.plan);
+        return Err(Error::input(&place, problem));
+    }
+    let run = place.join("run");
+    if !run.join("done.json").is_file() {
+        let problem = format!(
+            "block {id} is not done; `nightsplat blocks run {}` trains it",
+            folder.display()
+        );
+        return Err(Error::input(&run, problem));
+    }
+    Ok(block)
+}
+
+/// The devices on which the blocks were trained, ascending.
+fn devices(folder: &Path, blocks: &[Block], same_device: bool) -> Result<Vec<String>> {
+    let device = |block: &Block| {
+        let run = folder.join(BLOCKS).join(&block.id).join("run");
+        let with = &run::load_metrics(&run)[TRAINED_WITH];
+        let text = |key: &str| with[key].as_str().unwrap_or("unknown").to_owned();
+        format!("{}, {}", text("device"), text("driver"))
+    };
+    let devices: BTreeSet<String> = blocks.iter().map(device).collect();
+    let devices: Vec<String> = devices.into_iter().collect();
+    if devices.len() > 1 {
+        let names = devices.join("; ");
+        if same_device {
+            let problem = format!(
+                "has blocks of several devices ({names}); train them on one, or join without --same-device"
+            );
+            return Err(Error::input(folder, problem));
+        }
+        tracing::warn!(
+            "{}: blocks of several devices, whose bits may differ: {names}",
+            folder.display()
+        );
+    }
+    Ok(devices)
+}
+
+/// Writes the tile of a block; also returns the number of Gaussians left out, and the origin of its positions.
+fn write_tile(folder: &Path, block: &Block) -> Result<(Tile, usize, [f64; 3])> {
+    let id = &block.id;
+    let (mut gaussians, facts) = models::read(&folder.join(BLOCKS).join(id).join("run"))?;
+    let before = gaussians.count;
+    let inside: Vec<bool> =
+        (0..before).map(|index| block.core.contains(gaussians.position(index))).collect();
+    gaussians.retain(&inside);
+    let file = Path::new(TILES).join(format!("{id}.ply"));
+    let path = folder.join(&file);
+    let origin = gaussians.origin.to_array();
+    let provenance = Provenance { facts, ..Provenance::default() };
+    Format::Ply.write(&gaussians, &provenance, &path)?;
+    let kept = std::mem::take(&mut gaussians.count);
+    drop(gaussians);
+    // What is on the disk is checked, not what is in memory.
+    let written = ply::load(&path)?;
+    let is_whole = written.count == kept
+        && (0..written.count).all(|index| block.core.contains(written.position(index)));
+    if !is_whole {
+        return Err(Error::output(&path, "was not written as a tile of its core; check the disk"));
+    }
+    let sha256 = hex(&Sha256::digest(input::bytes(&path)?));
+    let bounds = bounds(&written);
+    let tile = Tile { id: id.clone(), level: 0, file, count: written.count, bounds, sha256 };
+    Ok((tile, before - written.count, origin))
+}
+
+/// The box of the means; `None` without Gaussians.
+fn bounds(gaussians: &Gaussians) -> Option<Cell> {
+    let mut positions = (0..gaussians.count).map(|index| gaussians.position(index));
+    let first = positions.next()?;
+    let (from, to) = positions.fold((first, first), |(from, to), own| (from.min(own), to.max(own)));
+    Some(Cell { from: from.to_array(), to: to.to_array() })
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// The numbers that `eval` and others print of a run.
+fn save_metrics(folder: &Path, plan: &PlanFile, manifest: &Manifest) -> Result<()> {
+    let steps: u64 = plan.blocks.iter().map(|row| row.steps).sum();
+    let seconds = plan.blocks.iter().map(|row| {
+        run::load_metrics(&folder.join(BLOCKS).join(&row.id).join("run"))["seconds"].as_f64()
+    });
+    let metrics = serde_json::json!({
+        "steps": steps + plan.coarse.steps,
+        "seconds": seconds.sum::<Option<f64>>(),
+        "gaussians": manifest.count,
+    });
+    output::write_whole(&folder.join("metrics.json"), format!("{metrics:#}\n").as_bytes())
+}

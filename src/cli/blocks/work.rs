@@ -1,0 +1,64 @@
+//! Runs the tasks of a plan one after another, each in a process of its own.
+
+use std::path::Path;
+use std::process::{Command, ExitStatus};
+
+use crate::blocks::{Task, load_tasks};
+use crate::cli::{child, signals};
+use crate::{Error, Result, Stop};
+
+/// Runs the tasks of the plan in a folder that are not done, in order; `begin` is called before each, with its number,
+/// the number of all, and whether it is done already. A signal is passed on, and no further task begins.
+///
+/// # Errors
+/// The folder contains no plan, a task fails, or [`Error::BatchStopped`] after a signal or when a training's time is
+/// up.
+pub(super) fn work(folder: &Path, mut begin: impl FnMut(&Task, [usize; 2], bool)) -> Result<()> {
+    let tasks = load_tasks(folder)?;
+    let requests = signals::requests()?;
+    for (number, task) in (1..).zip(&tasks) {
+        let is_done = folder.join(&task.done).is_file();
+        begin(task, [number, tasks.len()], is_done);
+        if is_done {
+            continue;
+        }
+        let status = run(folder, task, &requests).map_err(|error| {
+            Error::input(folder, format!("task {} cannot be started: {error}", task.id))
+        })?;
+        let stops = [Stop::Interrupted, Stop::Terminated, Stop::TimeUp];
+        let stopped = stops.into_iter().find(|stop| status.code() == Some(stop.exit_code().into()));
+        if let Some(cause) = stopped.or(requests.stops()) {
+            let (folder, done) = (folder.to_owned(), number - 1);
+            return Err(Error::BatchStopped { folder, done, all: tasks.len(), cause });
+        }
+        if !status.success() {
+            let problem = format!("task {} {}; run this again to continue", task.id, end(status));
+            return Err(Error::input(folder, problem));
+        }
+    }
+    Ok(())
+}
+
+fn run(
+    folder: &Path,
+    task: &Task,
+    requests: &crate::results::run::Requests,
+) -> std::io::Result<ExitStatus> {
+    let mut command = Command::new(child::this_program()?);
+    command.args(task.argv.iter().skip(1)).current_dir(folder);
+    // Signals of the terminal reach this process only, which passes them on once.
+    #[cfg(unix)]
+    {
+        use std::os::unix::process::CommandExt;
+        command.process_group(0).arg0("nightsplat");
+    }
+    child::ended(&mut command.spawn()?, requests)
+}
+
+/// How a process ended, in words.
+fn end(status: ExitStatus) -> String {
+    match status.code() {
+        Some(code) => format!("failed with exit code {code}, for the reason above"),
+        None => format!("ended by {status}"),
+    }
+}
