@@ -1,9 +1,9 @@
 //! A small dark multi-view dataset of an analytic scene, with the true normal-light photograph of every view.
 //!
 //! The scene is ray-traced in linear light: a corner of a room, or a street. The reference is the encoded render, 2x2
-//! supersampled. The dark photograph is the same light divided by [`DARKENING`], with the shot and read noise of a small
-//! sensor, encoded and quantised to 8 bits: as a camera stores it if the exposure is far too short. In a street this
-//! light also falls eightfold from one end to the other; that of the references does not.
+//! supersampled. The dark photograph is the same light divided by [`DARKENING`], with the shot and read noise of a
+//! small sensor, encoded and quantised to 8 bits: as a camera stores it if the exposure is far too short. In a street
+//! this light also falls eightfold from one end to the other; that of the references does not.
 
 use std::f64::consts::PI;
 use std::fs;

@@ -239,8 +239,8 @@ impl Scene for Room {
             .map(|(_, hit)| origin + hit.distance * direction)
     }
 
-    /// Cameras on a part of a sphere in front of the scene, spread evenly by a low-discrepancy sequence (Roberts' R2), so
-    /// that every 8th is among the others.
+    /// Cameras on a part of a sphere in front of the scene, spread evenly by a low-discrepancy sequence (Roberts' R2),
+    /// so that every 8th is among the others.
     fn place(&self, view: usize, _views: usize) -> [DVec3; 2] {
         const AZIMUTH: f64 = 0.75; // radians to either side
         const ELEVATION: (f64, f64) = (0.24, 0.62); // radians

@@ -1,6 +1,7 @@
 //! A long street of houses, trees and cars, its ray tracer, and the cameras that fly along it.
 //!
-//! World axes: x along the street, a unit a plot, y across, z up; the ground is z = 0. Colours are linear radiance, RGB.
+//! World axes: x along the street, a unit a plot, y across, z up; the ground is z = 0. Colours are linear radiance,
+//! RGB.
 
 use glam::{DMat3, DVec2, DVec3};
 
