@@ -11,15 +11,18 @@ use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
 pub struct SynthArgs {
     /// Folder to write to
     pub dir: PathBuf,
-    /// Number of photographs; every 8th is a test view
-    #[arg(long, default_value_t = SyntheticOptions::default().views)]
-    pub views: usize,
-    /// Width, pixels
-    #[arg(long, default_value_t = SyntheticOptions::default().width)]
-    pub width: u32,
-    /// Height, pixels
-    #[arg(long, default_value_t = SyntheticOptions::default().height)]
-    pub height: u32,
+    /// A street of this many plots, whose light falls eightfold along it; each view sees about three of them
+    #[arg(long, value_name = "PLOTS", conflicts_with = "fisheye")]
+    pub street: Option<u32>,
+    /// Number of photographs; every 8th is a test view [default: 24; of a street, 6 a plot]
+    #[arg(long)]
+    pub views: Option<usize>,
+    /// Width, pixels [default: 160; of a street, 128]
+    #[arg(long)]
+    pub width: Option<u32>,
+    /// Height, pixels [default: 120; of a street, 96]
+    #[arg(long)]
+    pub height: Option<u32>,
     /// Seed of textures, noise and sampled points
     #[arg(long, default_value_t = SyntheticOptions::default().seed)]
     pub seed: u64,
@@ -36,13 +39,23 @@ pub struct SynthArgs {
 /// # Errors
 /// [`Error::Output`] if the folder is not empty and `--overwrite` is not given, and those of [`synthetic::write`].
 pub fn run(args: SynthArgs) -> anyhow::Result<()> {
-    let SynthArgs { dir, views, width, height, seed, fisheye, overwrite } = args;
+    let SynthArgs { dir, street, views, width, height, seed, fisheye, overwrite } = args;
+    let usual = street.map_or_else(SyntheticOptions::default, SyntheticOptions::street);
+    let options = SyntheticOptions {
+        views: views.unwrap_or(usual.views),
+        width: width.unwrap_or(usual.width),
+        height: height.unwrap_or(usual.height),
+        seed,
+        fisheye,
+        ..usual
+    };
     let is_empty = std::fs::read_dir(&dir).map_or(true, |mut entries| entries.next().is_none());
     if !is_empty && !overwrite {
         let problem = "is not empty; choose another folder or pass --overwrite";
         return Err(Error::output(dir, problem).into());
     }
-    synthetic::write(&dir, &SyntheticOptions { views, width, height, seed, fisheye })?;
+    synthetic::write(&dir, &options)?;
+    let SyntheticOptions { views, width, height, .. } = options;
     let wrote = format!("{}: {views} views of {width}x{height}", dir.display());
     finish(&wrote, &format!("nightsplat train {} --out run", word(&dir)))
 }

@@ -15,5 +15,6 @@ mod hostile_bytes;
 mod metrics;
 mod properties;
 mod pseudo_gt;
+mod street;
 mod synthetic;
 mod tone;

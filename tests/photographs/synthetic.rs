@@ -14,7 +14,7 @@ use nightsplat::photographs::image::{Image, linear_from_srgb};
 use crate::common::command::run;
 
 const SMALL: SyntheticOptions =
-    SyntheticOptions { views: 10, width: 48, height: 36, seed: 5, fisheye: false };
+    SyntheticOptions { views: 10, width: 48, height: 36, seed: 5, fisheye: false, street: None };
 
 /// Every file below a folder, by relative path.
 fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
@@ -162,9 +162,11 @@ fn invalid_options_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     for options in [
         SyntheticOptions { views: 1, ..SMALL },
-        SyntheticOptions { views: 1000, ..SMALL },
+        SyntheticOptions { views: 100_000, ..SMALL },
         SyntheticOptions { width: 15, ..SMALL },
         SyntheticOptions { height: 100_000, ..SMALL },
+        SyntheticOptions { street: Some(0), ..SMALL },
+        SyntheticOptions { street: Some(4), fisheye: true, ..SMALL },
     ] {
         assert!(synthetic::write(dir.path(), &options).is_err(), "{options:?}");
     }
@@ -201,9 +203,10 @@ mod command {
     use nightsplat::cli::synth::{SynthArgs, run};
 
     fn args(dir: &Path, overwrite: bool) -> SynthArgs {
-        let SyntheticOptions { views, width, height, seed, fisheye } =
-            SyntheticOptions { width: 16, height: 16, ..SMALL };
-        SynthArgs { dir: dir.to_owned(), views, width, height, seed, fisheye, overwrite }
+        let (width, height) = (Some(16), Some(16));
+        let (views, seed) = (Some(SMALL.views), SMALL.seed);
+        let dir = dir.to_owned();
+        SynthArgs { dir, street: None, views, width, height, seed, fisheye: false, overwrite }
     }
 
     #[test]

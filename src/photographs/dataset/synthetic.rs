@@ -1,25 +1,43 @@
 //! A small dark multi-view dataset of an analytic scene, with the true normal-light photograph of every view.
 //!
-//! The scene is ray-traced in linear light. The reference is the encoded render, 2x2 supersampled. The dark photograph
-//! is the same light divided by [`DARKENING`], with the shot and read noise of a small sensor, encoded and quantised to
-//! 8 bits: as a camera stores it if the exposure is far too short.
+//! The scene is ray-traced in linear light: a corner of a room, or a street. The reference is the encoded render, 2x2
+//! supersampled. The dark photograph is the same light divided by [`DARKENING`], with the shot and read noise of a
+//! small sensor, encoded and quantised to 8 bits: as a camera stores it if the exposure is far too short. In a street
+//! this light also falls eightfold from one end to the other; that of the references does not.
 
 use std::f64::consts::PI;
-use std::fmt::Write as _;
 use std::fs;
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use self::room::{FOCUS, Room};
+use self::room::Room;
+use self::street::Street;
 use crate::base::random::Stream;
 use crate::camera::{Camera, CameraModel, KannalaBrandt};
 use crate::photographs::image::{Image, srgb_from_linear};
 use crate::{Error, Result};
 
+mod colmap;
 mod room;
+mod shapes;
+mod street;
+
+/// What is photographed.
+trait Scene: Sync {
+    /// The linear radiance along a ray, in the light of the references, and in that of the photographs before they are
+    /// darkened.
+    fn radiance(&self, origin: DVec3, direction: DVec3) -> [DVec3; 2];
+
+    /// The first point along a ray.
+    fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3>;
+
+    /// The position of camera `view` of `views`, and the unit vector from what it looks at towards it.
+    fn place(&self, view: usize, views: usize) -> [DVec3; 2];
+}
 
 /// How much darker the dark photographs are, in linear light.
 pub const DARKENING: f64 = 25.0;
@@ -66,7 +84,7 @@ impl Capture {
 /// Every this many views, from the first, one is a test view.
 const TEST_EVERY: usize = 8;
 
-/// The streams of random numbers of the seed; the room's textures use stream 0.
+/// The streams of random numbers of the seed; the scene uses stream 0.
 const NOISE_STREAM: u64 = 1;
 const POINT_STREAM: u64 = 2;
 
@@ -83,11 +101,22 @@ pub struct SyntheticOptions {
     pub seed: u64,
     /// Use a fisheye that sees 130 degrees across the image's longer side; black outside its circle.
     pub fisheye: bool,
+    /// A street of this many plots, of one world unit each, instead of the room. Cameras fly along it, and each sees a
+    /// stretch of about three.
+    pub street: Option<u32>,
 }
 
 impl Default for SyntheticOptions {
     fn default() -> Self {
-        Self { views: 24, width: 160, height: 120, seed: 0, fisheye: false }
+        Self { views: 24, width: 160, height: 120, seed: 0, fisheye: false, street: None }
+    }
+}
+
+impl SyntheticOptions {
+    /// A street of this many plots: six photographs of 128x96 a plot.
+    pub fn street(plots: u32) -> Self {
+        let views = 6 * plots as usize;
+        Self { views, width: 128, height: 96, street: Some(plots), ..Self::default() }
     }
 }
 
@@ -99,11 +128,14 @@ const FISHEYE_REACH: f64 = 65.0 * PI / 180.0;
 
 impl SyntheticOptions {
     fn check(&self) -> Result<()> {
-        const SIDES: std::ops::RangeInclusive<u32> = 16..=8192;
-        if !(2..=999).contains(&self.views) {
+        const SIDES: RangeInclusive<u32> = 16..=8192;
+        const PLOTS: RangeInclusive<u32> = 1..=10_000;
+        const VIEWS: RangeInclusive<usize> = 2..=99_999;
+        if !VIEWS.contains(&self.views) {
             return Err(Error::Usage(format!(
-                "{} views cannot be made; ask for 2 to 999",
-                self.views
+                "{} views cannot be made; ask for 2 to {}",
+                self.views,
+                VIEWS.end()
             )));
         }
         if !SIDES.contains(&self.width) || !SIDES.contains(&self.height) {
@@ -111,6 +143,18 @@ impl SyntheticOptions {
             return Err(Error::Usage(format!(
                 "views of {width}x{height} cannot be made; ask for sides of 16 to 8192"
             )));
+        }
+        if let Some(plots) = self.street
+            && !PLOTS.contains(&plots)
+        {
+            return Err(Error::Usage(format!(
+                "a street of {plots} plots cannot be made; ask for 1 to {}",
+                PLOTS.end()
+            )));
+        }
+        if self.street.is_some() && self.fisheye {
+            let problem = "a street is not made with a fisheye; ask for one of both";
+            return Err(Error::Usage(problem.to_owned()));
         }
         Ok(())
     }
@@ -155,18 +199,22 @@ pub fn write_captured(
         }
     }
 
-    let room = Room::new(options.seed);
-    let cameras: Vec<Camera> = (0..options.views).map(|view| camera(view, options)).collect();
+    let (scene, draws): (Box<dyn Scene>, u64) = match options.street {
+        None => (Box::new(Room::new(options.seed)), 2400),
+        Some(plots) => (Box::new(Street::new(plots, options.seed)), 400 * u64::from(plots)),
+    };
+    let camera = |view| camera(scene.place(view, options.views), options);
+    let cameras: Vec<Camera> = (0..options.views).map(camera).collect();
     for (view, camera) in cameras.iter().enumerate() {
-        let radiance = render(&room, camera);
-        reference(&radiance, camera).save_png8(high.join(file_name(view)))?;
+        let name = file_name(view, cameras.len());
+        let [lit, dim] = render(&*scene, camera);
+        reference(&lit, camera).save_png8(high.join(&name))?;
         let noise = Stream::new(options.seed, NOISE_STREAM << 32 | view as u64);
         let stops = capture.stops.get(view % capture.stops.len().max(1)).copied();
         let darkening = capture.darkening / stops.unwrap_or(0.0).exp2();
-        dark_photograph(&radiance, camera, capture, darkening, noise)
-            .save_png8(low.join(file_name(view)))?;
+        dark_photograph(&dim, camera, capture, darkening, noise).save_png8(low.join(&name))?;
     }
-    for (name, text) in colmap_model(&room, &cameras, options.seed) {
+    for (name, text) in colmap::model(&*scene, &cameras, draws, options.seed) {
         write_file(&sparse.join(name), &text)?;
     }
     let (test, train): (Vec<usize>, Vec<usize>) =
@@ -186,23 +234,13 @@ fn write_file(path: &Path, text: &str) -> Result<()> {
 }
 
 /// The photograph's name, the same in `low/`, `high/` and the COLMAP model.
-fn file_name(view: usize) -> String {
-    format!("{view:03}.png")
+fn file_name(view: usize, views: usize) -> String {
+    let digits = (views - 1).to_string().len().max(3);
+    format!("{view:0digits$}.png")
 }
 
-/// Cameras on a part of a sphere in front of the scene, spread evenly by a low-discrepancy sequence (Roberts' R2), so
-/// that every 8th is among the others.
-fn camera(view: usize, options: &SyntheticOptions) -> Camera {
-    const AZIMUTH: f64 = 0.75; // radians to either side
-    const ELEVATION: (f64, f64) = (0.24, 0.62); // radians
-    const DISTANCE: (f64, f64) = (2.95, 3.45);
-    let fraction = |step: f64| (0.5 + step * view as f64).fract();
-    let azimuth = AZIMUTH * (2.0 * fraction(0.754_877_666) - 1.0);
-    let elevation = ELEVATION.0 + (ELEVATION.1 - ELEVATION.0) * fraction(0.569_840_291);
-    let distance = DISTANCE.0 + (DISTANCE.1 - DISTANCE.0) * fraction(0.381_966_011);
-    let (sin, cos) = azimuth.sin_cos();
-    let back = DVec3::new(sin * elevation.cos(), -cos * elevation.cos(), elevation.sin());
-
+/// The camera at a position, with the direction from what it looks at.
+fn camera([center, back]: [DVec3; 2], options: &SyntheticOptions) -> Camera {
     let right = DVec3::Z.cross(back).normalize();
     let world_from_view = DMat3::from_cols(right, -back.cross(right), -back);
     let size = DVec2::new(options.width.into(), options.height.into());
@@ -218,8 +256,7 @@ fn camera(view: usize, options: &SyntheticOptions) -> Camera {
         focal: DVec2::new(focal, 1.01 * focal),
         principal_point: size * DVec2::new(0.525, 0.485),
         model,
-        view_from_world: DAffine3::from_mat3_translation(world_from_view, FOCUS + distance * back)
-            .inverse(),
+        view_from_world: DAffine3::from_mat3_translation(world_from_view, center).inverse(),
     }
 }
 
@@ -229,8 +266,8 @@ fn ray(camera: &Camera, pixel: DVec2) -> Option<DVec3> {
     Some((camera.view_from_world.matrix3.transpose() * in_view).normalize())
 }
 
-/// Linear radiance in row-major order, the mean of 2x2 rays per pixel.
-fn render(room: &Room, camera: &Camera) -> Vec<DVec3> {
+/// Linear radiance in row-major order, the mean of 2x2 rays per pixel, in both lights.
+fn render(scene: &dyn Scene, camera: &Camera) -> [Vec<DVec3>; 2] {
     const OFFSETS: [DVec2; 4] = [
         DVec2::new(0.25, 0.25),
         DVec2::new(0.75, 0.25),
@@ -240,13 +277,14 @@ fn render(room: &Room, camera: &Camera) -> Vec<DVec3> {
     let center = camera.center();
     let radiance = |index: u32| {
         let corner = DVec2::new((index % camera.width).into(), (index / camera.width).into());
-        OFFSETS
-            .iter()
-            .filter_map(|&offset| Some(room.radiance(center, ray(camera, corner + offset)?)))
-            .sum::<DVec3>()
-            / 4.0
+        let rays = OFFSETS.iter().filter_map(|&offset| ray(camera, corner + offset));
+        let sums = rays
+            .map(|ray| scene.radiance(center, ray))
+            .fold([DVec3::ZERO; 2], |sums, own| [sums[0] + own[0], sums[1] + own[1]]);
+        (sums[0] / 4.0, sums[1] / 4.0)
     };
-    (0..camera.width * camera.height).into_par_iter().map(radiance).collect()
+    let (lit, dim) = (0..camera.width * camera.height).into_par_iter().map(radiance).unzip();
+    [lit, dim]
 }
 
 /// The normal-light photograph.
@@ -294,7 +332,7 @@ fn transforms(cameras: &[Camera], folder: &str, views: &[usize]) -> Value {
             .map(|row| [right[row], -down[row], -forward[row], pose.translation[row]])
             .to_vec();
         rows.push([0.0, 0.0, 0.0, 1.0]);
-        json!({ "file_path": format!("{folder}/{}", file_name(view)), "transform_matrix": rows })
+        json!({ "file_path": format!("{folder}/{}", file_name(view, cameras.len())), "transform_matrix": rows })
     };
     let mut list = json!({
         "camera_angle_x": 2.0 * (f64::from(width) / (2.0 * focal.x)).atan(),
@@ -316,102 +354,4 @@ fn transforms(cameras: &[Camera], folder: &str, views: &[usize]) -> Value {
         }
     }
     list
-}
-
-/// A sparse point: its position and the views that see it, with the pixel positions.
-struct SparsePoint {
-    position: DVec3,
-    track: Vec<(usize, DVec2)>,
-}
-
-/// Points on surfaces that at least two views see.
-fn sparse_points(room: &Room, cameras: &[Camera], seed: u64) -> Vec<SparsePoint> {
-    const DRAWS: u64 = 2400;
-    const DRAWS_PER_POINT: u64 = 16;
-    const PRECISION: f64 = 0.002; // standard deviation of a position, world units
-    let stream = Stream::new(seed, POINT_STREAM << 32);
-    let sample = |index: u64| {
-        let uniform = |draw: u64| stream.uniform(index * DRAWS_PER_POINT + draw);
-        let camera = &cameras[(uniform(0) * cameras.len() as f64) as usize];
-        let pixel =
-            DVec2::new(uniform(1) * f64::from(camera.width), uniform(2) * f64::from(camera.height));
-        let position = room.first_point(camera.center(), ray(camera, pixel)?)?;
-        let seen =
-            |(view, camera): (usize, &Camera)| Some((view, seen_at(room, camera, position)?));
-        let track: Vec<_> = cameras.iter().enumerate().filter_map(seen).collect();
-        // Each normal sample takes two counters.
-        let error = DVec3::from_array(
-            [2, 3, 4].map(|draw| stream.normal(index * DRAWS_PER_POINT / 2 + draw)),
-        );
-        (track.len() >= 2).then(|| SparsePoint { position: position + PRECISION * error, track })
-    };
-    (0..DRAWS).into_par_iter().filter_map(sample).collect()
-}
-
-/// The pixel position at which a camera sees a position on a surface, unless it is occluded.
-fn seen_at(room: &Room, camera: &Camera, position: DVec3) -> Option<DVec2> {
-    const TOLERANCE: f64 = 1e-3;
-    let pixel = camera.project(position)?;
-    let size = DVec2::new(camera.width.into(), camera.height.into());
-    let inside = pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all();
-    let first = room.first_point(camera.center(), ray(camera, pixel)?)?;
-    (inside && first.distance(position) < TOLERANCE).then_some(pixel)
-}
-
-/// The files of a COLMAP text model, by name and content.
-fn colmap_model(room: &Room, cameras: &[Camera], seed: u64) -> [(&'static str, String); 3] {
-    const GREY: &str = "128 128 128";
-    let points = sparse_points(room, cameras, seed);
-    let Camera { width, height, focal, principal_point, model, .. } = cameras[0];
-    let (name, distortion) = match model {
-        CameraModel::Pinhole => ("PINHOLE", String::new()),
-        CameraModel::Fisheye(lens) => {
-            ("OPENCV_FISHEYE", lens.coefficients.map(|k| format!(" {k}")).concat())
-        }
-    };
-    let camera_list = format!(
-        "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 {name} {width} {height} {} {} {} {}{distortion}\n",
-        focal.x, focal.y, principal_point.x, principal_point.y
-    );
-
-    let mut observations = vec![String::new(); cameras.len()];
-    let mut observation_counts = vec![0; cameras.len()];
-    let mut point_list =
-        String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n");
-    // Writing to a string cannot fail, so the results below are ignored.
-    for (index, SparsePoint { position, track }) in points.iter().enumerate() {
-        let id = index + 1;
-        let _ = write!(point_list, "{id} {} {} {} {GREY} 0.5", position.x, position.y, position.z);
-        for &(view, pixel) in track {
-            let _ = write!(point_list, " {} {}", view + 1, observation_counts[view]);
-            let _ = write!(observations[view], "{:.3} {:.3} {id} ", pixel.x, pixel.y);
-            observation_counts[view] += 1;
-        }
-        point_list.push('\n');
-    }
-
-    let mut image_list = String::from(
-        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n",
-    );
-    for (view, camera) in cameras.iter().enumerate() {
-        let (_, rotation, translation) = camera.view_from_world.to_scale_rotation_translation();
-        let pose = [
-            rotation.w,
-            rotation.x,
-            rotation.y,
-            rotation.z,
-            translation.x,
-            translation.y,
-            translation.z,
-        ];
-        let pose = pose.map(|number| number.to_string()).join(" ");
-        let _ = writeln!(
-            image_list,
-            "{} {pose} 1 {}\n{}",
-            view + 1,
-            file_name(view),
-            observations[view].trim_end()
-        );
-    }
-    [("cameras.txt", camera_list), ("images.txt", image_list), ("points3D.txt", point_list)]
 }

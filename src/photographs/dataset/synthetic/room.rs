@@ -6,45 +6,28 @@ use std::f64::consts::{PI, TAU};
 
 use glam::{DMat3, DVec2, DVec3};
 
+use super::Scene;
+use super::shapes::{Noise, Shape, Surface, hidden_by_sphere, nearest, smoothstep};
 use crate::base::random::Stream;
 
-/// The shape of a surface.
-enum Shape {
-    /// The points whose dot product with the unit normal is the offset; visible from the side of the normal.
-    Plane { normal: DVec3, offset: f64 },
-    /// A sphere.
-    Sphere { center: DVec3, radius: f64 },
-    /// A box; `turn` maps directions from the world to the box's axes.
-    Block { center: DVec3, half: DVec3, turn: DMat3 },
-}
-
-/// A shape with its look.
-struct Surface {
-    shape: Shape,
+/// The look of a surface.
+struct Look {
     /// Linear reflectance at a position: in the world for planes, in the shape's own axes otherwise.
     albedo: fn(&Room, DVec3) -> DVec3,
     /// Strength of the highlight.
     gloss: f64,
 }
 
-/// The intersection of a ray and a surface.
-struct Hit {
-    distance: f64,
-    normal: DVec3,
-    /// The position at which the albedo is evaluated.
-    place: DVec3,
-}
-
 /// The scene.
 pub(super) struct Room {
-    surfaces: Vec<Surface>,
+    surfaces: Vec<Surface<Look>>,
     /// Positions on the lamp, the same for every position that it lights, so that all views agree on the shadows.
     lamp: Vec<DVec3>,
-    noise: Stream,
+    noise: Noise,
 }
 
 /// The point that the cameras look at.
-pub(super) const FOCUS: DVec3 = DVec3::new(0.0, 0.3, 0.5);
+const FOCUS: DVec3 = DVec3::new(0.0, 0.3, 0.5);
 
 /// The centre of the lamp, a square that faces the focus.
 const LAMP: DVec3 = DVec3::new(-1.5, -2.3, 3.4);
@@ -59,17 +42,18 @@ impl Room {
     pub(super) fn new(seed: u64) -> Self {
         let plane = |normal, offset, albedo| Surface {
             shape: Shape::Plane { normal, offset },
-            albedo,
-            gloss: 0.0,
+            look: Look { albedo, gloss: 0.0 },
         };
         let sphere = |center, radius, albedo| Surface {
             shape: Shape::Sphere { center, radius },
-            albedo,
-            gloss: 0.25,
+            look: Look { albedo, gloss: 0.25 },
         };
         let block = |center, half, yaw: f64, albedo| {
             let turn = DMat3::from_rotation_z(-yaw);
-            Surface { shape: Shape::Block { center, half, turn }, albedo, gloss: 0.0 }
+            Surface {
+                shape: Shape::Block { center, half, turn },
+                look: Look { albedo, gloss: 0.0 },
+            }
         };
         let surfaces = vec![
             plane(DVec3::Z, 0.0, Self::planks),
@@ -82,31 +66,7 @@ impl Room {
             block(DVec3::new(0.95, 0.45, 0.42), DVec3::new(0.5, 0.4, 0.42), 0.45, Self::checker),
             block(DVec3::new(0.12, 1.1, 0.62), DVec3::new(0.32, 0.2, 0.62), -0.3, Self::bands),
         ];
-        Self { surfaces, lamp: lamp_places(), noise: Stream::new(seed, 0) }
-    }
-
-    /// The radiance along a ray.
-    pub(super) fn radiance(&self, origin: DVec3, direction: DVec3) -> DVec3 {
-        let Some((surface, hit)) = self.nearest(origin, direction) else { return SKY_RADIANCE };
-        let position = origin + hit.distance * direction;
-        let albedo = (surface.albedo)(self, hit.place);
-        let up = 0.5 + 0.5 * hit.normal.z;
-        let ambient = GROUND_RADIANCE.lerp(SKY_RADIANCE, up) * self.openness(position, hit.normal);
-        let (lit, highlight) = self.lamp(position, hit.normal, direction, surface.gloss);
-        albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * highlight
-    }
-
-    /// The first point along a ray.
-    pub(super) fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {
-        self.nearest(origin, direction).map(|(_, hit)| origin + hit.distance * direction)
-    }
-
-    fn nearest(&self, origin: DVec3, direction: DVec3) -> Option<(&Surface, Hit)> {
-        let hits = self
-            .surfaces
-            .iter()
-            .filter_map(|surface| Some((surface, surface.shape.hit(origin, direction)?)));
-        hits.min_by(|(_, a), (_, b)| a.distance.total_cmp(&b.distance))
+        Self { surfaces, lamp: lamp_places(), noise: Noise(Stream::new(seed, 0)) }
     }
 
     /// The lamp's diffuse light (1 if perpendicular and unoccluded) and its highlight at a position.
@@ -143,7 +103,7 @@ impl Room {
     /// nearby positions.
     fn openness(&self, position: DVec3, normal: DVec3) -> f64 {
         const REACH: f64 = 0.4;
-        let open = |surface: &Surface| match surface.shape {
+        let open = |surface: &Surface<Look>| match surface.shape {
             Shape::Plane { normal: facing, offset } => {
                 let distance = position.dot(facing) - offset;
                 let away = 0.5 - 0.5 * normal.dot(facing);
@@ -159,34 +119,12 @@ impl Room {
         self.surfaces.iter().map(open).product()
     }
 
-    /// Value noise in [0, 1] with quintic interpolation, one feature per unit.
-    fn noise(&self, place: DVec3) -> f64 {
-        let cell = place.floor();
-        let t = place - cell;
-        let t = t * t * t * (t * (6.0 * t - 15.0) + 10.0);
-        let [x, y, z] = cell.to_array().map(|coordinate| coordinate as i64);
-        let corner = |dx: i64, dy: i64, dz: i64| {
-            let [x, y, z] = [x + dx, y + dy, z + dz].map(|coordinate| (coordinate & 0xffff) as u64);
-            self.noise.uniform(x << 32 | y << 16 | z)
-        };
-        let lerp = |a: f64, b: f64, t: f64| a + (b - a) * t;
-        let edge = |dy, dz| lerp(corner(0, dy, dz), corner(1, dy, dz), t.x);
-        lerp(lerp(edge(0, 0), edge(1, 0), t.y), lerp(edge(0, 1), edge(1, 1), t.y), t.z)
-    }
-
-    /// Three octaves of noise, in [0, 1].
-    fn fractal_noise(&self, place: DVec3) -> f64 {
-        let octave =
-            |k: i32| 0.5f64.powi(k) * self.noise(place * f64::from(1 << k) + 17.0 * f64::from(k));
-        (octave(0) + octave(1) + octave(2)) / 1.75
-    }
-
     fn planks(&self, place: DVec3) -> DVec3 {
         const WIDTH: f64 = 0.42;
         let plank = (place.x / WIDTH).floor();
-        let shade = self.noise(DVec3::new(plank * 7.3, 0.5, 0.5));
+        let shade = self.noise.value(DVec3::new(plank * 7.3, 0.5, 0.5));
         let grain =
-            self.fractal_noise(DVec3::new(place.x * 16.0, place.y * 1.8 + plank * 5.0, 3.0));
+            self.noise.fractal(DVec3::new(place.x * 16.0, place.y * 1.8 + plank * 5.0, 3.0));
         let across = (place.x / WIDTH - plank - 0.5).abs();
         let gap = 1.0 - 0.55 * smoothstep(0.46, 0.49, across);
         let light = DVec3::new(0.66, 0.44, 0.26);
@@ -211,13 +149,13 @@ impl Room {
         let diamond = ((u + v).rem_euclid(1.0) - 0.5).abs() + ((u - v).rem_euclid(1.0) - 0.5).abs();
         let tone = smoothstep(0.42, 0.58, diamond);
         let paper = DVec3::new(0.50, 0.60, 0.55).lerp(DVec3::new(0.76, 0.74, 0.62), tone);
-        paper * (0.86 + 0.28 * self.fractal_noise(place * 5.0))
+        paper * (0.86 + 0.28 * self.noise.fractal(place * 5.0))
     }
 
     /// The image on the wall, at coordinates in [-1, 1], y up.
     fn sunset(&self, place: DVec2) -> DVec3 {
         let ridge =
-            -0.25 + 0.7 * (self.fractal_noise(DVec3::new(place.x * 2.2 + 9.0, 0.0, 7.0)) - 0.5);
+            -0.25 + 0.7 * (self.noise.fractal(DVec3::new(place.x * 2.2 + 9.0, 0.0, 7.0)) - 0.5);
         if place.y < ridge {
             return DVec3::new(0.06, 0.10, 0.16)
                 .lerp(DVec3::new(0.16, 0.24, 0.22), (ridge - place.y).min(1.0));
@@ -230,7 +168,7 @@ impl Room {
     }
 
     fn plaster(&self, place: DVec3) -> DVec3 {
-        DVec3::new(0.62, 0.50, 0.40) * (0.7 + 0.5 * self.fractal_noise(place * 2.5))
+        DVec3::new(0.62, 0.50, 0.40) * (0.7 + 0.5 * self.noise.fractal(place * 2.5))
     }
 
     fn beach_ball(&self, place: DVec3) -> DVec3 {
@@ -244,17 +182,17 @@ impl Room {
             return WEDGES[1];
         }
         let wedge = ((place.y.atan2(place.x) / TAU).rem_euclid(1.0) * 9.0) as usize % WEDGES.len();
-        WEDGES[wedge] * (0.88 + 0.24 * self.fractal_noise(place * 6.0))
+        WEDGES[wedge] * (0.88 + 0.24 * self.noise.fractal(place * 6.0))
     }
 
     fn marble(&self, place: DVec3) -> DVec3 {
-        let turbulence = self.fractal_noise(place * 2.6);
+        let turbulence = self.noise.fractal(place * 2.6);
         let vein = (PI * (1.6 * place.x + 2.0 * place.z + 3.2 * turbulence)).sin().abs();
         DVec3::new(0.80, 0.74, 0.70).lerp(DVec3::new(0.34, 0.05, 0.10), (1.0 - vein).powi(2))
     }
 
     fn apple(&self, place: DVec3) -> DVec3 {
-        let blush = smoothstep(0.3, 0.75, self.fractal_noise(place * 2.0) + 0.2 * place.x);
+        let blush = smoothstep(0.3, 0.75, self.noise.fractal(place * 2.0) + 0.2 * place.x);
         DVec3::new(0.26, 0.46, 0.08).lerp(DVec3::new(0.70, 0.16, 0.06), blush)
     }
 
@@ -267,7 +205,7 @@ impl Room {
         } else {
             DVec3::new(0.10, 0.14, 0.30)
         };
-        tone * (0.85 + 0.3 * self.fractal_noise(place * 9.0))
+        tone * (0.85 + 0.3 * self.noise.fractal(place * 9.0))
     }
 
     fn bands(&self, place: DVec3) -> DVec3 {
@@ -279,44 +217,41 @@ impl Room {
         ];
         let wave = 0.04 * (place.x * 14.0 + place.y * 9.0).sin();
         let band = ((place.z + wave + 1.0) / 0.155).floor() as usize;
-        BANDS[band % BANDS.len()] * (0.9 + 0.2 * self.fractal_noise(place * 8.0))
+        BANDS[band % BANDS.len()] * (0.9 + 0.2 * self.noise.fractal(place * 8.0))
     }
 }
 
-impl Shape {
-    /// The first point of a ray on the shape's outside, if any.
-    fn hit(&self, origin: DVec3, direction: DVec3) -> Option<Hit> {
-        match *self {
-            Self::Plane { normal, offset } => {
-                let speed = direction.dot(normal);
-                let distance = (offset - origin.dot(normal)) / speed;
-                let place = origin + distance * direction;
-                (speed < 0.0 && distance > 0.0).then_some(Hit { distance, normal, place })
-            }
-            Self::Sphere { center, radius } => {
-                let from_center = origin - center;
-                let half_b = from_center.dot(direction);
-                let root = half_b * half_b - from_center.length_squared() + radius * radius;
-                let distance = -half_b - root.sqrt();
-                let normal = (from_center + distance * direction) / radius;
-                // A negative root makes the distance NaN, which is not greater than zero either.
-                (distance > 0.0).then_some(Hit { distance, normal, place: normal })
-            }
-            Self::Block { center, half, turn } => {
-                let (origin, direction) = (turn * (origin - center), turn * direction);
-                let (a, b) = ((-half - origin) / direction, (half - origin) / direction);
-                let (enter, exit) = (a.min(b), a.max(b));
-                let distance = enter.max_element();
-                let axis = [DVec3::X, DVec3::Y, DVec3::Z][enter.max_position()];
-                let normal = turn.transpose() * (-axis * direction.dot(axis).signum());
-                let place = origin + distance * direction;
-                (distance > 0.0 && distance < exit.min_element()).then_some(Hit {
-                    distance,
-                    normal,
-                    place,
-                })
-            }
-        }
+impl Scene for Room {
+    fn radiance(&self, origin: DVec3, direction: DVec3) -> [DVec3; 2] {
+        let Some((surface, hit)) = nearest(self.surfaces.iter(), origin, direction) else {
+            return [SKY_RADIANCE; 2];
+        };
+        let position = origin + hit.distance * direction;
+        let albedo = (surface.look.albedo)(self, hit.place);
+        let up = 0.5 + 0.5 * hit.normal.z;
+        let ambient = GROUND_RADIANCE.lerp(SKY_RADIANCE, up) * self.openness(position, hit.normal);
+        let (lit, highlight) = self.lamp(position, hit.normal, direction, surface.look.gloss);
+        [albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * highlight; 2]
+    }
+
+    fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {
+        nearest(self.surfaces.iter(), origin, direction)
+            .map(|(_, hit)| origin + hit.distance * direction)
+    }
+
+    /// Cameras on a part of a sphere in front of the scene, spread evenly by a low-discrepancy sequence (Roberts' R2),
+    /// so that every 8th is among the others.
+    fn place(&self, view: usize, _views: usize) -> [DVec3; 2] {
+        const AZIMUTH: f64 = 0.75; // radians to either side
+        const ELEVATION: (f64, f64) = (0.24, 0.62); // radians
+        const DISTANCE: (f64, f64) = (2.95, 3.45);
+        let fraction = |step: f64| (0.5 + step * view as f64).fract();
+        let azimuth = AZIMUTH * (2.0 * fraction(0.754_877_666) - 1.0);
+        let elevation = ELEVATION.0 + (ELEVATION.1 - ELEVATION.0) * fraction(0.569_840_291);
+        let distance = DISTANCE.0 + (DISTANCE.1 - DISTANCE.0) * fraction(0.381_966_011);
+        let (sin, cos) = azimuth.sin_cos();
+        let back = DVec3::new(sin * elevation.cos(), -cos * elevation.cos(), elevation.sin());
+        [FOCUS + distance * back, back]
     }
 }
 
@@ -330,15 +265,4 @@ fn lamp_places() -> Vec<DVec3> {
         (0..LAMP_SAMPLES_PER_SIDE).map(move |x| LAMP + offset(x) * right + offset(y) * up)
     };
     (0..LAMP_SAMPLES_PER_SIDE).flat_map(row).collect()
-}
-
-fn hidden_by_sphere(position: DVec3, normal: DVec3, center: DVec3, radius: f64) -> f64 {
-    let to_center = center - position;
-    let distance = to_center.length().max(radius);
-    (normal.dot(to_center) / distance).max(0.0) * (radius / distance).powi(2)
-}
-
-fn smoothstep(low: f64, high: f64, value: f64) -> f64 {
-    let t = ((value - low) / (high - low)).clamp(0.0, 1.0);
-    t * t * (3.0 - 2.0 * t)
 }

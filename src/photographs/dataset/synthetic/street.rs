@@ -1,0 +1,272 @@
+//! A long street of houses, trees and cars, its ray tracer, and the cameras that fly along it.
+//!
+//! World axes: x along the street, a unit a plot, y across, z up; the ground is z = 0. Colours are linear radiance,
+//! RGB.
+
+use glam::{DMat3, DVec2, DVec3};
+
+use super::Scene;
+use super::shapes::{Hit, Noise, Shape, Surface, hidden_by_sphere, nearest, smoothstep};
+use crate::base::random::Stream;
+
+/// How much darker the last plot's light is than the first one's, on the photographs.
+const FALL: f64 = 8.0;
+
+/// Plots before the first and after the last one, which cameras at the ends see.
+const BEYOND: usize = 4;
+
+/// Nothing is higher.
+const TOP: f64 = 1.2;
+
+/// The longest distance at which a ray meets something, plots.
+const REACH: f64 = 12.0;
+
+const SUN: DVec3 = DVec3::new(0.36, -0.48, 0.8);
+const SUN_RADIANCE: DVec3 = DVec3::new(0.80, 0.74, 0.64);
+const SKY_RADIANCE: DVec3 = DVec3::new(0.22, 0.25, 0.30);
+const GROUND_RADIANCE: DVec3 = DVec3::new(0.10, 0.09, 0.07);
+
+/// Linear reflectance at a position in a shape's own axes.
+type Albedo = fn(&Street, DVec3, &Look) -> DVec3;
+
+/// The look of a surface.
+struct Look {
+    albedo: Albedo,
+    colors: [DVec3; 2],
+    /// Where it is in the texture of its kind.
+    offset: f64,
+}
+
+/// The scene.
+pub(super) struct Street {
+    /// By plot, [`BEYOND`] before the first one.
+    plots: Vec<Vec<Surface<Look>>>,
+    ground: [Surface<Look>; 1],
+    noise: Noise,
+    length: f64,
+}
+
+impl Street {
+    /// The street of this many plots whose houses and textures are drawn from `seed`.
+    pub(super) fn new(plots: u32, seed: u64) -> Self {
+        let stream = Stream::new(seed, 0);
+        let ground = Surface {
+            shape: Shape::Plane { normal: DVec3::Z, offset: 0.0 },
+            look: Look { albedo: Self::ground, colors: [DVec3::ONE; 2], offset: 0.0 },
+        };
+        let plot = |index: usize| {
+            plot(index as f64 - BEYOND as f64, |draw| {
+                stream.uniform(1 << 48 | (index as u64) << 8 | draw)
+            })
+        };
+        Self {
+            plots: (0..plots as usize + 2 * BEYOND).map(plot).collect(),
+            ground: [ground],
+            noise: Noise(stream),
+            length: plots.into(),
+        }
+    }
+
+    /// The first surface along a ray: of the plots that the ray crosses below the top, and of their neighbours, into
+    /// which their surfaces reach.
+    fn nearest(&self, origin: DVec3, direction: DVec3) -> Option<(&Surface<Look>, Hit)> {
+        let at = |height: f64| ((height - origin.z) / direction.z).clamp(0.0, REACH);
+        let along = [at(0.0), at(TOP)].map(|distance| origin.x + distance * direction.x);
+        let place = |x: f64| (x + BEYOND as f64).max(0.0) as usize;
+        let first = place(along[0].min(along[1])).saturating_sub(1);
+        let last = place(along[0].max(along[1])).saturating_add(2).min(self.plots.len());
+        let plots = self.plots[first.min(last)..last].iter().flatten();
+        nearest(self.ground.iter().chain(plots), origin, direction)
+    }
+
+    /// The share of the sky that is visible above a position: each solid of its plot occludes as its bounding sphere.
+    fn openness(&self, position: DVec3, normal: DVec3) -> f64 {
+        let Some(plot) = self.plots.get((position.x + BEYOND as f64).max(0.0) as usize) else {
+            return 1.0;
+        };
+        let open = |surface: &Surface<Look>| match surface.shape {
+            Shape::Plane { .. } => 1.0,
+            Shape::Sphere { center, radius } => {
+                1.0 - hidden_by_sphere(position, normal, center, radius)
+            }
+            Shape::Block { center, half, .. } => {
+                1.0 - 0.8 * hidden_by_sphere(position, normal, center, half.element_sum() / 3.0)
+            }
+        };
+        plot.iter().map(open).product()
+    }
+
+    fn ground(&self, place: DVec3, _look: &Look) -> DVec3 {
+        let rough = self.noise.fractal(place * 6.0);
+        match place.y.abs() {
+            across if across < 0.03 && place.x.rem_euclid(0.5) < 0.28 => DVec3::splat(0.75),
+            across if across < 0.5 => DVec3::new(0.24, 0.24, 0.26) * (0.6 + 0.8 * rough),
+            across if across < 0.56 => DVec3::splat(0.62),
+            across if across < 0.8 => {
+                let slab = DVec2::new(place.x, place.y) / 0.12;
+                let joint = (slab - slab.floor() - 0.5).abs().max_element();
+                let tone = self.noise.value((slab.floor() * 3.7).extend(0.5));
+                DVec3::new(0.56, 0.50, 0.43)
+                    * (0.7 + 0.4 * tone)
+                    * (1.0 - 0.4 * smoothstep(0.42, 0.47, joint))
+            }
+            _ => {
+                let patch = self.noise.fractal(place * 1.7 + 40.0);
+                let grass = DVec3::new(0.16, 0.34, 0.10).lerp(DVec3::new(0.48, 0.46, 0.18), patch);
+                grass * (0.5 + rough)
+            }
+        }
+    }
+
+    /// Bricks in two tones, with rows of windows.
+    fn facade(&self, place: DVec3, look: &Look) -> DVec3 {
+        let along = if place.x.abs() > place.y.abs() { place.y } else { place.x } + look.offset;
+        let window = DVec2::new(along / 0.19, (place.z + look.offset) / 0.24);
+        let inside = (window - window.floor() - 0.5).abs();
+        if inside.x < 0.24 && inside.y < 0.3 {
+            let frame = inside.x > 0.2 || inside.y > 0.26 || inside.x < 0.03;
+            return if frame { DVec3::splat(0.7) } else { DVec3::new(0.06, 0.09, 0.14) };
+        }
+        let row = (place.z / 0.06).floor();
+        let brick = ((along / 0.12 + 0.5 * row.rem_euclid(2.0)).floor(), row);
+        let tone = self.noise.value(DVec3::new(brick.0 * 5.3, brick.1 * 3.1, 9.0 * look.offset));
+        look.colors[0].lerp(look.colors[1], tone)
+    }
+
+    /// Rows of tiles.
+    fn tiles(&self, place: DVec3, look: &Look) -> DVec3 {
+        let row = (place.y / 0.09 + 1e-4).floor();
+        let tile = ((place.x / 0.11 + 0.5 * row.rem_euclid(2.0)).floor(), row);
+        let tone = self.noise.value(DVec3::new(tile.0 * 4.1, tile.1 * 2.7, 7.0 * look.offset));
+        look.colors[0].lerp(look.colors[1], tone) * (0.75 + 0.4 * (place.y / 0.09 - row))
+    }
+
+    fn leaves(&self, place: DVec3, look: &Look) -> DVec3 {
+        let tone = self.noise.fractal(place * 3.2 + 11.0 * look.offset);
+        look.colors[0].lerp(look.colors[1], smoothstep(0.3, 0.7, tone))
+    }
+
+    /// A painted body with dark windows around its upper half.
+    fn car(&self, place: DVec3, look: &Look) -> DVec3 {
+        let upper = place.z > 0.02 && place.z < 0.065;
+        if upper { DVec3::new(0.05, 0.06, 0.08) } else { look.colors[0] }
+    }
+
+    /// Vertical boards.
+    fn fence(&self, place: DVec3, look: &Look) -> DVec3 {
+        let board = (place.x / 0.08).floor();
+        let tone = self.noise.value(DVec3::new(board * 2.3, look.offset * 13.0, 0.5));
+        look.colors[0].lerp(look.colors[1], tone)
+    }
+}
+
+impl Scene for Street {
+    fn radiance(&self, origin: DVec3, direction: DVec3) -> [DVec3; 2] {
+        let Some((surface, hit)) = self.nearest(origin, direction) else {
+            return [SKY_RADIANCE; 2];
+        };
+        let position = origin + hit.distance * direction;
+        let albedo = (surface.look.albedo)(self, hit.place, &surface.look);
+        let up = 0.5 + 0.5 * hit.normal.z;
+        let ambient = GROUND_RADIANCE.lerp(SKY_RADIANCE, up) * self.openness(position, hit.normal);
+        let cosine = hit.normal.dot(SUN);
+        let lit = cosine > 0.0 && self.nearest(position + 1e-6 * hit.normal, SUN).is_none();
+        let sun = if lit { SUN_RADIANCE * cosine } else { DVec3::ZERO };
+        let radiance = albedo * (ambient + sun);
+        [radiance, radiance * FALL.powf(0.5 - position.x / self.length)]
+    }
+
+    fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {
+        self.nearest(origin, direction).map(|(_, hit)| origin + hit.distance * direction)
+    }
+
+    /// Three lanes of cameras above the street, in turn, which look down at its middle and to the other side; every 8th
+    /// is of each lane.
+    fn place(&self, view: usize, views: usize) -> [DVec3; 2] {
+        let fraction = |step: f64| 2.0 * (0.5 + step * view as f64).fract() - 1.0;
+        let [a, b, c] = [0.754_877_666, 0.569_840_291, 0.381_966_011].map(fraction);
+        let side = (view % 3) as f64 - 1.0;
+        let x = self.length * (view as f64 + 0.5) / views as f64;
+        let center = DVec3::new(x, 1.15 * side + 0.15 * a, 1.95 + 0.2 * b);
+        let target = DVec3::new(x + 0.55 * c, -0.55 * side, 0.25);
+        [center, (center - target).normalize()]
+    }
+}
+
+/// The solids of the plot that begins at `x`, from draws in [0, 1).
+fn plot(x: f64, draw: impl Fn(u64) -> f64) -> Vec<Surface<Look>> {
+    let mut surfaces = vec![];
+    for side in 0..2 {
+        let across = 2.0 * side as f64 - 1.0;
+        let uniform =
+            |index: u64, low: f64, high: f64| low + (high - low) * draw(32 * side + index);
+        let color = |index: u64| {
+            DVec3::new(
+                uniform(index, 0.2, 0.8),
+                uniform(index + 1, 0.15, 0.65),
+                uniform(index + 2, 0.1, 0.55),
+            )
+        };
+        let look = |albedo: Albedo, color: DVec3, index: u64| Look {
+            albedo,
+            colors: [color, 0.55 * color],
+            offset: uniform(index, 0.0, 1.0),
+        };
+        let block = |center: DVec3, half: DVec3, yaw: f64, look: Look| {
+            let turn = DMat3::from_rotation_z(-yaw);
+            Surface { shape: Shape::Block { center, half, turn }, look }
+        };
+        let height = uniform(0, 0.35, 0.9);
+        let middle = DVec2::new(x + uniform(1, 0.42, 0.58), across * uniform(2, 1.3, 1.5));
+        let half = DVec2::new(uniform(3, 0.24, 0.33), uniform(4, 0.22, 0.32));
+        let yaw = uniform(5, -0.2, 0.2);
+        let house = middle.extend(0.5 * height);
+        surfaces.push(block(
+            house,
+            half.extend(0.5 * height),
+            yaw,
+            look(Street::facade, color(6), 9),
+        ));
+        let roof = middle.extend(height + 0.05);
+        surfaces.push(block(
+            roof,
+            (half + 0.04).extend(0.05),
+            yaw,
+            look(Street::tiles, color(10), 13),
+        ));
+        let chimney = roof + DVec3::new(0.6 * half.x, 0.2 * across, 0.1);
+        surfaces.push(block(
+            chimney,
+            DVec3::new(0.05, 0.05, 0.07),
+            yaw,
+            look(Street::facade, color(14), 17),
+        ));
+        let radius = uniform(18, 0.11, 0.19);
+        let center =
+            DVec3::new(x + uniform(19, 0.0, 1.0), across * uniform(20, 0.8, 0.95), 0.9 * radius);
+        let green = DVec3::new(uniform(21, 0.2, 0.6), 0.5, 0.14);
+        surfaces.push(Surface {
+            shape: Shape::Sphere { center, radius },
+            look: look(Street::leaves, green, 22),
+        });
+        if draw(32 * side + 23) < 0.6 {
+            let center = DVec3::new(x + uniform(24, 0.2, 0.8), across * 0.3, 0.08);
+            let paint = 0.9 * color(25);
+            surfaces.push(block(
+                center,
+                DVec3::new(0.18, 0.085, 0.08),
+                0.0,
+                look(Street::car, paint, 28),
+            ));
+        }
+        let center = DVec3::new(x + 0.5, across * 2.15, 0.13);
+        let wood = DVec3::new(0.5, 0.36, 0.22);
+        surfaces.push(block(
+            center,
+            DVec3::new(0.5, 0.03, 0.13),
+            0.0,
+            look(Street::fence, wood, 29),
+        ));
+    }
+    surfaces
+}

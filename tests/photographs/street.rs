@@ -1,0 +1,127 @@
+//! The synthetic street: its light falls along it, and a view sees a part of it.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::path::Path;
+
+use nightsplat::photographs::dataset::synthetic::{self, DARKENING, SyntheticOptions};
+use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
+use nightsplat::photographs::image::{Image, linear_from_srgb};
+
+use crate::common::command::run;
+
+/// The plots of the street.
+const PLOTS: u32 = 12;
+
+fn written(plots: u32) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    let options =
+        SyntheticOptions { width: 64, height: 48, seed: 3, ..SyntheticOptions::street(plots) };
+    synthetic::write(dir.path(), &options).unwrap();
+    dir
+}
+
+fn loaded(dir: &Path) -> Dataset {
+    Dataset::load(dir, &LoadOptions::default()).unwrap()
+}
+
+/// The share of views with at least `least` of their points between two places along the street.
+fn share_of_views(dataset: &Dataset, from: f64, to: f64, least: f64) -> f64 {
+    let mut counts = vec![[0.0; 2]; dataset.views.len()];
+    for point in &dataset.points {
+        for &view in &point.views {
+            counts[view as usize][0] += f64::from((from..to).contains(&point.position.x));
+            counts[view as usize][1] += 1.0;
+        }
+    }
+    let sees = counts.iter().filter(|[inside, all]| *inside >= least * all).count();
+    sees as f64 / counts.len() as f64
+}
+
+#[test]
+fn half_a_street_is_seen_by_little_more_than_half_of_its_views_and_a_quarter_by_a_third() {
+    let dataset = loaded(written(24).path());
+    assert_eq!(dataset.views.len(), 144);
+    for (parts, most) in [(2, 0.60), (4, 0.36)] {
+        let length = 24.0 / f64::from(parts);
+        let shares = (0..parts).map(|part| {
+            let from = f64::from(part) * length;
+            share_of_views(&dataset, from, from + length, 0.15)
+        });
+        let mean = shares.sum::<f64>() / f64::from(parts);
+        assert!((1.0 / f64::from(parts)..most).contains(&mean), "{parts} parts: {mean}");
+    }
+}
+
+#[test]
+fn every_part_of_the_street_has_points_that_many_views_see() {
+    let dataset = loaded(written(PLOTS).path());
+    for plot in 0..PLOTS {
+        let plot = f64::from(plot);
+        let own =
+            dataset.points.iter().filter(|point| (plot..plot + 1.0).contains(&point.position.x));
+        let tracks: Vec<usize> = own.map(|point| point.views.len()).collect();
+        let views = tracks.iter().sum::<usize>() as f64 / tracks.len() as f64;
+        assert!(
+            tracks.len() > 150 && views > 5.0,
+            "plot {plot}: {} points, {views} views",
+            tracks.len()
+        );
+    }
+}
+
+#[test]
+fn the_light_falls_eightfold_and_that_of_the_references_does_not() {
+    let dir = written(PLOTS);
+    let mean = |folder: &str, view: usize| {
+        let image = Image::load(dir.path().join(format!("{folder}/{view:03}.png"))).unwrap();
+        let values = image.data.iter().map(|&value| f64::from(linear_from_srgb(value)));
+        values.sum::<f64>() / image.data.len() as f64
+    };
+    let views = 6 * PLOTS as usize;
+    let factor = |view: usize| mean("high", view) / mean("low", view);
+    for view in (0..views).step_by(5) {
+        let at = (view as f64 + 0.5) / views as f64;
+        let expected = DARKENING * 8_f64.powf(at - 0.5);
+        let ratio = factor(view) / expected;
+        assert!((0.8..1.25).contains(&ratio), "view {view}: {ratio}");
+    }
+    let ends = [0, views - 9].map(|first| (first..first + 9).map(|view| mean("high", view)).sum());
+    let [first, last]: [f64; 2] = ends;
+    assert!((0.7..1.4).contains(&(last / first)), "{first} {last}");
+}
+
+#[test]
+fn every_eighth_view_is_a_test_view_and_they_are_all_along_the_street_and_in_every_lane() {
+    let dataset = loaded(written(PLOTS).path());
+    let centers = dataset.test_views().map(|view| view.camera.center());
+    let centers: Vec<_> = centers.collect();
+    assert_eq!(centers.len(), 9);
+    assert!(
+        dataset
+            .views
+            .iter()
+            .enumerate()
+            .all(|(index, view)| { (view.split == Split::Test) == (index % 8 == 0) })
+    );
+    for lane in [-1.0, 0.0, 1.0] {
+        let own = centers.iter().filter(|center| (center.y - 1.15 * lane).abs() < 0.2).count();
+        assert_eq!(own, 3, "lane {lane}");
+    }
+    assert!(centers[0].x < 0.5 && centers[8].x > 10.0, "{centers:?}");
+}
+
+#[test]
+fn the_command_makes_six_views_of_128x96_a_plot_unless_told_otherwise() {
+    let dir = tempfile::tempdir().unwrap();
+    let set = dir.path().join("set");
+    let line = run(&format!("synth {} --street 1", set.display()), 0).0;
+    assert!(line.contains("6 views of 128x96"), "{line}");
+    let few = dir.path().join("few");
+    let line =
+        run(&format!("synth {} --street 2 --views 4 --width 32 --height 16", few.display()), 0).0;
+    assert!(line.contains("4 views of 32x16"), "{line}");
+    let refused =
+        run(&format!("synth {} --street 2 --fisheye", dir.path().join("none").display()), 2).1;
+    assert!(refused.contains("--fisheye"), "{refused}");
+}
