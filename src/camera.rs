@@ -92,9 +92,14 @@ impl Camera {
     /// [`Camera::project`], and `None` outside the image.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn sees(&self, point: DVec3) -> Option<DVec2> {
+        self.sees_within(point, 0.0)
+    }
+
+    /// [`Camera::sees`] for an image with a margin, in widths and heights of the image.
+    pub(crate) fn sees_within(&self, point: DVec3, margin: f64) -> Option<DVec2> {
         let size = DVec2::new(self.width.into(), self.height.into());
-        self.project(point)
-            .filter(|pixel| pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all())
+        let (from, to) = (-margin * size, (1.0 + margin) * size);
+        self.project(point).filter(|pixel| pixel.cmpge(from).all() && pixel.cmplt(to).all())
     }
 
     /// The pixels that are at least partly outside the image circle of a fisheye, as indices into a plane, ascending.

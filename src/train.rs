@@ -4,6 +4,7 @@ mod best;
 mod cache;
 mod checkpoint;
 mod config;
+mod context;
 mod decisions;
 mod depth_seeding;
 pub mod diagnose;
@@ -55,6 +56,7 @@ pub use config::{
     Background, CheckConfig, DensityConfig, ExposureConfig, NotFinite, OnOff, StopConfig,
     TrainConfig,
 };
+use context::Initial;
 use early_stopping::Convergence;
 pub use early_stopping::{EndReason, Ended};
 use growth::Growth;
@@ -168,8 +170,8 @@ impl Trainer {
     /// # Errors
     /// The configuration is invalid, the initial model does not fit it, or the device is out of memory or lost.
     pub fn new(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
-        let initial = config.initial_model()?;
-        Self::on_patches(gpu, config, dataset, initial.as_ref())
+        let initial = Initial::of(&config, dataset)?;
+        Self::on_patches(gpu, config, dataset, &initial)
     }
 
     /// [`Trainer::new`] with given Gaussians to start from.
@@ -182,7 +184,8 @@ impl Trainer {
         dataset: &Dataset,
         gaussians: &Gaussians,
     ) -> Result<Self> {
-        Self::on_patches(gpu, config, dataset, Some(gaussians))
+        let initial = Initial { gaussians: Some(gaussians.clone()), context: None };
+        Self::on_patches(gpu, config, dataset, &initial)
     }
 
     /// The number of steps done.

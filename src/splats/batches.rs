@@ -57,7 +57,7 @@ pub struct Batch {
 
 /// A batch starts at a multiple of this many Gaussians: its binding is then aligned on every device, for any element
 /// size.
-const ALIGNMENT: usize = 64;
+pub(crate) const ALIGNMENT: usize = 64;
 
 impl Batches {
     /// Batches of planes of floats: each binding holds a batch.
@@ -248,6 +248,11 @@ impl Batch {
 
     fn range(&self, each: usize) -> Range<usize> {
         self.first * each..(self.first + self.count) * each
+    }
+
+    /// The same Gaussians in buffers that have others before them, a multiple of [`ALIGNMENT`].
+    pub(crate) fn after(self, others: usize) -> Self {
+        Self { first: self.first + others, ..self }
     }
 
     /// Its number of Gaussians in 32 bits, for kernels.

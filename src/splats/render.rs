@@ -12,6 +12,8 @@ mod buffers;
 mod cameras;
 mod capacity;
 #[cfg(feature = "io")]
+mod context;
+#[cfg(feature = "io")]
 mod depths;
 mod draw;
 #[cfg(feature = "io")]
@@ -33,7 +35,7 @@ use crate::kernels::{
     self, blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
 use crate::splats::batches::GradientKind;
-use crate::splats::scene::{GaussianSlice, Layout};
+use crate::splats::scene::{DeviceGaussians, GaussianSlice, Layout};
 use crate::splats::sort::{Count, RadixSort};
 use crate::{Error, Result};
 
@@ -102,6 +104,8 @@ pub struct Renderer {
     depth_sort: RadixSort,
     tile_sort: RadixSort,
     frame: RenderBuffers,
+    /// Rendered before those of every view, and without gradients.
+    context: Option<DeviceGaussians>,
     /// (H, W): the depths beyond which nothing is seen, where a draw has such.
     limits: Buffer<f32>,
     host_targets: Option<HostTargets>,
@@ -227,7 +231,7 @@ impl Renderer {
         let viewpoint = viewpoint.into();
         self.check(&gaussians.layout)?;
         let view = self.view(&viewpoint, depths.is_some())?;
-        let gaussian_count = gaussians.layout.count as u32;
+        let gaussian_count = (self.context_count() + gaussians.layout.count) as u32;
         pass.fill(&mut self.frame.gaussian_counts, gaussian_count);
         if viewpoint.on_device.is_none() {
             pass.update(&mut self.frame.camera, &[(&viewpoint.patch).into()])?;
@@ -293,6 +297,7 @@ impl Renderer {
             return Err(Error::Usage(problem.to_owned()));
         };
         let color_floats = color_floats(self.settings.channels());
+        let first = self.context_count();
         let frame = &mut self.frame;
         pass.dispatch(
             blend_backward,
@@ -311,7 +316,7 @@ impl Renderer {
         )?;
         let GaussianSlice { layout, parameters } = gaussians;
         for batch in layout.batches(&self.gpu).iter() {
-            let gaussian_count = batch.gaussian_count();
+            let (gaussian_count, rendered) = (batch.gaussian_count(), batch.after(first));
             pass.dispatch(
                 project_backward,
                 &project_backward::Params {
@@ -324,10 +329,10 @@ impl Renderer {
                 },
                 project_backward::Buffers {
                     parameters: batch.rows(parameters, layout.words())?,
-                    splats: batch.rows(&frame.splats, 1)?,
-                    colors: batch.rows(&frame.colors, color_floats)?,
-                    tile_counts: batch.rows(&frame.tile_counts, 1)?,
-                    intersection_ranges: batch.rows(&frame.intersection_ranges, 1)?,
+                    splats: rendered.rows(&frame.splats, 1)?,
+                    colors: rendered.rows(&frame.colors, color_floats)?,
+                    tile_counts: rendered.rows(&frame.tile_counts, 1)?,
+                    intersection_ranges: rendered.rows(&frame.intersection_ranges, 1)?,
                     gradient_records: frame.gradient_records.slice(),
                     status: frame.status.slice_mut(),
                     gradients: batch.planes_mut(&mut *gradients.parameters)?,
@@ -341,44 +346,52 @@ impl Renderer {
         Ok(())
     }
 
+    /// Records the projection of the context, and of the Gaussians of a view, which come after it.
     fn record_project(
         &mut self,
         pass: &mut Recorder<'_>,
-        GaussianSlice { layout, parameters }: GaussianSlice<'_>,
+        gaussians: GaussianSlice<'_>,
         view: &View<'_>,
         sh_degree: u32,
     ) -> Result<()> {
+        let Self { gpu, settings, projections, frame, context, .. } = self;
         let color_floats = color_floats(view.channels);
-        let frame = &mut self.frame;
-        let project = &self.projections[&(view.model, view.view_depths)].forward;
-        layout.batches(&self.gpu).iter().try_for_each(|batch| {
-            pass.dispatch(
-                project,
-                &project::Params {
-                    camera_index: view.camera_index,
-                    near: self.settings.near,
-                    gaussian_count: batch.gaussian_count(),
-                    sh_degree,
-                    first_gaussian: batch.first_gaussian(),
-                },
-                project::Buffers {
-                    parameters: batch.rows(parameters, layout.words())?,
-                    splats: batch.rows_mut(&mut frame.splats, 1)?,
-                    colors: batch.rows_mut(&mut frame.colors, color_floats)?,
-                    depth_keys: batch.rows_mut(&mut frame.depth_keys, 1)?,
-                    ids: batch.rows_mut(&mut frame.ids, 1)?,
-                    tile_counts: batch.rows_mut(&mut frame.tile_counts, 1)?,
-                    cameras: view.cameras.unwrap_or(&frame.camera).slice(),
-                },
-                Threads::Exactly([batch.gaussian_count(), 1, 1]),
-            )
-        })
+        let project = &projections[&(view.model, view.view_depths)].forward;
+        let context = context.as_ref().map(DeviceGaussians::slice);
+        let own = (gaussians, context.map_or(0, |context| context.layout.count));
+        let all = context.into_iter().map(|context| (context, 0)).chain([own]);
+        for (GaussianSlice { layout, parameters }, first) in all {
+            for batch in layout.batches(gpu).iter() {
+                let rendered = batch.after(first);
+                pass.dispatch(
+                    project,
+                    &project::Params {
+                        camera_index: view.camera_index,
+                        near: settings.near,
+                        gaussian_count: batch.gaussian_count(),
+                        sh_degree,
+                        first_gaussian: rendered.first_gaussian(),
+                    },
+                    project::Buffers {
+                        parameters: batch.rows(parameters, layout.words())?,
+                        splats: rendered.rows_mut(&mut frame.splats, 1)?,
+                        colors: rendered.rows_mut(&mut frame.colors, color_floats)?,
+                        depth_keys: rendered.rows_mut(&mut frame.depth_keys, 1)?,
+                        ids: rendered.rows_mut(&mut frame.ids, 1)?,
+                        tile_counts: rendered.rows_mut(&mut frame.tile_counts, 1)?,
+                        cameras: view.cameras.unwrap_or(&frame.camera).slice(),
+                    },
+                    Threads::Exactly([batch.gaussian_count(), 1, 1]),
+                )?;
+            }
+        }
+        Ok(())
     }
 
     /// Refuses Gaussians in another layout than the kernels read, or more than there is memory for.
     fn check(&self, layout: &Layout) -> Result<()> {
         self.check_layout(layout)?;
-        let (count, reserved) = (layout.count, self.frame.splats.len());
+        let (count, reserved) = (self.context_count() + layout.count, self.frame.splats.len());
         if count > reserved {
             let problem =
                 format!("{count} Gaussians exceed the {reserved} that the renderer reserved");
@@ -460,6 +473,11 @@ impl Renderer {
             &mut frame.intersection_ids,
             bits,
         )
+    }
+
+    /// The number of Gaussians that precede those of a view.
+    fn context_count(&self) -> usize {
+        self.context.as_ref().map_or(0, |context| context.layout.count)
     }
 
     /// Columns and rows of tiles.

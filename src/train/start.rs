@@ -6,6 +6,7 @@ use std::thread::{self, ScopedJoinHandle};
 use glam::UVec2;
 
 use super::cache::CacheSize;
+use super::context::Initial;
 use super::early_stopping::Convergence;
 use super::growth::Growth;
 use super::masks::Masks;
@@ -71,7 +72,8 @@ impl Trainer {
     /// # Errors
     /// Those of [`Trainer::new`].
     pub(crate) fn to_restore(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
-        Self::on_patches(gpu, config, dataset, None)
+        let initial = Initial::of_restored(&config, dataset)?;
+        Self::on_patches(gpu, config, dataset, &initial)
     }
 
     /// Restarts with smaller patches if the first Gaussians exceed the device's limits with the present ones.
@@ -79,10 +81,10 @@ impl Trainer {
         gpu: &Gpu,
         mut config: TrainConfig,
         dataset: &Dataset,
-        gaussians: Option<&Gaussians>,
+        initial: &Initial,
     ) -> Result<Self> {
         loop {
-            let mut trainer = Self::begin(gpu, config.clone(), dataset, gaussians)?;
+            let mut trainer = Self::begin(gpu, config.clone(), dataset, initial)?;
             config.patch_pixels = match trainer.fewer_patch_pixels()? {
                 None => {
                     trainer.supervision.views.log_patches(gpu);
@@ -99,7 +101,7 @@ impl Trainer {
         gpu: &Gpu,
         mut config: TrainConfig,
         dataset: &Dataset,
-        gaussians: Option<&Gaussians>,
+        initial: &Initial,
     ) -> Result<Self> {
         config.check()?;
         config.disable_missing_parts(dataset);
@@ -109,7 +111,7 @@ impl Trainer {
             let own = config.clone();
             let beside = scope
                 .spawn(move || Ok((Kernels::new(gpu, &own, dataset)?, Fingerprint::of(dataset)?)));
-            Self::assemble(gpu, config, dataset, gaussians, beside)
+            Self::assemble(gpu, config, dataset, initial, beside)
         })
     }
 
@@ -117,7 +119,7 @@ impl Trainer {
         gpu: &Gpu,
         config: TrainConfig,
         dataset: &Dataset,
-        gaussians: Option<&Gaussians>,
+        initial: &Initial,
         beside: ScopedJoinHandle<'_, Result<(Kernels, Fingerprint)>>,
     ) -> Result<Self> {
         if let Some(CacheSize(bytes)) = config.max_vram {
@@ -135,7 +137,7 @@ impl Trainer {
         }
         config.model.log_parts(&sizes);
         let starts = views.exposures(&pseudo_gt, dataset, &scene, &config)?;
-        let gaussians = match gaussians {
+        let gaussians = match &initial.gaussians {
             Some(gaussians) => given(gaussians, &config)?,
             None => {
                 views.initial_gaussians(gpu, &pseudo_gt, dataset, &config, starts.as_deref())?
@@ -191,6 +193,9 @@ impl Trainer {
         };
         // Given Gaussians may have SH degrees that the first step does not use.
         trainer.renderer.set_sh_degree(trainer.model.shape().sh_degree)?;
+        if let Some(context) = &initial.context {
+            trainer.renderer.set_context(&given(context, &trainer.config)?)?;
+        }
         trainer.reserve()?;
         trainer.keep_activations(&sizes)?;
         trainer.fixed_bytes = trainer.measure_fixed_bytes();

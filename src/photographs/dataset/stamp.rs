@@ -14,7 +14,7 @@ use crate::photographs::image::files::Files;
 impl Dataset {
     /// A checksum of the listing below `root`: views with their cameras and splits, and path, length and time of change
     /// of every file of the views or the points. Equal stamps mean the same dataset; one that was copied, or whose
-    /// photographs were rewritten, has another stamp even with the same pixels.
+    /// photographs were rewritten, has another stamp even with the same pixels; one that was moved has the same.
     ///
     /// # Errors
     /// As [`Dataset::photographs`].
@@ -36,7 +36,7 @@ impl Dataset {
             hasher.write_numbers(&source.view_from_world.to_cols_array());
             let mask = source.mask.map(|mask| mask.path);
             for file in [&source.input, &source.reference, &mask, &source.depth] {
-                file.iter().for_each(|path| write_file(&mut hasher, path));
+                file.iter().for_each(|path| write_file(&mut hasher, root, path));
             }
         }
         let folders = layout.models(&["images", "points3D"]);
@@ -46,7 +46,7 @@ impl Dataset {
             paths
                 .iter()
                 .filter(|path| tree::is_file(path))
-                .for_each(|path| write_file(&mut hasher, path));
+                .for_each(|path| write_file(&mut hasher, root, path));
         }
         Ok(hash::text(hasher.finish()))
     }
@@ -55,8 +55,9 @@ impl Dataset {
 /// Of how files are read: another where the same file gives other pixels than before.
 const READING: &[u8] = b"in sRGB, turned by what points show";
 
-fn write_file(hasher: &mut Hasher, path: &Path) {
-    hasher.write(path.as_os_str().as_encoded_bytes());
+/// Files in the dataset by their path from its root, which may be spelled otherwise, and moved.
+fn write_file(hasher: &mut Hasher, root: &Path, path: &Path) {
+    hasher.write(path.strip_prefix(root).unwrap_or(path).as_os_str().as_encoded_bytes());
     let Ok((length, changed)) = tree::metadata(path) else { return };
     // The Debug output distinguishes all times.
     let changed = format!("{changed:?}");

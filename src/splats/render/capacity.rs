@@ -44,7 +44,8 @@ impl Renderer {
                 return Err(self.too_many_tiles(size));
             }
         }
-        self.frame.reserve(&self.gpu, gaussian_count, capacity, pixels, tiles)
+        let before = self.context_count();
+        self.frame.reserve(&self.gpu, before + gaussian_count, before + capacity, pixels, tiles)
     }
 
     /// Grows the memory to `intersections`, and half as many again where the device can bind them; never shrinks.
@@ -69,11 +70,11 @@ impl Renderer {
         self.frame.bytes_per_gaussian() + self.depth_sort.bytes_per_item()
     }
 
-    /// The bytes of the buffers whose size follows the numbers of Gaussians and intersections, except for those of the
-    /// sorts, which are allocated with the first render.
+    /// The bytes of the buffers whose size follows the numbers of a view's own Gaussians and of intersections, except
+    /// for those of the sorts, which are allocated with the first render.
     pub(crate) fn reserved_bytes(&self) -> usize {
         let frame = &self.frame;
-        frame.splats.len() * frame.bytes_per_gaussian()
+        frame.splats.len().saturating_sub(self.context_count()) * frame.bytes_per_gaussian()
             + frame.tiles.len() * frame.bytes_per_intersection()
     }
 

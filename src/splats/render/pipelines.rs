@@ -80,6 +80,7 @@ impl Renderer {
             frame: RenderBuffers::new(gpu, settings.channels(), settings.purpose)?,
             limits: gpu.uninit("limits", 1)?,
             host_targets: None,
+            context: None,
         })
     }
 
@@ -117,6 +118,8 @@ impl Renderer {
             Ok((key, Projections::new(&self.gpu, &settings, tile, key, gradients)?))
         };
         self.projections = self.projections.keys().map(own).collect::<Result<_>>()?;
+        #[cfg(feature = "io")]
+        self.set_context_degree(sh_degree)?;
         self.settings = settings;
         Ok(())
     }
