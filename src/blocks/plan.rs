@@ -15,8 +15,8 @@ use crate::photographs::dataset::Dataset;
 use crate::photographs::dataset::block::{Block, Cell};
 use crate::photographs::tone::ToneLaw;
 use crate::results::joined::MANIFEST;
-use crate::splats::attributes::Attribute;
-use crate::train::{OnOff, PlannedRun, StopConfig, TrainConfig, law_of};
+use crate::splats::optimizer::Schedule;
+use crate::train::{CacheSize, OnOff, PlannedRun, StopConfig, TrainConfig, law_of};
 use crate::{Error, Result};
 
 /// The file of the plan's numbers.
@@ -351,15 +351,15 @@ impl BlockPlan {
         self.law.save(&folder.join(LAW))?;
         write(&folder.join(CONFIG), self.config.to_toml())?;
         write(&folder.join(FRAME), frame_file(&self.config))?;
-        let places = [(self.coarse, folder.join(COARSE))];
-        let others = self.blocks.into_iter().map(|block| {
-            let place = folder.join(BLOCKS).join(&block.id);
-            (block, place)
-        });
-        for (mut block, place) in places.into_iter().chain(others) {
+        let coarse = (self.coarse_settings(), &self.coarse);
+        let others = self.file.blocks.iter().map(|row| self.block_settings(row)).zip(&self.blocks);
+        for (settings, block) in std::iter::once(coarse).chain(others) {
+            let place = folder.join(place(&block.id));
             output::create_folder(&place)?;
+            let mut block = block.clone();
             block.dataset = relative(&root, &place)?;
             block.save(&place)?;
+            write(&place.join(CONFIG), settings.to_toml())?;
         }
         let text = toml::to_string(&self.file).map_err(|error| Error::Usage(error.to_string()));
         write(&path, text)?;
@@ -369,11 +369,8 @@ impl BlockPlan {
 
     fn tasks(&self) -> Vec<Task> {
         let PlanFile { coarse, blocks, .. } = &self.file;
-        let mut tasks = vec![self.training(coarse, COARSE, vec![], &self.coarse_options())];
-        for row in blocks {
-            let place = format!("{BLOCKS}/{}", row.id);
-            tasks.push(self.training(row, &place, vec![COARSE.to_owned()], &self.block_options()));
-        }
+        let mut tasks = vec![self.training(coarse, vec![])];
+        tasks.extend(blocks.iter().map(|row| self.training(row, vec![COARSE.to_owned()])));
         let largest = blocks.iter().map(|row| row.disk).max().unwrap_or_default();
         tasks.push(Task {
             id: "join".to_owned(),
@@ -387,32 +384,11 @@ impl BlockPlan {
         tasks
     }
 
-    fn training(&self, row: &Row, place: &str, needs: Vec<String>, own: &[String]) -> Task {
-        let run = format!("{place}/run");
-        let memory = self.file.memory.to_string();
-        let numbers = [row.steps.to_string(), row.seed.to_string(), row.gaussians.to_string()];
-        let [steps, seed, gaussians] = &numbers;
-        let common = [
-            "nightsplat",
-            "train",
-            place,
-            "--config",
-            CONFIG,
-            "--out",
-            &run,
-            "--resume",
-            "--steps",
-            steps,
-            "--seed",
-            seed,
-            "--max-gaussians",
-            gaussians,
-            "--max-vram",
-            &memory,
-            "--max-ram",
-            &memory,
-        ];
-        let argv = common.into_iter().map(str::to_owned).chain(own.iter().cloned()).collect();
+    fn training(&self, row: &Row, needs: Vec<String>) -> Task {
+        let place = place(&row.id);
+        let [config, run] = [CONFIG, "run"].map(|name| format!("{place}/{name}"));
+        let argv = ["nightsplat", "train", &place, "--config", &config, "--out", &run, "--resume"];
+        let argv = argv.map(str::to_owned).to_vec();
         let done = format!("{run}/done.json");
         Task {
             id: row.id.clone(),
@@ -425,31 +401,46 @@ impl BlockPlan {
         }
     }
 
-    /// The coarse model is trained at half size.
-    fn coarse_options(&self) -> Vec<String> {
-        let mut options = vec!["--downscale".to_owned(), (2.0 * self.config.downscale).to_string()];
-        if self.config.max_resolution > 1 {
-            options.extend([
-                "--max-resolution".to_owned(),
-                (self.config.max_resolution / 2).to_string(),
-            ]);
+    /// The settings of a task, with paths from the plan's folder.
+    fn settings(&self, row: &Row) -> TrainConfig {
+        let memory = Some(CacheSize(self.file.memory));
+        TrainConfig {
+            dataset: place(&row.id).into(),
+            steps: row.steps,
+            seed: row.seed,
+            max_gaussians: row.gaussians,
+            max_vram: memory,
+            max_ram: memory,
+            ..self.config.clone()
         }
-        options
     }
 
-    /// A block goes on where the coarse model ends: at full size, at the learning rates of that step.
-    fn block_options(&self) -> Vec<String> {
-        let schedule = &self.config.schedule;
-        let rates = schedule.learning_rates(self.file.coarse.steps, 1.0);
-        let means = rates[Attribute::Means].min(schedule.initial_rates[Attribute::Means]);
-        let set = [
-            "schedule.initial_rate_factor=1".to_owned(),
-            "schedule.resolution_steps=[0,0]".to_owned(),
-            format!("schedule.initial_rates.means={means:?}"),
-        ];
-        let init = ["--init".to_owned(), format!("{COARSE}/run/model.ply")];
-        init.into_iter().chain(set.into_iter().flat_map(|own| ["--set".to_owned(), own])).collect()
+    /// The coarse model is trained at half size. Blocks go on from it, so it has no cooldown.
+    fn coarse_settings(&self) -> TrainConfig {
+        let settings = self.settings(&self.file.coarse);
+        let schedule = Schedule { cooldown_steps: 0, ..settings.schedule.clone() };
+        TrainConfig {
+            schedule,
+            downscale: 2.0 * settings.downscale,
+            max_resolution: settings.max_resolution.div_ceil(2),
+            ..settings
+        }
     }
+
+    /// A block goes on where the coarse model ends. Its views are fewer, so that a step of it stands for several of the
+    /// whole scene: the schedule is as much faster.
+    fn block_settings(&self, row: &Row) -> TrainConfig {
+        let done = self.file.coarse.steps;
+        let left = self.config.steps.saturating_sub(done).max(1);
+        let schedule = self.config.schedule.from_step(done, row.steps as f64 / left as f64);
+        let init = Some(format!("{COARSE}/run/model.ply").into());
+        TrainConfig { init, schedule, ..self.settings(row) }
+    }
+}
+
+/// The folder of a task that trains, relative to the plan's.
+fn place(id: &str) -> String {
+    if id == COARSE { id.to_owned() } else { format!("{BLOCKS}/{id}") }
 }
 
 impl PlanFile {

@@ -57,6 +57,9 @@ pub struct PlanArgs {
     /// Number of blocks, in place of as many as the memory asks for
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(2..=9999))]
     pub blocks: Option<u16>,
+    /// Settings that `nightsplat diagnose --plan` wrote; none: defaults [default: diagnose the photographs]
+    #[arg(long, value_name = "FILE|none")]
+    pub plan: Option<PathBuf>,
     /// Print the plan, and write nothing
     #[arg(long)]
     pub dry_run: bool,
@@ -112,9 +115,10 @@ fn plan(args: &PlanArgs) -> Result<()> {
         }
     }
     let gpu = driver::open(&config.device.parse::<DeviceChoice>()?)?;
-    let planning = match args.options.wants_a_plan() {
-        true => PlanSource::Diagnosis,
-        false => PlanSource::Nothing,
+    let planning = match args.plan.as_deref() {
+        Some(file) if file != Path::new("none") => PlanSource::File(file),
+        None if args.options.wants_a_plan() => PlanSource::Diagnosis,
+        _ => PlanSource::Nothing,
     };
     let planned = requested.planned(planning, &gpu)?;
     let memory = match args.memory.or(config.max_vram) {

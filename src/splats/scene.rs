@@ -137,6 +137,7 @@ impl Gaussians {
     }
 
     /// The Gaussians with these features: new ones are zero, others are dropped.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn with_features(&self, features: Features) -> Self {
         let mut other = Self::zeros(self.count, Shape { features, ..self.shape });
         other.origin = self.origin;

@@ -62,7 +62,8 @@ impl TrainConfig {
     /// The SH degree in use at a step, at most `highest`.
     pub(super) fn sh_degree_at(&self, step: u64, highest: u32) -> u32 {
         // With fewer degrees, the first steps would train a given model to do without the higher ones.
-        if self.init.is_some() { highest } else { self.schedule.sh_degree(step, highest) }
+        let keeps_all = self.init.is_some() && self.schedule.first_sh_degree.is_none();
+        if keeps_all { highest } else { self.schedule.sh_degree(step, highest) }
     }
 }
 
@@ -175,6 +176,8 @@ impl Trainer {
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MAX_STEPS as usize)?,
         };
+        let degree = initial.context.as_ref().map_or(0, Gaussians::sh_degree_in_use);
+        let degree = degree.max(first_sh_degree(&config));
         let mut trainer = Self {
             gpu: gpu.clone(),
             fingerprint,
@@ -182,7 +185,7 @@ impl Trainer {
             extent: config.extent_of(dataset) * frame.scale,
             step: 0,
             supervision,
-            model: Model::upload(gpu, &gaussians, first_sh_degree(&config), &config.precision)?,
+            model: Model::upload(gpu, &gaussians, degree, &config.precision)?,
             renderer,
             optimizer: Optimizer { adam, finite, checked: 0 },
             growth: Growth { densifier, probes, has_logged_capacity: false },

@@ -12,6 +12,7 @@ use nightsplat::photographs::image::Image;
 use nightsplat::photographs::metrics::Scores;
 use serde_json::Value;
 
+mod blocks;
 #[path = "../common/mod.rs"]
 mod common;
 mod curves_command;

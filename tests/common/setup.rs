@@ -223,6 +223,15 @@ impl<'a> Rendered<'a> {
         Self { setup, gaussians, renderer, render: vec![], transmittances: vec![] }
     }
 
+    /// The render of a setup together with other Gaussians.
+    pub(crate) fn in_context(setup: &'a Setup, context: &Gaussians) -> Self {
+        let mut rendered = Self::new(setup);
+        rendered.renderer.set_context(context).unwrap();
+        rendered.renderer.reserve(setup.count, [&setup.camera]).unwrap();
+        rendered.forward();
+        rendered.download()
+    }
+
     /// Only the forward pass; the flags of the status stay.
     pub(crate) fn forward(&mut self) {
         let Self { setup, gaussians, renderer, .. } = self;

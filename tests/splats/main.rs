@@ -10,6 +10,7 @@ mod batches;
 mod camera_gradient;
 mod checked;
 mod conditioning;
+mod context;
 mod coverage;
 mod densify;
 mod fisheye;

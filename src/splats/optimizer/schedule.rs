@@ -8,6 +8,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::Result;
 use crate::base::settings::{Rule, Setting, settings};
+use crate::kernels::sh::MAX_SH_DEGREE;
 use crate::splats::attributes::{ATTRIBUTES, Attribute};
 
 /// Adam's learning rate of each attribute, by its name in TOML; that of the means in world units.
@@ -82,7 +83,10 @@ pub struct Schedule {
     initial_rate_factor: f64 = 4.0 => Rule::from_to(1e-3, 1e3);
     /// Steps over which that multiple decays.
     initial_rate_steps: u64 = 600 => Rule::COUNT, in "steps";
-    /// The SH degree in use grows by one after each interval of this many steps, from 0.
+    /// The SH degree in use in the first step.
+    first_sh_degree: Option<u32> = None, "0; that of the model where `init` gives one"
+        => Rule::Whole(0, MAX_SH_DEGREE as u64);
+    /// The SH degree in use grows by one after each interval of this many steps.
     sh_degree_interval: u64 = 1_000 => Rule::COUNT, in "steps";
     /// Density control acts after this step.
     densify_after: u64 = 50 => Rule::COUNT;
@@ -158,13 +162,10 @@ impl Schedule {
     /// constant.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn learning_rates(&self, step: u64, extent: f64) -> LearningRates {
-        let done = (step as f64 / self.means_rate_steps.max(1) as f64).min(1.0);
         let mut rates = self.initial_rates;
-        let decay = (self.final_means_rate / rates[Attribute::Means]).powf(done);
-        rates[Attribute::Means] = rates[Attribute::Means] * decay * extent;
-        let left = 1.0 - (step as f64 / self.initial_rate_steps.max(1) as f64).min(1.0);
-        if left > 0.0 {
-            let initial_rate_factor = self.initial_rate_factor.powf(left);
+        rates[Attribute::Means] = self.means_rate(step) * extent;
+        let initial_rate_factor = self.rate_factor(step);
+        if initial_rate_factor != 1.0 {
             let opacity = rates[Attribute::RawOpacities];
             rates.0.iter_mut().for_each(|rate| *rate *= initial_rate_factor);
             rates[Attribute::RawOpacities] = opacity;
@@ -172,10 +173,48 @@ impl Schedule {
         rates
     }
 
+    /// The learning rate of the means at `step`, for a scene of extent 1, without the factor of the first steps.
+    fn means_rate(&self, step: u64) -> f64 {
+        let done = (step as f64 / self.means_rate_steps.max(1) as f64).min(1.0);
+        let initial = self.initial_rates[Attribute::Means];
+        initial * (self.final_means_rate / initial).powf(done)
+    }
+
+    /// The factor on all learning rates but the opacity's at `step`.
+    fn rate_factor(&self, step: u64) -> f64 {
+        let left = 1.0 - (step as f64 / self.initial_rate_steps.max(1) as f64).min(1.0);
+        if left > 0.0 { self.initial_rate_factor.powf(left) } else { 1.0 }
+    }
+
+    /// What is left of the schedule after `step`, at another pace: `factor` steps for each of this schedule's.
+    #[cfg(feature = "cli")]
+    pub(crate) fn from_step(&self, step: u64, factor: f64) -> Self {
+        let scaled = |steps: u64| (steps as f64 * factor).round() as u64;
+        let left = |until: u64| scaled(until.saturating_sub(step));
+        let mut initial_rates = self.initial_rates;
+        initial_rates[Attribute::Means] = self.means_rate(step);
+        Self {
+            means_rate_steps: left(self.means_rate_steps),
+            initial_rate_factor: self.rate_factor(step),
+            initial_rate_steps: left(self.initial_rate_steps),
+            first_sh_degree: Some(self.sh_degree(step, MAX_SH_DEGREE)),
+            sh_degree_interval: scaled(self.sh_degree_interval).max(1),
+            densify_after: left(self.densify_after),
+            densify_before: left(self.densify_before),
+            densify_interval: scaled(self.densify_interval).max(1),
+            cooldown_steps: scaled(self.cooldown_steps),
+            resolution_steps: self.resolution_steps.map(left),
+            damping_steps: self.damping_steps.map(left),
+            initial_rates,
+            ..self.clone()
+        }
+    }
+
     /// The SH degree in use in `step`, at most `max`.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn sh_degree(&self, step: u64, max: u32) -> u32 {
-        let degree = step / self.sh_degree_interval.max(1);
+        let first = u64::from(self.first_sh_degree.unwrap_or_default());
+        let degree = first.saturating_add(step / self.sh_degree_interval.max(1));
         degree.min(u64::from(max)) as u32
     }
 
@@ -244,12 +283,33 @@ mod tests {
     }
 
     #[test]
+    fn the_rest_of_a_schedule_goes_on_where_the_whole_is_at_any_pace() {
+        let whole = Schedule { means_rate_steps: 2_000, ..Schedule::default() };
+        for (step, factor) in [(400, 0.25), (1_000, 1.0), (2_500, 0.1)] {
+            let rest = whole.from_step(step, factor);
+            for later in [0_u32, 200, 1_000] {
+                let own = rest.learning_rates((f64::from(later) * factor) as u64, 3.0);
+                let expected = whole.learning_rates(step + u64::from(later), 3.0);
+                for (own, expected) in own.0.into_iter().zip(expected.0) {
+                    assert!((own / expected - 1.0).abs() < 1e-9, "{step} {factor} {later}");
+                }
+            }
+            assert_eq!(rest.sh_degree(0, 3), whole.sh_degree(step, 3));
+            assert_eq!(rest.resolution_levels(), 1);
+        }
+        assert_eq!(whole.from_step(1_000, 0.1).densify_interval, 10);
+        assert_eq!(whole.from_step(1_000, 0.1).densify_before, 200);
+    }
+
+    #[test]
     fn the_sh_degree_grows_every_thousand_steps() {
         let schedule = Schedule::default();
         let degrees =
             [1, 999, 1_000, 2_999, 3_000, 100_000].map(|step| schedule.sh_degree(step, 3));
         assert_eq!(degrees, [0, 0, 1, 2, 3, 3]);
         assert_eq!(schedule.sh_degree(5_000, 1), 1);
+        let later = Schedule { first_sh_degree: Some(2), ..schedule };
+        assert_eq!([1, 1_000, 2_000].map(|step| later.sh_degree(step, 3)), [2, 3, 3]);
     }
 
     #[test]

@@ -10,15 +10,16 @@ const INVISIBLE: f32 = -100.0;
 
 impl Renderer {
     /// Renders these Gaussians together with those of every view from now on. They have neither gradients nor
-    /// statistics. Memory must be reserved anew.
+    /// statistics. SH degrees that the renderer does not have are dropped. Memory must be reserved anew.
     ///
     /// # Errors
-    /// Their shape is not that of the settings, or the device is out of memory or lost.
+    /// Their features are not those of the settings, or the device is out of memory or lost.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn set_context(&mut self, context: &Gaussians) -> Result<()> {
         // The Gaussians of a view come after, at an aligned index.
         let missing = context.count.next_multiple_of(ALIGNMENT) - context.count;
-        let mut padded = context.clone();
-        let mut padding = Gaussians::zeros(missing, context.shape);
+        let mut padded = context.with_sh_degree(self.settings.shape.sh_degree);
+        let mut padding = Gaussians::zeros(missing, padded.shape);
         padding.origin = context.origin;
         padding.raw_opacities_mut().fill(INVISIBLE);
         padded.append(&padding);

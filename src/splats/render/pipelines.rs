@@ -107,6 +107,7 @@ impl Renderer {
     ///
     /// # Errors
     /// The driver refuses a kernel; the renderer is as it was.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn set_sh_degree(&mut self, sh_degree: u32) -> Result<()> {
         if sh_degree == self.settings.shape.sh_degree {
             return Ok(());

@@ -69,6 +69,7 @@ impl Gaussians {
 
     /// Removes the Gaussians whose `keep` is false; the others keep their order.
     #[cfg(feature = "io")]
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn retain(&mut self, keep: &[bool]) {
         let kept = keep.iter().filter(|keep| **keep).count();
         if kept == self.count {
