@@ -5,7 +5,7 @@
 //! ```
 //!
 //! - `partition`: the cells of a scene, from its points
-//! - `sight`: which views show a cell
+//! - `visibility`: which views show a cell
 //! - `budget`: the memory of a block's training
 //! - `task`: what schedulers read
 //! - `plan`: everything that is measured and decided once
@@ -15,8 +15,8 @@ mod budget;
 mod join;
 mod partition;
 mod plan;
-mod sight;
 mod task;
+mod visibility;
 
 pub(crate) use join::join;
 pub(crate) use plan::{BlockPlan, Request, Row, plan};

@@ -26,7 +26,7 @@ pub mod eval;
 pub mod evaluation;
 pub mod export;
 pub mod finished_run;
-pub(crate) mod joined;
+pub mod joined;
 pub mod models;
 pub mod report;
 pub mod run;

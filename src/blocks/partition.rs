@@ -8,7 +8,7 @@ use glam::DVec3;
 use crate::photographs::dataset::block::Cell;
 
 /// The halo reaches this share of the core's side beyond each face of the core.
-const HALO: f64 = 0.1;
+const HALO: f64 = 0.3;
 /// A halo with fewer points in addition to those of the core is widened, up to [`WIDEST`].
 const HALO_POINTS: usize = 200;
 /// The largest share of the core's side that a halo reaches.
@@ -185,8 +185,8 @@ mod tests {
         let parts = partition(&points, DVec3::Y, Until::Count(4)).unwrap();
         assert_eq!(parts.len(), 4);
         for point in &points {
-            let owners = parts.iter().filter(|part| part.core.contains(point.position));
-            assert_eq!(owners.count(), 1);
+            let cores = parts.iter().filter(|part| part.core.contains(point.position));
+            assert_eq!(cores.count(), 1);
         }
         for part in &parts {
             let own = points.iter().filter(|point| part.core.contains(point.position));

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use super::budget::Budget;
 use super::partition::{Part, Until, WeightedPoint, partition};
-use super::sight::Sight;
 use super::task::{self, TASKS, Task};
+use super::visibility::Visibility;
 use crate::base::hash::{self, Hasher};
 use crate::base::random::Stream;
 use crate::base::{input, output};
@@ -34,7 +34,7 @@ pub(crate) const BLOCKS: &str = "blocks";
 
 const VERSION: u32 = 1;
 /// The share of the steps that the coarse model takes.
-const COARSE_STEPS: f64 = 0.25;
+const COARSE_STEPS: f64 = 0.125;
 /// Blocks whose mean share of the views is larger do not pay.
 const MOST_SHARED: f64 = 0.75;
 /// The fewest views of a block.
@@ -109,16 +109,17 @@ pub(crate) fn plan(planned: PlannedRun, request: &Request) -> Result<BlockPlan> 
             "has no points, by which a scene is divided; find them with `nightsplat pose`";
         return Err(Error::input(root, problem));
     }
-    let sight = Sight::of(&dataset);
+    let visibility = Visibility::of(&dataset);
     let budget = Budget::of(&config, &dataset);
-    let parts = parts(&dataset, &sight, &config, &budget, request)?;
-    let serving = sight.serving(&parts);
-    let shared = mean_share(&serving, sight.training.len());
+    let parts = parts(&dataset, &visibility, &config, &budget, request)?;
+    let serving = visibility.serving(&parts);
+    let shared = mean_share(&serving, visibility.training.len());
     check_views(root, &serving, shared)?;
     let law = law_of(&config.tone, &dataset)?;
     settle(&mut config, &dataset);
     let stamp = Dataset::stamp(root, &config.load_options())?;
-    let drawn = Draft { dataset: &dataset, sight: &sight, config: &config, budget, request };
+    let drawn =
+        Draft { dataset: &dataset, visibility: &visibility, config: &config, budget, request };
     let coarse = drawn.coarse();
     let rows = drawn.rows(&parts, &serving);
     let settings = config.checksum()?;
@@ -154,12 +155,12 @@ pub(crate) fn plan(planned: PlannedRun, request: &Request) -> Result<BlockPlan> 
 /// The parts of the scene, of as much weight each as the memory allows.
 fn parts(
     dataset: &Dataset,
-    sight: &Sight<'_>,
+    visibility: &Visibility<'_>,
     config: &TrainConfig,
     budget: &Budget,
     request: &Request,
 ) -> Result<Vec<Part>> {
-    let shares = sight.pixel_shares();
+    let shares = visibility.pixel_shares();
     let weighted = dataset.points.iter().zip(shares);
     let weighted: Vec<WeightedPoint> = weighted
         .map(|(point, share)| WeightedPoint { position: point.position, weight: 1.0 + share })
@@ -178,7 +179,7 @@ fn parts(
         }
         None => Until::Share(most),
     };
-    let parts = partition(&weighted, sight.up, until).ok_or_else(|| {
+    let parts = partition(&weighted, visibility.up, until).ok_or_else(|| {
         Error::input(
             &dataset.root,
             "cannot be divided further: its points are at one place; ask for fewer blocks",
@@ -190,7 +191,7 @@ fn parts(
             config.max_gaussians,
             budget.memory(
                 config.max_gaussians as f64,
-                sight.training.len() as f64,
+                visibility.training.len() as f64,
                 request.memory as f64
             ) as u64
                 >> 20
@@ -250,7 +251,7 @@ fn block_id(number: usize) -> String {
 /// What the numbers of the tasks follow from.
 struct Draft<'a> {
     dataset: &'a Dataset,
-    sight: &'a Sight<'a>,
+    visibility: &'a Visibility<'a>,
     config: &'a TrainConfig,
     budget: Budget,
     request: &'a Request,
@@ -289,7 +290,7 @@ impl Draft<'_> {
     }
 
     fn coarse_views(&self) -> Vec<usize> {
-        self.sight.thinned()
+        self.visibility.thinned()
     }
 
     /// The rows of the blocks, which share the steps by their views.
@@ -309,7 +310,7 @@ impl Draft<'_> {
     /// The block on these views; its dataset's path is set where it is written.
     fn block(&self, id: &str, plan: &str, cells: [Cell; 2], views: &[usize]) -> Block {
         let mut block = Block::new(id, plan, self.dataset.root.clone(), cells);
-        let name = |&view: &usize| self.dataset.views[self.sight.training[view]].name.clone();
+        let name = |&view: &usize| self.dataset.views[self.visibility.training[view]].name.clone();
         block.views = views.iter().map(name).collect();
         let points = (0..).zip(&self.dataset.points);
         let inside = points.filter(|(_, point)| block.halo.contains(point.position));

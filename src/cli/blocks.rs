@@ -22,7 +22,7 @@ use crate::train::{CacheSize, PlanSource};
 /// `plan` measures the photographs once and cuts the scene into blocks, each of which trains as an ordinary run; `run`
 /// trains them here, one after another; `join` joins them. Between plan and join, Snakemake, HyperQueue, Slurm or any
 /// other engine may run the tasks: it reads tasks.jsonl, and nothing else (examples/schedulers). The joined model has
-/// the same bytes whoever trained the blocks, in which order and after which interruptions. The folder of a plan is
+/// the same bytes for any number and order of workers, and after any interruption. The folder of a plan is
 /// used like a run: `nightsplat eval CITY`, `render`, `export`, `view`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct BlocksArgs {

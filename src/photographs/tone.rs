@@ -38,7 +38,7 @@ pub use self::histogram::LuminanceHistogram;
 #[cfg(feature = "fit")]
 pub(crate) use self::law::{CurveInputs, PhotographCurve, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
-pub use self::mapping::{MeasuredPhotograph, SceneTone, ToneMapping};
+pub use self::mapping::{MeasuredPhotograph, SceneTone};
 pub use self::profile::Profile;
 #[cfg(feature = "check")]
 pub(crate) use self::profile::profiled;
@@ -46,6 +46,7 @@ pub(crate) use self::profile::profiled;
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
 pub(crate) use self::recorded::ToneLaw;
+pub use self::recorded::ToneMapping;
 pub(crate) use self::settings::OF_CURVE;
 pub use self::settings::{GainChoice, ToneSettings};
 pub use self::statistics::{Statistics, percentile};

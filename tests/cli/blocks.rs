@@ -246,15 +246,15 @@ fn plans_that_do_not_pay_or_cannot_be_made_are_refused_with_the_figure() {
     refused(&plan("--memory 1M --plan none"), 2, &["1 MiB", "--memory"]);
     refused(&plan("--memory 64G --plan none"), 3, &["fits as a whole", "nightsplat train"]);
     refused(&plan("--blocks 200 --plan none"), 3, &["fewer than 3", "fewer blocks"]);
-    // Every view of a room shows most of it.
-    let [room, out] = ["room", "room-city"].map(|name| city.path(name).display().to_string());
-    succeed(&format!("synth {room} --views 9 --width 48 --height 36"));
+    // Every view of a small set shows most of it.
+    let [set, out] = ["set", "set-city"].map(|name| city.path(name).display().to_string());
+    succeed(&format!("synth {set} --views 9 --width 48 --height 36"));
     refused(
-        &format!("blocks plan {room} --out {out} --blocks 2 --plan none"),
+        &format!("blocks plan {set} --out {out} --blocks 2 --plan none"),
         3,
         &["seen as a whole", "%", "nightsplat train"],
     );
-    assert!(!city.path("room-city").exists() && !city.path("none").exists());
+    assert!(!city.path("set-city").exists() && !city.path("none").exists());
     let other = PLAN.replace("--seed 3", "--seed 4");
     refused(&city.plan("city", &other), 2, &["contains a plan with other settings"]);
 }
@@ -262,14 +262,12 @@ fn plans_that_do_not_pay_or_cannot_be_made_are_refused_with_the_figure() {
 #[test]
 fn a_law_is_read_in_place_of_measuring_and_one_of_another_set_is_refused() {
     let city = city();
-    let [street, run, room, law, frame] =
-        ["street", "by-law", "room2", "city/law.toml", "city/frame.toml"]
-            .map(|name| city.path(name).display().to_string());
+    let [street, run, law, frame] = ["street", "by-law", "city/law.toml", "city/frame.toml"]
+        .map(|name| city.path(name).display().to_string());
     let shared = format!("--law {law} --frame {frame} --steps 1 --plan none");
     succeed(&format!("train {street} --out {run} {shared}"));
     let config = fs::read_to_string(city.path("by-law/config.toml")).unwrap();
     assert!(config.contains("law.toml") && config.contains("extent = "), "{config}");
-    succeed(&format!("synth {room} --views 9 --width 48 --height 36"));
     let text = fs::read_to_string(&law).unwrap();
     let short = city.path("short.toml");
     fs::write(

@@ -35,8 +35,8 @@ const MODEL_FOLDERS: [&str; 8] = [
 const MOST_ABOVE: usize = 3;
 
 impl Layout {
-    /// The layout of a path that a user gives: a dataset's folder or archive, its transforms file, its COLMAP model, or a
-    /// block of it.
+    /// The layout of a path that a user gives: a dataset's folder or archive, its transforms file, its COLMAP model, or
+    /// a block of it.
     ///
     /// # Errors
     /// [`Error::Input`] if it is none of these, or an unreadable archive.

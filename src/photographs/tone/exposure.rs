@@ -19,11 +19,10 @@
 //! as a photographer would choose. Lamps and windows make it unbounded, so the mean is limited (18 % grey is 0.46 when
 //! encoded). Power and constants were chosen on pairs of low- and normal-light photographs (LOL, LOM, `RealX3D`).
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::histogram::LuminanceHistogram;
 use super::real::Real;
-use super::recorded::RecordedExposure;
 use crate::camera::{Camera, CameraPoses};
 
 /// The black level of [`soft`].
@@ -263,6 +262,20 @@ struct SerializedExposure {
     share: f64,
     black: usize,
     reason: String,
+}
+
+/// The numbers of an [`Exposure`].
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct RecordedExposure {
+    pub(super) gain: f64,
+    pub(super) target: f64,
+    pub(super) mean: f64,
+    pub(super) spread: f64,
+    pub(super) share: f64,
+    pub(super) black: usize,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) brightness: Option<f64>,
 }
 
 impl From<RecordedExposure> for Exposure {

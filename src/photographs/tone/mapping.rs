@@ -5,7 +5,8 @@ use std::sync::Arc;
 use super::exposure::{Exposure, solved};
 use super::histogram::LuminanceHistogram;
 use super::law::{clamped, curve_at};
-use super::{Statistics, ToneCurve, ToneLaw, ToneParameters, ToneSettings};
+use super::recorded::{ToneLaw, ToneMapping};
+use super::{Statistics, ToneCurve, ToneParameters, ToneSettings};
 use crate::camera::Camera;
 use crate::{Error, Result};
 
@@ -69,15 +70,6 @@ impl SceneTone {
     pub(crate) fn recorded_gain(&self) -> Option<f64> {
         self.law.as_ref()?.model_gain
     }
-}
-
-/// How a photograph is tone-mapped to its target.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ToneMapping {
-    /// The curve.
-    pub parameters: ToneParameters,
-    /// k of soft(x; k), whose mean luminance the target has, if it follows from the exposure.
-    pub gain: Option<f64>,
 }
 
 impl ToneSettings {

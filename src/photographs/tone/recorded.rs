@@ -9,14 +9,22 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::exposure::Exposure;
-use super::mapping::ToneMapping;
+use super::exposure::{Exposure, RecordedExposure};
 use super::{ToneParameters, ToneSettings};
 use crate::base::{input, output};
 use crate::{Error, Result};
 
 /// The version of the file's format.
 const VERSION: u32 = 1;
+
+/// How a photograph is tone-mapped to its target.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ToneMapping {
+    /// The curve.
+    pub parameters: ToneParameters,
+    /// k of soft(x; k), whose mean luminance the target has, if it follows from the exposure.
+    pub gain: Option<f64>,
+}
 
 /// The tone mapping of every photograph of a scene.
 #[derive(Clone, Debug)]
@@ -44,20 +52,6 @@ struct Head {
     exposure: Option<RecordedExposure>,
     #[serde(default, skip_serializing)]
     photographs: BTreeMap<String, Line>,
-}
-
-/// The numbers of an [`Exposure`].
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct RecordedExposure {
-    pub(super) gain: f64,
-    pub(super) target: f64,
-    pub(super) mean: f64,
-    pub(super) spread: f64,
-    pub(super) share: f64,
-    pub(super) black: usize,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) brightness: Option<f64>,
 }
 
 /// A photograph: the parameters of its curve, and its gain.

@@ -20,7 +20,7 @@ const NEW_SHARE: f64 = 0.1;
 const SAMPLES: usize = 20_000;
 
 /// What the views of a dataset see.
-pub(crate) struct Sight<'a> {
+pub(crate) struct Visibility<'a> {
     dataset: &'a Dataset,
     /// The training views with photographs, as indices into the dataset's views.
     pub(crate) training: Vec<usize>,
@@ -30,7 +30,7 @@ pub(crate) struct Sight<'a> {
     pub(crate) up: DVec3,
 }
 
-impl<'a> Sight<'a> {
+impl<'a> Visibility<'a> {
     /// By the recorded tracks of the points; where there are none, every point in a view's frame counts as seen.
     pub(crate) fn of(dataset: &'a Dataset) -> Self {
         let is_used = |view: &View| view.is_train() && view.has_photograph();
@@ -45,16 +45,16 @@ impl<'a> Sight<'a> {
                 seen[own].push(number);
             }
         }
-        let mut sight = Self { dataset, training, seen, up: dataset.up() };
-        if sight.seen.iter().all(Vec::is_empty) {
+        let mut visibility = Self { dataset, training, seen, up: dataset.up() };
+        if visibility.seen.iter().all(Vec::is_empty) {
             tracing::warn!(
                 "{}: its points do not record which photographs see them; every point in the frame of a photograph \
                  counts as seen",
                 dataset.root.display()
             );
-            sight.seen = sight.in_frame();
+            visibility.seen = visibility.in_frame();
         }
-        sight
+        visibility
     }
 
     fn in_frame(&self) -> Vec<Vec<u32>> {
@@ -85,10 +85,10 @@ impl<'a> Sight<'a> {
     pub(crate) fn serving(&self, parts: &[Part]) -> Vec<Vec<usize>> {
         let owner =
             |point: &Point| parts.iter().position(|part| part.core.contains(point.position));
-        let owners: Vec<Option<usize>> = self.dataset.points.par_iter().map(owner).collect();
+        let part_of: Vec<Option<usize>> = self.dataset.points.par_iter().map(owner).collect();
         let shares = |seen: &Vec<u32>| {
             let mut counts = vec![0_u32; parts.len()];
-            let owned = seen.iter().filter_map(|&point| owners[point as usize]);
+            let owned = seen.iter().filter_map(|&point| part_of[point as usize]);
             owned.for_each(|part| counts[part] += 1);
             counts.iter().map(|&count| f64::from(count) / seen.len().max(1) as f64).collect()
         };
@@ -187,8 +187,8 @@ mod tests {
     #[test]
     fn a_block_has_the_views_that_see_it_and_few_others() {
         let dataset = street(40, true);
-        let sight = Sight::of(&dataset);
-        let serving = sight.serving(&parts(&dataset, 4));
+        let visibility = Visibility::of(&dataset);
+        let serving = visibility.serving(&parts(&dataset, 4));
         assert!(serving[0].iter().all(|&view| view < 16), "{:?}", serving[0]);
         assert!((0..10).all(|view| serving[0].contains(&view)), "{:?}", serving[0]);
         let all: std::collections::BTreeSet<usize> = serving.into_iter().flatten().collect();
@@ -198,14 +198,14 @@ mod tests {
     #[test]
     fn without_tracks_what_is_in_the_frame_counts() {
         let dataset = street(40, false);
-        let serving = Sight::of(&dataset).serving(&parts(&dataset, 2));
+        let serving = Visibility::of(&dataset).serving(&parts(&dataset, 2));
         assert!(serving[0].contains(&3) && !serving[0].contains(&36), "{:?}", serving[0]);
     }
 
     #[test]
     fn the_coarse_model_has_views_for_every_point() {
         let dataset = street(200, true);
-        let thinned = Sight::of(&dataset).thinned();
+        let thinned = Visibility::of(&dataset).thinned();
         assert!(thinned.len() < 130, "{}", thinned.len());
         let has = |view: &u32| thinned.contains(&(*view as usize));
         assert!(
@@ -221,6 +221,6 @@ mod tests {
             point.views = views;
         }
         // Half a view, a view and a half, none; relative to their mean.
-        assert_eq!(Sight::of(&dataset).pixel_shares(), [0.75, 2.25, 0.0]);
+        assert_eq!(Visibility::of(&dataset).pixel_shares(), [0.75, 2.25, 0.0]);
     }
 }
