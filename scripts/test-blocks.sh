@@ -42,9 +42,20 @@ with() {
         uniq -d | cut -d / -f 3
 }
 
+# Their parents that run the steps of Slurm, whose environment is empty.
+steps_of() {
+    local process parent
+    for process in "$@"; do
+        parent=$(sed -n 's/^PPid:[[:space:]]*//p' "/proc/$process/status" 2> /dev/null) || continue
+        [ "$(cat "/proc/$parent/comm" 2> /dev/null)" != slurmstepd ] || echo "$parent"
+    done
+}
+
 end_all() {
+    local all
+    mapfile -t all < <(with "PROGRAM=$PROGRAM")
     # shellcheck disable=SC2046
-    kill -9 $(with "PROGRAM=$PROGRAM")
+    kill -9 $(steps_of "${all[@]}") "${all[@]}"
     wait
     rm -rf "$scratch"
 }
@@ -73,11 +84,13 @@ under_way() {
     return 1
 }
 
-# kills PLAN: kills such a training.
+# kills PLAN: kills such a training; another, where it was done before.
 kills() {
-    waits 120 "a block to be trained" under_way "$1"
-    kill -9 "$process" 2>> "$log" || fail "block $block ended before it was killed"
-    [ ! -e "$1/blocks/$block/run/done.json" ] || fail "block $block was done before it was killed"
+    block=
+    until [ -n "$block" ] && [ ! -e "$1/blocks/$block/run/done.json" ]; do
+        waits 120 "a block to be trained" under_way "$1"
+        kill -9 "$process" 2>> "$log" || true
+    done
 }
 
 # The checksums of the joined model.
@@ -197,6 +210,7 @@ MpiDefault=none
 SelectType=select/cons_tres
 SelectTypeParameters=CR_CPU_Memory
 SlurmdParameters=config_overrides
+SchedulerParameters=sched_interval=2,bf_interval=2
 SlurmdTimeout=10
 ReturnToService=2
 NodeName=w1 NodeHostname=$host NodeAddr=127.0.0.1 Port=${ports[1]} CPUs=1 RealMemory=2000
@@ -223,11 +237,12 @@ on_slurm() {
     cp -r plan slurmed
     GPU="" "$root/examples/schedulers/blocks_slurm.sh" slurmed > "$log" 2>&1 || fail "sbatch"
     waits 120 "a block to be trained" under_way slurmed
-    local node
+    local node own
     node=$(tr '\0' '\n' < "/proc/$process/environ" | sed -n 's/^SLURMD_NODENAME=//p')
-    # The node, with the steps that it runs and what they started.
+    # The node, the steps that it runs, and what they started; what ends after its parent does is gone already.
+    mapfile -t own < <(with "SLURMD_NODENAME=$node")
     # shellcheck disable=SC2046
-    kill -9 $(with "NODE=$node") $(with "SLURMD_NODENAME=$node") || true
+    kill -9 $(with "NODE=$node") $(steps_of "${own[@]}") "${own[@]}" 2>> "$log" || true
     [ ! -e "slurmed/blocks/$block/run/done.json" ] || fail "block $block was done before its node was killed"
     waits 200 "the jobs of Slurm" no_jobs
     cat slurm/slurmctld.log slurmed/logs/* >> "$log"
@@ -240,3 +255,54 @@ if has_slurm; then
 else
     "$root/scripts/not-run.sh" slurm "blocks on Slurm: Debian's packages could not be installed"
 fi
+
+# refused CODE TEXT: joining the plan `serial` ends with this exit code and one line of error, which contains the text;
+# of the joined model, nothing changes.
+refused() {
+    local code=0 before=none after=none
+    [ ! -e serial/model ] || before=$(model serial)
+    "$program" blocks join serial > /dev/null 2> "$log" || code=$?
+    [ ! -e serial/model ] || after=$(model serial)
+    [ "$code" = "$1" ] || fail "a join that must be refused ($2): exit code $code"
+    [ "$(wc -l < "$log")" = 1 ] && grep -qF "$2" "$log" || fail "a join that must be refused ($2): another error"
+    [ "$before" = "$after" ] || fail "a refused join ($2) changed the model"
+    sed 's/^/refused: /' "$log"
+}
+
+cp -r serial/model first
+plan other --blocks 4 --steps 1000 --max-gaussians 4000 --memory 1G --seed 2
+for model in joined none; do
+    [ "$model" = joined ] || rm -r serial/model
+    mv serial/blocks/0001 away
+    refused 3 "0001: is missing"
+    cp -r other/blocks/0001 serial/blocks/
+    refused 3 "another plan"
+    rm -r serial/blocks/0001
+    mv away serial/blocks/0001
+    mv serial/blocks/0003/run/done.json away
+    refused 3 "block 0003 is not done"
+    mv away serial/blocks/0003/run/done.json
+done
+photograph=$(find street/low -type f | head -n 1)
+touch -r "$photograph" before
+touch "$photograph"
+refused 3 "has changed since the plan was made"
+touch -r before "$photograph"
+
+# Two joins at once: the first is held while the second begins. Joins are short: it may take several.
+for attempt in {1..20}; do
+    [ "$attempt" = 1 ] || rm -r serial/model
+    "$program" blocks join serial > "$scratch/join" 2>&1 &
+    first=$!
+    until [ -e serial/.lock ] || [ ! -e "/proc/$first" ]; do :; done
+    kill -STOP "$first" 2>> "$log" || true
+    [ -e serial/model/manifest.json ] || break
+    kill -CONT "$first" 2>> "$log" || true
+    wait "$first"
+done
+[ ! -e serial/model/manifest.json ] || fail "no join could be held"
+refused 1 "process $first"
+kill -CONT "$first"
+wait "$first" || fail "the first of two joins"
+diff -r first serial/model || fail "two joins at once: another model"
+echo "two joins at once: one model; all at $SECONDS s"
