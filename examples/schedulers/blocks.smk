@@ -1,10 +1,10 @@
 # The blocks of a plan on Snakemake (`pip install snakemake`): a job per task of tasks.jsonl, the join last.
 #
 #     nightsplat blocks plan photos --out city
-#     snakemake -s blocks.smk --cores 2 --resources gpu=1 mem_mb=16000 --rerun-incomplete --config city=city
+#     snakemake -s blocks.smk --cores 2 --resources gpu=1 mem_mb=16000 -k --rerun-incomplete --config city=city
 #
 # `--resources` bounds what runs at a time: devices, and memory in MB. A task that is killed, or ends with exit code 75
-# as its time is up, is retried and continues; one that outlived the Snakemake that started it is waited for. After a
+# as its time is up, is run again and continues; one that outlived the Snakemake that started it is waited for. After a
 # kill of Snakemake itself, run it with `--unlock` once.
 
 import json
@@ -44,8 +44,16 @@ rule task:
     resources:
         gpu=lambda wildcards: TASKS[wildcards.task]["gpu"],
         mem_mb=lambda wildcards: -(-TASKS[wildcards.task]["memory"] // 1_000_000),
-    retries: 20
+    # A lost node. What a task says of its data or device is not repeated for long.
+    retries: 3
     threads: 1
     shell:
-        "cd {params.city}; for lock in {params.locks}; do if [ -e $lock ]; then flock $lock true; fi; done; "
-        "{params.command}"
+        """
+        cd {params.city}
+        for attempt in $(seq 20); do
+            for lock in {params.locks}; do if [ -e $lock ]; then flock $lock true; fi; done
+            code=0; {params.command} || code=$?
+            case $code in 75 | 137 | 143) ;; *) break ;; esac
+        done
+        exit $code
+        """
