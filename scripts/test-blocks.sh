@@ -113,8 +113,8 @@ echo "blocks run: $(wc -l < serial/tasks.jsonl) tasks, joined at $SECONDS s"
 
 # Whether Python's registry has brought the engines.
 if ! "$venv/bin/python" -c 'import hyperqueue, snakemake' 2> "$log"; then
-    python3 -m venv "$venv" > "$log" 2>&1 &&
-        "$venv/bin/pip" install -q --disable-pip-version-check snakemake==9.27.0 hyperqueue==0.27.0 >> "$log" 2>&1 || true
+    { python3 -m venv "$venv" && "$venv/bin/pip" install -q snakemake==9.27.0 hyperqueue==0.27.0; } > "$log" 2>&1 ||
+        true
 fi
 has() { "$venv/bin/python" -c "import $1" 2> /dev/null; }
 
@@ -145,7 +145,8 @@ on_snakemake() {
 on_hyperqueue() {
     cp -r plan queue
     # Its server lives in the home folder.
-    HOME=$scratch/home WORKERS=2 "$venv/bin/python" "$root/examples/schedulers/blocks_on_hyperqueue.py" queue > "$log" 2>&1 &
+    HOME=$scratch/home WORKERS=2 "$venv/bin/python" "$root/examples/schedulers/blocks_on_hyperqueue.py" queue \
+        > "$log" 2>&1 &
     local engine=$!
     kills queue
     wait "$engine" || fail "HyperQueue"
@@ -234,20 +235,25 @@ no_jobs() { squeue -h > "$scratch/jobs" && [ ! -s "$scratch/jobs" ]; }
 
 on_slurm() {
     cluster
-    cp -r plan slurmed
-    GPU="" "$root/examples/schedulers/blocks_slurm.sh" slurmed > "$log" 2>&1 || fail "sbatch"
-    waits 120 "a block to be trained" under_way slurmed
-    local node own
+    cp -r plan nodes
+    GPU="" "$root/examples/schedulers/blocks_slurm.sh" nodes > "$log" 2>&1 || fail "sbatch"
+    waits 120 "a block to be trained" under_way nodes
+    local node own job
     node=$(tr '\0' '\n' < "/proc/$process/environ" | sed -n 's/^SLURMD_NODENAME=//p')
     # The node, the steps that it runs, and what they started; what ends after its parent does is gone already.
     mapfile -t own < <(with "SLURMD_NODENAME=$node")
     # shellcheck disable=SC2046
     kill -9 $(with "NODE=$node") $(steps_of "${own[@]}") "${own[@]}" 2>> "$log" || true
-    [ ! -e "slurmed/blocks/$block/run/done.json" ] || fail "block $block was done before its node was killed"
+    [ ! -e "nodes/blocks/$block/run/done.json" ] || fail "block $block was done before its node was killed"
+    # As at the end of a job's time: another training saves, and its job is queued again.
+    waits 60 "another block to be trained" under_way nodes
+    job=$(tr '\0' '\n' < "/proc/$process/environ" | sed -n 's/^SLURM_JOB_ID=//p')
+    scancel --signal=TERM "$job" 2>> "$log" || fail "scancel"
     waits 200 "the jobs of Slurm" no_jobs
-    cat slurm/slurmctld.log slurmed/logs/* >> "$log"
-    grep -q "requeue.*node" slurm/slurmctld.log || fail "Slurm noticed no lost node"
-    same slurmed "Slurm, 3 nodes, $node killed"
+    cat slurm/slurmctld.log nodes/logs/* >> "$log"
+    grep -q "requeue job .* failure of node $node" slurm/slurmctld.log || fail "Slurm noticed no lost node"
+    grep -q "Requeuing JobId=$job" slurm/slurmctld.log || fail "job $job was not queued again"
+    same nodes "Slurm, 3 nodes, $node killed and a job queued again"
 }
 
 if has_slurm; then
