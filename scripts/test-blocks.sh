@@ -225,6 +225,8 @@ CONF
     slurmctld -D > "$slurm/slurmctld.log" 2>&1 &
     for node in w1 w2 w3; do
         NODE=$node slurmd -D -N "$node" > "$slurm/$node.log" 2>&1 &
+        # The shell does not report its end.
+        disown
     done
     waits 60 "three nodes of Slurm" three_idle
 }
