@@ -14,6 +14,7 @@ mod coverage;
 mod densify;
 mod fisheye;
 mod gradients;
+mod levels;
 mod limits;
 mod not_finite;
 mod optimizer;

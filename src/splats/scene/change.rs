@@ -89,6 +89,7 @@ impl Gaussians {
 
     /// These Gaussians, in this order.
     #[cfg(feature = "io")]
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn select(&self, places: &[u32]) -> Self {
         let mut some = Self::zeros(places.len(), self.shape);
         some.origin = self.origin;
@@ -107,6 +108,7 @@ impl Gaussians {
     /// Gaussians of one shape, one after the other, at least one set of them; the positions of all stay where they are
     /// in the world, relative to the first one's origin.
     #[cfg(feature = "io")]
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn concatenated(parts: &[&Self]) -> Self {
         let (shape, origin) = (parts[0].shape, parts[0].origin);
         let mut all = Self::zeros(parts.iter().map(|part| part.count).sum(), shape);
