@@ -17,7 +17,7 @@ use crate::photographs::image::Image;
 use crate::photographs::tone::ToneCurve;
 use crate::results::edit::fingerprint;
 use crate::results::export::page::{Bookmark, Page, Picture, moved};
-use crate::results::export::streamed::{self, Division, Tile, Written};
+use crate::results::export::streamed::{self, Division, MAX_LEVELS, Tile, Written};
 use crate::results::export::{Format, Provenance, spz};
 use crate::results::finished_run::{FinishedRun, config_of_file, is_model, needs_photographs};
 use crate::results::models;
@@ -161,15 +161,9 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
         }
         Some(format) => format.write(&gaussians, &provenance, out)?,
         None if args.to == To::StreamedSog => {
-            let (tile, wrote) = (Tile::whole(&args.run, &gaussians), out.display());
-            let Written { counts, chunks } = streamed::write(out, &[tile], &provenance, division)?;
-            let kib = size_of(out).div_ceil(1024);
-            let counts: Vec<String> = counts.iter().map(ToString::to_string).collect();
-            let (levels, counts) = (counts.len(), counts.join(", "));
-            let wrote = format!(
-                "{wrote}: {levels} levels of {counts} Gaussians in {chunks} chunks, {kib} KiB{turned}"
-            );
-            return Ok((out.clone(), wrote));
+            let tile = Tile::whole(&args.run, &gaussians);
+            let written = streamed::write(out, &[tile], &provenance, division)?;
+            return Ok((out.clone(), streamed_line(out, &written, &turned)));
         }
         None => write_whole(out, page(args, &config, &gaussians, provenance)?.as_bytes())?,
     }
@@ -203,15 +197,30 @@ fn check_levels(args: &ExportArgs) -> crate::Result<()> {
     let problem = match args {
         ExportArgs { levels: Some(_), .. } if !is_streamed => {
             "--levels is of --format streamed-sog; pass --level for one level of another format"
+                .to_owned()
         }
         ExportArgs { level: 1.., .. } if is_streamed => {
             "--level is of formats with one level; pass --levels for the number of levels"
+                .to_owned()
         }
-        ExportArgs { chunk: 0, .. } => "--chunk 0 holds no Gaussian; pass at least 1",
-        ExportArgs { levels: Some(0), .. } => "--levels 0 is no level; pass at least 1",
+        ExportArgs { levels: Some(levels), .. } if !(1..=MAX_LEVELS).contains(levels) => {
+            format!("--levels {levels} cannot be made; ask for 1 to {MAX_LEVELS}")
+        }
+        ExportArgs { level, .. } if *level >= MAX_LEVELS => {
+            format!("--level {level} cannot be made; the coarsest is {}", MAX_LEVELS - 1)
+        }
+        ExportArgs { chunk: 0, .. } => "--chunk 0 holds no Gaussian; pass at least 1".to_owned(),
         _ => return Ok(()),
     };
-    Err(Error::Usage(problem.to_owned()))
+    Err(Error::Usage(problem))
+}
+
+/// A line on the contents of a streamed SOG.
+fn streamed_line(out: &Path, Written { counts, chunks }: &Written, turned: &str) -> String {
+    let (out, kib) = (out.display(), size_of(out).div_ceil(1024));
+    let numbers: Vec<String> = counts.iter().map(ToString::to_string).collect();
+    let (levels, numbers) = (counts.len(), numbers.join(", "));
+    format!("{out}: {levels} levels of {numbers} Gaussians in {chunks} chunks, {kib} KiB{turned}")
 }
 
 /// The bytes of the files in the folders of a folder.

@@ -125,26 +125,26 @@ fn the_index_finds_every_gaussian_of_every_level_once_and_chunks_are_our_levels(
             assert_eq!(offset, ends[file], "{name}: a gap");
             ends[file] += count;
             let own: Vec<u32> = (offset as u32..(offset + count) as u32).collect();
-            let run = chunk(folder.path(), name).select(&own);
-            for mean in run.means() {
+            let cell = chunk(folder.path(), name).select(&own);
+            for mean in cell.means() {
                 let mean = mean.as_dvec3();
                 assert!(
                     mean.cmpge(corner(leaf, "min")).all() && mean.cmple(corner(leaf, "max")).all()
                 );
             }
-            found.push(run);
+            found.push(cell);
         }
     }
     for (name, end) in names.iter().zip(ends) {
         assert_eq!(chunk(folder.path(), name.as_str().unwrap()).count, end, "{name}");
         assert!(end <= division.chunk);
     }
-    for (k, runs) in found.iter().enumerate() {
-        let all = Gaussians::concatenated(&runs.iter().collect::<Vec<_>>());
+    for (k, cells) in found.iter().enumerate() {
+        let all = Gaussians::concatenated(&cells.iter().collect::<Vec<_>>());
         assert_eq!(all.origin, models[0].origin);
         for model in &models {
             let errors = errors(&level(model, division.cell(), k), &all);
-            let most = [3e-3, 0.03, 0.003, 0.03];
+            let most = [1e-3, 0.1, 0.003, 0.05];
             assert!(errors.iter().zip(most).all(|(error, most)| *error < most), "{k}: {errors:?}");
         }
     }
@@ -217,9 +217,10 @@ fn the_command_writes_levels_and_refuses_options_of_other_formats() {
     let half = ply::load(folder.path().join("b.ply")).unwrap();
     assert_eq!(half, level(&model, 40, 1).with_sh_degree(3));
     for (options, part) in [
-        ("--format ply --out b.ply --levels 2", "--level"),
+        ("--format sog --levels 2", "--level"),
         ("--format streamed-sog --level 1", "--levels"),
         ("--format streamed-sog --levels 0", "--levels 0"),
+        ("--format sog --level 16", "--level 16"),
         ("--format sog --chunk 0", "--chunk 0"),
         ("--format streamed-sog --out a.sog", "--format sog"),
     ] {

@@ -80,7 +80,10 @@ fn two_equal_gaussians_become_one_in_their_place_that_covers_as_much() {
         let expected = strength * (2.0 - 0.5 * strength);
         let covered = opacity(&merged, 0) * growth;
         assert!((covered / expected - 1.0).abs() < 1e-4, "{strength}: {covered}, not {expected}");
-        assert!(growth < 1.0001 || opacity(&merged, 0) > 0.98, "{strength}: {growth}");
+        // It is a little wider than each, and wider still where it would be more than opaque.
+        let spread = (2.0 - 0.25 * strength) / (2.0 - 0.5 * strength);
+        let is_opaque = opacity(&merged, 0) > 0.98;
+        assert!((growth / spread - 1.0).abs() < 1e-4 || is_opaque, "{strength}: {growth}");
     }
 }
 

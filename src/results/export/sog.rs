@@ -31,8 +31,8 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
     archive(&encoded(gaussians, provenance, &[gaussians.count]))
 }
 
-/// Writes a model as files in a folder, which is created. `runs`: the lengths of its parts, whose Gaussians stay
-/// together, in the order of the parts.
+/// Writes a model as files in a folder, which is created. The Gaussians of a cell stay together, and cells keep their
+/// order; `counts` are their Gaussians.
 ///
 /// # Errors
 /// [`Error::Output`] if an image cannot be encoded or a file cannot be written.
@@ -40,10 +40,10 @@ pub(super) fn write_folder(
     folder: &Path,
     gaussians: &Gaussians,
     provenance: &Provenance,
-    runs: &[usize],
+    counts: &[usize],
 ) -> Result<()> {
     create_folder(folder)?;
-    let Encoded { meta, images } = encoded(gaussians, provenance, runs);
+    let Encoded { meta, images } = encoded(gaussians, provenance, counts);
     for image in &images {
         write_whole(&folder.join(image.name), &image.webp()?)?;
     }
@@ -80,16 +80,15 @@ fn failed(error: &dyn std::fmt::Display) -> Error {
     Error::output("an export", format!("cannot be assembled: {error}"))
 }
 
-/// Gaussians of each run in the order of a Z-order curve.
-fn encoded(gaussians: &Gaussians, provenance: &Provenance, runs: &[usize]) -> Encoded {
+/// The Gaussians of each cell in the order of a Z-order curve.
+fn encoded(gaussians: &Gaussians, provenance: &Provenance, counts: &[usize]) -> Encoded {
     let (bounds, positions) = positions(gaussians);
     // Neighbours in space are neighbours in the images, which compresses better.
     let mut order: Vec<usize> = (0..gaussians.count).collect();
-    let mut rest = &mut order[..];
-    for &run in runs {
-        let (own, others) = rest.split_at_mut(run);
-        own.sort_by_key(|&i| morton(positions[i]));
-        rest = others;
+    let mut begin = 0;
+    for &count in counts {
+        order[begin..begin + count].sort_by_key(|&i| morton(positions[i]));
+        begin += count;
     }
     let size = image_size(gaussians.count);
     let pixels = |pixel: &dyn Fn(usize) -> [u8; 4]| {

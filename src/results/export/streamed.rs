@@ -3,7 +3,7 @@
 //!
 //! ```text
 //! lod-meta.json      a binary tree of boxes; its leaves state where their Gaussians of each level are
-//! LEVEL_CHUNK/       a SOG as files, with the runs of several leaves
+//! LEVEL_CHUNK/       a SOG as files, with a level of several leaves
 //! ```
 //!
 //! A leaf is a cell of [`levels`]: its levels are of the same Gaussians, so viewers can take each from another level.
@@ -31,8 +31,8 @@ pub const INDEX: &str = "lod-meta.json";
 /// Leaves of a chunk of level 0.
 const LEAVES_PER_CHUNK: usize = 4;
 
-/// The most levels: a leaf of the usual size is then a few Gaussians.
-const MAX_LEVELS: usize = 16;
+/// The most levels: the coarsest of a cell of the usual size is then one Gaussian.
+pub const MAX_LEVELS: usize = 16;
 
 /// A part of a model that is loaded at once.
 pub struct Tile<'a> {
@@ -312,14 +312,14 @@ struct Chunks<'a> {
     counts: Vec<usize>,
 }
 
-/// A chunk that more runs may be added to.
+/// A chunk that more cells may be added to.
 #[derive(Default)]
 struct Pending {
     /// Chunks of its level before it.
     number: usize,
     /// Its place in the list of files.
     file: usize,
-    runs: Vec<Gaussians>,
+    cells: Vec<Gaussians>,
     count: usize,
 }
 
@@ -332,37 +332,37 @@ impl<'a> Chunks<'a> {
     /// Adds the levels of a leaf, and returns where they are.
     fn add(&mut self, levels: Vec<Gaussians>) -> Result<Value> {
         let mut lods = serde_json::Map::new();
-        for (level, run) in levels.into_iter().enumerate() {
-            if self.pending[level].count + run.count > self.most {
+        for (level, cell) in levels.into_iter().enumerate() {
+            if self.pending[level].count + cell.count > self.most {
                 self.flush(level)?;
             }
             let pending = &mut self.pending[level];
-            if pending.runs.is_empty() {
+            if pending.cells.is_empty() {
                 pending.file = self.names.len();
                 self.names.push(format!("{level}_{}/{}", pending.number, sog::META));
             }
             let place =
-                json!({ "file": pending.file, "offset": pending.count, "count": run.count });
+                json!({ "file": pending.file, "offset": pending.count, "count": cell.count });
             lods.insert(level.to_string(), place);
-            pending.count += run.count;
-            self.counts[level] += run.count;
-            pending.runs.push(run);
+            pending.count += cell.count;
+            self.counts[level] += cell.count;
+            pending.cells.push(cell);
         }
         Ok(lods.into())
     }
 
     fn flush(&mut self, level: usize) -> Result<()> {
-        let Pending { number, runs, count, .. } = &mut self.pending[level];
-        if runs.is_empty() {
+        let Pending { number, cells, count, .. } = &mut self.pending[level];
+        if cells.is_empty() {
             return Ok(());
         }
         let folder = self.folder.join(format!("{level}_{number}"));
-        let runs = std::mem::take(runs);
+        let cells = std::mem::take(cells);
         (*number, *count) = (*number + 1, 0);
-        let lengths: Vec<usize> = runs.iter().map(|run| run.count).collect();
-        let chunk = Gaussians::concatenated(&runs.iter().collect::<Vec<_>>());
-        drop(runs);
-        sog::write_folder(&folder, &chunk, self.provenance, &lengths)
+        let counts: Vec<usize> = cells.iter().map(|cell| cell.count).collect();
+        let chunk = Gaussians::concatenated(&cells.iter().collect::<Vec<_>>());
+        drop(cells);
+        sog::write_folder(&folder, &chunk, self.provenance, &counts)
     }
 
     /// Writes all unfinished chunks.
