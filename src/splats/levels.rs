@@ -16,7 +16,7 @@
 //! ```
 //!
 //! A is the integral of a Gaussian of height 1 and I that of the product of two, over an image plane, summed over the
-//! planes of two axes of the world. Where o would exceed [`MAX_OPACITY`], the Gaussian is larger instead, so that it
+//! planes of two axes of the world. Where o would exceed 0.99, the Gaussian is larger instead, so that it
 //! covers as much. The change of images is the integral of the squared difference of premultiplied colour and alpha,
 //! without what one of the two hides of the other, summed over the same planes.
 

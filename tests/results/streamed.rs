@@ -185,7 +185,8 @@ fn a_folder_with_anything_else_and_tiles_that_changed_are_refused_and_nothing_is
     let [model, _] = tiles();
     let division = Division::default();
     fs::write(folder.path().join("letter.txt"), "mine").unwrap();
-    let problem = written(folder.path(), &[model.clone()], division).unwrap_err().to_string();
+    let problem =
+        written(folder.path(), std::slice::from_ref(&model), division).unwrap_err().to_string();
     assert!(problem.contains("letter.txt") && files(folder.path()).len() == 1, "{problem}");
     fs::remove_file(folder.path().join("letter.txt")).unwrap();
 
