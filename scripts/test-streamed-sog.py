@@ -4,9 +4,9 @@
     scripts/test-streamed-sog.py [NIGHTSPLAT]      (default: target/release/nightsplat, or debug)
 
 Trains a small synthetic street, exports three levels of detail in small chunks, and requires of each level that
-splat-transform reads that its Gaussians are ours within the precision of the format, and that it scores within 0.5 dB of
-ours. Needs Python and npm, which fetches splat-transform into a folder that is removed; without npm, or where it cannot
-fetch, this says that it is not run.
+splat-transform reads that its Gaussians are ours within the precision of the format, and that it scores within 0.5 dB
+of ours. Needs Python and npm, which fetches splat-transform into a folder that is removed; without npm, or where it
+cannot fetch, this says that it is not run.
 """
 
 import array

@@ -72,7 +72,7 @@ fn leaves(node: &Value) -> Vec<&Value> {
     children.iter().flat_map(leaves).collect()
 }
 
-/// The largest distance, and the largest differences of scales, opacities and colours, of each Gaussian and its nearest.
+/// The largest distance, and the largest differences of scales, opacities and colours, of Gaussians and their nearest.
 fn errors(own: &Gaussians, other: &Gaussians) -> [f32; 4] {
     (0..own.count).fold([0.0; 4], |most, i| {
         let offset = (own.origin - other.origin).as_vec3();
