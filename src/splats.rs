@@ -13,12 +13,15 @@
 //! - [`optimizer`]: Adam, learned parameters other than the Gaussians, and learning-rate schedules
 //! - [`render`]: the differentiable rasteriser
 //! - [`densify`]: density control: clone, split, prune
+//! - [`levels`]: levels of detail: neighbours merged
 
 pub mod attributes;
 pub mod batches;
 #[cfg(feature = "io")]
 pub mod densify;
 pub mod harmonics;
+#[cfg(feature = "io")]
+pub mod levels;
 pub mod model;
 #[cfg(feature = "io")]
 pub mod optimizer;

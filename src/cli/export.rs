@@ -2,7 +2,7 @@
 
 mod up;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use clap::ValueEnum;
@@ -17,9 +17,11 @@ use crate::photographs::image::Image;
 use crate::photographs::tone::ToneCurve;
 use crate::results::edit::fingerprint;
 use crate::results::export::page::{Bookmark, Page, Picture, moved};
+use crate::results::export::streamed::{self, Division, MAX_LEVELS, Tile, Written};
 use crate::results::export::{Format, Provenance, spz};
 use crate::results::finished_run::{FinishedRun, config_of_file, is_model, needs_photographs};
 use crate::results::models;
+use crate::splats::levels;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE};
 use crate::train::{TestTargets, TrainConfig};
@@ -46,6 +48,15 @@ pub struct ExportArgs {
     /// Version of SPZ; more programs read 3
     #[arg(long, value_name = "3|4", default_value_t = 4, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub spz: u8,
+    /// Level of detail to write: 0 has all Gaussians, each further level half as many
+    #[arg(long, value_name = "LEVEL", default_value_t = 0)]
+    pub level: usize,
+    /// For streamed-sog: number of levels of detail [default: until the coarsest is no larger than a chunk]
+    #[arg(long, value_name = "N")]
+    pub levels: Option<usize>,
+    /// For streamed-sog: the most Gaussians of a chunk; levels of detail are made in cells of a quarter of it
+    #[arg(long, value_name = "N", default_value_t = Division::default().chunk)]
+    pub chunk: usize,
     /// For html: number of views to start from, with their photographs
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub views: usize,
@@ -60,7 +71,8 @@ pub struct ExportArgs {
 const EXAMPLES: &str = "Examples:
   nightsplat export run --format html             run/model.html: a viewer, with photographs to compare
   nightsplat export run --format spz --out a.spz  a tenth of the size, eight bits per number
-  nightsplat export run --format glb              glTF with KHR_gaussian_splatting, at full precision";
+  nightsplat export run --format glb              glTF with KHR_gaussian_splatting, at full precision
+  nightsplat export run --format streamed-sog     run/model.streamed-sog: levels of detail, for large scenes";
 
 /// The formats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -73,6 +85,8 @@ pub enum To {
     Glb,
     /// A fifteenth of the size, by `PlayCanvas`
     Sog,
+    /// A folder of SOG in chunks at several levels of detail, which viewers of `PlayCanvas` load as needed
+    StreamedSog,
     /// A self-contained page with a viewer
     Html,
 }
@@ -84,6 +98,7 @@ impl To {
             Self::Spz => "spz",
             Self::Glb => "glb",
             Self::Sog => "sog",
+            Self::StreamedSog => "streamed-sog",
             Self::Html => "html",
         }
     }
@@ -100,6 +115,7 @@ pub fn run(args: &ExportArgs) -> Result<()> {
     let next = match args.to {
         To::Html => format!("open {out} in a browser"),
         To::Spz | To::Sog | To::Glb => format!("open {out} in a viewer of Gaussian splats"),
+        To::StreamedSog => format!("serve {out} and open its {} in a viewer", streamed::INDEX),
         To::Ply => format!("open {out} in a viewer of 3DGS models"),
     };
     finish(&wrote, &next)
@@ -108,6 +124,7 @@ pub fn run(args: &ExportArgs) -> Result<()> {
 /// Writes the file, and returns its path and a line on its contents.
 pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     check_ending(args)?;
+    check_levels(args)?;
     let (gaussians, facts, config) = opened(args)?;
     let own = own_file(args);
     let out = args.out.as_ref().unwrap_or(&own);
@@ -122,7 +139,11 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
         tracing::warn!("{}: the networks are not exported, only the Gaussians", args.run.display());
     }
     let (rotation, turned) = args.rotation(&config).unwrap_or_default();
-    let gaussians = up::turned(gaussians, rotation);
+    let mut gaussians = up::turned(gaussians, rotation);
+    let division = Division { levels: args.levels, chunk: args.chunk };
+    if args.level > 0 {
+        gaussians = levels::level(&gaussians, division.cell(), args.level);
+    }
     let provenance = Provenance { rotation, facts, ..provenance(args, &config) };
     let format = match args.to {
         To::Ply => Some(Format::Ply),
@@ -130,7 +151,7 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
         To::Spz => Some(Format::Spz(spz::Version::V4)),
         To::Glb => Some(Format::Glb),
         To::Sog => Some(Format::Sog),
-        To::Html => None,
+        To::StreamedSog | To::Html => None,
     };
     match format {
         // Viewers with a fixed layout expect the coefficients of degree 3.
@@ -139,6 +160,11 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
             Format::Ply.write(&padded, &provenance, out)?;
         }
         Some(format) => format.write(&gaussians, &provenance, out)?,
+        None if args.to == To::StreamedSog => {
+            let tile = Tile::whole(&args.run, &gaussians);
+            let written = streamed::write(out, &[tile], &provenance, division)?;
+            return Ok((out.clone(), streamed_line(out, &written, &turned)));
+        }
         None => write_whole(out, page(args, &config, &gaussians, provenance)?.as_bytes())?,
     }
     let (shown, count) = (out.display().to_string(), gaussians.count);
@@ -163,6 +189,48 @@ fn check_ending(args: &ExportArgs) -> crate::Result<()> {
         return Err(Error::Usage(problem));
     }
     check_writable(out)
+}
+
+/// Refuses options of levels that the format does not have.
+fn check_levels(args: &ExportArgs) -> crate::Result<()> {
+    let is_streamed = args.to == To::StreamedSog;
+    let problem = match args {
+        ExportArgs { levels: Some(_), .. } if !is_streamed => {
+            "--levels is of --format streamed-sog; pass --level for one level of another format"
+                .to_owned()
+        }
+        ExportArgs { level: 1.., .. } if is_streamed => {
+            "--level is of formats with one level; pass --levels for the number of levels"
+                .to_owned()
+        }
+        ExportArgs { levels: Some(levels), .. } if !(1..=MAX_LEVELS).contains(levels) => {
+            format!("--levels {levels} cannot be made; ask for 1 to {MAX_LEVELS}")
+        }
+        ExportArgs { level, .. } if *level >= MAX_LEVELS => {
+            format!("--level {level} cannot be made; the coarsest is {}", MAX_LEVELS - 1)
+        }
+        ExportArgs { chunk: 0, .. } => "--chunk 0 holds no Gaussian; pass at least 1".to_owned(),
+        _ => return Ok(()),
+    };
+    Err(Error::Usage(problem))
+}
+
+/// A line on the contents of a streamed SOG.
+fn streamed_line(out: &Path, Written { counts, chunks }: &Written, turned: &str) -> String {
+    let (out, kib) = (out.display(), size_of(out).div_ceil(1024));
+    let numbers: Vec<String> = counts.iter().map(ToString::to_string).collect();
+    let (levels, numbers) = (counts.len(), numbers.join(", "));
+    format!("{out}: {levels} levels of {numbers} Gaussians in {chunks} chunks, {kib} KiB{turned}")
+}
+
+/// The bytes of the files in the folders of a folder.
+fn size_of(folder: &Path) -> u64 {
+    let size = |entry: std::fs::DirEntry| match entry.metadata() {
+        Ok(found) if found.is_dir() => size_of(&entry.path()),
+        Ok(found) => found.len(),
+        Err(_) => 0,
+    };
+    std::fs::read_dir(folder).map_or(0, |entries| entries.flatten().map(size).sum())
 }
 
 /// The model as stored, what is stated of it, and its settings.

@@ -1,4 +1,4 @@
-//! Exports of a model: SPZ, glTF, SOG, and a page with its own viewer.
+//! Exports of a model: SPZ, glTF, SOG, streamed SOG, and a page with its own viewer.
 //!
 //! Each exports the Gaussians as they are in `model.ply`: in the colours that viewers expect and with `OpenCV`'s axes,
 //! y down and z forward. The model is as bright as its targets; a dark one would show banding, as SPZ quantises colours
@@ -9,6 +9,7 @@ pub mod page;
 mod palette;
 pub mod sog;
 pub mod spz;
+pub mod streamed;
 
 use std::io::Write as _;
 use std::path::Path;

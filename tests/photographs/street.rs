@@ -117,9 +117,9 @@ fn the_command_makes_six_views_of_128x96_a_plot_unless_told_otherwise() {
     let set = dir.path().join("set");
     let line = run(&format!("synth {} --street 1", set.display()), 0).0;
     assert!(line.contains("6 views of 128x96"), "{line}");
-    let few = dir.path().join("few");
+    let other = dir.path().join("other");
     let line =
-        run(&format!("synth {} --street 2 --views 4 --width 32 --height 16", few.display()), 0).0;
+        run(&format!("synth {} --street 2 --views 4 --width 32 --height 16", other.display()), 0).0;
     assert!(line.contains("4 views of 32x16"), "{line}");
     let refused =
         run(&format!("synth {} --street 2 --fisheye", dir.path().join("none").display()), 2).1;

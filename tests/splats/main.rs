@@ -15,6 +15,7 @@ mod coverage;
 mod densify;
 mod fisheye;
 mod gradients;
+mod levels;
 mod limits;
 mod not_finite;
 mod optimizer;

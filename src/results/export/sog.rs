@@ -5,6 +5,7 @@
 //! codebooks, rotations three bytes, and the higher coefficients an index of at most 65 536 vectors.
 
 use std::io::{Cursor, Read as _, Write as _};
+use std::path::Path;
 
 use glam::Vec3;
 use image::{ExtendedColorType, ImageFormat, codecs::webp::WebPEncoder};
@@ -15,6 +16,7 @@ use zip::write::{SimpleFileOptions, ZipWriter};
 
 use super::palette::{codebook, nearest, vectors};
 use super::{GENERATOR, Provenance, raw_opacity, sigmoid, unit};
+use crate::base::output::{create_folder, write_whole};
 use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE, rest_coefficients};
 use crate::{Error, Result};
 
@@ -26,10 +28,68 @@ const SETS_PER_ROW: usize = 64;
 /// # Errors
 /// [`Error::Output`] if an image or the archive cannot be encoded.
 pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>> {
+    archive(&encoded(gaussians, provenance, &[gaussians.count]))
+}
+
+/// Writes a model as files in a folder, which is created. The Gaussians of a cell stay together, and cells keep their
+/// order; `counts` are their Gaussians.
+///
+/// # Errors
+/// [`Error::Output`] if an image cannot be encoded or a file cannot be written.
+pub(super) fn write_folder(
+    folder: &Path,
+    gaussians: &Gaussians,
+    provenance: &Provenance,
+    counts: &[usize],
+) -> Result<()> {
+    create_folder(folder)?;
+    let Encoded { meta, images } = encoded(gaussians, provenance, counts);
+    for image in &images {
+        write_whole(&folder.join(image.name), &image.webp()?)?;
+    }
+    write_whole(&folder.join(META), meta.as_bytes())
+}
+
+/// The name of the description.
+pub(super) const META: &str = "meta.json";
+
+/// A model as a description and images.
+struct Encoded {
+    meta: String,
+    images: Vec<Pixmap>,
+}
+
+/// An image of four bytes a pixel.
+struct Pixmap {
+    name: &'static str,
+    size: [usize; 2],
+    bytes: Vec<u8>,
+}
+
+impl Pixmap {
+    fn webp(&self) -> Result<Vec<u8>> {
+        let ([width, height], mut bytes) = (self.size.map(|side| side as u32), vec![]);
+        WebPEncoder::new_lossless(&mut bytes)
+            .encode(&self.bytes, width, height, ExtendedColorType::Rgba8)
+            .map_err(|error| failed(&error))?;
+        Ok(bytes)
+    }
+}
+
+fn failed(error: &dyn std::fmt::Display) -> Error {
+    Error::output("an export", format!("cannot be assembled: {error}"))
+}
+
+/// The Gaussians of each cell in the order of a Z-order curve.
+fn encoded(gaussians: &Gaussians, provenance: &Provenance, counts: &[usize]) -> Encoded {
     let (bounds, positions) = positions(gaussians);
     // Neighbours in space are neighbours in the images, which compresses better.
     let mut order: Vec<usize> = (0..gaussians.count).collect();
-    order.sort_by_key(|&i| morton(positions[i]));
+    let mut begin = 0;
+    for &count in counts {
+        order[begin..begin + count].sort_by_key(|&i| morton(positions[i]));
+        begin += count;
+    }
     let size = image_size(gaussians.count);
     let pixels = |pixel: &dyn Fn(usize) -> [u8; 4]| {
         let mut bytes: Vec<u8> = order.iter().flat_map(|&i| pixel(i)).collect();
@@ -43,12 +103,17 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
     let byte = |i: usize, shift: u32| positions[i].map(|value| (value >> shift) as u8);
     let opaque = |[r, g, b]: [u8; 3], a: u8| [r, g, b, a];
     let opacity = |i: usize| (255.0 * sigmoid(gaussians.raw_opacities()[i])).round() as u8;
-    let mut files = vec![
-        ("means_l.webp", size, pixels(&|i| opaque(byte(i, 0), 255))),
-        ("means_u.webp", size, pixels(&|i| opaque(byte(i, 8), 255))),
-        ("scales.webp", size, pixels(&|i| opaque(coded(&scales, gaussians.log_scales()[i]), 255))),
-        ("quats.webp", size, pixels(&|i| rotation(gaussians.quats()[i]))),
-        ("sh0.webp", size, pixels(&|i| opaque(coded(&colors, gaussians.dc()[i]), opacity(i)))),
+    let image = |name, size, bytes| Pixmap { name, size, bytes };
+    let mut images = vec![
+        image("means_l.webp", size, pixels(&|i| opaque(byte(i, 0), 255))),
+        image("means_u.webp", size, pixels(&|i| opaque(byte(i, 8), 255))),
+        image(
+            "scales.webp",
+            size,
+            pixels(&|i| opaque(coded(&scales, gaussians.log_scales()[i]), 255)),
+        ),
+        image("quats.webp", size, pixels(&|i| rotation(gaussians.quats()[i]))),
+        image("sh0.webp", size, pixels(&|i| opaque(coded(&colors, gaussians.dc()[i]), opacity(i)))),
     ];
     let mut lines = provenance.lines();
     lines.extend(provenance.world_line(gaussians, false));
@@ -72,7 +137,7 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
         let codes = codebook(sets.iter().copied());
         let count = sets.len() / (3 * coefficients);
         let rows = count.div_ceil(SETS_PER_ROW).max(1);
-        let mut image: Vec<u8> = sets
+        let mut codes_of_sets: Vec<u8> = sets
             .chunks_exact(3)
             .flat_map(|value| {
                 [
@@ -84,9 +149,9 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
             })
             .collect();
         let sets_size = [SETS_PER_ROW * coefficients, rows];
-        image.resize(4 * sets_size[0] * sets_size[1], 255);
-        files.push(("shN_centroids.webp", sets_size, image));
-        files.push((
+        codes_of_sets.resize(4 * sets_size[0] * sets_size[1], 255);
+        images.push(image("shN_centroids.webp", sets_size, codes_of_sets));
+        images.push(image(
             "shN_labels.webp",
             size,
             pixels(&|i| [labels[i] as u8, (labels[i] >> 8) as u8, 0, 255]),
@@ -96,7 +161,7 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         });
     }
-    archive(&meta.to_string(), &files)
+    Encoded { meta: meta.to_string(), images }
 }
 
 /// Minimum and maximum of the signed logarithm per axis, and each position between them in 16 bits.
@@ -153,10 +218,7 @@ fn image_size(count: usize) -> [usize; 2] {
     [width, count.div_ceil(width).max(1)]
 }
 
-fn archive(meta: &str, files: &[(&str, [usize; 2], Vec<u8>)]) -> Result<Vec<u8>> {
-    let failed = |error: &dyn std::fmt::Display| {
-        Error::output("an export", format!("cannot be assembled: {error}"))
-    };
+fn archive(Encoded { meta, images }: &Encoded) -> Result<Vec<u8>> {
     // Stored, since the images are compressed.
     let stored = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
     let mut zip = ZipWriter::new(Cursor::new(vec![]));
@@ -164,13 +226,9 @@ fn archive(meta: &str, files: &[(&str, [usize; 2], Vec<u8>)]) -> Result<Vec<u8>>
         zip.start_file(name, stored).map_err(|error| failed(&error))?;
         zip.write_all(bytes).map_err(|error| failed(&error))
     };
-    add("meta.json", meta.as_bytes())?;
-    for (name, [width, height], pixels) in files {
-        let mut bytes = vec![];
-        WebPEncoder::new_lossless(&mut bytes)
-            .encode(pixels, *width as u32, *height as u32, ExtendedColorType::Rgba8)
-            .map_err(|error| failed(&error))?;
-        add(name, &bytes)?;
+    add(META, meta.as_bytes())?;
+    for image in images {
+        add(image.name, &image.webp()?)?;
     }
     Ok(zip.finish().map_err(|error| failed(&error))?.into_inner())
 }
@@ -220,7 +278,7 @@ const MOST: u64 = 1 << 30;
 pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     let mut zip =
         ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is not a SOG: {error}"))?;
-    let meta = bytes_of(&mut zip, "meta.json")?;
+    let meta = bytes_of(&mut zip, META)?;
     let meta: Value =
         serde_json::from_slice(&meta).map_err(|error| format!("meta.json: {error}"))?;
     if meta["version"] != 2 {
@@ -402,7 +460,8 @@ mod tests {
             edited[place] ^= 0x41;
             drop(decode(&edited));
         }
-        let problem = |meta: &str| decode(&archive(meta, &[]).unwrap()).unwrap_err();
+        let of_meta = |meta: &str| Encoded { meta: meta.to_owned(), images: vec![] };
+        let problem = |meta: &str| decode(&archive(&of_meta(meta)).unwrap()).unwrap_err();
         assert_eq!(problem(r#"{"version":1}"#), "is SOG of version 1; version 2 is read");
         assert!(problem(r#"{"version":2,"count":1}"#).contains("missing field `means`"));
         assert!(problem("{").starts_with("meta.json: "));

@@ -88,26 +88,58 @@ impl Gaussians {
         self.count = kept;
     }
 
+    /// These Gaussians, in this order.
+    #[cfg(feature = "io")]
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn select(&self, places: &[u32]) -> Self {
+        let mut some = Self::zeros(places.len(), self.shape);
+        some.origin = self.origin;
+        for spec in &ATTRIBUTES {
+            let from = &self.parameters[self.plane(spec.attribute)];
+            let width = from.len() / self.count.max(1);
+            let plane = some.plane(spec.attribute);
+            let rows = some.parameters[plane].chunks_exact_mut(width.max(1));
+            for (to, &place) in rows.zip(places) {
+                to.copy_from_slice(&from[width * place as usize..][..width]);
+            }
+        }
+        some
+    }
+
+    /// Gaussians of one shape, one after the other, at least one set of them; the positions of all stay where they are
+    /// in the world, relative to the first one's origin.
+    #[cfg(feature = "io")]
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn concatenated(parts: &[&Self]) -> Self {
+        let (shape, origin) = (parts[0].shape, parts[0].origin);
+        let mut all = Self::zeros(parts.iter().map(|part| part.count).sum(), shape);
+        all.origin = origin;
+        for spec in &ATTRIBUTES {
+            let mut at = all.plane(spec.attribute).start;
+            for part in parts {
+                debug_assert_eq!(part.shape, shape, "planes of two shapes");
+                let plane = &part.parameters[part.plane(spec.attribute)];
+                all.parameters[at..at + plane.len()].copy_from_slice(plane);
+                at += plane.len();
+            }
+        }
+        let mut at = 0;
+        for part in parts {
+            let offset = part.origin - origin;
+            if offset != DVec3::ZERO {
+                for mean in &mut all.means_mut()[at..at + part.count] {
+                    *mean = (mean.as_dvec3() + offset).as_vec3();
+                }
+            }
+            at += part.count;
+        }
+        all
+    }
+
     /// Appends Gaussians of the same shape; the positions of both stay where they are in the world.
     #[cfg(feature = "io")]
     pub(crate) fn append(&mut self, other: &Self) {
-        debug_assert_eq!(self.shape, other.shape, "planes of two shapes");
-        let offset = other.origin - self.origin;
-        let mut both = Self::zeros(self.count + other.count, self.shape);
-        both.origin = self.origin;
-        for spec in &ATTRIBUTES {
-            let plane = both.plane(spec.attribute);
-            let (first, second) =
-                both.parameters[plane].split_at_mut(self.plane(spec.attribute).len());
-            first.copy_from_slice(&self.parameters[self.plane(spec.attribute)]);
-            second.copy_from_slice(&other.parameters[other.plane(spec.attribute)]);
-        }
-        if offset != DVec3::ZERO {
-            for mean in &mut both.means_mut()[self.count..] {
-                *mean = (mean.as_dvec3() + offset).as_vec3();
-            }
-        }
-        *self = both;
+        *self = Self::concatenated(&[&*self, other]);
     }
 
     /// The position of a Gaussian in the world.
@@ -127,6 +159,14 @@ impl Gaussians {
             (nearest[1..].iter().map(|(squared, _)| squared).sum::<f64>() / 3.0).sqrt()
         };
         positions.par_iter().map(distance).collect()
+    }
+
+    /// The places of the `COUNT` Gaussians nearest to each, itself among them; there can be fewer.
+    #[cfg(feature = "io")]
+    pub(crate) fn nearest_of_each<const COUNT: usize>(&self) -> Vec<Vec<u32>> {
+        let positions: Vec<DVec3> = self.means().iter().map(|mean| mean.as_dvec3()).collect();
+        let neighbours = Neighbours::new(positions.clone());
+        positions.iter().map(|place| neighbours.nearest_places::<COUNT>(*place)).collect()
     }
 
     /// Opacities after the sigmoid.
@@ -175,6 +215,17 @@ mod tests {
         }
         some.retain(&[false; 5]);
         assert!(some.parameters.is_empty() && some.count == 0);
+    }
+
+    #[test]
+    fn those_that_are_selected_are_in_the_order_of_the_selection() {
+        let whole = Gaussians { origin: DVec3::new(1e6, 0.0, 0.0), ..drawn(9, 1) };
+        let some = whole.select(&[7, 0, 0, 8]);
+        assert_eq!((some.count, some.origin), (4, whole.origin));
+        for (index, from) in [7, 0, 0, 8].into_iter().enumerate() {
+            assert_eq!(row(&some, index), row(&whole, from), "{from}");
+        }
+        assert_eq!(drawn(0, 1).select(&[]).count, 0);
     }
 
     #[test]

@@ -7,14 +7,16 @@ use glam::DVec3;
 /// A balanced k-d tree without nodes: the median of every range splits the others along the axis of their largest
 /// extent; those before it are not above it, those after it not below it.
 pub(super) struct Neighbours {
-    positions: Vec<DVec3>,
+    /// With the place of each in the list that was given.
+    positions: Vec<(DVec3, u32)>,
     /// The axis along which each position splits its range.
     axes: Vec<usize>,
 }
 
 impl Neighbours {
     /// All positions must be finite.
-    pub(super) fn new(mut positions: Vec<DVec3>) -> Self {
+    pub(super) fn new(positions: Vec<DVec3>) -> Self {
+        let mut positions: Vec<(DVec3, u32)> = positions.into_iter().zip(0..).collect();
         let mut axes = vec![0; positions.len()];
         split(&mut positions, &mut axes);
         Self { positions, axes }
@@ -22,18 +24,31 @@ impl Neighbours {
 
     /// The nearest positions to `place`, sorted by squared distance; infinity where there are no more.
     pub(super) fn nearest<const COUNT: usize>(&self, place: DVec3) -> [(f64, DVec3); COUNT] {
-        let mut found = [(f64::INFINITY, DVec3::INFINITY); COUNT];
+        self.find(place).map(|(squared, slot)| {
+            (squared, self.positions.get(slot).map_or(DVec3::INFINITY, |(position, _)| *position))
+        })
+    }
+
+    /// The places of the nearest positions in the list that was given; there can be fewer.
+    pub(super) fn nearest_places<const COUNT: usize>(&self, place: DVec3) -> Vec<u32> {
+        let found = self.find::<COUNT>(place).into_iter();
+        found.filter_map(|(_, slot)| Some(self.positions.get(slot)?.1)).collect()
+    }
+
+    /// Squared distances and slots, sorted; beyond the last slot where there are no more.
+    fn find<const COUNT: usize>(&self, place: DVec3) -> [(f64, usize); COUNT] {
+        let mut found = [(f64::INFINITY, usize::MAX); COUNT];
         self.search(0..self.positions.len(), place, &mut found);
         found
     }
 
-    fn search(&self, range: Range<usize>, place: DVec3, found: &mut [(f64, DVec3)]) {
+    fn search(&self, range: Range<usize>, place: DVec3, found: &mut [(f64, usize)]) {
         if range.is_empty() {
             return;
         }
         let middle = range.start + range.len() / 2;
-        let position = self.positions[middle];
-        let mut candidate = (place.distance_squared(position), position);
+        let (position, _) = self.positions[middle];
+        let mut candidate = (place.distance_squared(position), middle);
         for slot in found.iter_mut() {
             if candidate.0 < slot.0 {
                 std::mem::swap(slot, &mut candidate);
@@ -51,13 +66,14 @@ impl Neighbours {
     }
 }
 
-fn split(positions: &mut [DVec3], axes: &mut [usize]) {
-    let Some(&first) = positions.first() else { return };
-    let bounds = |(low, high): (DVec3, DVec3), &place: &DVec3| (low.min(place), high.max(place));
+fn split(positions: &mut [(DVec3, u32)], axes: &mut [usize]) {
+    let Some(&(first, _)) = positions.first() else { return };
+    let bounds =
+        |(low, high): (DVec3, DVec3), &(place, _): &(DVec3, u32)| (low.min(place), high.max(place));
     let (low, high) = positions.iter().fold((first, first), bounds);
     let axis = (high - low).max_position();
     let middle = positions.len() / 2;
-    positions.select_nth_unstable_by(middle, |a, b| a[axis].total_cmp(&b[axis]));
+    positions.select_nth_unstable_by(middle, |(a, _), (b, _)| a[axis].total_cmp(&b[axis]));
     axes[middle] = axis;
     let ((below, above), (axes_below, axes_above)) =
         (positions.split_at_mut(middle), axes.split_at_mut(middle));
@@ -85,6 +101,11 @@ mod tests {
                     let mut expected: Vec<f64> = squared.chain([f64::INFINITY; 4]).collect();
                     expected.sort_by(f64::total_cmp);
                     let found = tree.nearest::<4>(place);
+                    let places = tree.nearest_places::<4>(place);
+                    assert_eq!(places.len(), positions.len().min(4));
+                    for (index, (_, position)) in places.into_iter().zip(found) {
+                        assert_eq!(positions[index as usize], position, "{count}, {grid}");
+                    }
                     assert_eq!(found.map(|(squared, _)| squared), expected[..4], "{count}, {grid}");
                     for (squared, position) in found.into_iter().filter(|found| found.0.is_finite())
                     {

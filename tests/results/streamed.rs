@@ -1,0 +1,230 @@
+//! Streamed SOG: its index, its chunks, and what is refused.
+
+use std::fs;
+use std::io::{Cursor, Write as _};
+use std::path::Path;
+
+use glam::DVec3;
+use nightsplat::base::random::Stream;
+use nightsplat::results::export::Provenance;
+use nightsplat::results::export::streamed::{self, Division, INDEX, Tile, Written};
+use nightsplat::splats::levels::level;
+use nightsplat::splats::model::Model;
+use nightsplat::splats::scene::{Gaussians, ply};
+use serde_json::Value;
+use zip::write::{SimpleFileOptions, ZipWriter};
+
+use crate::common::command::{refused, succeed};
+
+/// Tiles of 300 and of 130 Gaussians side by side, each with an origin of its own.
+fn tiles() -> [Gaussians; 2] {
+    [(300, 0.0), (130, 8.0)].map(|(count, x)| {
+        let mut gaussians = Gaussians::zeros(count, 1);
+        let stream = Stream::new(count as u64, 3);
+        for (index, value) in (0..).zip(&mut gaussians.parameters) {
+            *value = (stream.uniform(index) * 2.0 - 1.0) as f32;
+        }
+        gaussians.means_mut().iter_mut().for_each(|mean| *mean *= 4.0);
+        gaussians.log_scales_mut().iter_mut().for_each(|scale| *scale -= 2.0);
+        gaussians.origin = DVec3::new(1000.0 + x, -5.0, 0.0);
+        gaussians
+    })
+}
+
+fn written(folder: &Path, models: &[Gaussians], division: Division) -> nightsplat::Result<Written> {
+    let name = |index: usize| Path::new("model").join(index.to_string());
+    let tiles: Vec<Tile<'_>> =
+        models.iter().enumerate().map(|(index, model)| Tile::whole(&name(index), model)).collect();
+    streamed::write(folder, &tiles, &Provenance::default(), division)
+}
+
+fn index(folder: &Path) -> Value {
+    serde_json::from_slice(&fs::read(folder.join(INDEX)).unwrap()).unwrap()
+}
+
+/// The Gaussians of a chunk, given by the path of its description.
+fn chunk(folder: &Path, meta: &str) -> Gaussians {
+    let mut zip = ZipWriter::new(Cursor::new(vec![]));
+    for entry in fs::read_dir(folder.join(meta).parent().unwrap()).unwrap() {
+        let entry = entry.unwrap();
+        let name = entry.file_name().into_string().unwrap();
+        zip.start_file(name, SimpleFileOptions::default()).unwrap();
+        zip.write_all(&fs::read(entry.path()).unwrap()).unwrap();
+    }
+    let file = tempfile::NamedTempFile::new().unwrap();
+    fs::write(file.path(), zip.finish().unwrap().into_inner()).unwrap();
+    Model::load(file.path()).unwrap().gaussians
+}
+
+fn corner(node: &Value, which: &str) -> DVec3 {
+    let numbers = node["bound"][which].as_array().unwrap();
+    DVec3::from_array([0, 1, 2].map(|axis| numbers[axis].as_f64().unwrap()))
+}
+
+/// The leaves, from the left; asserts that every other node has two children within its box.
+fn leaves(node: &Value) -> Vec<&Value> {
+    let Some(children) = node["children"].as_array() else { return vec![node] };
+    assert!(children.len() == 2 && node.get("lods").is_none(), "{node}");
+    for child in children {
+        assert!(corner(child, "min").cmpge(corner(node, "min")).all());
+        assert!(corner(child, "max").cmple(corner(node, "max")).all());
+    }
+    children.iter().flat_map(leaves).collect()
+}
+
+/// The largest distance, and the largest differences of scales, opacities and colours, of Gaussians and their nearest.
+fn errors(own: &Gaussians, other: &Gaussians) -> [f32; 4] {
+    (0..own.count).fold([0.0; 4], |most, i| {
+        let offset = (own.origin - other.origin).as_vec3();
+        let distance = |j: &usize| (own.means()[i] + offset).distance(other.means()[*j]);
+        let j = (0..other.count).min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap();
+        let opacity =
+            |model: &Gaussians, index: usize| 1.0 / (1.0 + (-model.raw_opacities()[index]).exp());
+        let error = [
+            distance(&j),
+            (own.log_scales()[i] - other.log_scales()[j]).abs().max_element(),
+            (opacity(own, i) - opacity(other, j)).abs(),
+            (own.dc()[i] - other.dc()[j]).abs().max_element(),
+        ];
+        [0, 1, 2, 3].map(|k| most[k].max(error[k]))
+    })
+}
+
+#[test]
+fn the_index_finds_every_gaussian_of_every_level_once_and_chunks_are_our_levels() {
+    let (folder, models) = (tempfile::tempdir().unwrap(), tiles());
+    let division = Division { levels: Some(3), chunk: 160 };
+    let Written { counts, chunks } = written(folder.path(), &models, division).unwrap();
+    // Cells of at most 40: eight of 37 or 38, and four of 32 or 33.
+    assert_eq!(counts, [430, 4 * 19 + 4 * 19 + 2 * 16 + 2 * 17, 8 * 10 + 2 * 8 + 2 * 9]);
+    let index = index(folder.path());
+    let names = index["filenames"].as_array().unwrap();
+    assert_eq!((names.len(), index["version"].as_u64()), (chunks, Some(1)));
+    assert_eq!(index["count"], counts.iter().sum::<usize>());
+    assert_eq!(index["counts"], serde_json::json!(counts));
+    assert_eq!(index["lodLevels"], 3);
+    let leaves = leaves(&index["tree"]);
+    assert_eq!(leaves.len(), 12);
+
+    let mut ends = vec![0; names.len()];
+    let mut found: Vec<Vec<Gaussians>> = vec![vec![]; 3];
+    for leaf in &leaves {
+        let errors: Vec<f64> = leaf["errors"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|error| error.as_f64().unwrap())
+            .collect();
+        assert!(errors.len() == 3 && errors[0] == 0.0 && errors.is_sorted(), "{errors:?}");
+        for (level, found) in found.iter_mut().enumerate() {
+            let place = &leaf["lods"][level.to_string()];
+            let [file, offset, count] =
+                ["file", "offset", "count"].map(|key| place[key].as_u64().unwrap() as usize);
+            let name = names[file].as_str().unwrap();
+            assert!(name.starts_with(&format!("{level}_")), "{name}");
+            assert_eq!(offset, ends[file], "{name}: a gap");
+            ends[file] += count;
+            let own: Vec<u32> = (offset as u32..(offset + count) as u32).collect();
+            let cell = chunk(folder.path(), name).select(&own);
+            for mean in cell.means() {
+                let mean = mean.as_dvec3();
+                assert!(
+                    mean.cmpge(corner(leaf, "min")).all() && mean.cmple(corner(leaf, "max")).all()
+                );
+            }
+            found.push(cell);
+        }
+    }
+    for (name, end) in names.iter().zip(ends) {
+        assert_eq!(chunk(folder.path(), name.as_str().unwrap()).count, end, "{name}");
+        assert!(end <= division.chunk);
+    }
+    for (k, cells) in found.iter().enumerate() {
+        let all = Gaussians::concatenated(&cells.iter().collect::<Vec<_>>());
+        assert_eq!(all.origin, models[0].origin);
+        for model in &models {
+            let errors = errors(&level(model, division.cell(), k), &all);
+            let most = [1e-3, 0.1, 0.003, 0.05];
+            assert!(errors.iter().zip(most).all(|(error, most)| *error < most), "{k}: {errors:?}");
+        }
+    }
+}
+
+/// All files of a folder and its folders, by name.
+fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
+    let mut all = vec![];
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_string_lossy().into_owned();
+        match path.is_dir() {
+            true => all
+                .extend(files(&path).into_iter().map(|(own, bytes)| (name.clone() + &own, bytes))),
+            false => all.push((name, fs::read(&path).unwrap())),
+        }
+    }
+    all.sort();
+    all
+}
+
+#[test]
+fn the_same_tiles_are_the_same_bytes_and_replace_an_earlier_export() {
+    let [first, second] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+    let division = Division { levels: None, chunk: 100 };
+    let models = tiles();
+    written(first.path(), &models, division).unwrap();
+    written(second.path(), &models[..1], Division { chunk: 16, ..division }).unwrap();
+    written(second.path(), &models, division).unwrap();
+    assert!(files(first.path()) == files(second.path()));
+    // 430 Gaussians are 54 on the fourth level.
+    assert_eq!(index(first.path())["lodLevels"], 4);
+}
+
+#[test]
+fn a_folder_with_anything_else_and_tiles_that_changed_are_refused_and_nothing_is_lost() {
+    let folder = tempfile::tempdir().unwrap();
+    let [model, _] = tiles();
+    let division = Division::default();
+    fs::write(folder.path().join("letter.txt"), "mine").unwrap();
+    let problem =
+        written(folder.path(), std::slice::from_ref(&model), division).unwrap_err().to_string();
+    assert!(problem.contains("letter.txt") && files(folder.path()).len() == 1, "{problem}");
+    fs::remove_file(folder.path().join("letter.txt")).unwrap();
+
+    let mut tile = Tile::whole(Path::new("0007.ply"), &model);
+    tile.count += 1;
+    let provenance = Provenance::default();
+    let problem = streamed::write(folder.path(), &[tile], &provenance, division).unwrap_err();
+    assert!(problem.to_string().contains("0007.ply: has 300 Gaussians, not 301"), "{problem}");
+    assert!(!folder.path().join(INDEX).exists());
+    let problem = written(folder.path(), &[Gaussians::zeros(0, 1)], division).unwrap_err();
+    assert!(problem.to_string().contains("without Gaussians"), "{problem}");
+}
+
+#[test]
+fn the_command_writes_levels_and_refuses_options_of_other_formats() {
+    let folder = tempfile::tempdir().unwrap();
+    let [model, _] = tiles();
+    let root = folder.path().display();
+    ply::save(&model, folder.path().join("a.ply")).unwrap();
+    let line =
+        succeed(&format!("export {root}/a.ply --format streamed-sog --levels 2 --chunk 160"));
+    assert!(line.contains("2 levels of 300, 152 Gaussians in 3 chunks"), "{line}");
+    assert_eq!(
+        index(&folder.path().join("a.streamed-sog"))["counts"],
+        serde_json::json!([300, 152])
+    );
+
+    succeed(&format!("export {root}/a.ply --format ply --level 1 --chunk 160 --out {root}/b.ply"));
+    let half = ply::load(folder.path().join("b.ply")).unwrap();
+    assert_eq!(half, level(&model, 40, 1).with_sh_degree(3));
+    for (options, part) in [
+        ("--format sog --levels 2", "--level"),
+        ("--format streamed-sog --level 1", "--levels"),
+        ("--format streamed-sog --levels 0", "--levels 0"),
+        ("--format sog --level 16", "--level 16"),
+        ("--format sog --chunk 0", "--chunk 0"),
+        ("--format streamed-sog --out a.sog", "--format sog"),
+    ] {
+        refused(&format!("export {root}/a.ply {options}"), 2, &[part]);
+    }
+}
