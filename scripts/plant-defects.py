@@ -118,7 +118,7 @@ DEFECTS = [
     ("guard: a gradient that is not finite raises a flag", "shaders-glsl/splats/render/project_backward.comp",
      "if (bits >= 0x7f800000u) {", "if (false) {", "--test splats not_finite::"),
     ("guard: alpha has a largest value", "shaders-glsl/splats/render/blend_forward.comp",
-     "min(ALPHA_MAX, opacity * exp(-sigma))", "opacity * exp(-sigma)", "--test splats golden"),
+     "min(ALPHA_MAX, opacity * exp(exponent))", "opacity * exp(exponent)", "--test splats golden"),
     ("guard: a pixel ends before it is opaque", "shaders-glsl/splats/render/blend_forward.comp",
      "bool is_done = after < TRANSMITTANCE_MIN;", "bool is_done = after < 0.0;", "--test splats transmittance"),
     ("guard: infinite and NaN gradients count as zero", "shaders-glsl/splats/optimizer/adam.comp",

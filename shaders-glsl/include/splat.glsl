@@ -34,17 +34,17 @@ struct ProjectedSplat {
     float opacity;      // after the sigmoid
 };
 
-// The exponent of the Gaussian, sign reversed, along a column of pixels that is `x` from its mean: the coefficients of
-// a polynomial in y. alpha = opacity exp(-sigma), sigma = (conic.x x x + conic.z y y) / 2 + conic.y x y.
-vec3 sigma_in_column(vec3 conic, float x) {
-    precise vec3 by_power = vec3(0.5 * conic.x * x * x, conic.y * x, 0.5 * conic.z);
+// The exponent of the Gaussian, -sigma, along a column of pixels that is `x` from its mean: the coefficients of a
+// polynomial in y. alpha = opacity exp(-sigma), sigma = (conic.x x x + conic.z y y) / 2 + conic.y x y.
+vec3 exponent_in_column(vec3 conic, float x) {
+    precise vec3 by_power = vec3(-0.5 * conic.x * x * x, -conic.y * x, -0.5 * conic.z);
     return by_power;
 }
 
 // The exponent at `y` from the mean. Both passes round it alike, and so blend the same splats.
-float sigma_at(vec3 by_power, float y) {
-    precise float sigma = fma(fma(by_power.z, y, by_power.y), y, by_power.x);
-    return sigma;
+float exponent_at(vec3 by_power, float y) {
+    precise float exponent = fma(fma(by_power.z, y, by_power.y), y, by_power.x);
+    return exponent;
 }
 
 // Twice the sigma at which alpha falls to 1/255, slightly enlarged so that rounding never loses a pixel.

@@ -308,6 +308,7 @@ fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
     let mut render = gpu.zeros("render", 3 * pixels).unwrap();
     let mut transmittances = gpu.zeros("transmittances", pixels).unwrap();
     let limits = gpu.zeros("limits", 1).unwrap();
+    let mut segment_states = gpu.zeros("segment_states", 1).unwrap();
     gpu.run("fold", |pass| {
         let buffers = blend_forward::Buffers {
             counts: counts.slice(),
@@ -321,6 +322,7 @@ fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
             render: render.slice_mut(),
             transmittances: transmittances.slice_mut(),
             limits: limits.slice(),
+            segment_states: segment_states.slice_mut(),
         };
         pass.dispatch(&pipeline, &params, buffers, Threads::Workgroups([ROWS * COLUMNS, 1, 1]))
     })
