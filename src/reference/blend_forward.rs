@@ -141,9 +141,9 @@ fn segment_starts(run: UVec2, count: u32, segment: u32) -> Vec<(usize, usize)> {
     if segment == 0 { vec![] } else { starts.map(place).collect() }
 }
 
-/// Visits the state of every pixel of a tile before every segment: the list, the number of its splats before the segment,
-/// the centre of the pixel, `None` outside the image, and the index of its transmittance; its channels follow at a
-/// distance of a tile's pixels.
+/// Visits the state of every pixel of a tile before every segment: the list, the number of its splats before the
+/// segment, the centre of the pixel, `None` outside the image, and the index of its transmittance; its channels follow
+/// at a distance of a tile's pixels.
 fn for_each_state(
     params: &Params,
     constants: &Constants,
@@ -256,13 +256,13 @@ impl Reference for Kernel {
         let mut states = vec![0.0; slices.segment_states.len()];
         for_each_state(params, constants, &slices, |list, start, center, at| {
             let (seen, alpha_max) = (&list.splats[..start], constants.alpha_max.into());
-            let error =
-                center.map(|center| PixelModel::new(seen, center, alpha_max, tile_size).error);
+            let model = center.map(|center| PixelModel::new(seen, center, alpha_max, tile_size));
             let is_done = center.is_none_or(|center| is_done(seen, center, alpha_max));
+            states[at] = model.as_ref().map_or(0.0, |model| model.error);
+            // Of a pixel that is done, or is by another rounding, the transmittance alone is defined.
+            let is_defined = !is_done && model.is_none_or(|model| !model.is_fragile);
             let largest = list.largest_color(&[]);
-            states[at] = error.unwrap_or(0.0);
-            // Of a pixel that is done the transmittance alone is defined.
-            let of_channels = if is_done { f64::INFINITY } else { states[at] * largest };
+            let of_channels = if is_defined { states[at] * largest } else { f64::INFINITY };
             (1..=constants.channels as usize).for_each(|c| states[at + c * stride] = of_channels);
         });
         Tolerances {

@@ -6,6 +6,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
+use glam::DVec3;
 use nightsplat::Error;
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::{Defect, gpu, gpu_with, is_checked, with_defect};
@@ -16,7 +17,9 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
 use nightsplat::photographs::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::packed_sh::StorageFormat;
+use nightsplat::splats::scene::{Features, Shape};
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
 use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 
@@ -252,6 +255,30 @@ fn the_passes_of_long_runs_agree_with_their_references_in_segments() {
             assert!((whole - segments).abs() <= 1e-5 * largest, "{tile}: {whole} {segments}");
         }
         assert_eq!(whole.visit_counts, segments.visit_counts);
+    }
+}
+
+/// Two tiles with a run each, of which the second starts at a block's first intersection or within it; no pixel ends.
+#[test]
+fn runs_of_whole_segments_and_of_one_splat_more_or_less_agree_with_their_references() {
+    let length = gpu().properties().subgroup_size.max(16);
+    for count in [length - 1, length, length + 1, 2 * length, 2 * length + 1] {
+        let shape = Shape { sh_degree: 0, features: Features::NONE };
+        let mut setup = Setup::new(count as usize, [32, 16], shape, 7);
+        setup.settings.tile = Some(tile_of(([16, 16], 1)));
+        for i in 0..setup.count {
+            let faint = Gaussian { log_scale: DVec3::ZERO, raw_opacity: -3.0, ..setup.get(i) };
+            setup.set(i, &faint);
+        }
+        assert_eq!(setup.render().renderer.intersections().unwrap(), 2 * count);
+        let [whole, segments] = [0, length].map(|segment| {
+            setup.segment = Some(segment);
+            assert_passes_agree(&setup).parameters
+        });
+        let largest = whole.iter().fold(0.0f32, |most, d| most.max(d.abs()));
+        for (whole, segments) in whole.iter().zip(&segments) {
+            assert!((whole - segments).abs() <= 1e-5 * largest, "{count}: {whole} {segments}");
+        }
     }
 }
 

@@ -106,7 +106,8 @@ void main() [[subgroup_uniform_control_flow]] {
             uint pixel = g * SUBGROUP_SIZE;
             transmittance[g] = segment_states[segment_state(block, 0) + pixel];
             [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                if (c < SHAPING_CHANNELS) light[g] -= segment_states[segment_state(block, 1 + c) + pixel] * d_pixel[g][c];
+                if (c < SHAPING_CHANNELS)
+                    light[g] -= segment_states[segment_state(block, 1 + c) + pixel] * d_pixel[g][c];
             }
         }
     }

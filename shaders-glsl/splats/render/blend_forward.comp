@@ -140,8 +140,8 @@ void main() [[subgroup_uniform_control_flow]] {
 
     if (SEGMENT != 0) {
         // In segments after the end every pixel is done.
-        uint done = first - range.x;
-        for (uint start = range.x + max((done + SEGMENT - 1) / SEGMENT, 1) * SEGMENT; start < range.y; start += SEGMENT) {
+        uint segments = max((first - range.x + SEGMENT - 1) / SEGMENT, 1);
+        for (uint start = range.x + segments * SEGMENT; start < range.y; start += SEGMENT) {
             [[unroll]] for (uint g = 0; g < GROUPS; g++) {
                 [[unroll]] for (uint value = 0; value <= CHANNELS; value++)
                     segment_states[segment_state(start / SEGMENT, value) + g * SUBGROUP_SIZE] = 0.0;

@@ -191,7 +191,7 @@ impl RenderBuffers {
         let records = gpu.uninit("gradient_records", self.record_floats() * capacity)?;
         let tiles = gpu.uninit("tiles", capacity)?;
         let intersection_ids = gpu.uninit("intersection_ids", capacity)?;
-        let states = gpu.uninit("segment_states", self.state_floats(capacity).max(1))?;
+        let states = gpu.uninit("segment_states", self.state_floats(capacity))?;
         self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
         (self.tiles, self.intersection_ids) = (tiles, intersection_ids);
         self.segment_states = states;
@@ -213,8 +213,7 @@ impl RenderBuffers {
             self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
             self.gradient_records =
                 gpu.uninit("gradient_records", self.record_floats() * capacity)?;
-            let states = self.state_floats(capacity).max(1);
-            self.segment_states = gpu.uninit("segment_states", states)?;
+            self.segment_states = gpu.uninit("segment_states", self.state_floats(capacity))?;
             // Its length says that the others are there.
             self.tiles = gpu.uninit("tiles", capacity)?;
         }
@@ -230,18 +229,15 @@ impl RenderBuffers {
 
     /// Bytes per intersection.
     pub(super) fn bytes_per_intersection(&self) -> usize {
-        let state = self.segments.floats(self.channels).div_ceil(self.segments.length.max(1));
+        let Segments { length, state } = self.segments;
+        let state = if length == 0 { 0 } else { state.div_ceil(length) };
         3 * size_of::<u32>() + (self.record_floats() + state as usize) * size_of::<f32>()
     }
 
-    /// The floats of the states of segments.
+    /// The floats of the states of segments, or one that is bound in their place.
     fn state_floats(&self, capacity: usize) -> usize {
-        match self.segments.length {
-            0 => 0,
-            length => {
-                capacity.div_ceil(length as usize) * self.segments.floats(self.channels) as usize
-            }
-        }
+        let blocks = self.segments.blocks(capacity as u32) as usize;
+        (blocks * self.segments.state as usize).max(1)
     }
 
     /// The floats of a gradient record, in vectors of four; 0 without gradients.
@@ -256,11 +252,9 @@ impl RenderBuffers {
     pub(super) fn max_intersections(&self, gpu: &Gpu) -> u32 {
         let record = (self.record_floats() * size_of::<f32>()).max(size_of::<u32>()) as u64;
         let bindable = gpu.properties().max_storage_buffer_range;
-        let states = u64::from(self.segments.floats(self.channels)) * size_of::<f32>() as u64;
-        let in_segments = match self.segments.length {
-            0 => u64::MAX,
-            length => bindable / states.max(1) * u64::from(length),
-        };
+        let Segments { length, state } = self.segments;
+        let state = u64::from(state) * size_of::<f32>() as u64;
+        let in_segments = if length == 0 { u64::MAX } else { bindable / state * u64::from(length) };
         (bindable / record).min(in_segments).min(u32::MAX.into()) as u32
     }
 
@@ -274,16 +268,12 @@ impl RenderBuffers {
 pub(super) struct Segments {
     /// Splats; 0: a run has one segment.
     pub(super) length: u32,
-    /// Pixels of a tile.
-    pub(super) pixels: u32,
+    /// Floats of the state of a tile's pixels before a segment: transmittance and channels. Depths are not blended
+    /// backward and have no part in it.
+    pub(super) state: u32,
 }
 
 impl Segments {
-    /// The floats of the state before a segment.
-    fn floats(self, channels: usize) -> u32 {
-        if self.length == 0 { 0 } else { self.pixels * (channels as u32 + 1) }
-    }
-
     /// The blocks of `intersections`, each of which may have the start of a segment that is not the first of its tile.
     pub(super) fn blocks(self, intersections: u32) -> u32 {
         if self.length == 0 { 0 } else { intersections.div_ceil(self.length) }
@@ -323,7 +313,7 @@ mod tests {
     fn gaussians_and_intersections_take_the_bytes_that_are_foreseen() {
         let gpu = Gpu::new(&crate::gpu::DeviceChoice::Best).unwrap();
         for channels in [3, 11] {
-            let segments = Segments { length: 64, pixels: 256 };
+            let segments = Segments { length: 64, state: 256 * (channels as u32 + 1) };
             let mut frame = RenderBuffers::new(&gpu, channels, Purpose::Train, segments).unwrap();
             let before = gpu.memory_in_use();
             let (gaussians, intersections) = (100_000, 30_000);

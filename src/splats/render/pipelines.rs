@@ -76,7 +76,8 @@ impl Renderer {
                 segment,
             })?),
         };
-        let segments = Segments { length: segment, pixels: tile_width * tile_height };
+        let state = tile_width * tile_height * (channels + 1);
+        let segments = Segments { length: segment, state };
         let depth_sort = RadixSort::new(gpu, 0)?;
         let tile_sort = depth_sort.another()?;
         Ok(Self {
