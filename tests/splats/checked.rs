@@ -6,7 +6,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use nightsplat::Error;
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::{Defect, gpu, gpu_with, is_checked, with_defect};
@@ -267,8 +267,10 @@ fn runs_of_whole_segments_and_of_one_splat_more_or_less_agree_with_their_referen
         let mut setup = Setup::new(count as usize, [32, 16], shape, 7);
         setup.settings.tile = Some(tile_of(([16, 16], 1)));
         for i in 0..setup.count {
-            let faint = Gaussian { log_scale: DVec3::ZERO, raw_opacity: -3.0, ..setup.get(i) };
-            setup.set(i, &faint);
+            let mean =
+                setup.at_pixel(DVec2::new(14.0 + (i % 5) as f64, 8.0), 1.0 + 0.01 * i as f64);
+            let log_scale = DVec3::ZERO;
+            setup.set(i, &Gaussian { mean, log_scale, raw_opacity: -3.0, ..setup.get(i) });
         }
         assert_eq!(setup.render().renderer.intersections().unwrap(), 2 * count);
         let [whole, segments] = [0, length].map(|segment| {
