@@ -77,6 +77,23 @@ ivec2 splat_columns(ProjectedSplat splat, float top, float bottom) {
     return ivec2(int(ceil(left - 0.5)), int(floor(right - 0.5)));
 }
 
+// The shear, the half width at the height of the mean, and 1 / half_extent.y, for `splat_columns_of_row`.
+vec3 splat_outline(ProjectedSplat splat) {
+    float width = sqrt(splat_level(splat.opacity) / splat.conic.x);
+    return vec3(-splat.conic.y / splat.conic.x, width, 1.0 / splat.half_extent.y);
+}
+
+// `splat_columns` of one row of pixels, as numbers; what all rows have in common is in `outline`.
+vec2 splat_columns_of_row(ProjectedSplat splat, vec3 outline, float row) {
+    float y = row + 0.5 - splat.mean2d.y;
+    float height = y * outline.z;
+    float half_width = outline.y * sqrt(max(0.0, 1.0 - height * height)) + 0.01;
+    // Of no width where the row misses the ellipse.
+    half_width = abs(y) <= splat.half_extent.y ? half_width : -1.0;
+    float centre = splat.mean2d.x + outline.x * y - 0.5;
+    return vec2(ceil(centre - half_width), floor(centre + half_width));
+}
+
 // The tile columns [x, y) that the splat intersects in a row of tiles of an image `width` pixels wide.
 uvec2 splat_tiles(ProjectedSplat splat, uint tile_row, uint width) {
     float top = float(tile_row * TILE_HEIGHT);

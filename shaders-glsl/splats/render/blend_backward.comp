@@ -44,6 +44,13 @@ const uint RECORD_FLOATS = 4 * RECORD_VECTORS;
 shared float shares[(SUBGROUPS_PER_TILE - 1 / SUBGROUPS_PER_TILE) * BATCH * RECORD_FLOATS + 1];
 shared uint are_alive[SUBGROUPS_PER_TILE];
 
+// Whether the gradients of a splat's colours are summed over the groups when these are done, from their weights: narrow
+// subgroups do not have the registers for the colours and their gradients at once. A function, as `tile_is_shared`.
+bool sums_colors_last() {
+    uint lanes = SUBGROUP_SIZE;
+    return tile_is_shared() && CHANNELS > lanes;
+}
+
 // Whether any lane of any part says so; every lane has to ask.
 bool tile_any(bool says) {
     bool any = subgroupAny(says);
@@ -149,6 +156,7 @@ void main() [[subgroup_uniform_control_flow]] {
                         moments[i] = vec3(0.0);
                     }
 
+                    float weights[GROUPS];
                     // Choices are between names, both computed: a compiler makes branches of others.
                     [[unroll]] for (uint g = 0; g < GROUPS; g++) {
                         if ((groups >> g & 1) == 0) continue;
@@ -165,9 +173,10 @@ void main() [[subgroup_uniform_control_flow]] {
                         transmittance[g] = is_done ? 0.0 : after;
                         float weight = alpha * before;
                         weight = is_done ? 0.0 : weight;
+                        weights[g] = weight;
                         float shade = 0.0;
                         [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                            record[RECORD_HEAD + c] += weight * d_pixel[g][c];
+                            if (!sums_colors_last()) record[RECORD_HEAD + c] += weight * d_pixel[g][c];
                             if (c < SHAPING_CHANNELS) shade += splat_color[c] * d_pixel[g][c];
                         }
                         // -alpha dL/dalpha; at the cap alpha no longer depends on the splat.
@@ -187,6 +196,11 @@ void main() [[subgroup_uniform_control_flow]] {
                         record[3] += x * moment_x;
                         record[4] += x * moments[i].y;
                         record[5] += moments[i].z;
+                    }
+                    [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                        if (!sums_colors_last() || (groups >> g & 1) == 0) continue;
+                        [[unroll]] for (uint c = 0; c < CHANNELS; c++)
+                            record[RECORD_HEAD + c] += weights[g] * d_pixel[g][c];
                     }
                     sum_record(record);
                 }
