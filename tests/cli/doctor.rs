@@ -122,7 +122,7 @@ fn a_driver_that_crashes_costs_a_line_that_names_device_and_kernel() {
     for command in [
         "bench".to_owned(),
         format!("eval {run}"),
-        format!("render {run} --out {out}"),
+        format!("render {run} --split test --out {out}"),
         format!("compare {run} {run}"),
         format!("edit {run} --floaters --out {out}.ply"),
     ] {
