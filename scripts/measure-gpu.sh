@@ -18,7 +18,7 @@
 #     many.json         a million Gaussians at 1080p
 #     tune.json         every tile at 500x375 and 1920x1080, with registers and spills
 #     tune-N.json       the same with subgroups of N lanes, where the device has a choice
-#     steady-*.json     512 steps as training submits them, at two sizes: wall, passes, processor
+#     steady-*.json     512 steps as training submits them, at two sizes: wall, device, passes, processor
 #     checked.json      every pass against its reference: errors in units of their bounds
 #     hashes.txt        the models of equal runs, of one without push descriptors, and of one in other batches
 #     validation.txt    messages of the validation layer over two steps

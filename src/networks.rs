@@ -52,13 +52,20 @@ const RGB: u32 = 3;
 /// The columns and rows of pixels per lane of `conv3x3`.
 ///
 /// On a CPU, loads cost most, and the neighbouring columns of a lane share them; on a GPU, neighbouring lanes read
-/// neighbouring pixels, and registers limit the block.
+/// neighbouring pixels, and registers limit the block: narrow subgroups have fewer for a lane's share of the weights, and
+/// would spill (compiled by Mesa 25 for Arc).
 const CPU_SHAPE: [u32; 2] = [4, 4];
 const GPU_SHAPE: [u32; 2] = [1, 8];
+const NARROW_GPU_SHAPE: [u32; 2] = [1, 6];
+const NARROW_SUBGROUP: u32 = 8;
 
 /// The columns and rows of pixels for this device.
 pub(crate) fn conv_shape(gpu: &Gpu) -> [u32; 2] {
-    if gpu.properties().is_cpu { CPU_SHAPE } else { GPU_SHAPE }
+    match gpu.properties() {
+        own if own.is_cpu => CPU_SHAPE,
+        own if own.subgroup_size <= NARROW_SUBGROUP => NARROW_GPU_SHAPE,
+        _ => GPU_SHAPE,
+    }
 }
 
 /// The number of pixels of a view.

@@ -305,10 +305,26 @@ impl Trainer {
     /// Those of [`Trainer::advance`]. A step that overflows its memory is not counted; the next [`Trainer::advance`]
     /// redoes it.
     pub fn profile_step(&mut self) -> Result<Vec<PassTime>> {
+        self.timed_step(|gpu, trainer, step| {
+            gpu.profile("step", |pass| trainer.record_step(pass, step, 0))
+        })
+    }
+
+    /// Trains one step and measures its milliseconds on the device, as a whole.
+    ///
+    /// # Errors
+    /// Those of [`Trainer::profile_step`].
+    pub(crate) fn profile_whole_step(&mut self) -> Result<f64> {
+        self.timed_step(|gpu, trainer, step| {
+            gpu.profile_whole("step", |pass| trainer.record_step(pass, step, 0))
+        })
+    }
+
+    fn timed_step<T>(&mut self, run: impl FnOnce(&Gpu, &mut Self, u64) -> Result<T>) -> Result<T> {
         let step = self.step + 1;
         self.allocate_sh_degree()?;
         self.supervision.views.make_resident(&self.config, step..=step)?;
-        let times = self.gpu.clone().profile("step", |pass| self.record_step(pass, step, 0))?;
+        let times = run(&self.gpu.clone(), self, step)?;
         if self.gpu.read(self.renderer.status())?.first() == Some(&0) {
             self.step = step;
         }

@@ -42,3 +42,9 @@ uint longest_axis(vec3 log_scales) {
     float longest = max(log_scales.x, max(log_scales.y, log_scales.z));
     return log_scales.x == longest ? 0 : log_scales.y == longest ? 1 : 2;
 }
+
+// A column by choices between names: an index that is no constant moves the matrix to memory.
+vec3 axis_of(mat3 axes, uint axis) {
+    vec3 last_two = axis == 1 ? axes[1] : axes[2];
+    return axis == 0 ? axes[0] : last_two;
+}

@@ -34,17 +34,17 @@ struct ProjectedSplat {
     float opacity;      // after the sigmoid
 };
 
-// The exponent of the Gaussian, sign reversed, along a column of pixels that is `x` from its mean: the coefficients of
-// a polynomial in y. alpha = opacity exp(-sigma), sigma = (conic.x x x + conic.z y y) / 2 + conic.y x y.
-vec3 sigma_in_column(vec3 conic, float x) {
-    precise vec3 by_power = vec3(0.5 * conic.x * x * x, conic.y * x, 0.5 * conic.z);
+// The exponent of the Gaussian, -sigma, along a column of pixels that is `x` from its mean: the coefficients of a
+// polynomial in y. alpha = opacity exp(-sigma), sigma = (conic.x x x + conic.z y y) / 2 + conic.y x y.
+vec3 exponent_in_column(vec3 conic, float x) {
+    precise vec3 by_power = vec3(-0.5 * conic.x * x * x, -conic.y * x, -0.5 * conic.z);
     return by_power;
 }
 
 // The exponent at `y` from the mean. Both passes round it alike, and so blend the same splats.
-float sigma_at(vec3 by_power, float y) {
-    precise float sigma = fma(fma(by_power.z, y, by_power.y), y, by_power.x);
-    return sigma;
+float exponent_at(vec3 by_power, float y) {
+    precise float exponent = fma(fma(by_power.z, y, by_power.y), y, by_power.x);
+    return exponent;
 }
 
 // Twice the sigma at which alpha falls to 1/255, slightly enlarged so that rounding never loses a pixel.
@@ -75,6 +75,23 @@ ivec2 splat_columns(ProjectedSplat splat, float top, float bottom) {
     left = clamp(left, -1e6, 1e6);
     right = clamp(right, -1e6, 1e6);
     return ivec2(int(ceil(left - 0.5)), int(floor(right - 0.5)));
+}
+
+// The shear, the half width at the height of the mean, and 1 / half_extent.y, for `splat_columns_of_row`.
+vec3 splat_outline(ProjectedSplat splat) {
+    float width = sqrt(splat_level(splat.opacity) / splat.conic.x);
+    return vec3(-splat.conic.y / splat.conic.x, width, 1.0 / splat.half_extent.y);
+}
+
+// `splat_columns` of one row of pixels, as numbers; what all rows have in common is in `outline`.
+vec2 splat_columns_of_row(ProjectedSplat splat, vec3 outline, float row) {
+    float y = row + 0.5 - splat.mean2d.y;
+    float height = y * outline.z;
+    float half_width = outline.y * sqrt(max(0.0, 1.0 - height * height)) + 0.01;
+    // Of no width where the row misses the ellipse.
+    half_width = abs(y) <= splat.half_extent.y ? half_width : -1.0;
+    float centre = splat.mean2d.x + outline.x * y - 0.5;
+    return vec2(ceil(centre - half_width), floor(centre + half_width));
 }
 
 // The tile columns [x, y) that the splat intersects in a row of tiles of an image `width` pixels wide.

@@ -40,20 +40,28 @@ uvec2 group_offset(uint group) {
     return uvec2(group * SUBGROUP_SIZE % TILE_WIDTH, group * SUBGROUP_SIZE / TILE_WIDTH);
 }
 
+// Whether a group has whole rows of pixels, and any of a row's columns is in it. A function, as `tile_is_shared`.
+bool has_whole_rows() {
+    uint width = TILE_WIDTH;
+    return SUBGROUP_SIZE % width == 0;
+}
+
 // The groups of pixels, one bit each, that the splat's ellipse intersects in the part at `origin`. In all others its
 // alpha is below 1/255: skipping them changes only the time.
 uint splat_groups(ProjectedSplat splat, uvec2 origin) {
     uint groups = 0;
+    vec3 outline = splat_outline(splat);
     for (uint row = 0; row < PART_HEIGHT; row++) {
-        float y = float(origin.y + row);
-        ivec2 columns = splat_columns(splat, y, y) - int(origin.x);
-        columns = ivec2(max(columns.x, 0), min(columns.y, int(TILE_WIDTH) - 1));
-        if (columns.x <= columns.y) {
-            uint first = (row * TILE_WIDTH + uint(columns.x)) / SUBGROUP_SIZE;
-            uint last = (row * TILE_WIDTH + uint(columns.y)) / SUBGROUP_SIZE;
-            // Bits first..last; the shift past bit 31 wraps to zero as intended.
-            groups |= (2u << last) - (1u << first);
+        vec2 columns = splat_columns_of_row(splat, outline, float(origin.y + row)) - float(origin.x);
+        columns = vec2(max(columns.x, 0.0), min(columns.y, float(TILE_WIDTH - 1)));
+        uint first = row * TILE_WIDTH, last = first;
+        if (!has_whole_rows()) {
+            first += uint(min(columns.x, float(TILE_WIDTH - 1)));
+            last += uint(max(columns.y, 0.0));
         }
+        // Bits first..last; the shift past bit 31 wraps to zero as intended.
+        uint own = (2u << last / SUBGROUP_SIZE) - (1u << first / SUBGROUP_SIZE);
+        groups |= columns.x <= columns.y ? own : 0;
     }
     return SKIPS_GROUPS ? groups : ~0u;
 }

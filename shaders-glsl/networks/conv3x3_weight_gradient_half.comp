@@ -98,9 +98,11 @@ void main() {
             barrier();
             coopMatStore(sum[b][t], sums, 0, N, gl_CooperativeMatrixLayoutRowMajor);
             barrier();
-            for (uint i = gl_SubgroupInvocationID; i < M * N; i += SUBGROUP_SIZE) {
+            // Unrolled: around a loop that stays one, the index of a matrix is no constant and moves all to memory.
+            [[unroll]] for (uint k = 0; k < M * N; k += SUBGROUP_SIZE) {
+                uint i = k + gl_SubgroupInvocationID;
                 uint own = first_out + b * M + i / N, other = first_in + i % N;
-                if (own < out_channels && other < in_channels)
+                if (i < M * N && own < out_channels && other < in_channels)
                     partials[set + (own * in_channels + other) * TAPS + t] = unpacked(sums[i], largest_d_target[0],
                         largest_source[0]);
             }

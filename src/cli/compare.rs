@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 
 use super::eval::LpipsRange;
-use super::{finish, table, word};
+use super::{driver, finish, table, word};
 use crate::Error;
 use crate::base::output::{check_writable, write_whole};
 use crate::gpu::DeviceChoice;
@@ -59,7 +59,7 @@ pub fn run(args: &CompareArgs) -> Result<()> {
     args.report.iter().try_for_each(|path| check_writable(path))?;
     let options = CompareOptions {
         dataset: args.dataset.as_deref(),
-        device: args.device.as_ref(),
+        opener: driver::opener(args.device.as_ref()),
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),
         with_pictures: args.report.is_some(),
     };

@@ -142,7 +142,7 @@ fn holes(
     args: &DiagnoseArgs,
 ) -> Result<(String, BTreeMap<String, ResidualTransmittance>)> {
     let FinishedRun { config, dataset, mut model_renderer, .. } =
-        FinishedRun::open(run, Some(&args.dataset), args.device.as_ref())?;
+        FinishedRun::open(run, Some(&args.dataset), &driver::opener(args.device.as_ref()))?;
     let mut residual_transmittances = BTreeMap::new();
     for view in &dataset.views {
         let own = ResidualTransmittance::of(&model_renderer.render(view)?, view);

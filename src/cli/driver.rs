@@ -7,6 +7,7 @@ use std::process::{Command, ExitStatus, Stdio};
 
 use crate::base::output::write_whole;
 use crate::gpu::{DeviceChoice, DeviceReport, Gpu, SchedulerVariables, cache_folder, devices};
+use crate::results::finished_run::Opener;
 use crate::self_test::TEST_VARIABLE;
 use crate::{Error, Result};
 
@@ -18,6 +19,20 @@ const COMPILES: &str = "compiles";
 /// # Errors
 /// Those of [`Gpu::new`], and [`Error::Kernel`] for a driver that crashes.
 pub(super) fn open(choice: &DeviceChoice) -> Result<Gpu> {
+    check_new(choice)?;
+    Gpu::new(choice)
+}
+
+/// How a command opens the device of a run: the chosen one, or that of its configuration.
+pub(super) fn opener(device: Option<&DeviceChoice>) -> Opener {
+    Opener { device: device.cloned(), open }
+}
+
+/// Refuses a driver that is new on this machine and crashes when it compiles a kernel.
+///
+/// # Errors
+/// [`Error::Kernel`] for such a driver, and those of listing devices.
+pub(super) fn check_new(choice: &DeviceChoice) -> Result<()> {
     let wanted = std::env::var(TEST_VARIABLE).unwrap_or_default();
     if wanted != "off" {
         let devices = devices()?;
@@ -28,7 +43,7 @@ pub(super) fn open(choice: &DeviceChoice) -> Result<Gpu> {
             check(device, index)?;
         }
     }
-    Gpu::new(choice)
+    Ok(())
 }
 
 fn check(device: &DeviceReport, index: usize) -> Result<()> {

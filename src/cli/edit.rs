@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 
 use self::operations::Operations;
-use super::{finish, word};
+use super::{driver, finish, word};
 use crate::Error;
 use crate::base::output::{check_writable, printable};
 use crate::gpu::DeviceChoice;
@@ -66,7 +66,8 @@ pub fn run(args: &EditArgs) -> Result<()> {
     }
     Editor::check_output(&args.model, &args.out)?;
     args.save_edits.iter().try_for_each(|path| check_writable(path))?;
-    let mut editor = Editor::open(&args.model, args.dataset.as_deref(), args.device.as_ref())?;
+    let mut editor =
+        Editor::open(&args.model, args.dataset.as_deref(), driver::opener(args.device.as_ref()))?;
     if let (Some(list), Some(path)) = (&list, &args.edits) {
         editor.check_list(path, list)?;
     }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 
-use super::{finish, progress_bar, table, word};
+use super::{driver, finish, progress_bar, table, word};
 use crate::base::output::{check_writable, printable, write_whole};
 use crate::gpu::DeviceChoice;
 use crate::networks::lpips::{Lpips, Range};
@@ -81,9 +81,14 @@ impl From<LpipsRange> for Range {
 pub fn run(args: &EvalArgs) -> Result<()> {
     args.report.iter().try_for_each(|path| check_writable(path))?;
     let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer } =
-        FinishedRun::open_with(&args.run, args.dataset.as_deref(), args.device.as_ref(), |own| {
-            own.reference = args.reference.clone().or(own.reference.take());
-        })?;
+        FinishedRun::open_with(
+            &args.run,
+            args.dataset.as_deref(),
+            &driver::opener(args.device.as_ref()),
+            |own| {
+                own.reference = args.reference.clone().or(own.reference.take());
+            },
+        )?;
     let load = |weights| Lpips::load(&gpu, weights, args.lpips_range.into());
     let lpips = args.lpips.as_ref().map(load).transpose()?;
     let measure = lpips.as_ref().map(Lpips::measure);

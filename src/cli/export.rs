@@ -293,7 +293,7 @@ fn page(
         let FinishedRun { gpu, config, mut model_renderer, dataset, .. } = FinishedRun::open_with(
             &args.run,
             args.dataset.as_deref(),
-            args.device.as_ref(),
+            &driver::opener(args.device.as_ref()),
             |own| {
                 own.undistort = true;
             },

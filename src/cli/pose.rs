@@ -8,7 +8,7 @@ use std::time::Instant;
 use anyhow::Result;
 use indicatif::ProgressBar;
 
-use super::{finish, progress_bar, word};
+use super::{driver, finish, progress_bar, word};
 use crate::gpu::DeviceChoice;
 use crate::photographs::pose::{Mapper, Matcher, PoseOptions, Posed, Progress, describe, estimate};
 
@@ -116,6 +116,7 @@ impl PoseArgs {
             colmap_gpu: args.colmap_gpu,
             fps: args.fps,
             device: args.device.unwrap_or_default(),
+            open: driver::open,
         }
     }
 }

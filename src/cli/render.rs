@@ -9,7 +9,7 @@ mod shots;
 
 use self::shots::{Shot, shots};
 use super::words::Words;
-use super::{ImageFormat, finish, progress_bar, word};
+use super::{ImageFormat, driver, finish, progress_bar, word};
 use crate::Error;
 use crate::base::output::{check_writable, create_folder, printable};
 use crate::camera::Easing;
@@ -249,7 +249,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     }
     args.video.iter().chain([out]).try_for_each(|path| check_writable(path))?;
     let FinishedRun { config, dataset, mut model_renderer, .. } =
-        FinishedRun::open(run, args.dataset.as_deref(), device.as_ref())?;
+        FinishedRun::open(run, args.dataset.as_deref(), &driver::opener(device.as_ref()))?;
     let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
     let (shots, fps) = shots(args, &config, &dataset)?;
     model_renderer.set_background(args.background.0);

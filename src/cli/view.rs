@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex};
 use anyhow::Result;
 use glam::{DAffine3, DVec3, Vec3};
 
+use super::driver;
 use super::live::{DEFAULT_ADDRESS, Feed, Listen, Pictures, Server, Site, Source};
 use crate::camera::Camera;
 use crate::gpu::{DeviceChoice, Gpu};
@@ -87,7 +88,7 @@ fn started(listen: Listen, site: Arc<Site>) -> Result<Server> {
 /// The page of what the path names.
 fn opened(args: &ViewArgs) -> Result<Arc<Site>> {
     let path = &args.path;
-    let gpu = args.device.as_ref().map(Gpu::new).transpose()?;
+    let gpu = args.device.as_ref().map(driver::open).transpose()?;
     if is_model(path) {
         let (gaussians, facts) = models::read(path)?;
         let feed = Feed::new(Source::File(path.clone()), None);

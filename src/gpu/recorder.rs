@@ -43,7 +43,7 @@ pub struct Recorder<'g> {
     is_cut: bool,
     /// The timeline value that signals the end of this recording.
     pub(super) value: u64,
-    queries: Option<vk::QueryPool>,
+    timestamps: Option<Timestamps>,
     /// Each pass with the bytes of the buffers that it binds.
     pub(super) labels: Vec<(&'static str, u64)>,
     /// Buffers accessed since the last barrier; true if written.
@@ -53,6 +53,15 @@ pub struct Recorder<'g> {
     /// Runs each pass alone and compares it with its reference instead of recording it.
     #[cfg(feature = "check")]
     pub(super) observer: Option<&'g mut (dyn PassObserver + 'g)>,
+}
+
+/// Where a recording has timestamps.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Timestamps {
+    /// At its start and behind every pass, which then does not overlap with the next.
+    OfPasses(vk::QueryPool),
+    /// At its start and its end.
+    OfAll(vk::QueryPool),
 }
 
 /// Runs passes in its own way instead of recording them.
@@ -106,17 +115,17 @@ impl<'g> Recorder<'g> {
         shared: &'g Arc<Shared>,
         pool: vk::CommandPool,
         value: u64,
-        queries: Option<vk::QueryPool>,
+        timestamps: Option<Timestamps>,
     ) -> Result<Self> {
         let commands = shared.begin(pool)?;
         let mut recorder = Self {
             value,
-            queries,
+            timestamps,
             pool: Some(pool),
             ..Self::unstarted(shared, commands, vk::PipelineStageFlags2::HOST)
         };
         recorder.barrier();
-        recorder.timestamp();
+        recorder.timestamp(0);
         Ok(recorder)
     }
 
@@ -143,7 +152,7 @@ impl<'g> Recorder<'g> {
             pool: None,
             is_cut: false,
             value: HOST_SUBMITS,
-            queries: None,
+            timestamps: None,
             labels: vec![],
             pending: HashMap::new(),
             readers,
@@ -303,6 +312,9 @@ impl<'g> Recorder<'g> {
 
     /// Makes everything recorded so far visible to the stages that read it. Our own recordings begin with a barrier.
     pub(super) fn finish(&mut self) {
+        if let Some(Timestamps::OfAll(_)) = self.timestamps {
+            self.timestamp(1);
+        }
         if self.readers.is_empty() {
             return;
         }
@@ -406,12 +418,17 @@ impl<'g> Recorder<'g> {
         }
         self.shared.recorded.dispatches.fetch_add(1, Ordering::Relaxed);
         self.labels.push((name, bytes));
-        self.timestamp();
+        if let Some(Timestamps::OfPasses(_)) = self.timestamps {
+            self.timestamp(self.labels.len() as u32);
+        }
     }
 
-    fn timestamp(&self) {
-        let index = self.labels.len() as u32;
-        if let Some(queries) = self.queries.filter(|_| index < MAX_TIMESTAMPS) {
+    /// The time when everything recorded so far is done.
+    fn timestamp(&self, index: u32) {
+        let queries = self.timestamps.map(|own| match own {
+            Timestamps::OfPasses(queries) | Timestamps::OfAll(queries) => queries,
+        });
+        if let Some(queries) = queries.filter(|_| index < MAX_TIMESTAMPS) {
             let stage = vk::PipelineStageFlags2::ALL_COMMANDS;
             // SAFETY: the query was reset before recording began.
             unsafe {

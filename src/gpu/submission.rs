@@ -6,7 +6,7 @@ use std::thread;
 
 use ash::vk;
 
-use super::recorder::MAX_TIMESTAMPS;
+use super::recorder::{MAX_TIMESTAMPS, Timestamps};
 use super::{Gpu, Queue, Recorder, Retired, Shared, lock};
 use crate::{Error, Result};
 
@@ -121,6 +121,30 @@ impl Gpu {
         label: &str,
         record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
     ) -> Result<Vec<PassTime>> {
+        self.timed(label, Timestamps::OfPasses, Box::new(record))
+    }
+
+    /// As [`Gpu::run`], and measures the milliseconds from the start of the first pass to the end of the last, with
+    /// nothing between the passes that a run without measurement lacks.
+    ///
+    /// # Errors
+    /// Those of [`Gpu::profile`].
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn profile_whole(
+        &self,
+        label: &str,
+        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
+    ) -> Result<f64> {
+        let times = self.timed(label, Timestamps::OfAll, Box::new(record))?;
+        Ok(times.iter().map(|time| time.milliseconds).sum())
+    }
+
+    fn timed(
+        &self,
+        label: &str,
+        timestamps: fn(vk::QueryPool) -> Timestamps,
+        record: Record<'_>,
+    ) -> Result<Vec<PassTime>> {
         let shared = &self.shared;
         if shared.properties.timestamp_bits == 0 {
             let (device, feature) =
@@ -135,12 +159,15 @@ impl Gpu {
             .map_err(|result| shared.error("vkCreateQueryPool", result))?;
         // SAFETY: the pool was just created.
         unsafe { shared.device.reset_query_pool(queries, 0, MAX_TIMESTAMPS) };
-        let times = self.record_and_submit(label, Some(queries), Box::new(record)).and_then(
-            |(submission, labels)| {
-                submission.wait()?;
-                self.pass_times(queries, &labels)
-            },
-        );
+        let timestamps = timestamps(queries);
+        let times =
+            self.record_and_submit(label, Some(timestamps), record).and_then(|(done, labels)| {
+                done.wait()?;
+                match timestamps {
+                    Timestamps::OfPasses(_) => self.pass_times(queries, &labels),
+                    Timestamps::OfAll(_) => self.pass_times(queries, &[("all", 0)]),
+                }
+            });
         shared.retire(Retired::Queries(queries));
         times
     }
@@ -169,7 +196,7 @@ impl Gpu {
     fn record_and_submit(
         &self,
         label: &str,
-        queries: Option<vk::QueryPool>,
+        timestamps: Option<Timestamps>,
         record: Record<'_>,
     ) -> Result<(Submission, Vec<(&'static str, u64)>)> {
         let shared = &self.shared;
@@ -185,7 +212,7 @@ impl Gpu {
         // From here on, a dropped object may be in this recording.
         shared.last_submission.store(value, Ordering::Release);
         let queue = &recording.queue;
-        let submitted = self.record_with(queue, pool, value, label, queries, record);
+        let submitted = self.record_with(queue, pool, value, label, timestamps, record);
         // Where nothing was submitted, objects dropped meanwhile wait for the next submission, which has the same
         // value.
         shared.retire(Retired::Commands(pool));
@@ -199,16 +226,16 @@ impl Gpu {
         pool: vk::CommandPool,
         value: u64,
         label: &str,
-        queries: Option<vk::QueryPool>,
+        timestamps: Option<Timestamps>,
         record: Record<'_>,
     ) -> Result<(u64, Vec<(&'static str, u64)>)> {
         let shared = &self.shared;
         #[cfg(feature = "check")]
-        if queries.is_none() && shared.checks.are_on() {
+        if timestamps.is_none() && shared.checks.are_on() {
             let last = shared.record_checked(queue, pool, value, label, record)?;
             return Ok((last, vec![]));
         }
-        let mut recorder = Recorder::new(shared, pool, value, queries)?;
+        let mut recorder = Recorder::new(shared, pool, value, timestamps)?;
         shared.with_uploads(&mut recorder, record)?;
         recorder.finish();
         let parts = std::mem::take(&mut recorder.parts);

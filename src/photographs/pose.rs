@@ -57,6 +57,8 @@ pub struct PoseOptions {
     pub fps: f64,
     /// Device that brightens the photographs.
     pub device: DeviceChoice,
+    /// How it is opened.
+    pub open: fn(&DeviceChoice) -> Result<Gpu>,
 }
 
 /// Progress of [`estimate`].
@@ -116,7 +118,7 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(Progress<'_>)) -> Result<
     } else {
         distinct_photographs(&folder)?
     };
-    let gpu = Gpu::new(&options.device)?;
+    let gpu = (options.open)(&options.device)?;
     let tone_mapped = out.work.join("tone-mapped");
     let gain = tone_mapped::write(&gpu, &mut photographs, &tone_mapped, report)?;
     let all = photographs.len();

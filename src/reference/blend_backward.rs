@@ -115,6 +115,8 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
     let d_sum: f64 = (0..shaping).map(d).sum();
     let light: f64 = (0..shaping).map(|c| pixel.render[c].abs() * d(c)).sum();
     let light_error = model.error * list.largest_color(&pixel.render) * d_sum;
+    // At the start of a segment, the colour before it has the error of a render, too.
+    let renders = if constants.segment == 0 { 2.0 } else { 3.0 };
     let head = RECORD_HEAD as usize;
     // Every sum is over the pixels of the tile.
     let own = (chain(tile.element_product() as usize) + 64.0) * UNIT;
@@ -124,7 +126,7 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
         let share: f64 = (0..shaping).map(|c| fragment.before * color[c].abs() * d(c)).sum();
         let rounded = 2.0 * alpha_error / (1.0 - fragment.alpha) + own;
         let relative = if model.is_fragile { 1.0 } else { rounded };
-        let d_alpha = (2.0 * light_error + relative * (light + share)) / (1.0 - fragment.alpha);
+        let d_alpha = (renders * light_error + relative * (light + share)) / (1.0 - fragment.alpha);
         let d_sigma = fragment.alpha * d_alpha;
         // An offset has the rounding error of a tile's extent.
         let offset = fragment.d.abs() + 1.0;

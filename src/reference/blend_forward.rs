@@ -3,7 +3,7 @@
 use glam::{DVec2, UVec2};
 
 use super::blending::PixelModel;
-use super::splat::{Fragment, Splat, fragments, stored_color};
+use super::splat::{Fragment, Splat, fragments, is_done, stored_color};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ProjectedSplat;
 use crate::kernels::blend_forward::{Constants, Kernel, NO_DEPTH, Params, Slices, Tolerances};
@@ -134,6 +134,42 @@ impl<'a> Depths<'a> {
     }
 }
 
+/// The splats of a list before which segments start, except for the first, with their places in memory.
+fn segment_starts(run: UVec2, count: u32, segment: u32) -> Vec<(usize, usize)> {
+    let starts = (0..count).step_by(segment.max(1) as usize).skip(1);
+    let place = |start: u32| (start as usize, ((run.x + start) / segment) as usize);
+    if segment == 0 { vec![] } else { starts.map(place).collect() }
+}
+
+/// Visits the state of every pixel of a tile before every segment: the list, the number of its splats before the
+/// segment, the centre of the pixel, `None` outside the image, and the index of its transmittance; its channels follow
+/// at a distance of a tile's pixels.
+fn for_each_state(
+    params: &Params,
+    constants: &Constants,
+    slices: &Slices<'_>,
+    mut visit: impl FnMut(&TileList, usize, Option<DVec2>, usize),
+) {
+    let tile = UVec2::new(constants.tile_width, constants.tile_height);
+    let runs = tile_runs(params, constants, slices);
+    let mut index = 0;
+    for_each_tile(params, constants, slices, |list, _| {
+        let (run, _) = runs[index as usize];
+        let origin = UVec2::new(index % params.tile_columns, index / params.tile_columns) * tile;
+        let starts = segment_starts(run, list.splats.len() as u32, constants.segment);
+        let pixels = tile.element_product() as usize;
+        for (start, block) in starts {
+            for at in 0..pixels {
+                let pixel = origin + UVec2::new(at as u32 % tile.x, at as u32 / tile.x);
+                let is_inside = pixel.cmplt(params.size).all();
+                let center = is_inside.then(|| pixel.as_dvec2() + 0.5);
+                visit(list, start, center, (constants.channels as usize + 1) * pixels * block + at);
+            }
+        }
+        index += 1;
+    });
+}
+
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
         let depths = Depths::of(params, constants, slices.limits);
@@ -147,6 +183,22 @@ impl Reference for Kernel {
                 slices.status[2] = slices.status[2].max(count);
             }
         }
+        let (alpha_max, stride) =
+            (constants.alpha_max.into(), (constants.tile_width * constants.tile_height) as usize);
+        let states = std::mem::take(&mut slices.segment_states);
+        for_each_state(params, constants, &slices, |list, start, center, at| {
+            let seen = &list.splats[..start];
+            let black = vec![0.0; constants.channels as usize];
+            let (values, transmittance) = match center {
+                Some(center) => blend_pixel(seen, &list.colors, &black, center, alpha_max),
+                None => (black, 0.0),
+            };
+            let is_done = center.is_none_or(|center| is_done(seen, center, alpha_max));
+            states[at] = if is_done { 0.0 } else { transmittance as f32 };
+            for (c, value) in (1..).zip(values) {
+                states[at + c * stride] = value as f32;
+            }
+        });
         let (render, transmittances) =
             (std::mem::take(&mut slices.render), std::mem::take(&mut slices.transmittances));
         for_each_tile(params, constants, &slices, |list, tile| {
@@ -200,8 +252,22 @@ impl Reference for Kernel {
         if depths.is_some_and(|depths| depths.takes_median()) {
             render.splice(render.len() - pixels.., medians);
         }
+        let stride = (constants.tile_width * constants.tile_height) as usize;
+        let mut states = vec![0.0; slices.segment_states.len()];
+        for_each_state(params, constants, &slices, |list, start, center, at| {
+            let (seen, alpha_max) = (&list.splats[..start], constants.alpha_max.into());
+            let model = center.map(|center| PixelModel::new(seen, center, alpha_max, tile_size));
+            let is_done = center.is_none_or(|center| is_done(seen, center, alpha_max));
+            states[at] = model.as_ref().map_or(0.0, |model| model.error);
+            // Of a pixel that is done, or is by another rounding, the transmittance alone is defined.
+            let is_defined = !is_done && model.is_none_or(|model| !model.is_fragile);
+            let largest = list.largest_color(&[]);
+            let of_channels = if is_defined { states[at] * largest } else { f64::INFINITY };
+            (1..=constants.channels as usize).for_each(|c| states[at + c * stride] = of_channels);
+        });
         Tolerances {
             render: Tolerance::Each(render),
+            segment_states: Tolerance::Each(states),
             transmittances: Tolerance::Each(errors),
             ..Tolerances::default()
         }

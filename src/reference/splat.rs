@@ -62,6 +62,16 @@ pub struct Fragment {
 
 /// The fragments of `splats`, front to back, at a pixel's centre, and the transmittance after them.
 pub fn fragments(splats: &[Splat], pixel: DVec2, alpha_max: f64) -> (Vec<Fragment>, f64) {
+    let (fragments, transmittance, _) = blended(splats, pixel, alpha_max);
+    (fragments, transmittance)
+}
+
+/// Whether one of `splats` is the one before which the pixel ends.
+pub(super) fn is_done(splats: &[Splat], pixel: DVec2, alpha_max: f64) -> bool {
+    blended(splats, pixel, alpha_max).2
+}
+
+fn blended(splats: &[Splat], pixel: DVec2, alpha_max: f64) -> (Vec<Fragment>, f64, bool) {
     let mut fragments = vec![];
     let mut before = 1.0;
     for (index, splat) in splats.iter().enumerate() {
@@ -74,12 +84,12 @@ pub fn fragments(splats: &[Splat], pixel: DVec2, alpha_max: f64) -> (Vec<Fragmen
         }
         let after = before * (1.0 - alpha);
         if after < TRANSMITTANCE_MIN {
-            break;
+            return (fragments, before, true);
         }
         fragments.push(Fragment { index, d, falloff, alpha, before });
         before = after;
     }
-    (fragments, before)
+    (fragments, before, false)
 }
 
 /// The relative error of an ellipse's extent: of the square root of [`splat_level`], whose logarithm is good to 2^-21

@@ -5,10 +5,9 @@ use std::path::{Path, PathBuf};
 use serde_json::{Value, json};
 
 use super::eval::{self, ScoreReference, ScoredImages, ViewScore};
-use super::finished_run::{FinishedRun, is_model};
+use super::finished_run::{FinishedRun, Opener, is_model};
 use super::report::{Best, Column, Comparison, Facts, Picture, Report, Table};
 use super::run;
-use crate::gpu::DeviceChoice;
 use crate::networks::lpips::{Lpips, Measure, Range};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
@@ -46,7 +45,7 @@ pub(crate) struct RunComparison {
 #[derive(Debug)]
 pub(crate) struct CompareOptions<'a> {
     pub(crate) dataset: Option<&'a Path>,
-    pub(crate) device: Option<&'a DeviceChoice>,
+    pub(crate) opener: Opener,
     pub(crate) lpips: Option<(&'a Path, Range)>,
     /// Whether images are kept.
     pub(crate) with_pictures: bool,
@@ -64,7 +63,7 @@ impl RunComparison {
         let mut comparison = Self { runs: vec![], measure: None, pictures: vec![] };
         for (path, name) in paths.iter().zip(names) {
             let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer } =
-                FinishedRun::open(path, options.dataset, options.device)?;
+                FinishedRun::open(path, options.dataset, &options.opener)?;
             if first.is_none() {
                 let reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
                 first = Some((dataset.clone(), reference));

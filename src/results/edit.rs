@@ -23,9 +23,8 @@ use self::placement::Placement;
 use crate::base::output::{check_writable, is_same_file, write_whole};
 use crate::base::ply::Header;
 use crate::camera::enclosing_sphere;
-use crate::gpu::DeviceChoice;
 use crate::results::export::{EDITS, Format, Provenance};
-use crate::results::finished_run::is_model;
+use crate::results::finished_run::{Opener, is_model};
 use crate::results::{models, run};
 use crate::splats::scene::{Facts, Features, Gaussians, Shape};
 use crate::{Error, Result};
@@ -38,7 +37,7 @@ pub(crate) struct Editor {
     path: PathBuf,
     /// The dataset, if it is not the run's.
     dataset: Option<PathBuf>,
-    device: Option<DeviceChoice>,
+    opener: Opener,
     gaussians: Gaussians,
     facts: Facts,
     /// Identifies the model as it was opened.
@@ -57,16 +56,12 @@ impl Editor {
     ///
     /// # Errors
     /// Those of reading a model.
-    pub(crate) fn open(
-        path: &Path,
-        dataset: Option<&Path>,
-        device: Option<&DeviceChoice>,
-    ) -> Result<Self> {
+    pub(crate) fn open(path: &Path, dataset: Option<&Path>, opener: Opener) -> Result<Self> {
         let (gaussians, facts) = models::read(path)?;
         Ok(Self {
             path: path.to_owned(),
             dataset: dataset.map(Path::to_owned),
-            device: device.cloned(),
+            opener,
             fingerprint: fingerprint(&gaussians),
             gaussians,
             facts,
@@ -208,8 +203,8 @@ impl Editor {
 
     fn open_capture(&mut self) -> Result<&mut Capture> {
         if self.capture.is_none() {
-            let (dataset, device) = (self.dataset.as_deref(), self.device.as_ref());
-            self.capture = Some(Capture::open(&self.path, dataset, device)?);
+            let dataset = self.dataset.as_deref();
+            self.capture = Some(Capture::open(&self.path, dataset, &self.opener)?);
         }
         self.capture
             .as_mut()

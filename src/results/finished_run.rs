@@ -13,6 +13,14 @@ use crate::splats::scene::{Facts, Gaussians};
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
+/// The device of a command, and how it is opened.
+#[derive(Clone, Debug)]
+pub(crate) struct Opener {
+    /// `None`: the run's.
+    pub(crate) device: Option<DeviceChoice>,
+    pub(crate) open: fn(&DeviceChoice) -> Result<Gpu>,
+}
+
 /// The model of a run with its dataset.
 pub(crate) struct FinishedRun {
     pub(crate) gpu: Gpu,
@@ -28,12 +36,8 @@ impl FinishedRun {
     ///
     /// # Errors
     /// The folder contains no run with a model, its dataset is missing, or there is no such device.
-    pub(crate) fn open(
-        folder: &Path,
-        dataset: Option<&Path>,
-        device: Option<&DeviceChoice>,
-    ) -> Result<Self> {
-        Self::open_with(folder, dataset, device, |_| {})
+    pub(crate) fn open(folder: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
+        Self::open_with(folder, dataset, opener, |_| {})
     }
 
     /// [`Self::open`] with a change of the configuration.
@@ -43,11 +47,11 @@ impl FinishedRun {
     pub(crate) fn open_with(
         folder: &Path,
         dataset: Option<&Path>,
-        device: Option<&DeviceChoice>,
+        opener: &Opener,
         change: impl FnOnce(&mut TrainConfig),
     ) -> Result<Self> {
         if is_model(folder) {
-            return Self::open_model(folder, dataset, device, change);
+            return Self::open_model(folder, dataset, opener, change);
         }
         let mut config = run::load_config(folder)?;
         if let Some(dataset) = dataset {
@@ -67,8 +71,10 @@ impl FinishedRun {
             let steps = config.steps;
             tracing::warn!("{}: incomplete, at step {step} of {steps}", folder.display());
         }
-        let device = device.map_or_else(|| config.device.parse(), |choice| Ok(choice.clone()))?;
-        let gpu = Gpu::new(&device)?;
+        let gpu = match &opener.device {
+            Some(device) => (opener.open)(device)?,
+            None => (opener.open)(&config.device.parse()?)?,
+        };
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
         if let Some(difference) = run::other_views(folder, &dataset) {
             let root = dataset.root.display();
@@ -92,14 +98,14 @@ impl FinishedRun {
     fn open_model(
         path: &Path,
         dataset: Option<&Path>,
-        device: Option<&DeviceChoice>,
+        opener: &Opener,
         change: impl FnOnce(&mut TrainConfig),
     ) -> Result<Self> {
         let dataset = dataset.ok_or_else(|| needs_photographs(path))?;
         let (gaussians, facts) = models::read(path)?;
         let mut config = config_of_file(&gaussians, &facts, Some(dataset));
         change(&mut config);
-        let gpu = Gpu::new(device.unwrap_or(&DeviceChoice::Best))?;
+        let gpu = (opener.open)(opener.device.as_ref().unwrap_or(&DeviceChoice::Best))?;
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
         let frame = dataset.frame();
         config.frame = Some(frame);

@@ -264,6 +264,7 @@ impl Renderer {
                 tile_ranges: frame.tile_ranges.slice_mut(),
                 status: frame.status.slice_mut(),
                 limits: self.limits.slice(),
+                segment_states: frame.segment_states.slice_mut(),
             },
             Threads::Workgroups([view.tile_count(), 1, 1]),
         )
@@ -298,10 +299,11 @@ impl Renderer {
         };
         let color_floats = color_floats(self.settings.channels());
         let first = self.context_count();
-        let frame = &mut self.frame;
+        let (frame, tile_count) = (&mut self.frame, view.tile_count());
+        let further_segments = frame.segments.blocks(frame.intersection_capacity());
         pass.dispatch(
             blend_backward,
-            &blend_backward::Params { size: view.size, tile_columns: view.tiles.x },
+            &blend_backward::Params { size: view.size, tile_columns: view.tiles.x, tile_count },
             blend_backward::Buffers {
                 tile_ranges: frame.tile_ranges.slice(),
                 sorted_intersections: frame.intersection_ids.slice(),
@@ -311,8 +313,11 @@ impl Renderer {
                 render: frame.render.slice(),
                 d_render: d_render.slice(),
                 gradient_records: frame.gradient_records.slice_mut(),
+                counts: frame.counts.slice(),
+                sorted_tiles: frame.tiles.slice(),
+                segment_states: frame.segment_states.slice(),
             },
-            Threads::Workgroups([view.tile_count(), 1, 1]),
+            Threads::Workgroups([tile_count.saturating_add(further_segments), 1, 1]),
         )?;
         let GaussianSlice { layout, parameters } = gaussians;
         for batch in layout.batches(&self.gpu).iter() {

@@ -7,6 +7,7 @@ use serde_json::Value;
 
 use crate::common::command::{command, refused_with, succeed};
 use crate::common::not_run;
+use crate::fixture;
 
 #[test]
 fn json_has_every_requirement_of_every_device_and_the_choice() {
@@ -117,7 +118,16 @@ fn a_driver_that_crashes_costs_a_line_that_names_device_and_kernel() {
         .map(|fault| checking.into_iter().chain(fault).collect::<Vec<_>>());
     let parts = ["crashed when it compiled kernel `depth_boxes`", "update the driver", cache];
     refused_with("bench", &crashing, 4, &parts);
-    refused_with("bench", &sound, 4, &parts);
+    let (run, out) = (fixture().run(), format!("{cache}/out"));
+    for command in [
+        "bench".to_owned(),
+        format!("eval {run}"),
+        format!("render {run} --split test --out {out}"),
+        format!("compare {run} {run}"),
+        format!("edit {run} --floaters --out {out}.ply"),
+    ] {
+        refused_with(&command, &sound, 4, &parts);
+    }
     let verdict = std::fs::read_dir(format!("{cache}/nightsplat")).unwrap().map(Result::unwrap);
     let verdict =
         verdict.map(|file| file.path()).find(|path| path.extension().unwrap() == "driver");

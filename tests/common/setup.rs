@@ -1,6 +1,6 @@
 //! Gaussians and a view of them, rendered by the shipped renderer.
 
-use glam::{DAffine3, DMat3, DVec2, DVec3, UVec2, Vec2};
+use glam::{DAffine3, DMat3, DVec2, DVec3, DVec4, UVec2, Vec2};
 use nightsplat::camera::{self, CameraModel, KannalaBrandt};
 use nightsplat::gpu::Tile;
 use nightsplat::gpu::testing::gpu;
@@ -37,6 +37,8 @@ pub(crate) struct Setup {
     pub(crate) camera: camera::Camera,
     pub(crate) settings: RenderSettings,
     pub(crate) options: RenderOptions,
+    /// The splats of a segment of a tile's run; 0: a run has one. `None`: as the device has it.
+    pub(crate) segment: Option<u32>,
 }
 
 impl Setup {
@@ -72,7 +74,8 @@ impl Setup {
         };
         let settings = RenderSettings { shape, ..RenderSettings::default() };
         let options = RenderOptions { sh_degree: shape.sh_degree, background: [0.0, 0.1, 0.2] };
-        let mut setup = Self { count, parameters: vec![], camera, settings, options };
+        let mut setup =
+            Self { count, parameters: vec![], camera, settings, options, segment: None };
         setup.parameters = vec![0.0; setup.planes().float_count()];
         let mut random = Random::new(seed);
         for i in 0..count {
@@ -173,6 +176,19 @@ impl Setup {
         gaussians
     }
 
+    /// 90 Gaussians over six tiles of 16x16 pixels: the uppermost rows are opaque after the first, the others continue.
+    pub(crate) fn opaque_above(channels: usize) -> Self {
+        let shape = Shape { sh_degree: 0, features: features(channels) };
+        let mut setup = Self::new(90, [32, 35], shape, 52);
+        for i in 0..12 {
+            let mean = setup.at_pixel(DVec2::new(16.0, 2.0), 0.8 + 0.01 * i as f64);
+            let log_scale = DVec3::new(0.5, 0.03, 0.03).map(f64::ln);
+            let quat = DVec4::new(1.0, 0.0, 0.0, 0.0);
+            setup.set(i, &Gaussian { mean, quat, log_scale, raw_opacity: 6.0, ..setup.get(i) });
+        }
+        setup
+    }
+
     /// The render, with sufficient memory.
     pub(crate) fn render(&self) -> Rendered<'_> {
         let mut rendered = Rendered::new(self);
@@ -218,7 +234,12 @@ impl<'a> Rendered<'a> {
 
     fn new(setup: &'a Setup) -> Self {
         let gaussians = setup.upload();
-        let mut renderer = Renderer::new(&gpu(), setup.settings).unwrap();
+        let (gpu, settings) = (gpu(), setup.settings);
+        let mut renderer = match setup.segment {
+            None => Renderer::new(&gpu, settings),
+            Some(splats) => Renderer::with_segments(&gpu, settings, splats),
+        }
+        .unwrap();
         renderer.reserve(setup.count, [&setup.camera]).unwrap();
         Self { setup, gaussians, renderer, render: vec![], transmittances: vec![] }
     }

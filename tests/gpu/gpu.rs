@@ -7,7 +7,7 @@ use std::time::Duration;
 use glam::UVec2;
 use nightsplat::Error;
 use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_that_launches, misuse, not_run};
-use nightsplat::gpu::{Buffer, DeviceChoice, Gpu, Pipeline, Threads, devices};
+use nightsplat::gpu::{Buffer, DeviceChoice, Gpu, Pipeline, Recorder, Threads, devices};
 use nightsplat::kernels::{blend_forward, relu_backward};
 use nightsplat::splats::render::{RenderSettings, Renderer};
 
@@ -308,6 +308,7 @@ fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
     let mut render = gpu.zeros("render", 3 * pixels).unwrap();
     let mut transmittances = gpu.zeros("transmittances", pixels).unwrap();
     let limits = gpu.zeros("limits", 1).unwrap();
+    let mut segment_states = gpu.zeros("segment_states", 1).unwrap();
     gpu.run("fold", |pass| {
         let buffers = blend_forward::Buffers {
             counts: counts.slice(),
@@ -321,6 +322,7 @@ fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
             render: render.slice_mut(),
             transmittances: transmittances.slice_mut(),
             limits: limits.slice(),
+            segment_states: segment_states.slice_mut(),
         };
         pass.dispatch(&pipeline, &params, buffers, Threads::Workgroups([ROWS * COLUMNS, 1, 1]))
     })
@@ -357,18 +359,17 @@ fn a_profile_names_each_pass_and_its_time_in_order() {
     let pipeline = relu_pipeline();
     let params = relu_backward::Params { value_count: 5000 };
     let threads = Threads::Exactly([5000, 1, 1]);
-    let times = gpu
-        .profile("two passes", |pass| {
-            let buffers =
-                relu_backward::Buffers { activations: a.slice(), gradient: b.slice_mut() };
-            pass.dispatch(&pipeline, &params, buffers, threads)?;
-            let buffers =
-                relu_backward::Buffers { activations: b.slice(), gradient: a.slice_mut() };
-            pass.dispatch(&pipeline, &params, buffers, threads)
-        })
-        .unwrap();
+    let mut record = |pass: &mut Recorder<'_>| {
+        let buffers = relu_backward::Buffers { activations: a.slice(), gradient: b.slice_mut() };
+        pass.dispatch(&pipeline, &params, buffers, threads)?;
+        let buffers = relu_backward::Buffers { activations: b.slice(), gradient: a.slice_mut() };
+        pass.dispatch(&pipeline, &params, buffers, threads)
+    };
+    let times = gpu.profile("two passes", &mut record).unwrap();
     let names: Vec<_> = times.iter().map(|time| time.name).collect();
     assert_eq!(names, ["relu_backward", "relu_backward"]);
     let total: f64 = times.iter().map(|time| time.milliseconds).sum();
     assert!(times.iter().all(|time| time.milliseconds >= 0.0) && total > 0.0 && total < 10_000.0);
+    let whole = gpu.profile_whole("two passes", &mut record).unwrap();
+    assert!(whole > 0.0 && whole < 10_000.0, "{whole}");
 }

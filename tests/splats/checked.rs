@@ -6,6 +6,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
+use glam::{DVec2, DVec3};
 use nightsplat::Error;
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::testing::{Defect, gpu, gpu_with, is_checked, with_defect};
@@ -16,12 +17,14 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
 use nightsplat::photographs::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::packed_sh::StorageFormat;
+use nightsplat::splats::scene::{Features, Shape};
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
 use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 
 use crate::common::Random;
-use crate::common::setup::variants;
+use crate::common::setup::{Gradients, Setup, tile_of, variants};
 
 /// Six views of 40 x 30 pixels with depth maps, as the model requires.
 fn dataset(config: &TrainConfig) -> Dataset {
@@ -209,18 +212,75 @@ fn every_pass_of_the_pseudo_gt_agrees_with_its_reference_for_every_curve() {
     }
 }
 
+/// Renders forward and backward, each pass checked.
+fn assert_passes_agree(setup: &Setup) -> Gradients {
+    let mut random = Random::new(3);
+    let (gradients, report) = gpu().checked(|| {
+        let mut rendered = setup.render();
+        let d_render: Vec<f32> =
+            rendered.render.iter().map(|_| random.between(-1.0, 1.0) as f32).collect();
+        rendered.backward(&d_render)
+    });
+    assert_agrees(&format!("{} Gaussians, {:?}", setup.count, setup.settings), &report);
+    assert!(kernels(&report).is_superset(&BTreeSet::from(["project", "project_backward"])));
+    gradients
+}
+
 #[test]
 fn every_pass_of_the_rasteriser_agrees_with_its_reference_at_every_size() {
     for setup in variants() {
-        let mut random = Random::new(3);
-        let (_, report) = gpu().checked(|| {
-            let mut rendered = setup.render();
-            let d_render: Vec<f32> =
-                rendered.render.iter().map(|_| random.between(-1.0, 1.0) as f32).collect();
-            rendered.backward(&d_render)
+        assert_passes_agree(&setup);
+    }
+}
+
+/// Segments begin where the pixels of a part are done, where all of a tile's are, and with the last splat of a run.
+#[test]
+fn the_passes_of_long_runs_agree_with_their_references_in_segments() {
+    let lanes = gpu().properties().subgroup_size;
+    for (channels, size, subgroups) in
+        [(3, [16, 8], 1), (11, [16, 16], 1), (4, [16, 16], 2), (3, [16, 16], 4)]
+    {
+        let tile = tile_of((size, subgroups));
+        if !gpu().properties().suits_tile(tile) {
+            continue;
+        }
+        let mut setup = Setup::opaque_above(channels);
+        setup.settings.tile = Some(tile);
+        let [whole, segments] = [0, 1].map(|segment| {
+            setup.segment = Some(segment * lanes.max(16));
+            assert_passes_agree(&setup)
         });
-        assert_agrees(&format!("{} Gaussians, {:?}", setup.count, setup.settings), &report);
-        assert!(kernels(&report).is_superset(&BTreeSet::from(["project", "project_backward"])));
+        let largest = whole.parameters.iter().fold(0.0f32, |most, d| most.max(d.abs()));
+        for (whole, segments) in whole.parameters.iter().zip(&segments.parameters) {
+            assert!((whole - segments).abs() <= 1e-5 * largest, "{tile}: {whole} {segments}");
+        }
+        assert_eq!(whole.visit_counts, segments.visit_counts);
+    }
+}
+
+/// Two tiles with a run each, of which the second starts at a block's first intersection or within it; no pixel ends.
+#[test]
+fn runs_of_whole_segments_and_of_one_splat_more_or_less_agree_with_their_references() {
+    let length = gpu().properties().subgroup_size.max(16);
+    for count in [length - 1, length, length + 1, 2 * length, 2 * length + 1] {
+        let shape = Shape { sh_degree: 0, features: Features::NONE };
+        let mut setup = Setup::new(count as usize, [32, 16], shape, 7);
+        setup.settings.tile = Some(tile_of(([16, 16], 1)));
+        for i in 0..setup.count {
+            let mean =
+                setup.at_pixel(DVec2::new(14.0 + (i % 5) as f64, 8.0), 1.0 + 0.01 * i as f64);
+            let log_scale = DVec3::ZERO;
+            setup.set(i, &Gaussian { mean, log_scale, raw_opacity: -3.0, ..setup.get(i) });
+        }
+        assert_eq!(setup.render().renderer.intersections().unwrap(), 2 * count);
+        let [whole, segments] = [0, length].map(|segment| {
+            setup.segment = Some(segment);
+            assert_passes_agree(&setup).parameters
+        });
+        let largest = whole.iter().fold(0.0f32, |most, d| most.max(d.abs()));
+        for (whole, segments) in whole.iter().zip(&segments) {
+            assert!((whole - segments).abs() <= 1e-5 * largest, "{count}: {whole} {segments}");
+        }
     }
 }
 

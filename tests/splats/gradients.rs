@@ -1,6 +1,6 @@
 //! The backward pass: central differences of the f64 chain, the renderer against the chain, the same bits every time.
 
-use glam::{DVec2, DVec3, DVec4};
+use glam::{DVec2, DVec3};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::reference::camera::Model;
 use nightsplat::reference::gaussian::Gaussian;
@@ -125,15 +125,7 @@ fn the_gradient_is_correct_through_capped_alphas_and_done_pixels() {
 #[test]
 fn the_gradient_is_correct_where_one_part_of_a_tile_is_done_before_another() {
     for (channels, subgroups) in [(3, 2), (3, 4), (11, 4)] {
-        let shape = Shape { sh_degree: 0, features: features(channels) };
-        let mut setup = Setup::new(90, [32, 35], shape, 52);
-        // The uppermost part is opaque after the first Gaussians; the lower parts continue for several batches.
-        for i in 0..12 {
-            let mean = setup.at_pixel(DVec2::new(16.0, 2.0), 0.8 + 0.01 * i as f64);
-            let log_scale = DVec3::new(0.5, 0.03, 0.03).map(f64::ln);
-            let quat = DVec4::new(1.0, 0.0, 0.0, 0.0);
-            setup.set(i, &Gaussian { mean, quat, log_scale, raw_opacity: 6.0, ..setup.get(i) });
-        }
+        let mut setup = Setup::opaque_above(channels);
         let tile = tile_of(([16, 16], subgroups));
         setup.settings.tile = Some(tile).filter(|&tile| gpu().properties().suits_tile(tile));
         let chain = Chain::new(&setup);

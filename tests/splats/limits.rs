@@ -135,13 +135,14 @@ fn tile_runs(sorted_tiles: Vec<u32>, longest_run: u32) -> (Vec<UVec2>, Vec<u32>)
         takes_median: 0,
         background: [0.0; 11],
     };
-    let (_, _, ranges, status) = run_kernel!(
+    let segment_states = vec![0.0f32];
+    let (_, _, ranges, status, _) = run_kernel!(
         blend_forward,
         blend_forward::Constants::default(),
         params,
         Threads::Workgroups([120, 1, 1]),
         [counts, sorted_intersections, gaussian_ids, splats, colors, sorted_tiles, limits],
-        [render, transmittances, tile_ranges, status]
+        [render, transmittances, tile_ranges, status, segment_states]
     );
     (ranges, status)
 }

@@ -4,6 +4,7 @@
 
 use nightsplat::gpu::testing::{gpu, gpu_with};
 use nightsplat::gpu::{Buffer, Gpu, Threads};
+use nightsplat::kernels::digit::MAX_DIGITS;
 use nightsplat::kernels::{scan_downsweep, scan_upsweep, sort_downsweep, sort_upsweep};
 use nightsplat::splats::sort::{Count, RadixSort, Scan};
 
@@ -79,11 +80,13 @@ fn sorts_of_all_sizes_are_correct_and_stable() {
 
 #[test]
 fn a_sort_by_any_number_of_bits_uses_only_those_bits() {
-    let gpu = gpu();
-    let mut sort = RadixSort::new(&gpu, 3000).unwrap();
-    let keys = noise(3000);
-    for bits in [0, 1, 7, 8, 9, 13, 16, 17, 24, 31] {
-        assert_sorts(&gpu, &mut sort, "noise", &keys, 3000, bits);
+    for is_cpu in [true, false] {
+        let gpu = gpu_with(|own| own.is_cpu = is_cpu);
+        let mut sort = RadixSort::new(&gpu, 9000).unwrap();
+        let keys = noise(9000);
+        for bits in [0, 1, 7, 8, 9, 13, 16, 17, 24, 31] {
+            assert_sorts(&gpu, &mut sort, "noise", &keys, 9000, bits);
+        }
     }
 }
 
@@ -102,23 +105,28 @@ fn equal_and_extreme_keys_keep_their_order() {
 
 #[test]
 fn a_sort_reads_its_count_on_the_device_and_stays_within_the_buffers() {
-    let gpu = gpu();
-    let mut sort = RadixSort::new(&gpu, 4000).unwrap();
-    let keys = noise(4000);
-    for count in [0, 1, 1023, 2049, 3999, 4000, 4001, u32::MAX] {
-        assert_sorts(&gpu, &mut sort, "count", &keys, count, 32);
+    for is_cpu in [true, false] {
+        let gpu = gpu_with(|own| own.is_cpu = is_cpu);
+        let mut sort = RadixSort::new(&gpu, 9000).unwrap();
+        let keys = noise(9000);
+        // A larger count after a smaller one meets the tables that the smaller one left.
+        for count in [0, 1, 1023, 2049, 8191, 8193, 3, 8999, 9000, 9001, u32::MAX] {
+            assert_sorts(&gpu, &mut sort, "count", &keys, count, 32);
+        }
     }
 }
 
 #[test]
 fn twenty_five_sorts_are_identical() {
-    let gpu = gpu();
-    let mut sort = RadixSort::new(&gpu, 20_000).unwrap();
-    // Few distinct keys: a race between equal ones would change the values.
-    let keys: Vec<u32> = noise(20_000).iter().map(|n| n % 37).collect();
-    let first = sorted(&gpu, &mut sort, &keys, 20_000, 8);
-    for _ in 1..25 {
-        assert!(sorted(&gpu, &mut sort, &keys, 20_000, 8) == first);
+    for is_cpu in [true, false] {
+        let gpu = gpu_with(|own| own.is_cpu = is_cpu);
+        let mut sort = RadixSort::new(&gpu, 20_000).unwrap();
+        // Few distinct keys: a race between equal ones would change the values.
+        let keys: Vec<u32> = noise(20_000).iter().map(|n| n % 37 * 0x10_0001).collect();
+        let first = sorted(&gpu, &mut sort, &keys, 20_000, 24);
+        for _ in 1..25 {
+            assert!(sorted(&gpu, &mut sort, &keys, 20_000, 24) == first);
+        }
     }
 }
 
@@ -262,35 +270,71 @@ fn sort_kernels_match_their_references() {
 fn compare_sort_kernels(rank_by_ballot: bool, subgroups: u32) {
     let counted = sort_upsweep::Constants { subgroups, ..Default::default() };
     let ranked = sort_downsweep::Constants { rank_by_ballot, subgroups, ..Default::default() };
-    // A digit narrower than any subgroup, and the widest.
-    for (size, (shift, digit_bits)) in SIZES.into_iter().flat_map(|s| [(s, (31, 1)), (s, (5, 8))]) {
-        let (capacity, count_index, digits) = (size, 0, 1_u32 << digit_bits);
-        let partitions = size.div_ceil(PARTITION);
-        let workgroups = partitions.div_ceil(subgroups);
+    // A digit narrower than any subgroup and the last of its keys, and the widest before another.
+    for (size, (shift, digit_bits, next_bits)) in
+        SIZES.into_iter().flat_map(|s| [(s, (31, 1, 0)), (s, (5, 8, 6))])
+    {
+        let (capacity, count_index) = (size, 0);
+        let workgroups = size.div_ceil(PARTITION).div_ceil(subgroups);
+        let [own_table, next_table, cleared_table] = [0, 1, 2].map(|i| i * workgroups * MAX_DIGITS);
         // A count beyond the capacity is clamped to it.
         let (counts, keys) = (vec![size + 5], noise(size));
         let values: Vec<u32> = (0..size).map(|i| 3 * i).collect();
-        let [table, offsets, digit_begins] =
-            [digits * workgroups, digits * partitions, digits].map(|len| vec![0; len as usize]);
-        let arrivals = vec![0];
+        let (table, arrivals) = (vec![9; (3 * workgroups * MAX_DIGITS) as usize], vec![0]);
+        let digit_begins = vec![0; MAX_DIGITS as usize];
         // One workgroup more than there are partitions: it must not change anything.
-        let (table, offsets, digit_begins, arrivals) = run_kernel!(
+        let threads = Threads::Workgroups([workgroups + 1, 1, 1]);
+        let (table, digit_begins, arrivals) = run_kernel!(
             sort_upsweep,
             counted,
-            sort_upsweep::Params { count_index, capacity, shift, digit_bits },
-            Threads::Workgroups([workgroups + 1, 1, 1]),
+            sort_upsweep::Params { count_index, capacity, shift, digit_bits, next_table },
+            threads,
             [counts, keys],
-            [table, offsets, digit_begins, arrivals]
+            [table, digit_begins, arrivals]
         );
         assert_eq!(arrivals, [0]);
         let (sorted_keys, sorted_values) = (vec![0; keys.len()], vec![0; keys.len()]);
-        run_kernel!(
+        let (table, digit_begins, sorted_keys, sorted_values, arrivals) = run_kernel!(
             sort_downsweep,
             ranked,
-            sort_downsweep::Params { count_index, capacity, shift, digit_bits },
-            Threads::Workgroups([partitions + 1, 1, 1]),
-            [counts, table, offsets, digit_begins, keys, values],
-            [sorted_keys, sorted_values]
+            sort_downsweep::Params {
+                count_index,
+                capacity,
+                shift,
+                digit_bits,
+                next_bits,
+                own_table,
+                next_table,
+                cleared_table,
+            },
+            threads,
+            [counts, keys, values],
+            [table, digit_begins, sorted_keys, sorted_values, arrivals]
         );
+        assert_eq!(arrivals, [0]);
+        if next_bits == 0 || subgroups == 1 {
+            continue;
+        }
+        let (shift, digit_bits, next_bits) = (shift + digit_bits, next_bits, 0);
+        let (keys, values) = (sorted_keys, sorted_values);
+        let (sorted_keys, sorted_values) = (vec![0; keys.len()], vec![0; keys.len()]);
+        let (_, _, sorted_keys, _, _) = run_kernel!(
+            sort_downsweep,
+            ranked,
+            sort_downsweep::Params {
+                count_index,
+                capacity,
+                shift,
+                digit_bits,
+                next_bits,
+                own_table: next_table,
+                next_table: cleared_table,
+                cleared_table: own_table,
+            },
+            threads,
+            [counts, keys, values],
+            [table, digit_begins, sorted_keys, sorted_values, arrivals]
+        );
+        assert!(sorted_keys.is_sorted_by_key(|key| key >> 5 & 0x3fff), "{size} keys");
     }
 }

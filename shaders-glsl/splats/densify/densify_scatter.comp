@@ -72,7 +72,7 @@ Shape half_of(Shape parent, mat3 axes, uint copy_index) {
     float new_opacity = opacity * (SPLIT_OPACITY + SPLIT_OPACITY_SLOPE * opacity);
     float offset = (copy_index == 0 ? SPLIT_OFFSET : -SPLIT_OFFSET) * exp(log_scales[axis]);
     Shape child;
-    child.mean = parent.mean + offset * axes[axis];
+    child.mean = parent.mean + offset * axis_of(axes, axis);
     for (uint k = 0; k < 3; ++k) child.log_scales[k] = log_scales[k] + (k == axis ? along : across);
     child.raw_opacity = log(new_opacity / (1.0 - new_opacity));
     return child;

@@ -59,7 +59,7 @@ float view_change(vec3 mean, mat3 axes, float opacity, uint axis, Camera camera)
     vec3 mean_in_view = camera.view_from_world * vec4(mean, 1.0);
     mat3 view_axes = mat3(camera.view_from_world) * axes;
     float depth = camera_depth(mean_in_view, camera);
-    float shift = SPLIT_OFFSET * abs(camera_depth_change(mean_in_view, view_axes[axis], camera));
+    float shift = SPLIT_OFFSET * abs(camera_depth_change(mean_in_view, axis_of(view_axes, axis), camera));
     // Both halves are in front of the near plane.
     if (depth + shift <= near) return 0.0;
     // The nearer half has the largest footprint.

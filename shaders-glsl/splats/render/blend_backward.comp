@@ -6,6 +6,7 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "splat.glsl"
 #include "tile.glsl"
 #include "record_sums.glsl"
+#include "segments.glsl"
 
 //! Blend backward: a tile's subgroups, most often one, write the gradient record of every intersection to its slot.
 //!
@@ -14,11 +15,14 @@ layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 //! the product with dL/dC is all that is needed: one number a pixel, however many channels. The gradients of the
 //! ellipse are multiples of moments, sums of dL/dsigma times powers of the offset. No atomics: a slot is written by the
 //! one tile it belongs to, and the sums over a tile's parts and over a Gaussian's slots come in a fixed order.
+//!
+//! Where long runs have segments, the first workgroups have the first segment of every tile, the others one for each
+//! block of intersections, and with it at most one further segment.
 
 // This many channels, from the first, move and shape the splats; of the others only the colours learn.
 layout(constant_id = 8) const uint SHAPING_CHANNELS = 3;
 
-layout(push_constant, scalar) uniform Params { uvec2 size; uint tile_columns; };
+layout(push_constant, scalar) uniform Params { uvec2 size; uint tile_columns; uint tile_count; };
 
 layout(binding = 0) readonly  buffer Ranges  { uvec2 tile_ranges[]; };
 layout(binding = 1) readonly  buffer IntersectionIds   { uint sorted_intersections[]; };
@@ -29,6 +33,9 @@ layout(binding = 5) readonly  buffer Render  { float render[]; };    // (CHANNEL
 layout(binding = 6) readonly  buffer DRender { float d_render[]; };  // (CHANNELS, H, W)
 // (slots, RECORD_VECTORS): moments of dL/dsigma 6, gradients of the colour CHANNELS, zeros
 layout(binding = 7) writeonly buffer GradientRecords { vec4 gradient_records[]; };
+layout(binding = 8) readonly  buffer Counts  { uint counts[]; };  // [0]: intersections
+layout(binding = 9) readonly  buffer Tiles   { uint sorted_tiles[]; };
+layout(binding = 10) readonly buffer SegmentStates { float segment_states[]; };  // include/segments.glsl
 
 // The splats that a subgroup loads at once: one a lane; at most 32 where parts add their records in shared memory.
 const uint BATCH = SUBGROUP_SIZE / (1 + (1 - 1 / SUBGROUPS_PER_TILE) * ((SUBGROUP_SIZE - 1) / 32));
@@ -36,6 +43,13 @@ const uint RECORD_FLOATS = 4 * RECORD_VECTORS;
 // (parts, BATCH, RECORD_FLOATS): the records of a batch; without use where a tile has one part.
 shared float shares[(SUBGROUPS_PER_TILE - 1 / SUBGROUPS_PER_TILE) * BATCH * RECORD_FLOATS + 1];
 shared uint are_alive[SUBGROUPS_PER_TILE];
+
+// Whether the gradients of a splat's colours are summed over the groups when these are done, from their weights: narrow
+// subgroups do not have the registers for the colours and their gradients at once. A function, as `tile_is_shared`.
+bool sums_colors_last() {
+    uint lanes = SUBGROUP_SIZE;
+    return tile_is_shared() && CHANNELS > lanes;
+}
 
 // Whether any lane of any part says so; every lane has to ask.
 bool tile_any(bool says) {
@@ -48,12 +62,32 @@ bool tile_any(bool says) {
     return any;
 }
 
+// The tile of this workgroup and its intersections; none where the block has no start of a segment.
+uvec2 segment_of(out uint tile) {
+    tile = WORKGROUP_INDEX;
+    uvec2 range = uvec2(0);
+    if (SEGMENT == 0) return tile < tile_count ? tile_ranges[tile] : range;
+    if (tile < tile_count) {
+        range = tile_ranges[tile];
+    } else {
+        uint begin = (tile - tile_count) * SEGMENT;
+        tile = begin < counts[0] ? sorted_tiles[begin] : tile_count;
+        if (tile >= tile_count) return range;
+        range = tile_ranges[tile];
+        uint start = range.x + (begin - range.x + SEGMENT - 1) / SEGMENT * SEGMENT;
+        range.x = start == range.x ? range.y : min(start, range.y);
+    }
+    range.y = min(range.y, range.x + SEGMENT);
+    return range;
+}
+
 // Subgroups that share a tile leave its loops each for itself.
 void main() [[subgroup_uniform_control_flow]] {
-    uint tile = WORKGROUP_INDEX;
+    uint tile;
+    uvec2 range = segment_of(tile);
     uint lane = gl_SubgroupInvocationID;
+    if (range.x >= range.y) return;
     uvec2 origin = tile_origin(tile, tile_columns);
-    if (origin.y >= size.y) return;
     origin.y += gl_SubgroupID * PART_HEIGHT;
     uvec2 first_pixel = origin + lane_pixel();
 
@@ -72,7 +106,19 @@ void main() [[subgroup_uniform_control_flow]] {
         }
     }
 
-    uvec2 range = tile_ranges[tile];
+    // The light still to come at the start of a further segment is what those before it left.
+    if (SEGMENT != 0 && WORKGROUP_INDEX >= tile_count) {
+        uint block = range.x / SEGMENT;
+        [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+            uint pixel = g * SUBGROUP_SIZE;
+            transmittance[g] = segment_states[segment_state(block, 0) + pixel];
+            [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
+                if (c < SHAPING_CHANNELS)
+                    light[g] -= segment_states[segment_state(block, 1 + c) + pixel] * d_pixel[g][c];
+            }
+        }
+    }
+
     uint first = range.x;
     for (; first < range.y; first += BATCH) {
         bool alive = false;
@@ -103,21 +149,22 @@ void main() [[subgroup_uniform_control_flow]] {
                     float splat_color[CHANNELS];
                     [[unroll]] for (uint c = 0; c < CHANNELS; c++)
                         splat_color[c] = subgroupShuffle(my_color[c / 4][c % 4], j);
-                    vec3 sigma_by_power[COLUMNS];
+                    vec3 exponents[COLUMNS];
                     vec3 moments[COLUMNS];  // 1, y, yy
                     [[unroll]] for (uint i = 0; i < COLUMNS; i++) {
-                        sigma_by_power[i] = sigma_in_column(conic, offset.x - float(group_offset(i).x));
+                        exponents[i] = exponent_in_column(conic, offset.x - float(group_offset(i).x));
                         moments[i] = vec3(0.0);
                     }
 
+                    float weights[GROUPS];
                     // Choices are between names, both computed: a compiler makes branches of others.
                     [[unroll]] for (uint g = 0; g < GROUPS; g++) {
                         if ((groups >> g & 1) == 0) continue;
                         float y = offset.y - float(group_offset(g).y);
-                        float sigma = sigma_at(sigma_by_power[g % COLUMNS], y);
-                        float free_alpha = opacity * exp(-sigma);
+                        float exponent = exponent_at(exponents[g % COLUMNS], y);
+                        float free_alpha = opacity * exp(exponent);
                         float alpha = min(ALPHA_MAX, free_alpha);
-                        bool counts = all(bvec2(sigma >= 0.0, alpha >= ALPHA_MIN));
+                        bool counts = all(bvec2(exponent <= 0.0, alpha >= ALPHA_MIN));
                         // What does not count has alpha 0: the lanes never part.
                         alpha = counts ? alpha : 0.0;
                         float before = transmittance[g];
@@ -126,9 +173,10 @@ void main() [[subgroup_uniform_control_flow]] {
                         transmittance[g] = is_done ? 0.0 : after;
                         float weight = alpha * before;
                         weight = is_done ? 0.0 : weight;
+                        weights[g] = weight;
                         float shade = 0.0;
                         [[unroll]] for (uint c = 0; c < CHANNELS; c++) {
-                            record[RECORD_HEAD + c] += weight * d_pixel[g][c];
+                            if (!sums_colors_last()) record[RECORD_HEAD + c] += weight * d_pixel[g][c];
                             if (c < SHAPING_CHANNELS) shade += splat_color[c] * d_pixel[g][c];
                         }
                         // -alpha dL/dalpha; at the cap alpha no longer depends on the splat.
@@ -148,6 +196,11 @@ void main() [[subgroup_uniform_control_flow]] {
                         record[3] += x * moment_x;
                         record[4] += x * moments[i].y;
                         record[5] += moments[i].z;
+                    }
+                    [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                        if (!sums_colors_last() || (groups >> g & 1) == 0) continue;
+                        [[unroll]] for (uint c = 0; c < CHANNELS; c++)
+                            record[RECORD_HEAD + c] += weights[g] * d_pixel[g][c];
                     }
                     sum_record(record);
                 }

@@ -5,6 +5,7 @@
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "splat.glsl"
 #include "tile.glsl"
+#include "segments.glsl"
 #include "status.glsl"
 
 //! Blend forward: a subgroup owns a tile or a part of one, finds the tile's run of the sorted intersections and
@@ -37,6 +38,7 @@ layout(binding = 7) readonly  buffer Tiles      { uint sorted_tiles[]; };
 layout(binding = 8) writeonly buffer Ranges { uvec2 tile_ranges[]; };  // (tiles) first intersection, one past the last
 layout(binding = 9)           buffer Status     { uint status[]; };
 layout(binding = 10) readonly buffer Limits     { float limits[]; };  // (H, W) depth beyond which nothing is seen
+layout(binding = 11) writeonly buffer SegmentStates { float segment_states[]; };  // include/segments.glsl
 
 layout(constant_id = 11) const uint VIEW_DEPTHS = 0;  // 1: the last channel is the depth
 // The depth of a pixel without a limit, and of one where nothing is visible.
@@ -70,10 +72,20 @@ void main() [[subgroup_uniform_control_flow]] {
 
     uvec2 range = tile_run(tile, longest_run);
     if (gl_SubgroupID == 0 && subgroupElect()) tile_ranges[tile] = range;
-    for (uint first = range.x; first < range.y; first += SUBGROUP_SIZE) {
+    uint first = range.x;
+    for (; first < range.y; first += SUBGROUP_SIZE) {
         bool alive = false;
         [[unroll]] for (uint g = 0; g < GROUPS; g++) alive = alive || transmittance[g] > 0.0;
         if (!subgroupAny(alive)) break;
+        if (SEGMENT != 0 && first != range.x && (first - range.x) % SEGMENT == 0) {
+            uint block = first / SEGMENT;
+            [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                uint pixel = g * SUBGROUP_SIZE;
+                segment_states[segment_state(block, 0) + pixel] = max(transmittance[g], 0.0);
+                [[unroll]] for (uint c = 0; c < CHANNELS; c++)
+                    segment_states[segment_state(block, 1 + c) + pixel] = color[g][c];
+            }
+        }
 
         uint batch = min(SUBGROUP_SIZE, range.y - first);
         // Lanes beyond the batch load its last splat, which counts on no pixel without opacity.
@@ -95,16 +107,16 @@ void main() [[subgroup_uniform_control_flow]] {
                 float splat_color[CHANNELS];
                 [[unroll]] for (uint c = 0; c < CHANNELS; c++)
                     splat_color[c] = subgroupShuffle(my_color[c / 4][c % 4], j);
-                vec3 sigma_by_power[COLUMNS];
+                vec3 exponents[COLUMNS];
                 [[unroll]] for (uint k = 0; k < COLUMNS; k++)
-                    sigma_by_power[k] = sigma_in_column(conic, offset.x - float(group_offset(k).x));
+                    exponents[k] = exponent_in_column(conic, offset.x - float(group_offset(k).x));
 
                 // Choices are between names, both computed: a compiler makes branches of others.
                 [[unroll]] for (uint g = 0; g < GROUPS; g++) {
                     if ((groups >> g & 1) == 0) continue;
-                    float sigma = sigma_at(sigma_by_power[g % COLUMNS], offset.y - float(group_offset(g).y));
-                    float alpha = min(ALPHA_MAX, opacity * exp(-sigma));
-                    bool counts = all(bvec2(sigma >= 0.0, alpha >= ALPHA_MIN));
+                    float exponent = exponent_at(exponents[g % COLUMNS], offset.y - float(group_offset(g).y));
+                    float alpha = min(ALPHA_MAX, opacity * exp(exponent));
+                    bool counts = all(bvec2(exponent <= 0.0, alpha >= ALPHA_MIN));
                     // What does not count is composited with alpha 0: the lanes never part.
                     alpha = counts ? alpha : 0.0;
                     float before = transmittance[g];
@@ -126,6 +138,16 @@ void main() [[subgroup_uniform_control_flow]] {
         }
     }
 
+    if (SEGMENT != 0) {
+        // In segments after the end every pixel is done.
+        uint segments = max((first - range.x + SEGMENT - 1) / SEGMENT, 1);
+        for (uint start = range.x + segments * SEGMENT; start < range.y; start += SEGMENT) {
+            [[unroll]] for (uint g = 0; g < GROUPS; g++) {
+                [[unroll]] for (uint value = 0; value <= CHANNELS; value++)
+                    segment_states[segment_state(start / SEGMENT, value) + g * SUBGROUP_SIZE] = 0.0;
+            }
+        }
+    }
     [[unroll]] for (uint g = 0; g < GROUPS; g++) {
         uvec2 pixel = first_pixel + group_offset(g);
         if (all(lessThan(pixel, size))) {

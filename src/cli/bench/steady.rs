@@ -1,4 +1,4 @@
-//! Many steps as training submits them: time on the wall, in the passes, and of the processor.
+//! Many steps as training submits them: time on the wall, on the device, in the passes, and of the processor.
 
 use std::time::Instant;
 
@@ -13,7 +13,9 @@ use crate::train::Trainer;
 pub(super) struct Steady {
     steps: u64,
     wall: f64,
-    /// Of all passes, one after the other.
+    /// From the start of the first pass to the end of the last.
+    device: f64,
+    /// Of all passes, each with a timestamp behind it, which keeps it from overlapping with the next.
     passes: f64,
     /// User and system time of this process; absent where the system does not report it.
     processor: Option<f64>,
@@ -23,6 +25,7 @@ pub(super) struct Steady {
 /// The device is out of memory or lost.
 pub(super) fn time(bench: &Bench, trainer: &mut Trainer, steps: u64) -> Result<Steady> {
     let passes = bench.median(|| Ok(total(&trainer.profile_step()?)))?;
+    let device = bench.median(|| trainer.profile_whole_step())?;
     let (begin, processor) = (Instant::now(), processor_seconds());
     let until = trainer.steps_done() + steps;
     while trainer.steps_done() < until {
@@ -33,6 +36,7 @@ pub(super) fn time(bench: &Bench, trainer: &mut Trainer, steps: u64) -> Result<S
     Ok(Steady {
         steps,
         wall: per_step(begin.elapsed().as_secs_f64()),
+        device,
         passes,
         processor: used.map(per_step),
     })
@@ -43,18 +47,20 @@ impl Steady {
         json!({
             "steps": self.steps,
             "wall_ms": self.wall,
+            "device_ms": self.device,
             "passes_ms": self.passes,
-            "idle_ms": self.wall - self.passes,
+            "idle_ms": self.wall - self.device,
             "processor_ms": self.processor,
         })
     }
 
     pub(super) fn as_text(&self) -> String {
-        let Self { steps, wall, passes, processor } = self;
+        let Self { steps, wall, device, passes, processor } = self;
         let processor = processor.map(|ms| format!(", {ms:.3} of the processor"));
         format!(
-            "{steps} steps: {wall:.3} ms each, {passes:.3} in passes, {:.3} between them{}",
-            wall - passes,
+            "{steps} steps: {wall:.3} ms each, {device:.3} on the device, {:.3} between steps{}; \
+             {passes:.3} with every pass timed",
+            wall - device,
             processor.unwrap_or_default()
         )
     }

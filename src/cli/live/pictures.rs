@@ -6,6 +6,7 @@ use glam::DVec3;
 use hyper::body::Bytes;
 
 use crate::Result;
+use crate::cli::driver;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, MeasuredSize, View};
 use crate::photographs::image::Image;
@@ -122,7 +123,7 @@ impl Pictures {
                 if targets.is_none() {
                     let opened = match gpu.take() {
                         Some(own) => own,
-                        None => Gpu::new(&config.device.parse()?)?,
+                        None => driver::open(&config.device.parse()?)?,
                     };
                     *targets = Some(TestTargets::new(&opened, &config.tone, dataset)?);
                     *gpu = Some(opened);

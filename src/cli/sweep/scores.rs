@@ -5,6 +5,7 @@ use std::path::Path;
 use serde_json::{Value, json};
 
 use crate::base::output::write_whole;
+use crate::cli::driver;
 use crate::gpu::Gpu;
 use crate::networks::lpips::{Lpips, Range};
 use crate::photographs::dataset::View;
@@ -27,7 +28,7 @@ pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range)
             continue;
         }
         let FinishedRun { gpu, config, dataset, mut model_renderer, .. } =
-            FinishedRun::open(run, None, None)?;
+            FinishedRun::open(run, None, &driver::opener(None))?;
         let lpips = Lpips::load(&gpu, weights, range)?;
         let mut reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
         let render = |view: &View| model_renderer.render(view);

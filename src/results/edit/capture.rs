@@ -8,12 +8,12 @@ use glam::DVec3;
 use super::placement::Placement;
 use crate::base::input;
 use crate::camera::Camera;
-use crate::gpu::{DeviceChoice, Gpu};
+use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::photographs::tone::ToneSettings;
 use crate::results::eval::{self, ModelRenderer, ScoreReference};
-use crate::results::finished_run::{FinishedRun, is_model};
+use crate::results::finished_run::{FinishedRun, Opener, is_model};
 use crate::results::run;
 use crate::splats::model::Model;
 use crate::splats::render::RenderSettings;
@@ -38,12 +38,8 @@ const LARGE_ERROR: f64 = 0.05;
 impl Capture {
     /// # Errors
     /// The dataset is missing, or there is no such device.
-    pub(super) fn open(
-        model: &Path,
-        dataset: Option<&Path>,
-        device: Option<&DeviceChoice>,
-    ) -> Result<Self> {
-        let FinishedRun { gpu, config, dataset, .. } = FinishedRun::open(model, dataset, device)?;
+    pub(super) fn open(model: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
+        let FinishedRun { gpu, config, dataset, .. } = FinishedRun::open(model, dataset, opener)?;
         let (is_model, learns) = (is_model(model), config.exposure.learn == OnOff::On);
         let tone = if is_model { ToneSettings::default() } else { config.tone.clone() };
         Ok(Self { gpu, config, dataset, tone, adjusts: is_model || learns })

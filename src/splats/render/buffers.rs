@@ -58,6 +58,7 @@ pub struct RenderBuffers {
     /// Values per pixel.
     channels: usize,
     purpose: Purpose,
+    pub(super) segments: Segments,
     // Gaussians
     /// `[0]`: the number of rendered Gaussians
     pub gaussian_counts: Buffer<u32>,
@@ -75,6 +76,8 @@ pub struct RenderBuffers {
     pub intersection_ids: Buffer<u32>,
     pub gaussian_ids: Buffer<u32>,
     pub gradient_records: Buffer<f32>,
+    /// The pixels of each tile before the segments of its run after the first.
+    pub segment_states: Buffer<f32>,
     // pixels and tiles
     pub render: Buffer<f32>,
     pub transmittances: Buffer<f32>,
@@ -90,10 +93,16 @@ pub struct RenderBuffers {
 
 impl RenderBuffers {
     /// Empty but for the single numbers.
-    pub(super) fn new(gpu: &Gpu, channels: usize, purpose: Purpose) -> Result<Self> {
+    pub(super) fn new(
+        gpu: &Gpu,
+        channels: usize,
+        purpose: Purpose,
+        segments: Segments,
+    ) -> Result<Self> {
         Ok(Self {
             channels,
             purpose,
+            segments,
             gaussian_counts: gpu.zeros("gaussian_counts", 1)?,
             splats: gpu.uninit("splats", 0)?,
             colors: gpu.uninit("colors", 0)?,
@@ -107,6 +116,7 @@ impl RenderBuffers {
             intersection_ids: gpu.uninit("intersection_ids", 0)?,
             gaussian_ids: gpu.uninit("gaussian_ids", 0)?,
             gradient_records: gpu.uninit("gradient_records", 0)?,
+            segment_states: gpu.uninit("segment_states", 1)?,
             render: gpu.uninit("render", 0)?,
             transmittances: gpu.uninit("transmittances", 0)?,
             tile_ranges: gpu.uninit("tile_ranges", 0)?,
@@ -181,8 +191,10 @@ impl RenderBuffers {
         let records = gpu.uninit("gradient_records", self.record_floats() * capacity)?;
         let tiles = gpu.uninit("tiles", capacity)?;
         let intersection_ids = gpu.uninit("intersection_ids", capacity)?;
+        let states = gpu.uninit("segment_states", self.state_floats(capacity))?;
         self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
         (self.tiles, self.intersection_ids) = (tiles, intersection_ids);
+        self.segment_states = states;
         self.gradient_records = records;
         Ok(())
     }
@@ -195,11 +207,13 @@ impl RenderBuffers {
                 *numbers = gpu.uninit("intersections", 0)?;
             }
             self.gradient_records = gpu.uninit("gradient_records", 0)?;
+            self.segment_states = gpu.uninit("segment_states", 1)?;
             gpu.free_unused();
             self.intersection_ids = gpu.uninit("intersection_ids", capacity)?;
             self.gaussian_ids = gpu.uninit("gaussian_ids", capacity)?;
             self.gradient_records =
                 gpu.uninit("gradient_records", self.record_floats() * capacity)?;
+            self.segment_states = gpu.uninit("segment_states", self.state_floats(capacity))?;
             // Its length says that the others are there.
             self.tiles = gpu.uninit("tiles", capacity)?;
         }
@@ -215,7 +229,15 @@ impl RenderBuffers {
 
     /// Bytes per intersection.
     pub(super) fn bytes_per_intersection(&self) -> usize {
-        3 * size_of::<u32>() + self.record_floats() * size_of::<f32>()
+        let Segments { length, state } = self.segments;
+        let state = if length == 0 { 0 } else { state.div_ceil(length) };
+        3 * size_of::<u32>() + (self.record_floats() + state as usize) * size_of::<f32>()
+    }
+
+    /// The floats of the states of segments, or one that is bound in their place.
+    fn state_floats(&self, capacity: usize) -> usize {
+        let blocks = self.segments.blocks(capacity as u32) as usize;
+        (blocks * self.segments.state as usize).max(1)
     }
 
     /// The floats of a gradient record, in vectors of four; 0 without gradients.
@@ -226,14 +248,35 @@ impl RenderBuffers {
         }
     }
 
-    /// The number of intersections whose records, or ids, fit one binding.
+    /// The number of intersections whose records, segments, or ids, fit one binding.
     pub(super) fn max_intersections(&self, gpu: &Gpu) -> u32 {
         let record = (self.record_floats() * size_of::<f32>()).max(size_of::<u32>()) as u64;
-        (gpu.properties().max_storage_buffer_range / record).min(u32::MAX.into()) as u32
+        let bindable = gpu.properties().max_storage_buffer_range;
+        let Segments { length, state } = self.segments;
+        let state = u64::from(state) * size_of::<f32>() as u64;
+        let in_segments = if length == 0 { u64::MAX } else { bindable / state * u64::from(length) };
+        (bindable / record).min(in_segments).min(u32::MAX.into()) as u32
     }
 
     pub(super) fn intersection_capacity(&self) -> u32 {
         self.tiles.len() as u32
+    }
+}
+
+/// The segments of the run of a tile, which the backward pass blends side by side.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Segments {
+    /// Splats; 0: a run has one segment.
+    pub(super) length: u32,
+    /// Floats of the state of a tile's pixels before a segment: transmittance and channels. Depths are not blended
+    /// backward and have no part in it.
+    pub(super) state: u32,
+}
+
+impl Segments {
+    /// The blocks of `intersections`, each of which may have the start of a segment that is not the first of its tile.
+    pub(super) fn blocks(self, intersections: u32) -> u32 {
+        if self.length == 0 { 0 } else { intersections.div_ceil(self.length) }
     }
 }
 
@@ -270,7 +313,8 @@ mod tests {
     fn gaussians_and_intersections_take_the_bytes_that_are_foreseen() {
         let gpu = Gpu::new(&crate::gpu::DeviceChoice::Best).unwrap();
         for channels in [3, 11] {
-            let mut frame = RenderBuffers::new(&gpu, channels, Purpose::Train).unwrap();
+            let segments = Segments { length: 64, state: 256 * (channels as u32 + 1) };
+            let mut frame = RenderBuffers::new(&gpu, channels, Purpose::Train, segments).unwrap();
             let before = gpu.memory_in_use();
             let (gaussians, intersections) = (100_000, 30_000);
             frame.reserve(&gpu, gaussians, gaussians, 0, 0).unwrap();

@@ -2,8 +2,8 @@
 
 use glam::UVec2;
 
-use super::RenderSettings;
 use super::buffers::color_floats;
+use super::{Purpose, RenderSettings};
 use crate::gpu::{Gpu, Properties, Tile};
 use crate::kernels::ProjectedSplat;
 use crate::{Error, Result};
@@ -12,6 +12,22 @@ use crate::{Error, Result};
 /// limit can process a hundred thousand splats on a tile; one and four were measured to be slower there.
 pub(super) fn splats_per_turn(gpu: &Gpu) -> u32 {
     if gpu.properties().max_loop_iterations < u32::MAX { 2 } else { 1 }
+}
+
+/// The splats of a segment of a tile's run on a GPU, where the last splats of a long run would wait for all before them
+/// while the device has nothing else to do; shorter where subgroups share the tiles of small views. The states between
+/// segments take memory. A processor is busy with other tiles.
+const SEGMENT: u32 = 1024;
+const SEGMENT_OF_SHARED_TILE: u32 = 128;
+
+/// The splats of a segment; 0: a run has one segment.
+pub(super) fn segment_length(gpu: &Properties, purpose: Purpose, tile: Tile) -> u32 {
+    match purpose {
+        Purpose::Train if gpu.is_cpu => 0,
+        Purpose::Train if tile.subgroups > 1 => SEGMENT_OF_SHARED_TILE,
+        Purpose::Train => SEGMENT,
+        Purpose::Show => 0,
+    }
 }
 
 impl RenderSettings {

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::buffers::{RANKS_PER_PARTITION, RenderBuffers};
-use super::limits::{longest_run, splats_per_turn};
+use super::buffers::{RANKS_PER_PARTITION, RenderBuffers, Segments};
+use super::limits::{longest_run, segment_length, splats_per_turn};
 use super::{Purpose, RenderSettings, Renderer};
 use crate::Result;
 use crate::camera::CameraModel;
@@ -35,6 +35,26 @@ impl Renderer {
         gradients: GradientKind,
     ) -> Result<Self> {
         let tile = settings.tile_on(gpu)?;
+        let segment = segment_length(gpu.properties(), settings.purpose, tile);
+        Self::build(gpu, settings, gradients, tile, segment)
+    }
+
+    /// [`Renderer::new`] with segments of `segment` splats, a multiple of the subgroup size; 0: a run has one segment.
+    ///
+    /// # Errors
+    /// Those of [`Renderer::new`].
+    #[cfg(feature = "testing")]
+    pub fn with_segments(gpu: &Gpu, settings: RenderSettings, segment: u32) -> Result<Self> {
+        Self::build(gpu, settings, GradientKind::All, settings.tile_on(gpu)?, segment)
+    }
+
+    fn build(
+        gpu: &Gpu,
+        settings: RenderSettings,
+        gradients: GradientKind,
+        tile: Tile,
+        segment: u32,
+    ) -> Result<Self> {
         let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
@@ -53,8 +73,11 @@ impl Renderer {
                 skips_groups,
                 splats_per_turn,
                 subgroups_per_tile,
+                segment,
             })?),
         };
+        let state = tile_width * tile_height * (channels + 1);
+        let segments = Segments { length: segment, state };
         let depth_sort = RadixSort::new(gpu, 0)?;
         let tile_sort = depth_sort.another()?;
         Ok(Self {
@@ -72,12 +95,12 @@ impl Renderer {
                 tile_height,
                 partition_size,
             })?,
-            blend_forward: blending(gpu, &settings, tile, false)?,
+            blend_forward: blending(gpu, &settings, tile, segment, false)?,
             blend_depths: None,
             blend_backward,
             depth_sort,
             tile_sort,
-            frame: RenderBuffers::new(gpu, settings.channels(), settings.purpose)?,
+            frame: RenderBuffers::new(gpu, settings.channels(), settings.purpose, segments)?,
             limits: gpu.uninit("limits", 1)?,
             host_targets: None,
             context: None,
@@ -98,7 +121,7 @@ impl Renderer {
     /// Builds the blending kernel that keeps depths where it is needed and not there yet.
     pub(super) fn build_blending(&mut self, view_depths: bool) -> Result<()> {
         if view_depths && self.blend_depths.is_none() {
-            self.blend_depths = Some(blending(&self.gpu, &self.settings, self.tile, true)?);
+            self.blend_depths = Some(blending(&self.gpu, &self.settings, self.tile, 0, true)?);
         }
         Ok(())
     }
@@ -176,6 +199,7 @@ fn blending(
     gpu: &Gpu,
     settings: &RenderSettings,
     Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile }: Tile,
+    segment: u32,
     has_depths: bool,
 ) -> Result<Pipeline<blend_forward::Kernel>> {
     let view_depths = u32::from(has_depths);
@@ -188,5 +212,6 @@ fn blending(
         splats_per_turn: splats_per_turn(gpu),
         subgroups_per_tile,
         view_depths,
+        segment,
     })
 }

@@ -1,11 +1,13 @@
 //! The radix sort: least significant digit first, up to 8 bits per pass.
+//!
+//! On a GPU, only the first pass has an upsweep: where a downsweep places a key, it counts it for the next pass.
 
 use std::sync::Arc;
 
 use super::{Count, common_len};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads, WORKGROUP};
-use crate::kernels::digit::MAX_DIGIT_BITS;
+use crate::kernels::digit::{MAX_DIGIT_BITS, MAX_DIGITS};
 use crate::kernels::{sort_downsweep, sort_upsweep};
 
 /// A stable sort of (key, value) pairs of `u32`, ascending by key.
@@ -14,9 +16,9 @@ pub struct RadixSort {
     gpu: Gpu,
     kernels: Arc<Kernels>,
     partition_size: u32,
-    /// Partitions of a workgroup of the upsweep.
+    /// Partitions of a workgroup.
     subgroups: u32,
-    /// Workgroups of an upsweep that are done; 0 between upsweeps.
+    /// Workgroups of a kernel that are done; 0 between kernels.
     arrivals: Buffer<u32>,
     scratch: Scratch,
 }
@@ -28,8 +30,8 @@ struct Kernels {
     downsweep: Pipeline<sort_downsweep::Kernel>,
 }
 
-/// The most subgroups of a workgroup of the upsweep on a GPU, where the last workgroup scans the counts of all with as
-/// many threads. On a CPU, a barrier between subgroups costs more than that saves.
+/// The most subgroups of a workgroup on a GPU, where the last workgroup scans the counts of all with as many threads.
+/// On a CPU, a barrier between subgroups costs more than that saves.
 const SUBGROUPS_ON_A_GPU: u32 = 8;
 
 /// Scratch memory of a sort.
@@ -38,12 +40,21 @@ struct Scratch {
     /// Each pass writes the pairs here; then these and the caller's buffers are swapped.
     keys: Buffer<u32>,
     values: Buffer<u32>,
-    /// (workgroups, digits)
+    /// (workgroups, digits), in turn that of a pass, of the next and of the one after it; one where each pass counts its
+    /// own keys.
     table: Buffer<u32>,
-    /// (partitions, digits); none where a workgroup has one partition.
-    offsets: Buffer<u32>,
     /// (digits)
     digit_begins: Buffer<u32>,
+}
+
+/// A pass of a sort.
+struct Digit {
+    shift: u32,
+    bits: u32,
+    /// The bits of the next pass's digit; 0: there is none.
+    next_bits: u32,
+    /// How many passes are before it.
+    index: u32,
 }
 
 impl RadixSort {
@@ -127,8 +138,11 @@ impl RadixSort {
         count.check()?;
         common_len("sort", &[keys.len(), values.len()])?;
         self.reserve(keys.len())?;
-        for (shift, digit_bits) in digits(bits) {
-            self.record_pass(pass, count, keys, values, shift, digit_bits)?;
+        let mut digits = digits(bits).zip(0..).peekable();
+        while let Some(((shift, bits), index)) = digits.next() {
+            let next_bits = digits.peek().map_or(0, |((_, bits), _)| *bits);
+            let digit = Digit { shift, bits, next_bits, index };
+            self.record_pass(pass, count, keys, values, &digit)?;
             std::mem::swap(keys, &mut self.scratch.keys);
             std::mem::swap(values, &mut self.scratch.values);
         }
@@ -142,55 +156,73 @@ impl RadixSort {
         Count { counts, index: count_index }: Count<'_>,
         keys: &Buffer<u32>,
         values: &Buffer<u32>,
-        shift: u32,
-        digit_bits: u32,
+        digit: &Digit,
     ) -> Result<()> {
         let capacity = common_len("sort", &[keys.len(), values.len()])?;
-        let Scratch { keys: sorted_keys, values: sorted_values, table, offsets, digit_begins } =
+        let Digit { shift, bits: digit_bits, next_bits, index } = *digit;
+        let Scratch { keys: sorted_keys, values: sorted_values, table, digit_begins } =
             &mut self.scratch;
         let arrivals = &mut self.arrivals;
-        let partitions = capacity.div_ceil(self.partition_size);
-        pass.dispatch(
-            &self.kernels.upsweep,
-            &sort_upsweep::Params { count_index, capacity, shift, digit_bits },
-            sort_upsweep::Buffers {
-                counts: counts.slice(),
-                keys: keys.slice(),
-                table: table.slice_mut(),
-                offsets: offsets.slice_mut(),
-                digit_begins: digit_begins.slice_mut(),
-                arrivals: arrivals.slice_mut(),
-            },
-            Threads::Workgroups([partitions.div_ceil(self.subgroups), 1, 1]),
-        )?;
+        let workgroups = capacity.div_ceil(self.partition_size).div_ceil(self.subgroups);
+        let counts_next = self.subgroups > 1;
+        let table_of = |index| if counts_next { index % 3 * workgroups * MAX_DIGITS } else { 0 };
+        let threads = Threads::Workgroups([workgroups, 1, 1]);
+        if index == 0 || !counts_next {
+            pass.dispatch(
+                &self.kernels.upsweep,
+                &sort_upsweep::Params {
+                    count_index,
+                    capacity,
+                    shift,
+                    digit_bits,
+                    next_table: table_of(1),
+                },
+                sort_upsweep::Buffers {
+                    counts: counts.slice(),
+                    keys: keys.slice(),
+                    table: table.slice_mut(),
+                    digit_begins: digit_begins.slice_mut(),
+                    arrivals: arrivals.slice_mut(),
+                },
+                threads,
+            )?;
+        }
         pass.dispatch(
             &self.kernels.downsweep,
-            &sort_downsweep::Params { count_index, capacity, shift, digit_bits },
+            &sort_downsweep::Params {
+                count_index,
+                capacity,
+                shift,
+                digit_bits,
+                next_bits,
+                own_table: table_of(index),
+                next_table: table_of(index + 1),
+                cleared_table: table_of(index + 2),
+            },
             sort_downsweep::Buffers {
                 counts: counts.slice(),
-                table: table.slice(),
-                offsets: offsets.slice(),
-                digit_begins: digit_begins.slice(),
+                table: table.slice_mut(),
+                digit_begins: digit_begins.slice_mut(),
                 keys: keys.slice(),
                 values: values.slice(),
                 sorted_keys: sorted_keys.slice_mut(),
                 sorted_values: sorted_values.slice_mut(),
+                arrivals: arrivals.slice_mut(),
             },
-            Threads::Workgroups([partitions, 1, 1]),
+            threads,
         )
     }
 }
 
 impl Scratch {
     fn new(gpu: &Gpu, capacity: u32, [partition_size, subgroups]: [u32; 2]) -> Result<Self> {
-        let partitions = capacity.div_ceil(partition_size);
         let rows = |count: u32| (count as usize) << MAX_DIGIT_BITS;
+        let workgroups = capacity.div_ceil(partition_size).div_ceil(subgroups);
+        let tables = if subgroups > 1 { 3 } else { 1 };
         Ok(Self {
             keys: gpu.uninit("sort_keys", capacity as usize)?,
             values: gpu.uninit("sort_values", capacity as usize)?,
-            table: gpu.uninit("sort_table", rows(partitions.div_ceil(subgroups)))?,
-            offsets: gpu
-                .uninit("sort_offsets", if subgroups > 1 { rows(partitions) } else { 0 })?,
+            table: gpu.uninit("sort_table", rows(tables * workgroups))?,
             digit_begins: gpu.uninit("sort_digit_begins", rows(1))?,
         })
     }
