@@ -17,4 +17,5 @@ mod profile;
 mod rendered;
 mod report;
 mod run;
+mod scored_later;
 mod turned;
