@@ -31,6 +31,8 @@ mod preset;
 mod reference;
 mod rendered;
 pub mod settings;
+#[cfg(feature = "window")]
+mod shown;
 mod start;
 mod submission;
 mod supervision;
@@ -71,6 +73,8 @@ pub use preset::Preset;
 #[cfg(feature = "testing")]
 pub use reference::reference;
 pub use rendered::Rendered;
+#[cfg(feature = "window")]
+pub(crate) use shown::ShownModel;
 use submission::Submissions;
 use supervision::Supervision;
 pub use target_views::TestTargets;
