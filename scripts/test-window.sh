@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Builds examples/window.rs and compares its picture, on an X server without a screen, with our own render.
+# Builds examples/window.rs and `view --window`, and compares their pictures, on an X server without a screen, with our
+# own renders.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 

@@ -83,7 +83,7 @@ impl Gpu {
         Self::open_validated(choice)?.tested()
     }
 
-    fn tested(self) -> Result<Self> {
+    pub(crate) fn tested(self) -> Result<Self> {
         if std::env::var_os(TEST_VARIABLE).is_none_or(|value| value != "off") {
             self.self_test()?;
         }

@@ -32,6 +32,8 @@ mod preset;
 mod reference;
 mod rendered;
 pub mod settings;
+#[cfg(feature = "window")]
+mod shown;
 mod start;
 mod submission;
 mod supervision;
@@ -74,6 +76,8 @@ pub use preset::Preset;
 #[cfg(feature = "testing")]
 pub use reference::reference;
 pub use rendered::Rendered;
+#[cfg(feature = "window")]
+pub(crate) use shown::ShownModel;
 use submission::Submissions;
 use supervision::Supervision;
 pub use target_views::TestTargets;

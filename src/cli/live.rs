@@ -9,7 +9,7 @@ mod pictures;
 mod server;
 mod site;
 
-pub(super) use self::feed::{Feed, Source};
+pub(super) use self::feed::Feed;
 pub use self::listen::{DEFAULT_ADDRESS, Listen};
 pub(super) use self::pictures::Pictures;
 pub(super) use self::server::Server;

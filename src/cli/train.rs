@@ -4,6 +4,7 @@ mod options;
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::Result;
 
@@ -61,6 +62,13 @@ pub struct TrainArgs {
     /// model.
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = live::DEFAULT_ADDRESS)]
     pub view: Option<live::Listen>,
+    /// Show the model in a window of this machine while it trains; needs a build with the feature `window`
+    ///
+    /// Show the model in a window of this machine while it trains, drawn by the same device from its own memory; needs a
+    /// build with the feature `window`. Space pauses the training, Esc closes the window and lets the training go on;
+    /// `nightsplat view --help` has the other keys. Watching changes no bit of the model.
+    #[arg(long)]
+    pub window: bool,
     /// Print every setting, its value and where that comes from; do not train
     #[arg(long)]
     pub explain: bool,
@@ -98,7 +106,12 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         return print_done(args, steps);
     }
     let device = requested.settings(None)?.config()?.device;
-    let gpu = driver::open(&device.parse::<DeviceChoice>()?)?;
+    let choice = device.parse::<DeviceChoice>()?;
+    let screen = args.window.then(|| view::screen(&choice)).transpose()?;
+    let gpu = match &screen {
+        Some(screen) => screen.gpu.clone(),
+        None => driver::open(&choice)?,
+    };
     let planning = planning(args, file.as_deref(), is_resumed);
     let PlannedRun { config, settings, plan, dataset } = requested.planned(planning, &gpu)?;
     if args.explain {
@@ -123,17 +136,29 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         if args.resume { IfExists::Resume } else { overwrite_or_refuse(args.overwrite) };
     let mut progress = Reporter::new(form).with_facts(serde_json::json!(facts));
     let requests = signals::requests()?;
-    let page =
-        args.view.map(|listen| view::of_training(listen, &args.out, &config, &gpu, &requests));
+    let dataset = Arc::new(dataset);
+    let page = args
+        .view
+        .map(|listen| view::of_training(listen, &args.out, (&config, &dataset), &gpu, &requests));
     let page = page.transpose()?;
-    let session = Session { plan: plan.as_ref(), settings: Some(&settings), if_exists, requests };
-    let RunSummary { trainer, ended, scored, spent, .. } =
+    let session = Session {
+        plan: plan.as_ref(),
+        settings: Some(&settings),
+        if_exists,
+        requests: requests.clone(),
+    };
+    let mut train = || {
         run::train_in(&gpu, &config, &dataset, &args.out, &session, |event| {
             progress.observe(event);
             if let Some((site, _)) = &page {
                 site.feed.observe(event);
             }
-        })?;
+        })
+    };
+    let RunSummary { trainer, ended, scored, spent, .. } = match screen {
+        Some(screen) => view::beside(screen, (&args.out, &dataset), &requests, train)?,
+        None => train()?,
+    };
     if !is_text {
         return Ok(());
     }

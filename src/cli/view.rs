@@ -1,4 +1,14 @@
-//! `nightsplat view`: a live page of a run, a model or a dataset.
+//! `nightsplat view`: a live page of a run, a model or a dataset, or a window.
+
+#[cfg(feature = "window")]
+mod newest;
+#[cfg(feature = "window")]
+mod window;
+#[cfg(feature = "window")]
+mod windows;
+#[cfg(not(feature = "window"))]
+#[path = "view/no_windows.rs"]
+mod windows;
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -7,15 +17,15 @@ use std::sync::{Arc, Mutex};
 use anyhow::Result;
 use glam::{DAffine3, DVec3, Vec3};
 
+pub(super) use self::windows::{beside, screen};
 use super::driver;
-use super::live::{DEFAULT_ADDRESS, Feed, Listen, Pictures, Server, Site, Source};
+use super::live::{DEFAULT_ADDRESS, Feed, Listen, Pictures, Server, Site};
 use crate::camera::Camera;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::Dataset;
 use crate::results::export::Provenance;
 use crate::results::export::page::{Bookmark, Page};
 use crate::results::finished_run::{config_of_file, is_model};
-use crate::results::models;
 use crate::results::run::{self, Requests};
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Facts, Gaussians, Shape};
@@ -38,6 +48,19 @@ pub struct ViewArgs {
     /// Photographs of a model, or of a run whose dataset moved
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
+    /// Show the model in a window of this machine instead, drawn by the device; needs a build with the feature `window`
+    ///
+    /// Show the model in a window of this machine instead, drawn by the device; needs a build with the feature `window`.
+    /// Drag to turn, scroll or press W and S to approach; the arrow keys go through the views, R goes back to one, P
+    /// saves nightsplat.png, Esc closes the window.
+    #[arg(long)]
+    pub window: bool,
+    /// Close the window after this number of frames
+    #[arg(long, value_name = "N", requires = "window")]
+    pub frames: Option<u64>,
+    /// Save the last of these frames as PNG
+    #[arg(long, value_name = "FILE", requires = "frames")]
+    pub screenshot: Option<PathBuf>,
     /// Vulkan device that makes the targets: its index, part of its name, uuid:..., pci:... or cpu [default: the run's]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
@@ -53,6 +76,9 @@ const EXAMPLES: &str = "Examples:
 /// # Errors
 /// The path is no run, model or dataset, the dataset is missing, or the address cannot be used.
 pub fn run(args: &ViewArgs) -> Result<()> {
+    if args.window {
+        return Ok(windows::run(args)?);
+    }
     let site = opened(args)?;
     let _server = started(args.listen, site)?;
     loop {
@@ -67,13 +93,13 @@ pub fn run(args: &ViewArgs) -> Result<()> {
 pub(super) fn of_training(
     listen: Listen,
     run: &Path,
-    config: &TrainConfig,
+    (config, dataset): (&TrainConfig, &Arc<Dataset>),
     gpu: &Gpu,
     requests: &Requests,
 ) -> Result<(Arc<Site>, Server)> {
-    let pictures = Pictures::load(config.clone(), Some(gpu.clone()))?;
+    let pictures = Pictures::of_training(config.clone(), gpu.clone(), dataset)?;
     let facts = config.facts(&config.frame.unwrap_or_else(|| pictures.dataset().frame()));
-    let feed = Feed::new(Source::Run(run.to_owned()), Some(requests.clone()));
+    let feed = Feed::of_run(run, Some(requests.clone()));
     let site = of_dataset(run, feed, pictures, &facts)?;
     Ok((Arc::clone(&site), started(listen, site)?))
 }
@@ -90,8 +116,7 @@ fn opened(args: &ViewArgs) -> Result<Arc<Site>> {
     let path = &args.path;
     let gpu = args.device.as_ref().map(driver::open).transpose()?;
     if is_model(path) {
-        let (gaussians, facts) = models::read(path)?;
-        let feed = Feed::new(Source::File(path.clone()), None);
+        let (feed, gaussians, facts) = Feed::of_file(path)?;
         if args.dataset.is_none() {
             return of_model(path, feed, &gaussians, &facts);
         }
@@ -103,7 +128,7 @@ fn opened(args: &ViewArgs) -> Result<Arc<Site>> {
         if let Some(dataset) = &args.dataset {
             config.move_dataset(dataset);
         }
-        let feed = Feed::new(Source::Run(path.clone()), None);
+        let feed = Feed::of_run(path, None);
         let pictures = Pictures::load(config.clone(), gpu)?;
         let facts = config.facts(&config.frame.unwrap_or_else(|| pictures.dataset().frame()));
         return of_dataset(path, feed, pictures, &facts);
@@ -115,7 +140,7 @@ fn opened(args: &ViewArgs) -> Result<Arc<Site>> {
     }
     let config = TrainConfig { dataset: path.clone(), ..TrainConfig::default() };
     let pictures = Pictures::load(config, gpu)?;
-    let feed = Feed::new(Source::Fixed(points(pictures.dataset())?), None);
+    let feed = Feed::of_gaussians(&points(pictures.dataset())?);
     of_dataset(path, feed, pictures, &Facts::default())
 }
 
@@ -135,7 +160,7 @@ fn of_dataset(path: &Path, feed: Feed, pictures: Pictures, facts: &Facts) -> Res
 /// The page of a model alone, which is seen from outside, with -y up.
 fn of_model(path: &Path, feed: Feed, gaussians: &Gaussians, facts: &Facts) -> Result<Arc<Site>> {
     let bookmark =
-        Bookmark { name: "overview".to_owned(), camera: overview(gaussians), pictures: vec![] };
+        Bookmark { name: "overview".to_owned(), camera: overview(gaussians).0, pictures: vec![] };
     let provenance = Provenance { facts: *facts, ..Provenance::default() };
     let shown = (vec![bookmark], DVec3::NEG_Y, provenance);
     page(path, feed, None, shown, gaussians.origin)
@@ -156,8 +181,9 @@ fn page(
     Ok(Arc::new(Site { html: html.into(), feed, pictures: pictures.map(Mutex::new) }))
 }
 
-/// A camera that sees nine tenths of the Gaussians along each axis, looking along +z.
-fn overview(gaussians: &Gaussians) -> Camera {
+/// A camera that sees nine tenths of the Gaussians along each axis, looking along +z, and the middle of what it sees,
+/// relative to the origin of the Gaussians.
+fn overview(gaussians: &Gaussians) -> (Camera, DVec3) {
     const FOV: f64 = 0.9;
     const SIZE: [u32; 2] = [1280, 720];
     let range = |axis: usize| {
@@ -166,11 +192,11 @@ fn overview(gaussians: &Gaussians) -> Camera {
         let at = |share: f64| values.get((share * values.len() as f64) as usize).copied();
         [at(0.05), at(0.5), at(0.95)].map(|value| f64::from(value.unwrap_or_default()))
     };
-    let [[_, x, _], [top, y, bottom], [front, _, back]] = [0, 1, 2].map(range);
-    let [left, _, right] = range(0);
+    let [[left, x, right], [top, y, bottom], [front, z, back]] = [0, 1, 2].map(range);
     let half = 0.5 * (right - left).max(bottom - top).max(1e-3);
     let eye = DVec3::new(x, y, front - half / (0.5 * FOV).tan() - 0.5 * (back - front));
-    Camera::perspective(DAffine3::from_translation(-eye), FOV, SIZE)
+    let camera = Camera::perspective(DAffine3::from_translation(-eye), FOV, SIZE);
+    (camera, DVec3::new(x, y, z))
 }
 
 /// The points of a dataset, in grey.

@@ -1,6 +1,6 @@
 //! The Vulkan loader, our instance, and the physical devices that it lists.
 
-use std::ffi::CStr;
+use std::ffi::{CStr, c_char};
 use std::path::PathBuf;
 
 use ash::{ext, khr, vk};
@@ -90,7 +90,8 @@ fn instance_has(entry: &ash::Entry, extension: &CStr) -> Result<bool> {
     Ok(all.iter().any(|own| own.extension_name_as_c_str() == Ok(extension)))
 }
 
-pub(super) fn instance(validate: bool) -> Result<OwnedInstance> {
+/// An instance with further extensions, such as those of windows.
+pub(super) fn instance(validate: bool, more: &[*const c_char]) -> Result<OwnedInstance> {
     let entry = entry()?;
     let app = vk::ApplicationInfo::default()
         .application_name(c"nightsplat")
@@ -106,7 +107,8 @@ pub(super) fn instance(validate: bool) -> Result<OwnedInstance> {
         extensions.push(khr::portability_enumeration::NAME);
         flags |= vk::InstanceCreateFlags::ENUMERATE_PORTABILITY_KHR;
     }
-    let extensions: Vec<_> = extensions.into_iter().map(CStr::as_ptr).collect();
+    let extensions = extensions.into_iter().map(CStr::as_ptr);
+    let extensions: Vec<_> = extensions.chain(more.iter().copied()).collect();
     let checks = [vk::ValidationFeatureEnableEXT::SYNCHRONIZATION_VALIDATION];
     let mut features = vk::ValidationFeaturesEXT::default().enabled_validation_features(&checks);
     let messenger_info = validation::messenger();

@@ -4,10 +4,12 @@
 //! model was moved to before. The same model, operations and dataset give the same bits.
 
 mod capture;
+mod content;
 mod evidence;
 mod floaters;
 mod operation;
 mod placement;
+mod step;
 
 use std::fmt::Write as _;
 use std::fs::File;
@@ -17,19 +19,21 @@ use std::path::{Path, PathBuf};
 use glam::DVec3;
 
 use self::capture::Capture;
+use self::content::Content;
 use self::evidence::Measured;
 use self::floaters::Found;
 use self::placement::Placement;
+use self::step::Step;
 use crate::base::output::{check_writable, is_same_file, write_whole};
 use crate::base::ply::Header;
 use crate::camera::enclosing_sphere;
 use crate::results::export::{EDITS, Format, Provenance};
 use crate::results::finished_run::{Opener, is_model};
 use crate::results::{models, run};
-use crate::splats::scene::{Facts, Features, Gaussians, Shape};
+use crate::splats::scene::{Facts, Features, Gaussians, Shape, is_far};
 use crate::{Error, Result};
 
-pub(crate) use operation::{EditList, Operation, Region, Scale, Span, fingerprint};
+pub(crate) use operation::{EditList, Operation, Region, Scale, fingerprint};
 
 /// A model while it is edited.
 pub(crate) struct Editor {
@@ -38,7 +42,7 @@ pub(crate) struct Editor {
     /// The dataset, if it is not the run's.
     dataset: Option<PathBuf>,
     opener: Opener,
-    gaussians: Gaussians,
+    content: Content,
     facts: Facts,
     /// Identifies the model as it was opened.
     fingerprint: String,
@@ -57,13 +61,13 @@ impl Editor {
     /// # Errors
     /// Those of reading a model.
     pub(crate) fn open(path: &Path, dataset: Option<&Path>, opener: Opener) -> Result<Self> {
-        let (gaussians, facts) = models::read(path)?;
+        let (content, facts) = Content::open(path)?;
         Ok(Self {
             path: path.to_owned(),
             dataset: dataset.map(Path::to_owned),
             opener,
-            fingerprint: fingerprint(&gaussians),
-            gaussians,
+            fingerprint: content.fingerprint()?,
+            content,
             facts,
             placement: Placement::IDENTITY,
             capture: None,
@@ -110,34 +114,32 @@ impl Editor {
         if operation.needs_dataset() {
             self.open_capture()?;
         }
-        let before = self.gaussians.count;
+        let before = self.content.count();
         let (line, done) = match operation {
             Operation::Crop(region) => self.crop(region)?,
             Operation::Delete(spans) => {
-                let keep = kept(spans, before)?;
-                self.retain("delete", &keep)?;
+                self.step("delete", Step::delete(spans, before)?)?;
                 ("delete".to_owned(), operation.clone())
             }
             Operation::Floaters => (self.remove_floaters()?, operation.clone()),
             Operation::OpacityMin(least) => {
-                let keep: Vec<bool> =
-                    self.gaussians.opacities().map(|opacity| opacity >= *least).collect();
-                self.retain("opacity-min", &keep)?;
+                self.step("opacity-min", Step::OpacityMin(*least))?;
                 (format!("opacity-min {least}"), operation.clone())
             }
             Operation::MaxGaussians(count) => (self.keep_most(*count)?, operation.clone()),
             Operation::ShDegree(degree) => {
-                self.gaussians = self.gaussians.with_sh_degree(*degree);
+                self.content.apply(Step::ShDegree(*degree))?;
                 (format!("sh-degree {degree}"), operation.clone())
             }
             Operation::Up(None) => {
                 let up = self.up()?;
                 return self.apply(&Operation::Up(Some(up)));
             }
-            Operation::Up(_) | Operation::Rotate { .. } => self.rotate(operation),
+            Operation::Up(_) | Operation::Rotate { .. } => self.rotate(operation)?,
             Operation::Scale(scale) => self.scale(scale)?,
             Operation::Move(by) => {
-                self.gaussians.translate(*by);
+                let is_far = is_far(*by, self.content.none().origin, self.content.size()?);
+                self.content.apply(Step::Move { by: *by, is_far })?;
                 self.placement.translate(*by);
                 (format!("move by {by}"), operation.clone())
             }
@@ -145,7 +147,7 @@ impl Editor {
         };
         self.done.push(done);
         let mut line = line;
-        let count = self.gaussians.count;
+        let count = self.content.count();
         // Writing to a string cannot fail.
         let _ = match count.cmp(&before) {
             std::cmp::Ordering::Less => {
@@ -182,8 +184,11 @@ impl Editor {
         edits.push(self.list().line());
         let facts = self.facts;
         let provenance = Provenance { dataset, curve, facts, edits, ..Provenance::default() };
-        Format::of(out)?.write(&self.gaussians, &provenance, out)?;
-        let Gaussians { count, shape, .. } = &self.gaussians;
+        match Format::of(out)? {
+            Format::Ply => self.content.save_ply(&provenance, out)?,
+            format => format.write(&*self.content.whole()?, &provenance, out)?,
+        }
+        let (count, shape) = (self.content.count(), self.content.none().shape);
         Ok(format!("{}: {count} Gaussians, {shape}", out.display()))
     }
 
@@ -222,16 +227,16 @@ impl Editor {
             capture.psnr(run.as_deref(), (gaussians, &facts), &placement, &mut reference)
         };
         let measured = |gaussians: &Gaussians| Measured::new(capture, placement, gaussians, &facts);
-        let before = psnr(&self.gaussians)?;
+        let gaussians = self.content.whole()?;
+        let before = psnr(&gaussians)?;
         let cameras: Vec<DVec3> =
             capture.cameras().iter().map(|camera| placement.camera(camera).center()).collect();
         let near = capture.near(&facts, &placement);
         let Found { keep, contradicted, unseen } =
-            floaters::found(&self.gaussians, &capture.targets()?, (&cameras, near), measured)?;
-        let mut kept = self.gaussians.clone();
-        kept.retain(&keep);
+            floaters::found(&gaussians, &capture.targets()?, (&cameras, near), measured)?;
+        let kept = retained("floaters", gaussians.into_owned(), &keep)?;
         let after = psnr(&kept)?;
-        self.retain("floaters", &keep)?;
+        self.content.set(kept);
         let scores = before.zip(after).map(|(before, after)| {
             format!("; held-out PSNR {before:.3} dB before, {after:.3} dB after")
         });
@@ -242,33 +247,30 @@ impl Editor {
     /// Keeps the Gaussians with the largest rendered weight over the training views; of equal ones the first.
     fn keep_most(&mut self, count: usize) -> Result<String> {
         let name = format!("max-gaussians {count}");
-        if count >= self.gaussians.count {
+        if count >= self.content.count() {
             return Ok(name);
         }
         self.open_capture()?;
         let Some(capture) = &self.capture else { return Ok(name) };
-        let mut sums = vec![0.0; self.gaussians.count];
-        Measured::new(capture, self.placement, &self.gaussians, &self.facts).weights(
-            |weights| {
-                sums.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight);
-            },
-        )?;
+        let gaussians = self.content.whole()?;
+        let mut sums = vec![0.0; gaussians.count];
+        Measured::new(capture, self.placement, &gaussians, &self.facts).weights(|weights| {
+            sums.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight);
+        })?;
         let mut order: Vec<usize> = (0..sums.len()).collect();
         order.sort_by(|&a, &b| sums[b].total_cmp(&sums[a]));
         let mut keep = vec![false; sums.len()];
         order[..count].iter().for_each(|&index| keep[index] = true);
-        self.retain(&name, &keep)?;
+        let kept = retained(&name, gaussians.into_owned(), &keep)?;
+        self.content.set(kept);
         Ok(name)
     }
 
-    /// Removes Gaussians, unless none would be left.
-    fn retain(&mut self, what: &str, keep: &[bool]) -> Result<()> {
-        if !keep.contains(&true) {
-            let count = self.gaussians.count;
-            return Err(Error::Usage(format!("{what} leaves none of {count} Gaussians")));
-        }
-        self.gaussians.retain(keep);
-        Ok(())
+    /// Takes a step, unless it leaves nothing.
+    fn step(&mut self, what: &str, step: Step) -> Result<()> {
+        let before = self.content.count();
+        self.content.apply(step)?;
+        if self.content.count() == 0 { Err(leaves_nothing(what, before)) } else { Ok(()) }
     }
 
     fn crop(&mut self, region: &Region) -> Result<(String, Operation)> {
@@ -292,10 +294,7 @@ impl Editor {
             }
             Region::Cameras => "crop".to_owned(),
         };
-        let keep: Vec<bool> = (0..self.gaussians.count)
-            .map(|index| region.contains(self.gaussians.position(index)))
-            .collect();
-        self.retain(&name, &keep)?;
+        self.step(&name, Step::Crop(region))?;
         Ok((name, Operation::Crop(region)))
     }
 
@@ -314,14 +313,14 @@ impl Editor {
         Ok(self.placement.rotation * up)
     }
 
-    fn rotate(&mut self, operation: &Operation) -> (String, Operation) {
+    fn rotate(&mut self, operation: &Operation) -> Result<(String, Operation)> {
         let rotation = operation.rotation().unwrap_or_default();
-        self.gaussians.rotate(rotation);
+        self.content.apply(Step::Rotate(rotation))?;
         self.placement.rotate(rotation);
         let (axis, angle) = rotation.to_axis_angle();
         let name = if matches!(operation, Operation::Up(_)) { "up" } else { "rotate" };
         let line = format!("{name}: turned by {:.3} degrees about {axis:.4}", angle.to_degrees());
-        (line, operation.clone())
+        Ok((line, operation.clone()))
     }
 
     fn scale(&mut self, scale: &Scale) -> Result<(String, Operation)> {
@@ -335,7 +334,7 @@ impl Editor {
         };
         let done = Scale::Factor(factor);
         done.factor().map_err(Error::Usage)?;
-        self.gaussians.scale(factor);
+        self.content.apply(Step::Scale(factor))?;
         self.placement.scale(factor);
         if let Some(near) = &mut self.facts.near {
             *near = (f64::from(*near) * factor) as f32;
@@ -359,38 +358,35 @@ impl Editor {
             let problem = "renders with other colours or another alpha limit than the model; train both alike";
             return refused(problem.to_owned());
         }
-        if other.shape.features != self.gaussians.shape.features {
+        let mut own = self.content.whole()?.into_owned();
+        if other.shape.features != own.shape.features {
             tracing::warn!("{}: has other features; those of both are dropped", file.display());
+            own = own.with_features(Features::NONE);
             other = other.with_features(Features::NONE);
-            self.gaussians = self.gaussians.with_features(Features::NONE);
         }
         let degree = |gaussians: &Gaussians| gaussians.shape.sh_degree;
-        let degree = degree(&other).max(degree(&self.gaussians));
-        for gaussians in [&mut other, &mut self.gaussians] {
+        let degree = degree(&other).max(degree(&own));
+        for gaussians in [&mut other, &mut own] {
             if gaussians.shape != (Shape { sh_degree: degree, ..gaussians.shape }) {
                 *gaussians = gaussians.with_sh_degree(degree);
             }
         }
-        self.gaussians.append(&other);
+        own.append(&other);
+        self.content.set(own);
         let line = format!("merge {}", file.display());
         Ok((line, Operation::Merge { file: file.to_owned(), hash: Some(fingerprint) }))
     }
 }
 
-/// Which of `count` Gaussians stay.
-fn kept(spans: &[Span], count: usize) -> Result<Vec<bool>> {
-    let mut keep = vec![true; count];
-    for span in spans {
-        let (first, last) = match *span {
-            Span::One(index) => (index, index),
-            Span::Range(first, last) => (first, last),
-        };
-        let range = keep.get_mut(first..=last).ok_or_else(|| {
-            Error::Usage(format!("delete names Gaussians {first} to {last} of {count}"))
-        })?;
-        range.fill(false);
-    }
-    Ok(keep)
+/// The Gaussians of a model that stay.
+fn retained(what: &str, mut gaussians: Gaussians, keep: &[bool]) -> Result<Gaussians> {
+    let before = gaussians.count;
+    gaussians.retain(keep);
+    if gaussians.count == 0 { Err(leaves_nothing(what, before)) } else { Ok(gaussians) }
+}
+
+fn leaves_nothing(what: &str, count: usize) -> Error {
+    Error::Usage(format!("{what} leaves none of {count} Gaussians"))
 }
 
 /// The edit lists in the header of a PLY, oldest first.

@@ -63,13 +63,11 @@ impl Format {
     ) -> Result<()> {
         let bytes = match self {
             Self::Ply => {
-                let mut lines = provenance.lines();
-                // The origin is added by the reader in the rotated world.
-                let turned = provenance.rotation != DQuat::IDENTITY;
-                let line = provenance.world_line(gaussians, false).filter(|_| turned);
-                lines.extend(line.map(|line| format!("dataset's {line}")));
-                lines.extend(provenance.facts.comments());
-                return ply::save_with_comments(gaussians, path, &lines);
+                return ply::save_with_comments(
+                    gaussians,
+                    path,
+                    &provenance.ply_comments(gaussians),
+                );
             }
             Self::Spz(version) => spz::encode(gaussians, provenance, version)?,
             Self::Glb => glb::encode(gaussians, provenance)?,
@@ -162,6 +160,17 @@ impl Provenance {
 }
 
 impl Provenance {
+    /// The comments of a PLY, with those that tell a reader how to render it.
+    pub(crate) fn ply_comments(&self, gaussians: &Gaussians) -> Vec<String> {
+        let mut lines = self.lines();
+        // The origin is added by the reader in the rotated world.
+        let turned = self.rotation != DQuat::IDENTITY;
+        let line = self.world_line(gaussians, false).filter(|_| turned);
+        lines.extend(line.map(|line| format!("dataset's {line}")));
+        lines.extend(self.facts.comments());
+        lines
+    }
+
     /// The facts for a file of `gaussians`, with their origin.
     fn facts_of(&self, gaussians: &Gaussians) -> Facts {
         Facts { origin: gaussians.origin, ..self.facts }

@@ -8,6 +8,7 @@ use crate::error::Error;
 use crate::results::export::{sog, spz};
 use crate::results::run;
 use crate::splats::model::{FileKind, Model};
+use crate::splats::scene::ply::parts::PartFile;
 use crate::splats::scene::{Facts, Gaussians, ply};
 
 impl Model {
@@ -42,8 +43,30 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
         None => Err("is not a model: neither PLY, SPZ nor SOG".to_owned()),
     };
     let (gaussians, facts) = parsed.map_err(|problem| Error::input(path, problem))?;
+    warn_of(path, &facts);
+    Ok((gaussians, facts))
+}
+
+/// [`read`], but part by part: `None` if it is no PLY.
+///
+/// # Errors
+/// Those of [`Model::load`], except for the numbers of the Gaussians.
+pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, Facts)>> {
+    if path.is_dir() {
+        let config = run::load_config(path)?;
+        let file = PartFile::open(&path.join("model.ply"), part)?;
+        return Ok(file.map(|file| (file, config.facts(&config.frame.unwrap_or_default()))));
+    }
+    let file = PartFile::open(path, part)?;
+    Ok(file.map(|file| {
+        let facts = *file.facts();
+        warn_of(path, &facts);
+        (file, facts)
+    }))
+}
+
+fn warn_of(path: &Path, facts: &Facts) {
     if facts.near.is_none() {
         tracing::warn!("{}: does not state its near plane; the default is used", path.display());
     }
-    Ok((gaussians, facts))
 }

@@ -19,6 +19,8 @@ pub mod ply;
 use crate::camera::TrainingFrame;
 pub use crate::splats::attributes::{ATTRIBUTES, Attribute, PlaneCounts, rest_coefficients};
 use crate::splats::attributes::{column_count, planes};
+#[cfg(feature = "io")]
+pub(crate) use change::{Lengths, is_far};
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
 pub use facts::Facts;
 pub use features::{COLOR_CHANNELS, FEATURES, Feature, FeatureSpec, Features};

@@ -172,6 +172,11 @@ fn a_training_is_paused_saved_and_stopped_from_its_page() {
     let first = serving.until("a model", |state| state["model"].as_u64() > Some(0));
     assert_eq!((&first["phase"], &first["canControl"]), (&"training".into(), &true.into()));
     assert!(first["modelStep"].is_u64(), "{first}");
+    // The first view is a test view, whose dark photograph no training loads.
+    for (view, kind) in [(0, "photograph"), (0, "target"), (0, "reference"), (1, "target")] {
+        let (status, jpeg) = serving.ask("GET", &format!("picture/{view}/{kind}"));
+        assert!(status == 200 && jpeg.starts_with(&[0xff, 0xd8]), "{view} {kind}: {status}");
+    }
     assert_eq!(serving.ask("POST", "do/pause").0, 200);
     let mut paused = serving.until("paused", |state| state["phase"] == "paused");
     // The steps under way are done.
@@ -272,6 +277,12 @@ fn an_address_in_use_and_a_path_that_is_nothing_are_refused() {
     );
     refused("view nowhere", 3, &["nowhere", "does not exist", "run directory"]);
     refused(&format!("view {} --listen here", fixture().run()), 2, &["here", "127.0.0.1:7007"]);
+    if cfg!(not(feature = "window")) {
+        let remedy = &["--window", "--features window"];
+        refused(&format!("view {} --window", fixture().run()), 2, remedy);
+        refused(&format!("train {} --out no --window", fixture().set()), 2, remedy);
+        assert!(!Path::new("no").exists());
+    }
     let empty = tempfile::tempdir().unwrap();
     refused(&format!("view {}", empty.path().display()), 3, &["transforms"]);
 }

@@ -258,3 +258,71 @@ fn a_table_of_cameras_in_metres_scales_a_model_and_cameras_crop_it_wherever_it_i
     assert!(cropped.count > 0 && cropped.count <= own.count);
     assert_eq!(cropped.count, moved.count, "{set}");
 }
+
+#[test]
+fn the_gaussians_that_contribute_most_to_the_photographs_are_kept() {
+    let place = Place::new();
+    let path = |name: &str| place.path(name).display().to_string();
+    succeed(&place.train("run", "--steps 40"));
+    let own = ply::load(place.path("run/model.ply")).unwrap();
+    // As many again: half of them outside all views, half as transparent as 8 bits do not show.
+    let mut unseen = own.clone();
+    unseen.means_mut().iter_mut().for_each(|mean| *mean += Vec3::new(0.0, 500.0, 0.0));
+    let half = own.count / 2;
+    for index in 0..half {
+        unseen.means_mut()[index] = own.means()[index];
+        unseen.raw_opacities_mut()[index] = -7.0;
+    }
+    ply::save(&unseen, place.path("unseen.ply")).unwrap();
+    let merge = format!("edit {} --merge {}", path("run"), path("unseen.ply"));
+    let stdout =
+        succeed(&format!("{merge} --max-gaussians {} --out {}", own.count, path("kept.ply")));
+    assert!(stdout.contains(&format!("max-gaussians {0}: {0} of", own.count)), "{stdout}");
+    let kept = ply::load(place.path("kept.ply")).unwrap();
+    // Of the run's own, only those that no view sees may make room.
+    let is_own = |mean: &&Vec3| own.means().contains(mean) && mean.y < 250.0;
+    let stayed = kept.means().iter().filter(is_own).count();
+    assert!(kept.count == own.count && stayed * 100 >= own.count * 95, "{stayed} of {}", own.count);
+
+    // Fewer lose little, and those of the most weight lose less than others.
+    let set = path("set");
+    let psnr = |name: &str| -> f64 {
+        let scores = succeed(&format!("eval {} --dataset {set} --json", path(name)));
+        let scores: serde_json::Value = serde_json::from_str(&scores).unwrap();
+        scores["mean"]["psnr"].as_f64().unwrap()
+    };
+    let most = own.count * 2 / 3;
+    let edit = format!("edit {} --max-gaussians {most} --out {}", path("run"), path("most.ply"));
+    succeed(&edit);
+    let first = place.read("most.ply");
+    succeed(&edit);
+    assert!(first == place.read("most.ply"), "the same command gave other bytes");
+    let span = format!("[[0, {}]]", own.count - most - 1);
+    let list = succeed(&format!(
+        "edit {} --move 0,0,0 --save-edits {} --out {}",
+        path("run"),
+        path("list.json"),
+        path("same.ply")
+    ));
+    let text = fs::read_to_string(place.path("list.json")).unwrap();
+    let (before, _) = text.split_once("\"edits\": [").unwrap();
+    fs::write(place.path("list.json"), format!("{before}\"edits\": [{{\"delete\": {span}}}]}}"))
+        .unwrap();
+    succeed(&format!(
+        "edit {} --edits {} --out {}",
+        path("run"),
+        path("list.json"),
+        path("others.ply")
+    ));
+    let others = ply::load(place.path("others.ply")).unwrap();
+    assert_eq!(others.means(), &own.means()[own.count - most..], "{list}");
+    let (best, other) = (psnr("most.ply"), psnr("others.ply"));
+    assert!(best > other, "{best} dB, others {other} dB");
+    let all = succeed(&format!(
+        "edit {} --max-gaussians {} --out {}",
+        path("run"),
+        own.count + 5,
+        path("all.ply")
+    ));
+    assert!(!all.contains("removed"), "{all}");
+}

@@ -17,5 +17,6 @@ mod profile;
 mod rendered;
 mod report;
 mod run;
+mod scored_later;
 mod streamed;
 mod turned;

@@ -1,4 +1,4 @@
-//! The picture of `examples/window.rs`, on an X server without a screen, beside a composite of our own in f64.
+//! The pictures of `examples/window.rs` and `view --window`, on an X server without a screen, beside our own.
 
 #![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
@@ -8,6 +8,7 @@ mod common;
 #[allow(dead_code, reason = "the near plane is that of the depth image alone")]
 #[path = "../../examples/window/scene.rs"]
 mod scene;
+mod view;
 
 use std::path::Path;
 use std::process::Command;

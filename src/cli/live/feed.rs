@@ -4,18 +4,18 @@
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use glam::Vec3;
 use hyper::body::Bytes;
 use serde_json::{Value, json};
 
-use crate::Stop;
 use crate::results::edit::fingerprint;
 use crate::results::export::page::packed;
 use crate::results::models;
-use crate::results::run::{Event, Requests, RunTail};
-use crate::splats::scene::Gaussians;
+use crate::results::run::{Event, Requests, Stamp, WatchedRun, stamp};
+use crate::splats::scene::{Facts, Gaussians};
+use crate::{Result, Stop};
 
 /// The most Gaussians that are sent: those that cover most, by opacity and size.
 const MOST_GAUSSIANS: usize = 500_000;
@@ -28,33 +28,32 @@ const STATE_EVERY: Duration = Duration::from_millis(250);
 
 /// What is shown.
 #[derive(Debug)]
-pub(in crate::cli) enum Source {
-    /// A run directory.
-    Run(PathBuf),
+enum Source {
+    Run(WatchedRun),
     /// A model file, read again when it changes.
     File(PathBuf),
-    /// Gaussians that do not change.
-    Fixed(Gaussians),
+    /// What does not change.
+    Fixed,
 }
 
 /// The source of the model and the progress.
 #[derive(Debug)]
 pub(in crate::cli) struct Feed {
-    source: Source,
     /// To the training in this process.
     requests: Option<Requests>,
     state: Mutex<State>,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct State {
+    source: Source,
     /// Counts the models; 0: there is none yet.
     version: u64,
     model: Bytes,
     /// Steps of the model, if it is of the training in this process.
     step: Option<u64>,
     /// Time and length of the file that it was read from.
-    file: Option<(SystemTime, u64)>,
+    file: Option<Stamp>,
     /// The checksum by which edit lists name a model file; `None` of a model that is no file, or not sent whole.
     fingerprint: Option<String>,
     /// Why the newest model cannot be shown, on one line.
@@ -66,13 +65,30 @@ struct State {
 }
 
 impl Feed {
-    /// `requests`: to the training in this process, if there is one.
-    pub(in crate::cli) fn new(source: Source, requests: Option<Requests>) -> Self {
-        let mut state = State::default();
-        if let Source::Fixed(gaussians) = &source {
-            state.show(gaussians, None);
-        }
-        Self { source, requests, state: Mutex::new(state) }
+    /// Of a run directory; `requests`: to its training, if that is in this process.
+    pub(in crate::cli) fn of_run(run: &Path, requests: Option<Requests>) -> Self {
+        let state = Mutex::new(State::of(Source::Run(WatchedRun::new(run.to_owned()))));
+        Self { requests, state }
+    }
+
+    /// Of a model file, with its Gaussians.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub(in crate::cli) fn of_file(path: &Path) -> Result<(Self, Gaussians, Facts)> {
+        let mut state = State::of(Source::File(path.to_owned()));
+        // Before reading: a file that changes meanwhile is read again.
+        state.file = stamp(path).ok();
+        let (gaussians, facts) = models::read(path)?;
+        state.show_file(&gaussians);
+        Ok((Self { requests: None, state: Mutex::new(state) }, gaussians, facts))
+    }
+
+    /// Of Gaussians that do not change.
+    pub(in crate::cli) fn of_gaussians(gaussians: &Gaussians) -> Self {
+        let mut state = State::of(Source::Fixed);
+        state.show(gaussians, None);
+        Self { requests: None, state: Mutex::new(state) }
     }
 
     /// Takes what the training in this process reports.
@@ -120,11 +136,11 @@ impl Feed {
                 state.next = Some(now + SNAPSHOT_EVERY);
             }
             Some(_) => {}
-            None => self.read(&mut state),
+            None => state.read(),
         }
-        let mut told = match &self.source {
-            Source::Run(run) => json!(RunTail::of(run)),
-            Source::File(_) | Source::Fixed(_) => json!({ "phase": "model" }),
+        let mut told = match &mut state.source {
+            Source::Run(run) => json!(run.tail()),
+            Source::File(_) | Source::Fixed => json!({ "phase": "model" }),
         };
         let paused = self.requests.as_ref().is_some_and(Requests::is_paused);
         if paused {
@@ -139,22 +155,44 @@ impl Feed {
         told
     }
 
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn of(source: Source) -> Self {
+        Self {
+            source,
+            version: 0,
+            model: Bytes::new(),
+            step: None,
+            file: None,
+            fingerprint: None,
+            problem: None,
+            next: None,
+            told: None,
+        }
+    }
+
     /// Reads the model file if it has changed. A file that has vanished or is damaged leaves the last model.
-    fn read(&self, state: &mut State) {
-        let path = match &self.source {
-            Source::Run(run) => run.join("model.ply"),
-            Source::File(path) => path.clone(),
-            Source::Fixed(_) => return,
+    fn read(&mut self) {
+        let (path, from) = match &self.source {
+            Source::Run(run) => (run.path().join("model.ply"), run.path().to_owned()),
+            Source::File(path) => (path.clone(), path.clone()),
+            Source::Fixed => return,
         };
-        let found = std::fs::metadata(&path).and_then(|file| Ok((file.modified()?, file.len())));
-        match found {
-            Ok(found) if state.file == Some(found) => state.problem = None,
+        match stamp(&path) {
+            Ok(found) if self.file == Some(found) => self.problem = None,
             Ok(found) => {
-                state.file = Some(found);
-                self.reread(&path, state);
+                self.file = Some(found);
+                match models::read(&from) {
+                    Ok((gaussians, _)) => self.show_file(&gaussians),
+                    Err(error) => self.problem = Some(error.to_string()),
+                }
             }
-            Err(error) if state.version > 0 => {
-                state.problem =
+            Err(error) if self.version > 0 => {
+                self.problem =
                     Some(format!("{} is gone ({error}); the last model is shown", path.display()));
             }
             // The first checkpoint of a run is still to come.
@@ -162,24 +200,13 @@ impl Feed {
         }
     }
 
-    fn reread(&self, path: &Path, state: &mut State) {
-        let from = if let Source::Run(run) = &self.source { run } else { path };
-        match models::read(from) {
-            Ok((gaussians, _)) => {
-                state.show(&gaussians, None);
-                let is_whole = gaussians.count <= MOST_GAUSSIANS;
-                state.fingerprint = is_whole.then(|| fingerprint(&gaussians));
-            }
-            Err(error) => state.problem = Some(error.to_string()),
-        }
+    /// Shows the model of a file.
+    fn show_file(&mut self, gaussians: &Gaussians) {
+        self.show(gaussians, None);
+        let is_whole = gaussians.count <= MOST_GAUSSIANS;
+        self.fingerprint = is_whole.then(|| fingerprint(gaussians));
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl State {
     fn show(&mut self, gaussians: &Gaussians, step: Option<u64>) {
         self.model = packed(&most_visible(gaussians, MOST_GAUSSIANS)).into();
         (self.step, self.problem) = (step, None);
@@ -235,34 +262,42 @@ mod tests {
     #[test]
     fn a_model_file_is_shown_again_when_it_changes_and_stays_when_it_vanishes() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("model.ply");
-        let feed = Feed::new(Source::File(path.clone()), None);
+        let feed = Feed::of_run(folder.path(), None);
         assert_eq!((feed.state()["model"].as_u64(), feed.model()), (Some(0), None));
+        let path = folder.path().join("model.ply");
+        assert!(Feed::of_file(&path).is_err());
+        model(&[0.5]).save(&path).unwrap();
+        let (feed, gaussians, _) = Feed::of_file(&path).unwrap();
+        assert_eq!((feed.lock().version, gaussians), (1, model(&[0.5])));
+        assert_eq!(feed.state()["model"], 1, "the file is read once");
         let state = || {
             feed.lock().told = None;
             feed.state()
         };
         model(&[1.0]).save(&path).unwrap();
+        std::fs::write(&path, "ply").unwrap();
+        state();
+        model(&[1.0]).save(&path).unwrap();
         let shown = state();
-        assert_eq!((shown["model"].as_u64(), shown["fingerprint"].is_string()), (Some(1), true));
+        assert_eq!((shown["model"].as_u64(), shown["fingerprint"].is_string()), (Some(2), true));
         let first = feed.model().unwrap();
-        assert_eq!(state()["model"], 1);
-        model(&[1.0, 2.0]).save(&path).unwrap();
         assert_eq!(state()["model"], 2);
+        model(&[1.0, 2.0]).save(&path).unwrap();
+        assert_eq!(state()["model"], 3);
         assert_ne!(feed.model().unwrap(), first);
         std::fs::write(&path, "ply\n").unwrap();
         assert!(state()["problem"].as_str().unwrap().contains("model.ply"));
         std::fs::remove_file(&path).unwrap();
         let gone = state();
         assert!(gone["problem"].as_str().unwrap().contains("is gone"), "{gone}");
-        assert_eq!((gone["model"].as_u64(), gone["canControl"].as_bool()), (Some(2), Some(false)));
+        assert_eq!((gone["model"].as_u64(), gone["canControl"].as_bool()), (Some(3), Some(false)));
         assert!(!feed.follow("stop"));
     }
 
     #[test]
     fn a_page_asks_the_training_for_a_model_at_a_bounded_rate_and_controls_it() {
         let requests = Requests::default();
-        let feed = Feed::new(Source::Run("no such run".into()), Some(requests.clone()));
+        let feed = Feed::of_run(Path::new("no such run"), Some(requests.clone()));
         assert_eq!(feed.state()["model"], 0);
         assert!(requests.takes_snapshot());
         feed.lock().told = None;

@@ -1,14 +1,17 @@
 //! Images of a dataset's views for the live page, made when they are asked for.
 
-use std::collections::VecDeque;
+use std::borrow::Cow;
+use std::collections::{BTreeSet, VecDeque};
+use std::sync::Arc;
 
 use glam::DVec3;
 use hyper::body::Bytes;
 
 use crate::Result;
+use crate::camera::CameraModel;
 use crate::cli::driver;
 use crate::gpu::Gpu;
-use crate::photographs::dataset::{Dataset, MeasuredSize, View};
+use crate::photographs::dataset::{Dataset, LoadOptions, MeasuredSize, View};
 use crate::photographs::image::Image;
 use crate::photographs::tone::ToneCurve;
 use crate::results::export::page::{Bookmark, Picture, moved};
@@ -33,7 +36,11 @@ const KEPT: usize = 64 << 20;
 /// The images of a dataset's views.
 #[derive(Debug)]
 pub(in crate::cli) struct Pictures {
-    dataset: Dataset,
+    dataset: Arc<Dataset>,
+    /// The names of views with a photograph that `dataset` does not have.
+    unloaded: BTreeSet<String>,
+    /// With the photographs of all views, loaded for the first of those.
+    complete: Option<Dataset>,
     config: TrainConfig,
     /// Opened for the first target.
     gpu: Option<Gpu>,
@@ -49,13 +56,39 @@ impl Pictures {
     /// # Errors
     /// Those of [`Dataset::load`].
     pub(in crate::cli) fn load(config: TrainConfig, gpu: Option<Gpu>) -> Result<Self> {
-        let mut options = config.load_options();
-        // The viewer has a pinhole camera.
-        (options.undistort, options.load_low_test, options.keep) = (true, true, Some(0));
-        // Photographs are measured for the first target, if one is asked for.
-        options.measured = MeasuredSize::None;
-        let dataset = Dataset::load(&config.dataset, &options)?;
-        Ok(Self { dataset, config, gpu, targets: None, finished: VecDeque::new() })
+        let dataset = Dataset::load(&config.dataset, &options(&config))?;
+        Ok(Self::new(dataset.into(), BTreeSet::new(), config, gpu))
+    }
+
+    /// The dataset that a training has loaded, unless a lens of it is a fisheye's, which is loaded again for the pinhole
+    /// cameras of the viewer.
+    ///
+    /// # Errors
+    /// Those of [`Dataset::load`].
+    pub(in crate::cli) fn of_training(
+        config: TrainConfig,
+        gpu: Gpu,
+        dataset: &Arc<Dataset>,
+    ) -> Result<Self> {
+        if dataset.views.iter().any(|view| view.camera.model != CameraModel::Pinhole) {
+            return Self::load(config, Some(gpu));
+        }
+        // A training does not load the photographs of test views.
+        let (listed, ..) = Dataset::listed(&config.dataset, &options(&config))?;
+        let listed: BTreeSet<String> = listed.into_iter().map(|listed| listed.name).collect();
+        let lacks = |view: &&View| !view.has_photograph() && listed.contains(&view.name);
+        let unloaded = dataset.views.iter().filter(lacks).map(|view| view.name.clone()).collect();
+        Ok(Self::new(Arc::clone(dataset), unloaded, config, Some(gpu)))
+    }
+
+    fn new(
+        dataset: Arc<Dataset>,
+        unloaded: BTreeSet<String>,
+        config: TrainConfig,
+        gpu: Option<Gpu>,
+    ) -> Self {
+        let finished = VecDeque::new();
+        Self { dataset, unloaded, complete: None, config, gpu, targets: None, finished }
     }
 
     pub(in crate::cli) fn dataset(&self) -> &Dataset {
@@ -86,10 +119,11 @@ impl Pictures {
     }
 
     fn has(&self, view: &View, kind: Kind) -> bool {
+        let has_photograph = view.has_photograph() || self.unloaded.contains(&view.name);
         match kind {
-            Kind::Photograph => view.has_photograph(),
+            Kind::Photograph => has_photograph,
             Kind::Reference => view.has_reference(),
-            Kind::Target => view.has_photograph() && self.config.tone.curve != ToneCurve::None,
+            Kind::Target => has_photograph && self.config.tone.curve != ToneCurve::None,
         }
     }
 
@@ -113,11 +147,19 @@ impl Pictures {
     }
 
     fn image(&mut self, place: usize, kind: Kind) -> Result<Option<Image>> {
-        let Self { dataset, config, gpu, targets, .. } = self;
-        let Some(view) = dataset.views.get(place) else { return Ok(None) };
+        let Self { dataset, unloaded, complete, config, gpu, targets, .. } = self;
+        let Some(mut view) = dataset.views.get(place) else { return Ok(None) };
+        if kind != Kind::Reference && unloaded.contains(&view.name) {
+            let all = match complete.take() {
+                Some(all) => all,
+                None => Dataset::load(&config.dataset, &options(config))?,
+            };
+            let all = complete.insert(all);
+            view = all.views.iter().find(|own| own.name == view.name).unwrap_or(view);
+        }
         let image = match kind {
-            Kind::Photograph => view.loaded()?.map(std::borrow::Cow::into_owned),
-            Kind::Reference => view.loaded_reference()?.map(std::borrow::Cow::into_owned),
+            Kind::Photograph => view.loaded()?.map(Cow::into_owned),
+            Kind::Reference => view.loaded_reference()?.map(Cow::into_owned),
             Kind::Target if config.tone.curve == ToneCurve::None => None,
             Kind::Target => {
                 if targets.is_none() {
@@ -133,4 +175,14 @@ impl Pictures {
         };
         Ok(image.map(|image| view.upright(image)))
     }
+}
+
+/// How the page loads a dataset: no photograph is kept, and photographs are measured for the first target, if one is
+/// asked for.
+fn options(config: &TrainConfig) -> LoadOptions {
+    let mut options = config.load_options();
+    // The viewer has a pinhole camera.
+    (options.undistort, options.load_low_test, options.keep) = (true, true, Some(0));
+    options.measured = MeasuredSize::None;
+    options
 }

@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::base::{hash, input};
-use crate::splats::scene::{Gaussians, MAX_SH_DEGREE};
+use crate::splats::scene::{Gaussians, MAX_SH_DEGREE, Shape};
 use crate::{Error, Result};
 
 /// A change of a model.
@@ -269,17 +269,37 @@ fn json(value: &impl Serialize) -> String {
 }
 
 /// The checksum of a model by which an edit list names it: of the shape and every number as the file has them,
-/// whatever its header says.
-pub(crate) fn fingerprint(gaussians: &Gaussians) -> String {
-    let Gaussians { count, shape, parameters, origin } = gaussians;
-    let mut hasher = hash::Hasher::default();
-    hasher.write(format!("{count} {shape}").as_bytes());
-    hasher.write_numbers(&origin.to_array());
-    for number in parameters.chunks(1 << 16) {
-        let bytes: Vec<u8> = number.iter().flat_map(|number| number.to_le_bytes()).collect();
-        hasher.write(&bytes);
+/// whatever its header says. Gaussians are added in order, in any parts.
+pub(super) struct Fingerprint(hash::Hasher);
+
+impl Fingerprint {
+    pub(super) fn new(count: usize, shape: Shape, origin: DVec3) -> Self {
+        let mut hasher = hash::Hasher::default();
+        hasher.write(format!("{count} {shape}").as_bytes());
+        hasher.write_numbers(&origin.to_array());
+        Self(hasher)
     }
-    hash::text(hasher.finish())
+
+    pub(super) fn add(&mut self, part: &Gaussians) {
+        let mut row = vec![];
+        for index in 0..part.count {
+            row.clear();
+            part.row(index)
+                .for_each(|numbers| row.extend_from_slice(bytemuck::cast_slice(numbers)));
+            self.0.write(&row);
+        }
+    }
+
+    pub(super) fn text(self) -> String {
+        hash::text(self.0.finish())
+    }
+}
+
+/// The [`Fingerprint`] of a model.
+pub(crate) fn fingerprint(gaussians: &Gaussians) -> String {
+    let mut fingerprint = Fingerprint::new(gaussians.count, gaussians.shape, gaussians.origin);
+    fingerprint.add(gaussians);
+    fingerprint.text()
 }
 
 #[cfg(test)]

@@ -2,7 +2,8 @@
 
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use serde::Serialize;
 
@@ -44,9 +45,45 @@ pub(crate) struct RunTail {
 /// The bytes at the end of the log that are read: some 60 lines.
 const TAIL: u64 = 4096;
 
+/// A run whose progress is read again and again.
+#[derive(Debug)]
+pub(crate) struct WatchedRun {
+    path: PathBuf,
+    /// Time and length of the configuration, and its steps: a resumed run may have more.
+    steps: Option<(Stamp, Option<u64>)>,
+}
+
+impl WatchedRun {
+    pub(crate) fn new(path: PathBuf) -> Self {
+        Self { path, steps: None }
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Reads the ends of its files. What is missing or being written is left out.
+    pub(crate) fn tail(&mut self) -> RunTail {
+        let stamp = stamp(&self.path.join("config.toml")).ok();
+        if self.steps.map(|(known, _)| known) != stamp {
+            let steps = load_config(&self.path).ok().map(|config| config.steps);
+            self.steps = stamp.map(|stamp| (stamp, steps));
+        }
+        RunTail::of(&self.path, self.steps.and_then(|(_, steps)| steps))
+    }
+}
+
+/// When a file was changed, and its length.
+pub(crate) type Stamp = (SystemTime, u64);
+
+/// The stamp of a file, by which it is read again once it changes.
+pub(crate) fn stamp(path: &Path) -> std::io::Result<Stamp> {
+    let file = path.metadata()?;
+    Ok((file.modified()?, file.len()))
+}
+
 impl RunTail {
-    /// Reads the ends of the files of a run. What is missing or being written is left out.
-    pub(crate) fn of(run: &Path) -> Self {
+    fn of(run: &Path, steps: Option<u64>) -> Self {
         let rows = last_rows(&run.join(LOG)).unwrap_or_default();
         let last = rows.last();
         let times: Vec<f64> = rows.iter().map(|row| row.milliseconds).collect();
@@ -63,7 +100,7 @@ impl RunTail {
                 (false, false) => Phase::Stopped,
             },
             step: last.map(|row| row.step),
-            steps: load_config(run).ok().map(|config| config.steps),
+            steps,
             loss: last.map(|row| row.loss).filter(|loss| loss.is_finite()),
             gaussians: last.map(|row| row.gaussians),
             milliseconds: last.map(|_| times.iter().sum::<f64>() / times.len() as f64),
@@ -129,7 +166,7 @@ mod tests {
             format!("step,view,loss,l1,ssim,gaussians,milliseconds\n{long}201,\"a,\"\"b\",0.2");
         std::fs::write(folder.path().join(LOG), log).unwrap();
         std::fs::write(folder.path().join(HELD_OUT), "step,psnr\n100,20.5\n200,2").unwrap();
-        let tail = RunTail::of(folder.path());
+        let tail = WatchedRun::new(folder.path().into()).tail();
         let known = (tail.step, tail.loss, tail.gaussians, tail.milliseconds);
         assert_eq!(known, (Some(200), Some(0.25), Some(2000), Some(8.0)));
         assert_eq!((tail.phase, tail.steps), (Phase::Stopped, None));
@@ -137,9 +174,26 @@ mod tests {
     }
 
     #[test]
+    fn the_steps_of_a_run_are_read_again_once_its_configuration_changes() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut run = WatchedRun::new(folder.path().into());
+        assert_eq!(run.tail().steps, None);
+        let write = |steps: u64| {
+            let config = crate::train::TrainConfig { steps, ..Default::default() };
+            std::fs::write(folder.path().join("config.toml"), config.to_toml().unwrap()).unwrap();
+        };
+        write(700);
+        assert_eq!(run.tail().steps, Some(700));
+        let known = run.steps;
+        assert_eq!((run.tail().steps, run.steps), (Some(700), known));
+        write(12_000);
+        assert_eq!(run.tail().steps, Some(12_000));
+    }
+
+    #[test]
     fn a_folder_without_files_of_a_run_has_no_numbers() {
         let folder = tempfile::tempdir().unwrap();
-        let tail = RunTail::of(folder.path());
+        let tail = WatchedRun::new(folder.path().into()).tail();
         assert_eq!((tail.step, tail.loss, tail.held_out.len()), (None, None, 0));
         assert_eq!(serde_json::json!(tail)["phase"], "stopped");
     }

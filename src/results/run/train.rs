@@ -348,6 +348,14 @@ impl<'a> TrainLoop<'a> {
                 let seconds = begin.elapsed().as_secs_f64();
                 observe(Event::Snapshot { step, model, seconds });
             }
+            #[cfg(feature = "window")]
+            if requests.takes_show() {
+                // A window without a newer model is no reason to end a training.
+                match trainer.shown() {
+                    Ok(model) => requests.give_shown(model),
+                    Err(error) => tracing::debug!("the window gets no newer model: {error}"),
+                }
+            }
             if !requests.is_paused() || requests.stops().is_some() {
                 return Ok(());
             }

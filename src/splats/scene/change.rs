@@ -49,16 +49,10 @@ impl Gaussians {
         }
     }
 
-    /// Moves the world; far moves change the origin instead of the means, which are f32.
+    /// Moves the world. `is_far`: by the origin, as the means, which are f32, would lose precision; [`is_far`] tells.
     #[cfg(feature = "io")]
-    pub(crate) fn translate(&mut self, by: DVec3) {
-        let mut distances: Vec<f32> = self.means().iter().map(|mean| mean.length()).collect();
-        let middle = distances.len() / 2;
-        let size = match distances.is_empty() {
-            true => 0.0,
-            false => f64::from(*distances.select_nth_unstable_by(middle, f32::total_cmp).1),
-        };
-        if self.origin != DVec3::ZERO || by.length() > FAR * size {
+    pub(crate) fn translate(&mut self, by: DVec3, is_far: bool) {
+        if is_far {
             self.origin += by;
             return;
         }
@@ -142,6 +136,26 @@ impl Gaussians {
         *self = Self::concatenated(&[&*self, other]);
     }
 
+    /// Replaces the Gaussians from `first` on by others of the same shape.
+    #[cfg(feature = "io")]
+    pub(crate) fn replace(&mut self, first: usize, by: &Self) {
+        for spec in &ATTRIBUTES {
+            let (_, width) = self.columns(spec.attribute);
+            let start = self.plane(spec.attribute).start + first * width;
+            self.parameters[start..start + by.count * width]
+                .copy_from_slice(&by.parameters[by.plane(spec.attribute)]);
+        }
+    }
+
+    /// The parameters of a Gaussian, attribute by attribute.
+    #[cfg(feature = "io")]
+    pub(crate) fn row(&self, index: usize) -> impl Iterator<Item = &[f32]> {
+        ATTRIBUTES.iter().map(move |spec| {
+            let (column, width) = self.columns(spec.attribute);
+            &self.parameters[column * self.count + index * width..][..width]
+        })
+    }
+
     /// The position of a Gaussian in the world.
     #[cfg(feature = "io")]
     pub(crate) fn position(&self, index: usize) -> DVec3 {
@@ -176,6 +190,50 @@ impl Gaussians {
     }
 }
 
+/// Whether a move of a model, whose median distance to its origin is `size`, is left to the origin.
+#[cfg(feature = "io")]
+pub(crate) fn is_far(by: DVec3, origin: DVec3, size: f64) -> bool {
+    origin != DVec3::ZERO || by.length() > FAR * size
+}
+
+/// The distribution of lengths, in memory that does not depend on how many they are.
+#[cfg(feature = "io")]
+#[derive(Clone, Debug)]
+pub(crate) struct Lengths {
+    /// By the leading bits: exponent, and the next two.
+    counts: [u64; 1 << Self::BITS],
+}
+
+#[cfg(feature = "io")]
+impl Default for Lengths {
+    fn default() -> Self {
+        Self { counts: [0; 1 << Self::BITS] }
+    }
+}
+
+#[cfg(feature = "io")]
+impl Lengths {
+    const BITS: u32 = 10;
+    /// The bits of an f32 behind the sign and the leading ones.
+    const REST: u32 = 31 - Self::BITS;
+
+    /// Adds a length, 0 or more.
+    pub(crate) fn add(&mut self, length: f32) {
+        self.counts[(length.to_bits() >> Self::REST) as usize] += 1;
+    }
+
+    /// The median, at most a quarter too small; 0 of none.
+    pub(crate) fn median(&self) -> f64 {
+        let middle = self.counts.iter().sum::<u64>() / 2;
+        let mut sum = 0;
+        let place = (0..).zip(&self.counts).find(|(_, count)| {
+            sum += **count;
+            sum > middle
+        });
+        place.map_or(0.0, |(place, _): (u32, _)| f32::from_bits(place << Self::REST).into())
+    }
+}
+
 #[cfg(all(test, feature = "io"))]
 mod tests {
     use super::*;
@@ -194,11 +252,7 @@ mod tests {
 
     /// The parameters of a Gaussian in the order of the planes.
     fn row(gaussians: &Gaussians, index: usize) -> Vec<f32> {
-        let of = |attribute: Attribute| {
-            let (column, width) = gaussians.columns(attribute);
-            gaussians.parameters[column * gaussians.count + index * width..][..width].to_vec()
-        };
-        let row: Vec<f32> = ATTRIBUTES.iter().flat_map(|spec| of(spec.attribute)).collect();
+        let row = gaussians.row(index).collect::<Vec<_>>().concat();
         assert_eq!(row.len(), width(gaussians.shape));
         row
     }
@@ -249,10 +303,30 @@ mod tests {
     fn a_far_move_keeps_the_precision_of_the_means() {
         let mut model = drawn(5, 3);
         let before = model.clone();
-        model.translate(DVec3::new(0.5, 0.0, 0.0));
+        let mut lengths = Lengths::default();
+        before.means().iter().for_each(|mean| lengths.add(mean.length()));
+        let mut sorted = before.means().iter().map(|mean| mean.length()).collect::<Vec<_>>();
+        sorted.sort_by(f32::total_cmp);
+        let (size, median) = (lengths.median(), f64::from(sorted[2]));
+        assert!(size <= median && size > 0.75 * median, "{size} {median}");
+        assert_eq!(Lengths::default().median(), 0.0);
+        let moved = |model: &mut Gaussians, by| model.translate(by, is_far(by, DVec3::ZERO, size));
+        moved(&mut model, DVec3::new(0.5, 0.0, 0.0));
         assert!(model.origin == DVec3::ZERO && model.means() != before.means());
         let mut far = before.clone();
-        far.translate(DVec3::new(5e6, 0.0, 0.25));
+        moved(&mut far, DVec3::new(5e6, 0.0, 0.25));
         assert_eq!((far.origin, far.means()), (DVec3::new(5e6, 0.0, 0.25), before.means()));
+    }
+
+    #[test]
+    fn parts_that_are_put_into_place_make_the_whole() {
+        let whole = drawn(7, 4);
+        let mut made = Gaussians::zeros(7, whole.shape);
+        for range in [0..3, 3..5, 5..7] {
+            let mut part = whole.clone();
+            part.retain(&(0..7).map(|index| range.contains(&index)).collect::<Vec<_>>());
+            made.replace(range.start, &part);
+        }
+        assert_eq!(made, whole);
     }
 }

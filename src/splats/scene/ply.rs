@@ -7,6 +7,9 @@
 //! zero; `f_rest_*` is channel-major (all of red, then green, then blue); opacity is before the sigmoid, scales are
 //! logarithms, `rot_0` is w. Source: `save_ply` of the 3DGS code.
 
+#[cfg(feature = "io")]
+pub(crate) mod parts;
+
 use std::fs;
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
@@ -22,8 +25,12 @@ use crate::{Error, Result};
 
 /// The prefix of the comment with the origin of the positions.
 const ORIGIN: &str = "world = position + ";
+/// The first of the properties, which the normals follow.
+const MEANS: usize = 3;
+const NORMALS: [&str; 3] = ["nx", "ny", "nz"];
 
 /// A property of the file: its name, and its attribute and component.
+#[derive(Debug)]
 struct Property {
     name: String,
     attribute: Attribute,
@@ -97,44 +104,75 @@ pub fn save_with_comments(
 }
 
 fn write(gaussians: &Gaussians, path: &Path, comments: &[impl AsRef<str>]) -> std::io::Result<()> {
-    const NORMALS: [&str; 3] = ["nx", "ny", "nz"];
-    let properties = properties(gaussians.shape);
-    let (means, others) = properties.split_at(3);
-    let mut file = BufWriter::new(fs::File::create(path)?);
-    writeln!(file, "ply\nformat binary_little_endian 1.0")?;
-    if gaussians.origin != glam::DVec3::ZERO {
-        let [x, y, z] = gaussians.origin.to_array();
-        writeln!(file, "comment {ORIGIN}{x} {y} {z}")?;
-    }
-    for comment in comments {
-        writeln!(file, "comment {}", comment.as_ref())?;
-    }
-    writeln!(file, "element vertex {}", gaussians.count)?;
-    let names = means.iter().map(|property| property.name.as_str());
-    let names = names.chain(NORMALS).chain(others.iter().map(|property| property.name.as_str()));
-    for name in names {
-        writeln!(file, "property float {name}")?;
-    }
-    writeln!(file, "end_header")?;
+    let lines = comment_lines(gaussians.origin, comments);
+    let kind = (gaussians.shape, gaussians.count);
+    let mut writer = Writer::new(fs::File::create(path)?, &lines, kind)?;
+    writer.add(gaussians)?;
+    writer.finish()
+}
 
-    let value = |(begin, stride): (usize, usize), gaussian: usize| {
-        gaussians.parameters[begin + stride * gaussian]
-    };
-    let means: Vec<_> = means.iter().map(|property| property.address(gaussians)).collect();
-    let others: Vec<_> = others.iter().map(|property| property.address(gaussians)).collect();
-    let mut row = Vec::with_capacity(properties.len() + NORMALS.len());
-    for gaussian in 0..gaussians.count {
-        row.clear();
-        row.extend(means.iter().map(|&address| value(address, gaussian)));
-        row.extend([0.0; NORMALS.len()]);
-        row.extend(others.iter().map(|&address| value(address, gaussian)));
-        for number in &row {
-            file.write_all(&number.to_le_bytes())?;
+/// The comments of a file, with the origin of its positions.
+fn comment_lines(origin: glam::DVec3, comments: &[impl AsRef<str>]) -> Vec<String> {
+    let [x, y, z] = origin.to_array();
+    let origin = (origin != glam::DVec3::ZERO).then(|| format!("{ORIGIN}{x} {y} {z}"));
+    let comments = comments.iter().map(|comment| comment.as_ref().to_owned());
+    origin.into_iter().chain(comments).collect()
+}
+
+/// A file to which Gaussians are added.
+struct Writer {
+    file: BufWriter<fs::File>,
+    properties: Vec<Property>,
+}
+
+impl Writer {
+    /// Writes the header of a file of `count` Gaussians.
+    fn new(
+        file: fs::File,
+        comments: &[String],
+        (shape, count): (Shape, usize),
+    ) -> std::io::Result<Self> {
+        let mut file = BufWriter::new(file);
+        writeln!(file, "ply\nformat binary_little_endian 1.0")?;
+        for comment in comments {
+            writeln!(file, "comment {comment}")?;
         }
+        writeln!(file, "element vertex {count}")?;
+        let properties = properties(shape);
+        let (means, others) = properties.split_at(MEANS);
+        let all = means.iter().map(|property| property.name.as_str()).chain(NORMALS);
+        for name in all.chain(others.iter().map(|property| property.name.as_str())) {
+            writeln!(file, "property float {name}")?;
+        }
+        writeln!(file, "end_header")?;
+        Ok(Self { file, properties })
     }
-    let file = file.into_inner().map_err(std::io::IntoInnerError::into_error)?;
-    // A pipe cannot be synchronised.
-    if file.metadata()?.is_file() { file.sync_all() } else { Ok(()) }
+
+    fn add(&mut self, gaussians: &Gaussians) -> std::io::Result<()> {
+        let Self { file, properties } = self;
+        let addresses: Vec<_> = properties.iter().map(|own| own.address(gaussians)).collect();
+        let (means, others) = addresses.split_at(MEANS);
+        let value = |(begin, stride): (usize, usize), gaussian: usize| {
+            gaussians.parameters[begin + stride * gaussian]
+        };
+        let mut row = Vec::with_capacity(addresses.len() + NORMALS.len());
+        for gaussian in 0..gaussians.count {
+            row.clear();
+            row.extend(means.iter().map(|&address| value(address, gaussian)));
+            row.extend([0.0; NORMALS.len()]);
+            row.extend(others.iter().map(|&address| value(address, gaussian)));
+            for number in &row {
+                file.write_all(&number.to_le_bytes())?;
+            }
+        }
+        Ok(())
+    }
+
+    fn finish(self) -> std::io::Result<()> {
+        let file = self.file.into_inner().map_err(std::io::IntoInnerError::into_error)?;
+        // A pipe cannot be synchronised.
+        if file.metadata()?.is_file() { file.sync_all() } else { Ok(()) }
+    }
 }
 
 /// Reads Gaussians from a binary little-endian PLY; unknown properties are skipped.
@@ -155,51 +193,81 @@ pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
 /// The problem, as in [`load`].
 pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
     let header = Header::parse(bytes)?;
-    if header.encoding != Encoding::Little {
-        let format = header.encoding.name();
-        return Err(format!("is a PLY of format {format}; save it as binary_little_endian"));
-    }
     let body = &bytes[header.length..];
-    let expected = header.count.checked_mul(header.stride).ok_or("the vertex count is absurd")?;
-    if body.len() < expected {
-        return Err(format!(
-            "is truncated: {} vertices of {} bytes need {expected} bytes, the file has {}",
-            header.count,
-            header.stride,
-            body.len()
-        ));
-    }
-    if body.len() > expected && !header.has_more {
-        return Err(format!(
-            "has {} bytes more than its {} vertices need",
-            body.len() - expected,
-            header.count
-        ));
+    let layout = Layout::of(&header, body.len() as u64)?;
+    Ok((layout.gaussians(&body[..layout.count * layout.stride], 0)?, layout.facts))
+}
+
+/// Where the numbers of Gaussians are in the vertices of a file.
+#[derive(Debug)]
+struct Layout {
+    count: usize,
+    shape: Shape,
+    facts: Facts,
+    /// Bytes before the first vertex.
+    #[cfg(feature = "io")]
+    length: usize,
+    /// Bytes of a vertex.
+    stride: usize,
+    /// With the place of each in a vertex.
+    properties: Vec<(usize, Property)>,
+}
+
+impl Layout {
+    /// Of a file with `length` bytes after its header.
+    fn of(header: &Header, length: u64) -> Result<Self, String> {
+        let &Header { count, stride, .. } = header;
+        if header.encoding != Encoding::Little {
+            let format = header.encoding.name();
+            return Err(format!("is a PLY of format {format}; save it as binary_little_endian"));
+        }
+        let expected = count.checked_mul(stride).ok_or("the vertex count is absurd")?;
+        if length < expected as u64 {
+            return Err(format!(
+                "is truncated: {count} vertices of {stride} bytes need {expected} bytes, the file has {length}"
+            ));
+        }
+        if length > expected as u64 && !header.has_more {
+            let more = length - expected as u64;
+            return Err(format!("has {more} bytes more than its {count} vertices need"));
+        }
+        let (facts, shape) = (facts(header)?, shape(header)?);
+        let offset_of = |property: Property| Ok((offset(header, &property.name)?, property));
+        let properties = properties(shape).into_iter().map(offset_of);
+        let properties = properties.collect::<Result<_, String>>()?;
+        Ok(Self {
+            count,
+            shape,
+            facts,
+            #[cfg(feature = "io")]
+            length: header.length,
+            stride,
+            properties,
+        })
     }
 
-    let facts = facts(&header)?;
-    // Before allocation: vertices without properties take no bytes of the file, however many there are.
-    let shape = shape(&header)?;
-    let offset_of = |property: Property| Ok((offset(&header, &property.name)?, property));
-    let properties =
-        properties(shape).into_iter().map(offset_of).collect::<Result<Vec<_>, String>>()?;
-    let mut gaussians = Gaussians::zeros(header.count, shape);
-    gaussians.origin = facts.origin;
-    for (offset, property) in properties {
-        let (begin, stride) = property.address(&gaussians);
-        for (gaussian, vertex) in body[..expected].chunks_exact(header.stride).enumerate() {
-            let [a, b, c, d] = [0, 1, 2, 3].map(|byte| vertex[offset + byte]);
-            let value = f32::from_le_bytes([a, b, c, d]);
-            if !value.is_finite() {
-                return Err(format!(
-                    "vertex {gaussian}: `{}` is {value}, not a finite number",
-                    property.name
-                ));
+    /// The Gaussians of some vertices, of which the first has the number `first`.
+    fn gaussians(&self, vertices: &[u8], first: usize) -> Result<Gaussians, String> {
+        // Every vertex has bytes, since `of` requires properties.
+        let mut gaussians = Gaussians::zeros(vertices.len() / self.stride, self.shape);
+        gaussians.origin = self.facts.origin;
+        for (offset, property) in &self.properties {
+            let (begin, stride) = property.address(&gaussians);
+            for (gaussian, vertex) in vertices.chunks_exact(self.stride).enumerate() {
+                let [a, b, c, d] = [0, 1, 2, 3].map(|byte| vertex[offset + byte]);
+                let value = f32::from_le_bytes([a, b, c, d]);
+                if !value.is_finite() {
+                    return Err(format!(
+                        "vertex {}: `{}` is {value}, not a finite number",
+                        first + gaussian,
+                        property.name
+                    ));
+                }
+                gaussians.parameters[begin + stride * gaussian] = value;
             }
-            gaussians.parameters[begin + stride * gaussian] = value;
         }
+        Ok(gaussians)
     }
-    Ok((gaussians, facts))
 }
 
 /// What the comments state.

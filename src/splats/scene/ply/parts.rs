@@ -1,0 +1,169 @@
+//! A PLY of Gaussians that is read and written part by part, in memory that does not depend on its size.
+
+use std::fs::File;
+use std::io::{Read as _, Seek as _, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use super::{Layout, Writer, comment_lines};
+use crate::base::output::write_whole_with;
+use crate::base::ply::Header;
+use crate::splats::scene::{Facts, Gaussians, Shape};
+use crate::{Error, Result};
+
+/// The Gaussians of a part: 15 MB of degree 3.
+pub(crate) const PART: usize = 1 << 16;
+/// A header with longer edit lists is read with the whole file.
+const LONGEST_HEADER: u64 = 1 << 26;
+
+/// A PLY file whose Gaussians are read part by part, as often as they are needed.
+#[derive(Debug)]
+pub(crate) struct PartFile {
+    path: PathBuf,
+    file: File,
+    layout: Layout,
+    /// Gaussians of a part.
+    part: usize,
+}
+
+impl PartFile {
+    /// Opens a PLY in the INRIA layout; `None` for a file of another kind, and for what is not read twice, such as a
+    /// pipe.
+    ///
+    /// # Errors
+    /// [`Error::Input`], as of [`super::load`], except for the numbers, which are checked when they are read.
+    pub(crate) fn open(path: &Path, part: usize) -> Result<Option<Self>> {
+        let cannot = |error: std::io::Error| Error::input(path, format!("cannot be read: {error}"));
+        if !path.is_file() {
+            return Ok(None);
+        }
+        let mut file = File::open(path).map_err(cannot)?;
+        let length = file.metadata().map_err(cannot)?.len();
+        let (mut start, mut read) = (vec![], 1 << 16);
+        let header = loop {
+            let more = read - start.len() as u64;
+            (&mut file).take(more).read_to_end(&mut start).map_err(cannot)?;
+            if !start.starts_with(b"ply") {
+                return Ok(None);
+            }
+            match Header::parse(&start) {
+                Ok(header) => break header,
+                Err(_) if read < length.min(LONGEST_HEADER) => read *= 2,
+                Err(problem) => return Err(Error::input(path, problem)),
+            }
+        };
+        let layout = Layout::of(&header, length - header.length as u64);
+        let layout = layout.map_err(|problem| Error::input(path, problem))?;
+        Ok(Some(Self { path: path.to_owned(), file, layout, part }))
+    }
+
+    /// What the header states.
+    pub(crate) fn facts(&self) -> &Facts {
+        &self.layout.facts
+    }
+
+    pub(crate) fn count(&self) -> usize {
+        self.layout.count
+    }
+
+    pub(crate) fn shape(&self) -> Shape {
+        self.layout.shape
+    }
+
+    /// All Gaussians, a part at a time and in order.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if the file can no longer be read, or a number is not finite; those of `take`.
+    pub(crate) fn read(&self, mut take: impl FnMut(Gaussians) -> Result<()>) -> Result<()> {
+        let Layout { count, stride, length, .. } = self.layout;
+        let cannot =
+            |error: std::io::Error| Error::input(&self.path, format!("cannot be read: {error}"));
+        let mut file = &self.file;
+        file.seek(SeekFrom::Start(length as u64)).map_err(cannot)?;
+        let mut vertices = vec![];
+        for first in (0..count).step_by(self.part) {
+            vertices.resize((count - first).min(self.part) * stride, 0);
+            file.read_exact(&mut vertices).map_err(cannot)?;
+            let part = self.layout.gaussians(&vertices, first);
+            take(part.map_err(|problem| Error::input(&self.path, problem))?)?;
+        }
+        Ok(())
+    }
+}
+
+/// Writes a file of `count` Gaussians of the shape and origin of `of`, which `parts` hands over in order; the same bytes
+/// as of [`super::save_with_comments`].
+///
+/// # Errors
+/// [`Error::Output`] if the file cannot be written; those of `parts`. No partial file is left.
+pub(crate) fn save_parts(
+    path: &Path,
+    (of, count): (&Gaussians, usize),
+    comments: &[String],
+    parts: impl FnOnce(&mut dyn FnMut(&Gaussians) -> Result<()>) -> Result<()>,
+) -> Result<()> {
+    let mut failed = None;
+    let written = write_whole_with(path, |partial| {
+        let lines = comment_lines(of.origin, comments);
+        let mut writer = Writer::new(File::create(partial)?, &lines, (of.shape, count))?;
+        let mut unwritten = None;
+        let handed = parts(&mut |part| {
+            writer.add(part).map_err(|error| {
+                unwritten = Some(error);
+                Error::output(path, "cannot be written")
+            })
+        });
+        if let Some(error) = unwritten {
+            return Err(error);
+        }
+        if let Err(error) = handed {
+            failed = Some(error);
+            return Err(std::io::Error::other("its parts cannot be read"));
+        }
+        writer.finish()
+    });
+    failed.map_or(written, Err)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::results::export::tests::drawn;
+
+    #[test]
+    fn parts_are_the_whole_and_write_the_same_bytes() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let mut model = drawn(23, 2);
+        model.origin = glam::DVec3::new(1e6, 2.0, -3.0);
+        let comments = ["x".repeat(200_000), "nightsplat near 0.1".to_owned()];
+        super::super::save_with_comments(&model, path("a.ply"), &comments).unwrap();
+        let file = PartFile::open(&path("a.ply"), 5).unwrap().unwrap();
+        assert_eq!((file.count(), file.shape(), file.facts().near), (23, 2.into(), Some(0.1)));
+        let mut sizes = vec![];
+        save_parts(&path("b.ply"), (&model, 23), &comments, |take| {
+            file.read(|part| {
+                sizes.push(part.count);
+                take(&part)
+            })
+        })
+        .unwrap();
+        assert_eq!(sizes, [5, 5, 5, 5, 3]);
+        let [a, b] = ["a.ply", "b.ply"].map(|name| std::fs::read(path(name)).unwrap());
+        assert_eq!(a, b);
+
+        let mut broken = a.clone();
+        let end = a.len();
+        broken[end - 4..].copy_from_slice(&f32::INFINITY.to_le_bytes());
+        std::fs::write(path("c.ply"), broken).unwrap();
+        let file = PartFile::open(&path("c.ply"), 5).unwrap().unwrap();
+        let copy = |take: &mut dyn FnMut(&Gaussians) -> Result<()>| file.read(|part| take(&part));
+        let refused = save_parts(&path("d.ply"), (&model, 23), &comments, copy).unwrap_err();
+        assert!(refused.to_string().contains("vertex 22: `rot_3` is inf"), "{refused}");
+        std::fs::write(path("c.ply"), &a[..end - 1]).unwrap();
+        let refused = PartFile::open(&path("c.ply"), 5).unwrap_err().to_string();
+        assert!(refused.contains("is truncated"), "{refused}");
+        std::fs::write(path("c.spz"), "no model").unwrap();
+        assert!(PartFile::open(&path("c.spz"), 5).unwrap().is_none());
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 4);
+    }
+}
