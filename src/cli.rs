@@ -37,6 +37,7 @@ pub mod synth;
 mod table;
 pub mod tone;
 pub mod train;
+pub mod vary;
 pub mod view;
 mod words;
 
@@ -72,6 +73,7 @@ For developers:
   bench        time every kernel, and find the fastest tiles
   check        hold every pass of a training step to its CPU reference, on this device
   synth        write a small dark set with known references
+  vary         write a set of varying exposure from one in normal light
   completions  print what a shell completes
   man          write the man pages
 
@@ -94,6 +96,8 @@ enum Command {
     Sweep(Box<sweep::SweepArgs>),
     #[command(hide = true)]
     Synth(synth::SynthArgs),
+    #[command(hide = true)]
+    Vary(vary::VaryArgs),
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
     #[command(hide = true)]
@@ -139,6 +143,7 @@ impl Cli {
             Command::Tone(args) => tone::run(&args),
             Command::Sweep(args) => sweep::run(&args),
             Command::Synth(args) => synth::run(args),
+            Command::Vary(args) => vary::run(&args),
             Command::Demo(args) => demo::run(&args),
             Command::Doctor(args) => doctor::run(&args),
             Command::Bench(args) => bench::run(&args),

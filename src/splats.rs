@@ -13,6 +13,7 @@
 //! - [`optimizer`]: Adam, learned parameters other than the Gaussians, and learning-rate schedules
 //! - [`render`]: the differentiable rasteriser
 //! - [`densify`]: density control: clone, split, prune
+//! - [`smoothing`]: no Gaussian smaller than training views resolve
 
 pub mod attributes;
 pub mod batches;
@@ -25,4 +26,6 @@ pub mod optimizer;
 pub mod packed_sh;
 pub mod render;
 pub mod scene;
+#[cfg(feature = "io")]
+pub mod smoothing;
 pub mod sort;

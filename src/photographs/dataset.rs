@@ -37,6 +37,7 @@ mod transforms;
 mod turns;
 mod undistort;
 mod unused;
+pub mod varied;
 
 use std::borrow::Cow;
 use std::collections::{BTreeSet, HashSet};

@@ -45,5 +45,11 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
     if facts.near.is_none() {
         tracing::warn!("{}: does not state its near plane; the default is used", path.display());
     }
+    if let Some(stops) = facts.linear {
+        let path = path.display();
+        tracing::warn!(
+            "{path}: its colours are linear light, raised by {stops} stops, and are shown as they are"
+        );
+    }
     Ok((gaussians, facts))
 }

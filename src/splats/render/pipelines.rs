@@ -22,10 +22,10 @@ impl Renderer {
     /// # Errors
     /// The driver refuses a kernel, or the tile does not suit the device.
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
-        Self::with_gradients(gpu, settings, GradientKind::All)
+        Self::with_gradients(gpu, settings, GradientKind::All, 0)
     }
 
-    /// [`Renderer::new`] whose backward pass writes such gradients.
+    /// [`Renderer::new`] whose backward pass writes such gradients, but not those of the first `frozen_columns`.
     ///
     /// # Errors
     /// Those of [`Renderer::new`].
@@ -33,13 +33,15 @@ impl Renderer {
         gpu: &Gpu,
         settings: RenderSettings,
         gradients: GradientKind,
+        frozen_columns: u32,
     ) -> Result<Self> {
         let tile = settings.tile_on(gpu)?;
         let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
         let pinhole = (CameraModel::Pinhole.number(), false);
-        let projections = Projections::new(gpu, &settings, tile.size, pinhole, gradients)?;
+        let written = (gradients, frozen_columns);
+        let projections = Projections::new(gpu, &settings, tile.size, pinhole, written)?;
         let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         let blend_backward = match settings.purpose {
@@ -61,6 +63,7 @@ impl Renderer {
             gpu: gpu.clone(),
             settings,
             gradients,
+            frozen_columns,
             tile,
             longest_run: longest_run(gpu),
             projections: BTreeMap::from([(pinhole, projections)]),
@@ -88,7 +91,8 @@ impl Renderer {
         let key = (model, view_depths);
         if !self.projections.contains_key(&key) {
             let (settings, tile) = (&self.settings, self.tile.size);
-            let own = Projections::new(&self.gpu, settings, tile, key, self.gradients)?;
+            let written = (self.gradients, self.frozen_columns);
+            let own = Projections::new(&self.gpu, settings, tile, key, written)?;
             self.projections.insert(key, own);
         }
         Ok(())
@@ -113,8 +117,8 @@ impl Renderer {
         let shape = Shape { sh_degree, ..self.settings.shape };
         let settings = RenderSettings { shape, ..self.settings };
         let own = |&key: &(u32, bool)| {
-            let (tile, gradients) = (self.tile.size, self.gradients);
-            Ok((key, Projections::new(&self.gpu, &settings, tile, key, gradients)?))
+            let (tile, written) = (self.tile.size, (self.gradients, self.frozen_columns));
+            Ok((key, Projections::new(&self.gpu, &settings, tile, key, written)?))
         };
         self.projections = self.projections.keys().map(own).collect::<Result<_>>()?;
         self.settings = settings;
@@ -136,12 +140,13 @@ impl Projections {
         settings: &RenderSettings,
         [tile_width, tile_height]: [u32; 2],
         (camera_model, has_depths): (u32, bool),
-        gradients: GradientKind,
+        (gradients, frozen_columns): (GradientKind, u32),
     ) -> Result<Self> {
         let color_gradients = gradients == GradientKind::Colors;
         let (view_depths, alpha_max) = (u32::from(has_depths), settings.max_alpha);
         let channels = settings.channels() as u32 + view_depths;
-        let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
+        let RenderSettings { raw_colors, antialiased, .. } = *settings;
+        let sh_degree = settings.shape.sh_degree;
         let half_rest = settings.rest == StorageFormat::Half;
         let rest_by_column = rest_by_column(gpu);
         macro_rules! pipeline {
@@ -153,6 +158,7 @@ impl Projections {
                     tile_height,
                     sh_degree,
                     raw_colors,
+                    antialiased,
                     half_rest,
                     rest_by_column,
                     camera_model,
@@ -161,8 +167,11 @@ impl Projections {
             };
         }
         let has_gradients = settings.purpose == Purpose::Train && !has_depths;
-        let backward =
-            if has_gradients { Some(pipeline!(project_backward, color_gradients)) } else { None };
+        let backward = if has_gradients {
+            Some(pipeline!(project_backward, color_gradients, frozen_columns))
+        } else {
+            None
+        };
         Ok(Self { forward: pipeline!(project, view_depths), backward })
     }
 }
