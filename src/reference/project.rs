@@ -71,7 +71,7 @@ pub fn project_gaussian(
     }
     if antialiased {
         opacity *= (normal.dot(normal) / det).sqrt();
-        if !(opacity > ALPHA_MIN) {
+        if opacity.is_nan() || opacity <= ALPHA_MIN {
             return None;
         }
     }

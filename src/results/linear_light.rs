@@ -103,6 +103,7 @@ impl Clipped {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::photographs::image::srgb_from_linear;
     use crate::photographs::tone::{MeasuredPhotograph, ToneCurve, ToneSettings};
 
     #[test]
@@ -158,7 +159,7 @@ mod tests {
         assert_eq!((clipped.clipped, clipped.pixels), (1, 2 * 144));
         // Grey of 18 % is raised to 18 %.
         let grey = 0.18 * (-inverse.stops_to_target()).exp2();
-        let encoded = crate::photographs::image::srgb_from_linear(grey as f32);
+        let encoded = srgb_from_linear(grey as f32);
         let shown = inverse.target([encoded.into(); 3])[1] as f32;
         assert!((linear_from_srgb(shown) - 0.18).abs() < 1e-4, "{shown}");
     }

@@ -100,7 +100,8 @@ impl InverseTone {
     /// The value of a photograph whose target is `value`.
     fn solved(&self, value: f64, channel: usize, factor: f64) -> f64 {
         // Written so that a NaN is black.
-        if !(value > self.channel(0.0, channel, factor)) {
+        let is_lit = value > self.channel(0.0, channel, factor);
+        if !is_lit {
             return 0.0;
         }
         let (mut low, mut high) = (0.0, self.white.min(1.0));
@@ -110,9 +111,9 @@ impl InverseTone {
         for _ in 0..TRIALS {
             let middle = 0.5 * (low + high);
             if self.channel(middle, channel, factor) < value {
-                low = middle
+                low = middle;
             } else {
-                high = middle
+                high = middle;
             }
             if high - low <= PRECISION * high {
                 break;
@@ -196,7 +197,7 @@ mod tests {
     /// In stops of linear light: an eighth of a code value of the target, and what a flat curve makes of it.
     #[test]
     fn the_round_trip_through_a_curve_restores_linear_light_to_a_thousandth_of_a_stop() {
-        let linear = |x: f64| f64::from(crate::photographs::image::linear_from_srgb(x as f32));
+        let linear = |x: f64| f64::from(linear_from_srgb(x as f32));
         for curve in [ToneCurve::Auto, ToneCurve::Ase, ToneCurve::Linear, ToneCurve::None] {
             let inverse = inverse(&ToneSettings::new(curve));
             let mut restored = 0;

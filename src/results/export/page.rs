@@ -221,6 +221,11 @@ mod tests {
         let constant = |name: &str, value: f64| format!("const float {name} = {value:?};");
         assert!(html.contains(&constant("DILATION", DILATION)) && html.contains("void sh_basis("));
         assert_eq!(html.matches(&constant("ALPHA_MIN", ALPHA_MIN)).count(), 2);
+        assert!(html.contains("const bool ANTIALIASED = false;"));
+        let facts = Facts { antialiased: true, ..Facts::default() };
+        let provenance = Provenance { facts, ..Provenance::default() };
+        let compensated = Page { provenance, ..page.clone() }.html().unwrap();
+        assert!(compensated.contains("const bool ANTIALIASED = true;"));
         assert_eq!(html.matches("<script").count(), html.matches("</script>").count());
         for outside in ["http://", "https://", "src=\"/", "@import"] {
             assert!(!html.contains(outside), "{outside}");
