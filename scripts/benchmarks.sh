@@ -3,7 +3,8 @@
 #
 #     scripts/benchmarks.sh [SECTION...] > tables.md
 #
-# Sections: step tiles quality presets curves targets parts background profile memory growth loading build fisheye.
+# Sections: step tiles quality presets curves targets parts background profile memory growth loading build fisheye
+# antialiasing light recolour varying.
 # Without a section: all of them, some hours on two cores. Each table is preceded by its date, device and command.
 #
 # NIGHTSPLAT    the command (default: target/release/nightsplat, built first)
@@ -15,6 +16,7 @@
 # SIZE          options of `bench`; REPEATS (7) and TUNE_REPEATS (3): of step and tiles
 # GROWTH        arguments of examples/growth.rs; PROFILE (release): cargo's profile of growth and build
 # VIEWS, POINTS of loading (2000, 100000); STEPS (1500): of fisheye
+# SCALE (1): of antialiasing, light, recolour and varying, a factor on the downscale; BRIGHT: the set of varying
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -67,7 +69,7 @@ import json, sys
 run, columns = sys.argv[1], sys.argv[2:]
 found = json.load(open(f"{run}/metrics.json")) | json.load(open(f"{run}/eval.json"))
 spent, mean = found["spent"], found["mean"]
-residual = found["leftover_transmittance"]["mean"]
+residual = found["residual_transmittance"]["mean"]
 cells = {
     "psnr": lambda: f"{mean['psnr']:.2f}",
     "channel_mean": lambda: f"{mean['psnr_channel_mean']:.2f}",
@@ -291,7 +293,110 @@ section_fisheye() {
     echo '```'
 }
 
+# The scores of a run at other sizes: sizes RUN DOWNSCALE...; PSNR, and with gain and bias of each channel taken out.
+sizes() {
+    local run=$RUNS/$1 downscale
+    shift
+    for downscale in "$@"; do
+        tool eval "$run" --downscale "$downscale" --align --json > "$scratch/size.json"
+        python3 - "$scratch/size.json" << 'PYTHON'
+import json, sys
+found = json.load(open(sys.argv[1]))
+print(f" {found['mean']['psnr']:.2f} ({found['aligned_with_reference']['mean']['psnr']:.2f}) |", end="")
+PYTHON
+    done
+}
+
+# Antialiasing by the protocol of Mip-Splatting: trained at full size and scored at 1 to 1/8, and the other way round.
+section_antialiasing() {
+    local scale=${SCALE:-1}
+    stamp "nightsplat train SCENE --steps 5000 --set stop.views=0 OPTIONS; nightsplat eval RUN --downscale F --align"
+    echo "| scene | trained at | filters | seed | 1 | 1/2 | 1/4 | 1/8 | processor, s |"
+    echo "|---|---|---|---:|---:|---:|---:|---:|---:|"
+    for name in ${NAMES//,/ }; do
+        for trained in 1 8; do
+            for filters in none compensation smoothing both; do
+                local own=()
+                case $filters in compensation | both) own+=(--antialiasing on) ;; esac
+                case $filters in smoothing | both) own+=(--set antialiasing.smoothing=0.2) ;; esac
+                for seed in ${SEEDS//,/ }; do
+                    local run=antialiasing-$name-$trained-$filters-$seed
+                    train "$run" "$(scene "$name")" --seed "$seed" --steps 5000 --set stop.views=0 \
+                        --downscale $((trained * scale)) "${own[@]}"
+                    echo "| $name | 1/$trained | $filters | $seed |$(sizes "$run" $((scale)) $((2 * scale)) \
+                        $((4 * scale)) $((8 * scale))) $(figures "$run" processor) |"
+                done
+            done
+        done
+    done
+}
+
+# Renders as dark photographs, against the photographs.
+section_light() {
+    stamp 'nightsplat train SCENE; nightsplat eval RUN --photographs'
+    echo "| scene | seed | PSNR of the target, dB | PSNR of the photograph, dB | brighter by, stops |"
+    echo "|---|---:|---:|---:|---:|"
+    for name in ${NAMES//,/ }; do
+        for seed in ${SEEDS//,/ }; do
+            local run=light-$name-$seed
+            train "$run" "$(scene "$name")" --seed "$seed" --downscale "${SCALE:-1}"
+            tool eval "$RUNS/$run" --photographs --json > "$scratch/light.json"
+            python3 - "$name" "$seed" "$scratch/light.json" << 'PYTHON'
+import json, sys
+name, seed, path = sys.argv[1:]
+found = json.load(open(path))
+dark = found["as_photographs"]["mean"]
+print(f"| {name} | {seed} | {found['mean']['psnr']:.2f} | {dark['psnr']:.2f} | {dark['stops']:+.3f} |")
+PYTHON
+        done
+    done
+}
+
+# Night colours on day geometry: the geometry of `high`, the colours of `low`, against everything of `low`.
+section_recolour() {
+    local frozen=means,quats,scales,opacities
+    stamp "nightsplat train SCENE --init DAY.ply --freeze $frozen"
+    echo "| scene | training | seed | PSNR, dB | SSIM | LPIPS | steps | Gaussians | processor, s |"
+    echo "|---|---|---:|---:|---:|---:|---:|---:|---:|"
+    for name in ${NAMES//,/ }; do
+        for seed in ${SEEDS//,/ }; do
+            local own=(--seed "$seed" --downscale "${SCALE:-1}") bright
+            bright=$(scene "$name")
+            train "recolour-$name-day-$seed" "$bright" "${own[@]}" --images "$bright/high" --curve none
+            train "recolour-$name-night-$seed" "$bright" "${own[@]}"
+            train "recolour-$name-frozen-$seed" "$bright" "${own[@]}" --freeze "$frozen" \
+                --init "$RUNS/recolour-$name-day-$seed/model.ply"
+            for how in night frozen; do
+                echo "| $name | $how | $seed |" \
+                    "$(figures "recolour-$name-$how-$seed" psnr ssim lpips steps gaussians processor) |"
+            done
+        done
+    done
+}
+
+# Exposures that vary: the curves of the paper's third benchmark on a set of our own, against its clean photographs.
+section_varying() {
+    local bright=${BRIGHT:?set BRIGHT to a dataset in normal light}
+    stamp "nightsplat vary BRIGHT --seed S --stops 2 --gamma 0.8,1.25; nightsplat train SET OPTIONS"
+    echo "| seed | curve | exposures learned | PSNR, dB | SSIM | LPIPS | processor, s |"
+    echo "|---:|---|---|---:|---:|---:|---:|"
+    for seed in ${SEEDS//,/ }; do
+        local set=$RUNS/varying-set-$seed
+        [ -d "$set" ] || tool vary "$bright" --out "$set" --seed "$seed" --gamma 0.8,1.25 \
+            --downscale "${SCALE:-1}" > /dev/null
+        for curve in "linear --theta 0.49" "ase --gain 0" "ap3 --gain 0" auto; do
+            for learned in off on; do
+                local run=varying-$seed-${curve%% *}-$learned words
+                read -r -a words <<< "$curve"
+                train "$run" "$set" --seed "$seed" --curve "${words[@]}" --exposure "$learned"
+                echo "| $seed | $curve | $learned | $(figures "$run" psnr ssim lpips processor) |"
+            done
+        done
+    done
+}
+
 sections=(step tiles quality presets curves targets parts background profile memory growth loading build fisheye)
+sections+=(antialiasing light recolour varying)
 for name in "${@:-${sections[@]}}"; do
     declare -F "section_$name" > /dev/null || { echo "no section $name; there are: ${sections[*]}" >&2; exit 2; }
 done

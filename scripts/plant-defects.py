@@ -19,6 +19,13 @@ ROOT = Path(__file__).resolve().parent.parent
 DEFECTS = [
     ("the sign of a conic's off-diagonal", "shaders-glsl/splats/render/project.comp",
      "vec3(cov2d.z, -cov2d.y, cov2d.x)", "vec3(cov2d.z, cov2d.y, cov2d.x)", "--test splats golden"),
+    ("a compensated opacity has the gradient of the dilated area", "shaders-glsl/include/conic.glsl",
+     "float own0 = DILATION * ((yy / own)", "float own0 = DILATION * ((xx / own)", "--test splats compensated"),
+    ("the smoothing floor is that of the coarsest view", "shaders-glsl/splats/optimizer/smoothing_floor.comp",
+     "sampling = min(sampling,", "sampling = max(sampling,", "--test splats floor"),
+    ("a frozen quad's neighbour is frozen, too", "shaders-glsl/splats/optimizer/adam.comp",
+     "lessThan(i - begin, uvec4(end - begin))", "lessThan(i - (begin + 3), uvec4(end - begin - 3))",
+     "--test train freeze::"),
     ("colours at the stride of three channels", "shaders-glsl/splats/render/blend_forward.comp",
      "my_color[k] = colors[COLOR_VECTORS * id + k]", "my_color[k] = colors[id + k]", "--test splats golden"),
     ("pixels beyond the right and the lower edge are written", "shaders-glsl/splats/render/blend_forward.comp",

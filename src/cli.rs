@@ -39,6 +39,7 @@ pub mod synth;
 mod table;
 pub mod tone;
 pub mod train;
+pub mod vary;
 pub mod view;
 mod words;
 
@@ -75,6 +76,7 @@ For developers:
   bench        time every kernel, and find the fastest tiles
   check        hold every pass of a training step to its CPU reference, on this device
   synth        write a small dark set with known references
+  vary         write a set of varying exposure from one in normal light
   completions  print what a shell completes
   man          write the man pages
 
@@ -98,6 +100,8 @@ enum Command {
     Blocks(Box<blocks::BlocksArgs>),
     #[command(hide = true)]
     Synth(synth::SynthArgs),
+    #[command(hide = true)]
+    Vary(vary::VaryArgs),
     Demo(demo::DemoArgs),
     Doctor(doctor::DoctorArgs),
     #[command(hide = true)]
@@ -144,6 +148,7 @@ impl Cli {
             Command::Sweep(args) => sweep::run(&args),
             Command::Blocks(args) => blocks::run(&args),
             Command::Synth(args) => synth::run(args),
+            Command::Vary(args) => vary::run(&args),
             Command::Demo(args) => demo::run(&args),
             Command::Doctor(args) => doctor::run(&args),
             Command::Bench(args) => bench::run(&args),

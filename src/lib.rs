@@ -236,8 +236,9 @@ pub mod config {
     pub use crate::splats::densify::DensityControl;
     pub use crate::splats::optimizer::{LearningRates, Schedule};
     pub use crate::train::{
-        Background, CacheSize, CheckConfig, DensityConfig, EndReason, ExposureConfig, ModelConfig,
-        NetworkRates, NotFinite, OnOff, PhotographBits, PrecisionConfig, StopConfig,
+        AntialiasingConfig, Background, CacheSize, CheckConfig, DensityConfig, EndReason,
+        ExposureConfig, Freeze, ModelConfig, NetworkRates, NotFinite, OnOff, PhotographBits,
+        PrecisionConfig, StopConfig,
     };
 }
 

@@ -81,6 +81,7 @@ mod scan_downsweep;
 mod scan_upsweep;
 mod self_test;
 pub mod sh;
+mod smoothing_floor;
 mod sort_downsweep;
 mod sort_upsweep;
 pub mod splat;

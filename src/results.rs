@@ -10,6 +10,7 @@
 //! - [`comparison`]: runs on one dataset, view by view
 //! - [`diagnosis`]: a diagnosis of photographs as a table and a page
 //! - [`evaluation`]: scores as a table, and the page of a run
+//! - [`linear_light`]: renders and colours in the light of the photographs
 //! - [`models`]: model files and run directories, read
 //! - `joined`: a model in tiles, of a scene that was trained in blocks
 //! - [`finished_run`]: a finished run or a model file, opened for rendering
@@ -27,6 +28,7 @@ pub mod evaluation;
 pub mod export;
 pub mod finished_run;
 pub mod joined;
+pub mod linear_light;
 pub mod models;
 pub mod report;
 pub mod run;

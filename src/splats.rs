@@ -14,6 +14,7 @@
 //! - [`render`]: the differentiable rasteriser
 //! - [`densify`]: density control: clone, split, prune
 //! - [`levels`]: levels of detail: neighbours merged
+//! - [`smoothing`]: no Gaussian smaller than training views resolve
 
 pub mod attributes;
 pub mod batches;
@@ -28,4 +29,6 @@ pub mod optimizer;
 pub mod packed_sh;
 pub mod render;
 pub mod scene;
+#[cfg(feature = "io")]
+pub mod smoothing;
 pub mod sort;

@@ -31,6 +31,7 @@ mod preset;
 #[cfg(feature = "testing")]
 mod reference;
 mod rendered;
+mod scene_light;
 pub mod settings;
 #[cfg(feature = "window")]
 mod shown;
@@ -49,18 +50,20 @@ use crate::loss::Term;
 use crate::photographs::dataset::{Dataset, Fingerprint};
 use crate::splats::optimizer::{Adam, FiniteCheck, GaussianStep, LearningRates};
 use crate::splats::render::{Damping, Gradients, RenderOptions, Renderer};
-use crate::splats::scene::Gaussians;
+use crate::splats::scene::{ATTRIBUTES, Gaussians};
+use crate::splats::smoothing::SmoothingFloor;
 use crate::{Error, Result, splats};
 
 pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
 pub use config::{
-    Background, CheckConfig, DensityConfig, ExposureConfig, NotFinite, OnOff, StopConfig,
-    TrainConfig,
+    AntialiasingConfig, Background, CheckConfig, DensityConfig, ExposureConfig, Freeze, NotFinite,
+    OnOff, StopConfig, TrainConfig,
 };
 use context::Initial;
 use early_stopping::Convergence;
 pub use early_stopping::{EndReason, Ended};
+pub(crate) use exposures::known_stops;
 use growth::Growth;
 pub use layers::{Origin, Settings, SettingsLayer, values};
 pub use measuring::TargetExposure;
@@ -76,6 +79,7 @@ pub use preset::Preset;
 #[cfg(feature = "testing")]
 pub use reference::reference;
 pub use rendered::Rendered;
+pub use scene_light::SceneLight;
 #[cfg(feature = "window")]
 pub(crate) use shown::ShownModel;
 use submission::Submissions;
@@ -94,6 +98,9 @@ mod streams {
     pub(super) const BOXES: u64 = 8;
     pub(super) const FILL: u64 = 9;
 }
+
+/// The interval of the smoothing floor, which visits every camera; scales change by at most 8 % in between.
+const FLOOR_STEPS: u64 = 16;
 
 /// The result of one step.
 #[derive(Clone, Debug)]
@@ -164,6 +171,8 @@ pub struct Trainer {
 struct Optimizer {
     adam: Adam,
     finite: FiniteCheck,
+    /// `None`: off.
+    floor: Option<SmoothingFloor>,
     /// The step of the last check of the parameters.
     checked: u64,
 }
@@ -340,6 +349,8 @@ impl Trainer {
         let schedule = &self.config.schedule;
         let view = self.view_id(step);
         let cooldown_factor = self.cooldown_factor(step);
+        let is_floored = step.is_multiple_of(FLOOR_STEPS) || step == self.last_step();
+        let rates = self.learning_rates(step);
         let options = RenderOptions {
             sh_degree: self.sh_degree(step),
             background: background(&self.config, step),
@@ -363,7 +374,6 @@ impl Trainer {
             },
         )?;
         supervision.regularise((gpu, pass), model, renderer, slot)?;
-        let rates = schedule.learning_rates(step, self.extent).scaled(cooldown_factor);
         let status = renderer.status();
         let own = GaussianStep {
             step,
@@ -373,6 +383,9 @@ impl Trainer {
             status,
         };
         model.update((gpu, pass), &optimizer.adam, own, renderer.gradient_kind())?;
+        if let Some(floor) = optimizer.floor.as_ref().filter(|_| is_floored) {
+            floor.record(pass, &mut model.gaussians, status)?;
+        }
         supervision.update(pass, &optimizer.adam, step, cooldown_factor, status)
     }
 
@@ -386,7 +399,13 @@ impl Trainer {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn learning_rates(&self, step: u64) -> LearningRates {
         let rates = self.config.schedule.learning_rates(step, self.extent);
-        rates.scaled(self.cooldown_factor(step))
+        let mut rates = rates.scaled(self.cooldown_factor(step));
+        for spec in &ATTRIBUTES {
+            if self.config.freeze.as_ref().is_some_and(|freeze| freeze.has(spec.attribute)) {
+                rates[spec.attribute] = 0.0;
+            }
+        }
+        rates
     }
 
     /// Renders the model from `camera`, with the SH degree reached so far, over a black background.

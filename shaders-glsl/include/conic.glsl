@@ -1,4 +1,5 @@
-// From the gradient of a splat's conic to those of U = J W R S, where cov2d = U U^T + 0.3 I and conic is its inverse.
+// From the gradients of a splat's conic and compensation to those of U = J W R S, where cov2d = U U^T + 0.3 I and conic
+// is its inverse.
 
 struct ConicGradient {
     vec3 u0;  // of U's rows
@@ -17,4 +18,19 @@ ConicGradient conic_backward(vec3 conic, vec3 u0, vec3 u1, vec3 d_conic) {
     vec3 g0 = d_conic.x * w0 + 0.5 * d_conic.y * w1;
     vec3 g1 = 0.5 * d_conic.y * w0 + d_conic.z * w1;
     return ConicGradient(-2.0 * (a * g0 + b * g1), -2.0 * (b * g0 + c * g1), -2.0 * (w0 * g0 + w1 * g1));
+}
+
+// The gradient of the logarithm of the compensation, sqrt(det(U U^T) / det(cov2d)). The large terms of both determinants
+// are cancelled by hand: of a wide splat only rounding would be left. A seen splat's det(U U^T) is not tiny.
+ConicGradient compensation_backward(vec3 u0, vec3 u1) {
+    float xx = dot(u0, u0), xy = dot(u0, u1), yy = dot(u1, u1);
+    vec3 normal = cross(u0, u1);
+    float own = dot(normal, normal);
+    float det = own + DILATION * (xx + yy) + DILATION * DILATION;
+    float shared_term = DILATION * (xy / own) * ((xx + yy + DILATION) / det);
+    float own0 = DILATION * ((yy / own) * ((yy + DILATION) / det) + (xy / own) * (xy / det));
+    float own1 = DILATION * ((xx / own) * ((xx + DILATION) / det) + (xy / own) * (xy / det));
+    vec3 d_u0 = own0 * u0 - shared_term * u1;
+    vec3 d_u1 = own1 * u1 - shared_term * u0;
+    return ConicGradient(d_u0, d_u1, u0 * d_u0 + u1 * d_u1);
 }

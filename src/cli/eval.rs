@@ -6,15 +6,18 @@ use std::path::PathBuf;
 use anyhow::Result;
 
 use super::{driver, finish, progress_bar, table, word};
+use crate::Error;
 use crate::base::output::{check_writable, printable, write_whole};
 use crate::gpu::DeviceChoice;
 use crate::networks::lpips::{Lpips, Range};
-use crate::photographs::dataset::View;
-use crate::results::eval::{self, ScoreReference};
+use crate::photographs::dataset::{DOWNSCALE, View};
+use crate::photographs::metrics::psnr_of_counted;
+use crate::results::eval::{self, ScoreReference, ScoredImages};
 use crate::results::evaluation::{EvalPage, score_table};
 use crate::results::finished_run::{FinishedRun, is_model};
+use crate::results::linear_light::{photograph_of, stops_between};
 use crate::results::run;
-use crate::train::OnOff;
+use crate::train::{OnOff, SceneLight, known_stops};
 
 /// Score a run on the test views of its dataset.
 ///
@@ -38,6 +41,16 @@ pub struct EvalArgs {
     /// Folder of reference images that were found since, under the names of the photographs
     #[arg(long, value_name = "DIR")]
     pub reference: Option<PathBuf>,
+    /// Score at 1/F of the size of the photographs, for a model that was trained at another [default: the run's]
+    #[arg(long, value_name = "F")]
+    pub downscale: Option<f64>,
+    /// Add the scores after the least-squares gain and bias of each channel of each view, which use the reference
+    #[arg(long)]
+    pub align: bool,
+    /// Add the scores of the renders as dark photographs, against the photographs of the test views: PSNR, and by how
+    /// many stops the render is brighter
+    #[arg(long)]
+    pub photographs: bool,
     /// Add LPIPS, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)
     #[arg(long, value_name = "WEIGHTS")]
     pub lpips: Option<PathBuf>,
@@ -74,12 +87,29 @@ impl From<LpipsRange> for Range {
     }
 }
 
+/// PSNR of a render as a photograph against the photograph of its view, and the stops by which it is brighter; `None`
+/// if the view has none.
+fn as_photograph(
+    light: &SceneLight,
+    compared: &ScoredImages<'_>,
+) -> crate::Result<Option<[f64; 2]>> {
+    let Some(photograph) = compared.view.loaded()? else { return Ok(None) };
+    let (own, _) = photograph_of(&compared.render, &light.of_view(compared.view)?);
+    let mask = compared.view.mask.as_ref();
+    let psnr = psnr_of_counted(&own, &photograph, mask)?;
+    Ok(Some([psnr, stops_between(&own, &photograph)]))
+}
+
 /// Scores the run and prints the scores.
 ///
 /// # Errors
 /// The folder contains no run with a model, its dataset is missing, or a file cannot be written.
 pub fn run(args: &EvalArgs) -> Result<()> {
     args.report.iter().try_for_each(|path| check_writable(path))?;
+    if let Some(downscale) = args.downscale.filter(|&own| !DOWNSCALE.takes_number(own)) {
+        let (key, rule) = ("downscale".to_owned(), DOWNSCALE.to_string());
+        return Err(Error::Setting { key, value: downscale.to_string(), rule }.into());
+    }
     let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer } =
         FinishedRun::open_with(
             &args.run,
@@ -87,11 +117,14 @@ pub fn run(args: &EvalArgs) -> Result<()> {
             &driver::opener(args.device.as_ref()),
             |own| {
                 own.reference = args.reference.clone().or(own.reference.take());
+                own.downscale = args.downscale.unwrap_or(own.downscale);
             },
         )?;
     let load = |weights| Lpips::load(&gpu, weights, args.lpips_range.into());
     let lpips = args.lpips.as_ref().map(load).transpose()?;
     let measure = lpips.as_ref().map(Lpips::measure);
+    let light = args.photographs.then(|| SceneLight::of(&config.tone, &dataset)).transpose()?;
+    let stops = known_stops(&dataset, &config)?;
     let mut score_reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
     let images = match is_model(&args.run) {
         true => args.run.with_extension("eval"),
@@ -106,8 +139,14 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     let scored = eval::score_by(&mut score_reference, &dataset, render, |score, compared| {
         let lpips = lpips.as_ref().map(|lpips| compared.lpips(&gpu, lpips));
         score.scores.lpips = lpips.transpose()?;
-        if config.exposure.learn == OnOff::On {
+        if args.align || config.exposure.learn == OnOff::On {
             score.aligned = Some(compared.aligned()?);
+        }
+        if let Some(stops) = stops.get(&score.name) {
+            score.exposed = Some(compared.exposed(*stops)?);
+        }
+        if let Some(light) = &light {
+            score.photograph = as_photograph(light, compared)?;
         }
         if args.save_images {
             compared.save(&images, score.against)?;
@@ -155,6 +194,12 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         }
         if config.exposure.learn == OnOff::On {
             eval::add_exposure(&mut metrics, &scored);
+        } else if args.align {
+            eval::add_aligned(&mut metrics, &scored);
+        }
+        eval::add_exposed(&mut metrics, &scored);
+        if args.photographs {
+            eval::add_photographs(&mut metrics, &scored);
         }
         writeln!(out, "{metrics:#}")?;
     } else {

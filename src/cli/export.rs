@@ -20,11 +20,12 @@ use crate::results::export::page::{Bookmark, Page, Picture, moved};
 use crate::results::export::streamed::{self, Division, MAX_LEVELS, Tile, Written};
 use crate::results::export::{Format, Provenance, spz};
 use crate::results::finished_run::{FinishedRun, config_of_file, is_model, needs_photographs};
+use crate::results::linear_light::linear_gaussians;
 use crate::results::models;
 use crate::splats::levels;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE};
-use crate::train::{TestTargets, TrainConfig};
+use crate::train::{SceneLight, TestTargets, TrainConfig};
 use crate::{Error, results::run};
 
 pub use up::Up;
@@ -45,6 +46,10 @@ pub struct ExportArgs {
     /// none keeps the dataset's axes [default: the run's for GLB, SPZ and html; none for PLY and SOG]
     #[arg(long, value_name = "DIRECTION", allow_hyphen_values = true)]
     pub up: Option<Up>,
+    /// Colours in linear light, for engines: that of the photographs, raised to the brightness of the target by the
+    /// stops that the file states. For ply and glb, whose numbers are floats
+    #[arg(long)]
+    pub linear: bool,
     /// Version of SPZ; more programs read 3
     #[arg(long, value_name = "3|4", default_value_t = 4, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub spz: u8,
@@ -60,7 +65,7 @@ pub struct ExportArgs {
     /// For html: number of views to start from, with their photographs
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub views: usize,
-    /// For html: dataset, if it moved since training [default: the run's]
+    /// For html and --linear: dataset, if it moved since training [default: the run's]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the run's]
@@ -125,7 +130,10 @@ pub fn run(args: &ExportArgs) -> Result<()> {
 pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     check_ending(args)?;
     check_levels(args)?;
+    check_linear(args)?;
     let (gaussians, facts, config) = opened(args)?;
+    let (gaussians, facts) =
+        if args.linear { linear(args, &config, gaussians, facts)? } else { (gaussians, facts) };
     let own = own_file(args);
     let out = args.out.as_ref().unwrap_or(&own);
     if args.to == To::Ply && is_same_file(out, &own) {
@@ -215,6 +223,25 @@ fn check_levels(args: &ExportArgs) -> crate::Result<()> {
     Err(Error::Usage(problem))
 }
 
+/// Refuses linear light for formats of eight bits, which would show banding, and for model files, whose tone curve is
+/// unknown.
+fn check_linear(args: &ExportArgs) -> crate::Result<()> {
+    let problem = match args.to {
+        _ if !args.linear => return Ok(()),
+        To::Spz | To::Sog | To::StreamedSog | To::Html => {
+            "--linear needs floats; export to ply or glb".to_owned()
+        }
+        _ if is_model(&args.run) => {
+            let run = args.run.display();
+            format!(
+                "--linear inverts the tone curve of a run, and {run} is a model file; pass the run directory"
+            )
+        }
+        To::Ply | To::Glb => return Ok(()),
+    };
+    Err(Error::Usage(problem))
+}
+
 /// A line on the contents of a streamed SOG.
 fn streamed_line(out: &Path, Written { counts, chunks }: &Written, turned: &str) -> String {
     let (out, kib) = (out.display(), size_of(out).div_ceil(1024));
@@ -231,6 +258,31 @@ fn size_of(folder: &Path) -> u64 {
         Err(_) => 0,
     };
     std::fs::read_dir(folder).map_or(0, |entries| entries.flatten().map(size).sum())
+}
+
+/// The model in linear light, and the facts that state it.
+fn linear(
+    args: &ExportArgs,
+    config: &TrainConfig,
+    gaussians: Gaussians,
+    facts: Facts,
+) -> crate::Result<(Gaussians, Facts)> {
+    let mut config = config.clone();
+    if let Some(dataset) = &args.dataset {
+        config.move_dataset(dataset);
+    }
+    let dataset = Dataset::load(&config.dataset, &config.load_options())?;
+    let inverse = SceneLight::of(&config.tone, &dataset)?.of_scene()?;
+    let stops = inverse.stops_to_target();
+    let (linear, clipped) = linear_gaussians(&gaussians, &inverse, stops);
+    if clipped > 0 {
+        let count = gaussians.count;
+        tracing::warn!(
+            "{clipped} of {count} Gaussians are as bright as the tone curve gets in some direction: their light is \
+             at least what is written"
+        );
+    }
+    Ok((linear, Facts { linear: Some(stops as f32), ..facts }))
 }
 
 /// The model as stored, what is stated of it, and its settings.

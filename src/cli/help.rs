@@ -28,7 +28,8 @@ const GROUPS: [(&str, &str); 6] = [
     ("Tone curve", "curve profile gain brightness colour theta law exposure exposures"),
     (
         "Model",
-        "preset model parts sh-degree init max-gaussians density near background ssim-weight raw-colors depth \
+        "preset model parts sh-degree init freeze max-gaussians density near background ssim-weight raw-colors \
+         antialiasing depth \
          depth-is-disparity denoiser-stages denoiser-repeats denoiser-channels denoiser-precision denoiser-crop",
     ),
     ("Settings", "config set frame plan explain seed"),

@@ -19,8 +19,10 @@ use crate::photographs::image::Image;
 use crate::results::colour_map;
 use crate::results::eval::RenderLayer;
 use crate::results::finished_run::FinishedRun;
+use crate::results::linear_light::{Clipped, STOPS, photograph_of};
 use crate::results::video;
 use crate::results::view_exposures::ViewExposures;
+use crate::train::SceneLight;
 
 /// Render a run from the cameras of its dataset, or along a path through them.
 ///
@@ -80,6 +82,11 @@ pub struct RenderArgs {
     /// Depths at the ends of the colours, in world units [default: of each image its own]
     #[arg(long, value_name = "NEAR,FAR")]
     pub depth_range: Option<DepthRange>,
+    /// Light of the images: target, as trained; photograph, as dark as the photographs; linear, the photographs' linear
+    /// light at the exposure of the scene, for --format exr: 1 is where they clip, and the header has the stops to raise
+    /// it by for the brightness of the target
+    #[arg(long = "as", value_name = "LIGHT", value_enum, default_value_t)]
+    pub light: Light,
     /// Render each training view at the exposure of its target, not at the model's
     #[arg(long)]
     pub view_exposure: bool,
@@ -96,7 +103,20 @@ const EXAMPLES: &str = "Examples:
   nightsplat render run --path auto --frames 180 --out frames --video flight.mp4
   nightsplat render run --path interpolate --out frames --video moving.png
   nightsplat render run --path keyframes.json --size 1280x720 --out frames --video film.mp4
-  nightsplat render run --split test --layer depth --out depths";
+  nightsplat render run --split test --layer depth --out depths
+  nightsplat render run --split test --as linear --format exr --out light";
+
+/// The light of an image on the command line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Light {
+    /// As trained
+    #[default]
+    Target,
+    /// As dark as the photographs
+    Photograph,
+    /// Linear, at the exposure of the scene
+    Linear,
+}
 
 /// A camera path on the command line.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -242,6 +262,14 @@ pub fn run(args: &RenderArgs) -> Result<()> {
             format!("--video {} requires PNG frames; leave out --format exr", video.display());
         return Err(Error::Usage(problem).into());
     }
+    if args.light == Light::Linear && *format != ImageFormat::Exr {
+        let problem = "--as linear is not clamped, and needs floats; add --format exr";
+        return Err(Error::Usage(problem.to_owned()).into());
+    }
+    if args.light != Light::Target && layer.is_some_and(|layer| !layer.is_color()) {
+        let problem = "--as photograph and --as linear are of colours; leave out --layer";
+        return Err(Error::Usage(problem.to_owned()).into());
+    }
     if let Some(fov) = args.fov.filter(|fov| !(*fov > 0.0 && *fov < 180.0)) {
         let problem =
             format!("--fov {fov} is no field of view; it is above 0 and below 180 degrees");
@@ -252,17 +280,35 @@ pub fn run(args: &RenderArgs) -> Result<()> {
         FinishedRun::open(run, args.dataset.as_deref(), &driver::opener(device.as_ref()))?;
     let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
     let (shots, fps) = shots(args, &config, &dataset)?;
+    let light = match args.light {
+        Light::Target => None,
+        _ => Some(SceneLight::of(&config.tone, &dataset)?),
+    };
+    let mut clipped = Clipped::default();
     model_renderer.set_background(args.background.0);
     make_folder(out, &dataset, run)?;
     let bar = progress_bar(shots.len());
     for Shot { name, camera, orientation } in &shots {
         bar.set_message(printable(name).into_owned());
         let path = file(out, name, *format);
-        let color = |image: Image| {
+        let mut color = |image: Image| {
             let image = image.turned(*orientation);
-            match &exposures {
-                Some(exposures) => format.save(&exposures.applied(name, image), &path),
-                None => format.save(&image, &path),
+            let image = match &exposures {
+                Some(exposures) => exposures.applied(name, image),
+                None => image,
+            };
+            let Some(light) = &light else { return format.save(&image, &path) };
+            let view = dataset.views.iter().find(|view| view.name == *name);
+            let inverse = match view.filter(|_| args.light == Light::Photograph) {
+                Some(view) => light.of_view(view)?,
+                None => light.at(camera)?,
+            };
+            let photograph = clipped.add(photograph_of(&image, &inverse));
+            match format {
+                ImageFormat::Exr => {
+                    photograph.save_exr_with(&path, &[(STOPS, inverse.stops_to_target() as f32)])
+                }
+                _ => format.save(&photograph, &path),
             }
         };
         match layer {
@@ -276,6 +322,7 @@ pub fn run(args: &RenderArgs) -> Result<()> {
         bar.inc(1);
     }
     bar.finish_and_clear();
+    clipped.warn();
     let mut wrote = format!("{} images to {}", shots.len(), out.display());
     if let Some(video) = &args.video {
         let files: Vec<PathBuf> = shots.iter().map(|shot| file(out, &shot.name, *format)).collect();

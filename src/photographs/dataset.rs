@@ -38,6 +38,7 @@ mod transforms;
 mod turns;
 mod undistort;
 mod unused;
+pub mod varied;
 
 use std::borrow::Cow;
 use std::collections::{BTreeSet, HashSet};

@@ -21,6 +21,7 @@ mod exposure;
 mod families;
 mod file;
 mod histogram;
+mod inverse;
 mod law;
 mod mapping;
 mod profile;
@@ -35,6 +36,7 @@ pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
 pub use self::families::{Constant, FAMILIES, Family, OffsetMode, ToneCurve, White};
 pub use self::file::CurveChoice;
 pub use self::histogram::LuminanceHistogram;
+pub use self::inverse::{InverseTone, Inverted};
 #[cfg(feature = "fit")]
 pub(crate) use self::law::{CurveInputs, PhotographCurve, law};
 pub(crate) use self::law::{clamped, curve_at, tone_curve};

@@ -88,7 +88,8 @@ impl Reference for Kernel {
             return;
         }
         let gaussian_count = params.gaussian_count as usize;
-        for i in 0..params.column_count as usize * gaussian_count {
+        let frozen = constants.frozen_columns as usize * gaussian_count;
+        for i in frozen..params.column_count as usize * gaussian_count {
             let moments = [&*first_moments, &*second_moments];
             let before = before(constants, i, parameters, gradients, moments, both_moments);
             let [parameter, first, second] = updated(params, i / gaussian_count, before);
@@ -107,8 +108,12 @@ impl Reference for Kernel {
         let Slices { parameters, gradients, first_moments, second_moments, both_moments, status } =
             slices;
         let count = if status[0] == 0 { params.column_count * params.gaussian_count } else { 0 };
+        let frozen = (constants.frozen_columns * params.gaussian_count) as usize;
         let bounds = |which: usize| {
             let of = |i: usize| {
+                if i < frozen {
+                    return 0.0;
+                }
                 let moments = [&*first_moments, &*second_moments];
                 let before = before(constants, i, parameters, gradients, moments, both_moments);
                 let column = i / params.gaussian_count as usize;

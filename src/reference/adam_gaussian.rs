@@ -24,7 +24,7 @@ fn updates(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<U
     if status[0] != 0 {
         return vec![];
     }
-    let Constants { sh_degree, feature_count, rest_by_column } = *constants;
+    let Constants { sh_degree, feature_count, rest_by_column, frozen_columns } = *constants;
     let count = params.gaussian_count as usize;
     let own = Planes { count, feature_count: feature_count as usize, sh_degree, rest_by_column };
     let camera = Camera::from(&cameras[params.camera_index as usize]);
@@ -57,7 +57,7 @@ fn updates(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<U
             }
         };
         let columns = if params.sh_degree == 0 { before_rest } else { places.len() };
-        (0..columns).map(update).collect::<Vec<_>>()
+        (frozen_columns as usize..columns).map(update).collect::<Vec<_>>()
     };
     (0..count).flat_map(of_gaussian).collect()
 }

@@ -4,7 +4,7 @@ use glam::{DMat3, DVec2, DVec3, DVec4};
 
 use super::camera::Camera;
 use super::gaussian::{Gaussian, Planes};
-use super::project_backward::{conic_backward, splat_gradient, summed_record};
+use super::project_backward::{rows_backward, splat_gradient, summed_record};
 use super::rotation::{rotation, unit_quat};
 use super::rounding::{UNIT, sensitivity};
 use super::splat::Splat;
@@ -14,19 +14,20 @@ use crate::kernels::camera_backward::{Constants, Kernel, Params, Slices, Toleran
 
 const WIDTH: usize = CAMERA_WIDTH as usize;
 
-/// A Gaussian's share of the gradient of the camera, from the gradients of its mean and of its splat.
+/// A Gaussian's share of the gradient of the camera, from the gradients of its mean and of its splat: mean, conic, and
+/// the logarithm of the compensation.
 pub fn camera_backward(
     camera: &Camera,
     gaussian: &Gaussian,
     d_mean: DVec3,
     conic: DVec3,
-    (d_mean2d, d_conic): (DVec2, DVec3),
+    (d_mean2d, d_conic, d_dimming): (DVec2, DVec3, f64),
 ) -> [f64; WIDTH] {
     let point = camera.view(gaussian.mean);
     let scale = DMat3::from_diagonal(gaussian.log_scale.exp());
     let view_axes = camera.rotation * rotation(unit_quat(gaussian.quat)) * scale;
     let rows = camera.jacobian(point).map(|row| view_axes.transpose() * row);
-    let (d_u0, d_u1, _) = conic_backward(conic, rows, d_conic);
+    let (d_u0, d_u1, _) = rows_backward(conic, rows, (d_conic, d_dimming));
     let d_rows = [view_axes * d_u0, view_axes * d_u1];
     camera.gradient(point, camera.rotation * d_mean, d_mean2d, d_rows)
 }
@@ -57,7 +58,7 @@ fn inputs(params: &Params, constants: &Constants, slices: &Slices<'_>, i: usize)
     [values, errors]
 }
 
-fn share(camera: &Camera, inputs: &[f64]) -> Vec<f64> {
+fn share(camera: &Camera, antialiased: bool, inputs: &[f64]) -> Vec<f64> {
     let vector = |at: usize| DVec3::from_slice(&inputs[at..]);
     let gaussian = Gaussian {
         mean: vector(0),
@@ -68,8 +69,10 @@ fn share(camera: &Camera, inputs: &[f64]) -> Vec<f64> {
         sh: vec![],
     };
     let splat = Splat { mean2d: DVec2::ZERO, conic: vector(10), opacity: 1.0 };
-    let (d_mean2d, d_conic, _) = splat_gradient(&splat, &inputs[16..]);
-    camera_backward(camera, &gaussian, vector(13), splat.conic, (d_mean2d, d_conic)).to_vec()
+    // The opacity cancels in the gradient of its logarithm.
+    let (d_mean2d, d_conic, d_dimming) = splat_gradient(&splat, &inputs[16..]);
+    let arriving = (d_mean2d, d_conic, if antialiased { d_dimming } else { 0.0 });
+    camera_backward(camera, &gaussian, vector(13), splat.conic, arriving).to_vec()
 }
 
 impl Reference for Kernel {
@@ -79,7 +82,11 @@ impl Reference for Kernel {
         slices.shares[..n * WIDTH].fill(0.0);
         for i in (0..n).filter(|&i| slices.tile_counts[i] > 0) {
             let [values, _] = inputs(params, constants, &slices, i);
-            for (to, number) in slices.shares[WIDTH * i..].iter_mut().zip(share(&camera, &values)) {
+            for (to, number) in slices.shares[WIDTH * i..].iter_mut().zip(share(
+                &camera,
+                constants.antialiased,
+                &values,
+            )) {
                 *to = number as f32;
             }
         }
@@ -92,9 +99,10 @@ impl Reference for Kernel {
         let mut shares = vec![0.0; n * WIDTH];
         for i in (0..n).filter(|&i| slices.tile_counts[i] > 0) {
             let [values, errors] = inputs(params, constants, &slices, i);
-            let exact = share(&camera, &values);
+            let share = |inputs: &[f64]| share(&camera, constants.antialiased, inputs);
+            let exact = share(&values);
             let largest = exact.iter().fold(0.0_f64, |largest, number| largest.max(number.abs()));
-            let moved = sensitivity(&values, &errors, |inputs| share(&camera, inputs));
+            let moved = sensitivity(&values, &errors, share);
             for (to, moved) in shares[WIDTH * i..].iter_mut().zip(moved) {
                 *to = moved + 256.0 * UNIT * largest;
             }

@@ -25,19 +25,33 @@ pub struct Projection {
     pub color: DVec3,
     /// In the camera model's definition, world units.
     pub depth: f64,
+    /// The rounding errors of the compensation, in units of one rounding of it: a thin splat's determinant cancels.
+    pub conditioning: f64,
 }
 
-/// Projects one Gaussian with SH up to `sh_degree`; `None` if it is culled. Raw colours are the bare SH sum.
+/// How Gaussians are projected.
+#[derive(Clone, Copy, Debug)]
+pub struct ProjectionSettings {
+    /// World units.
+    pub near: f64,
+    /// The SH degree in use.
+    pub sh_degree: u32,
+    /// Colours are the bare SH sum.
+    pub raw_colors: bool,
+    /// Opacities are compensated for the dilation.
+    pub antialiased: bool,
+}
+
+/// Projects one Gaussian; `None` if it is culled.
 pub fn project_gaussian(
     camera: &Camera,
-    near: f64,
-    sh_degree: u32,
-    raw_colors: bool,
+    settings: ProjectionSettings,
     gaussian: &Gaussian,
 ) -> Option<Projection> {
+    let ProjectionSettings { near, sh_degree, raw_colors, antialiased } = settings;
     let mean_in_view = camera.view(gaussian.mean);
     let depth = camera.depth(mean_in_view);
-    let opacity = sigmoid(gaussian.raw_opacity);
+    let mut opacity = sigmoid(gaussian.raw_opacity);
     if !(depth > near && opacity > ALPHA_MIN) {
         return None;
     }
@@ -55,6 +69,12 @@ pub fn project_gaussian(
     if !(det < 1e30 && mean2d.abs().cmplt(DVec2::splat(1e30)).all()) {
         return None;
     }
+    if antialiased {
+        opacity *= (normal.dot(normal) / det).sqrt();
+        if opacity.is_nan() || opacity <= ALPHA_MIN {
+            return None;
+        }
+    }
 
     let conic = DVec3::new(cov2d.z, -cov2d.y, cov2d.x) / det;
     let level = 2.002 * (255.0 * opacity).ln() + 1e-3;
@@ -67,6 +87,7 @@ pub fn project_gaussian(
         half_extent,
         color: if raw_colors { color } else { (color + 0.5).max(DVec3::ZERO) },
         depth,
+        conditioning: if antialiased { (xx * yy).sqrt() / normal.length() } else { 0.0 },
     })
 }
 
@@ -134,8 +155,10 @@ impl<'a> ProjectionInputs<'a> {
 
     fn project(&self, gaussian: &Gaussian) -> Option<Projection> {
         let Params { near, sh_degree, .. } = *self.params;
-        let raw_colors = self.constants.raw_colors;
-        project_gaussian(&self.camera, near.into(), sh_degree, raw_colors, gaussian)
+        let Constants { raw_colors, antialiased, .. } = *self.constants;
+        let near = near.into();
+        let settings = ProjectionSettings { near, sh_degree, raw_colors, antialiased };
+        project_gaussian(&self.camera, settings, gaussian)
     }
 
     /// The error bound of each of [`Projection::numbers`]: the kernel computes them for a Gaussian that is off by a few
@@ -185,7 +208,10 @@ impl<'a> ProjectionInputs<'a> {
         let widest = 64.0 * conic.x.max(conic.z);
         // Sixteen terms, whose basis is a polynomial of magnitude 3 and degree 3.
         let color = 128.0 * (1.0 + gaussian.sh.iter().map(|c| c.abs().max_element()).sum::<f64>());
-        let extent = projection.half_extent * extent_error(opacity as f32) / UNIT;
+        let dimmed = 32.0 * projection.conditioning;
+        let level = f64::from(splat_level(opacity as f32));
+        let extent =
+            projection.half_extent * (extent_error(opacity as f32) / UNIT + dimmed / level);
         let own = [
             16.0 * center.x,
             16.0 * center.y,
@@ -194,7 +220,7 @@ impl<'a> ProjectionInputs<'a> {
             widest,
             widest,
             widest,
-            8.0 * opacity,
+            (8.0 + dimmed) * opacity,
             color,
             color,
             color,

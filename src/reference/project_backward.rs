@@ -43,6 +43,7 @@ pub fn splat_gradient(splat: &Splat, record: &[f64]) -> (DVec2, DVec3, f64) {
 pub fn project_gaussian_backward(
     camera: &Camera,
     sh_degree: u32,
+    antialiased: bool,
     gaussian: &Gaussian,
     splat: &Splat,
     d_splat: &DSplat,
@@ -55,7 +56,9 @@ pub fn project_gaussian_backward(
     let [t0, t1] = camera.jacobian(mean_in_view).map(|row| world_from_view * row);
     let (u0, u1) = (scaled_axes.transpose() * t0, scaled_axes.transpose() * t1);
 
-    let (d_u0, d_u1, d_log_scale) = conic_backward(splat.conic, [u0, u1], d_splat.conic);
+    let d_dimming = if antialiased { d_splat.opacity * splat.opacity } else { 0.0 };
+    let (d_u0, d_u1, d_log_scale) =
+        rows_backward(splat.conic, [u0, u1], (d_splat.conic, d_dimming));
 
     let d_scaled_axes = outer_product(t0, d_u0) + outer_product(t1, d_u1);
     let d_unit = rotation_backward(unit, d_scaled_axes * DMat3::from_diagonal(scale));
@@ -67,7 +70,7 @@ pub fn project_gaussian_backward(
 
     let (d_mean_sh, d_sh) =
         sh_backward(sh_degree, &gaussian.sh, gaussian.mean - camera.center(), d_splat.color);
-    let opacity = sigmoid(gaussian.raw_opacity);
+    let opacity = if antialiased { splat.opacity } else { sigmoid(gaussian.raw_opacity) };
     Gaussian {
         mean: world_from_view * d_mean_in_view + d_mean_sh,
         quat: d_quat,
@@ -78,22 +81,31 @@ pub fn project_gaussian_backward(
     }
 }
 
-/// From the gradient of a conic to those of the rows of U, where cov2d = U U^T + 0.3 I, and of the logarithms of the
-/// scales.
-pub(super) fn conic_backward(
+/// From the gradients of a conic and of the logarithm of the compensation to those of the rows of U, where cov2d = U U^T
+/// + 0.3 I, and of the logarithms of the scales.
+pub(super) fn rows_backward(
     conic: DVec3,
     [u0, u1]: [DVec3; 2],
-    d_conic: DVec3,
+    (d_conic, d_dimming): (DVec3, f64),
 ) -> (DVec3, DVec3, DVec3) {
     let [a, b, c] = conic.to_array();
     let normal = u0.cross(u1);
     let trace = u0.dot(u0) + u1.dot(u1);
-    let det = normal.dot(normal) + DILATION * trace + DILATION * DILATION;
+    let own = normal.dot(normal);
+    let det = own + DILATION * trace + DILATION * DILATION;
     let w0 = (u1.cross(normal) + DILATION * u0) / det;
     let w1 = (normal.cross(u0) + DILATION * u1) / det;
     let g0 = d_conic.x * w0 + 0.5 * d_conic.y * w1;
     let g1 = 0.5 * d_conic.y * w0 + d_conic.z * w1;
-    (-2.0 * (a * g0 + b * g1), -2.0 * (b * g0 + c * g1), -2.0 * (w0 * g0 + w1 * g1))
+    let (mut d_u0, mut d_u1) = (-2.0 * (a * g0 + b * g1), -2.0 * (b * g0 + c * g1));
+    let mut d_log_scale = -2.0 * (w0 * g0 + w1 * g1);
+    if d_dimming != 0.0 {
+        let by = [u1.cross(normal) / own - w0, normal.cross(u0) / own - w1];
+        let [by_u0, by_u1] = by.map(|by| d_dimming * by);
+        (d_u0, d_u1) = (d_u0 + by_u0, d_u1 + by_u1);
+        d_log_scale += u0 * by_u0 + u1 * by_u1;
+    }
+    (d_u0, d_u1, d_log_scale)
 }
 
 /// The gradient of the mean through the viewing direction, and those of the SH coefficients.
@@ -165,9 +177,9 @@ impl<'a> ProjectionInputs<'a> {
     }
 
     fn backward(&self, gaussian: &Gaussian, splat: &Splat, d_splat: &DSplat) -> Gaussian {
-        let degree = self.params.sh_degree;
+        let (degree, antialiased) = (self.params.sh_degree, self.constants.antialiased);
         let mut gradient =
-            project_gaussian_backward(&self.camera, degree, gaussian, splat, d_splat);
+            project_gaussian_backward(&self.camera, degree, antialiased, gaussian, splat, d_splat);
         if self.constants.color_gradients {
             let rest = &mut gradient.sh[1..];
             rest.fill(DVec3::ZERO);
@@ -195,6 +207,11 @@ impl<'a> ProjectionInputs<'a> {
         let t = DVec2::from_array(self.camera.jacobian(mean_in_view).map(DVec3::length));
         let scale = gaussian.log_scale.max_element().exp();
         let d_u = DVec2::new(2.0 * d_xx * t.x + d_xy * t.y, 2.0 * d_yy * t.y + d_xy * t.x);
+        // Of the compensation, d_u is the product of U and the difference of two inverse covariances.
+        let dimming =
+            if self.constants.antialiased { d_splat.opacity * splat.opacity } else { 0.0 };
+        let dimmed = 2.0 * dimming.abs() * DILATION * (a + c) * (a + c);
+        let d_u = d_u + t * dimmed;
         512.0 * UNIT * scale * scale * t.dot(d_u) / gaussian.quat.length().max(1e-12)
     }
 
@@ -252,7 +269,8 @@ impl Reference for Kernel {
         let scene = ProjectionInputs::new(params, constants, slices.cameras);
         let (planes, parameters) = scene.planes.floats(parameters, constants.half_rest);
         let written = scene.written_columns() * scene.planes.count;
-        gradients[..written].fill(0.0);
+        let frozen = constants.frozen_columns as usize * scene.planes.count;
+        gradients[frozen..written].fill(0.0);
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
             let record =
                 summed_record(constants.channels, intersection_ranges[i], gradient_records);
@@ -263,14 +281,14 @@ impl Reference for Kernel {
             let mut is_finite = (8.0 * d_splat.color.as_vec3()).is_finite();
             scene.planes.store(&gradient, i, |at, value| {
                 let value = value as f32;
-                is_finite &= value.is_finite();
-                if at < written {
+                is_finite &= value.is_finite() || at < frozen;
+                if (frozen..written).contains(&at) {
                     gradients[at] = value;
                 }
             });
             if !is_finite {
                 status[0] |= if before & !STATUS_GRADIENT == 0 { STATUS_GRADIENT } else { 0 };
-            } else if before == 0 {
+            } else if before == 0 && frozen == 0 {
                 grad_norm_sums[i] += scene.damped_norm(&gaussian, &d_splat) as f32;
                 visit_counts[i] += 1;
             }

@@ -352,10 +352,10 @@ impl Editor {
         let look = |facts: &Facts| {
             let defaults = crate::splats::render::RenderSettings::default();
             let raw_colors = facts.raw_colors.unwrap_or(defaults.raw_colors);
-            (raw_colors, facts.max_alpha.unwrap_or(defaults.max_alpha))
+            (raw_colors, facts.max_alpha.unwrap_or(defaults.max_alpha), facts.antialiased)
         };
         if look(&facts) != look(&self.facts) {
-            let problem = "renders with other colours or another alpha limit than the model; train both alike";
+            let problem = "renders with other colours, alpha limit or antialiasing than the model; train both alike";
             return refused(problem.to_owned());
         }
         let mut own = self.content.whole()?.into_owned();

@@ -11,7 +11,7 @@ use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::lpips::{Lpips, Measure};
 use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::image::Image;
+use crate::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use crate::photographs::metrics::{self, Scores};
 use crate::photographs::tone::{SceneTone, ToneCurve, ToneSettings};
 use crate::splats::model::Model;
@@ -156,6 +156,11 @@ pub struct ViewScore {
     pub r0: Option<Scores>,
     /// Scores after the least-squares gain and bias of each channel, if requested.
     pub aligned: Option<Scores>,
+    /// Scores at the view's own exposure, if it is known.
+    pub exposed: Option<Scores>,
+    /// The view as a photograph against its own photograph, if requested: PSNR in dB, and by how many stops of linear
+    /// light it is brighter.
+    pub photograph: Option<[f64; 2]>,
     /// The background that shows through; `None` if the image is not a render.
     pub residual_transmittance: Option<ResidualTransmittance>,
     /// What the view was scored against.
@@ -191,6 +196,18 @@ impl ScoredImages<'_> {
     pub fn aligned(&self) -> Result<Scores> {
         let affine = Affine::least_squares(&self.render, &self.target)?;
         Scores::of(&quantized(&affine.applied(&self.render)), &self.target)
+    }
+
+    /// The scores of the render by some stops of linear light brighter.
+    ///
+    /// # Errors
+    /// None for images from [`score_by`].
+    pub(crate) fn exposed(&self, stops: f64) -> Result<Scores> {
+        let light = stops.exp2() as f32;
+        let brighter = |&x: &f32| srgb_from_linear(light * linear_from_srgb(x));
+        let data = self.render.data.iter().map(brighter).collect();
+        let brighter = quantized(&Image { data, ..self.render });
+        Scores::of_counted(&brighter, &self.target, self.view.mask.as_ref())
     }
 
     /// Writes `renders/NAME.png` and `references/NAME.png` in `folder`; `targets/NAME.png` if there are no reference
@@ -326,6 +343,8 @@ pub fn score_by(
             scores: of(&compared.render)?,
             r0: has_denoiser.then(|| of(&quantized(&rendered.colors))).transpose()?,
             aligned: None,
+            exposed: None,
+            photograph: None,
             residual_transmittance: ResidualTransmittance::of(&rendered, view),
             against,
         };
@@ -415,16 +434,56 @@ pub fn add_lpips(metrics: &mut Value, scored: &[ViewScore], measure: Measure) {
 /// a least-squares affine correction of each channel to the reference image, as other work reports them; these use the
 /// reference and are not comparable with other scores here.
 pub fn add_exposure(metrics: &mut Value, scored: &[ViewScore]) {
-    let aligned = || scored.iter().filter_map(|view| Some((&view.name, view.aligned?)));
-    let scores: Vec<Scores> = aligned().map(|(_, scores)| scores).collect();
-    let views: Map<String, Value> =
-        aligned().map(|(name, scores)| (name.clone(), entry(&scores, None))).collect();
     metrics["exposure"] = json!("neutral: the mean of the training views'");
-    metrics["aligned_with_reference"] = json!({
-        "what": "after the least-squares gain and bias of each channel of each test view against its reference image",
-        "mean": Scores::mean(&scores).map(|mean| entry(&mean, None)),
+    add_aligned(metrics, scored);
+}
+
+/// Adds to `metrics.json` the scores after a least-squares affine correction of each channel to the reference image.
+pub(crate) fn add_aligned(metrics: &mut Value, scored: &[ViewScore]) {
+    let what = "after the least-squares gain and bias of each channel of each test view against its reference image";
+    metrics["aligned_with_reference"] = other_scores(what, scored, |view| view.aligned);
+}
+
+/// Adds to `metrics.json` the scores of test views at their own exposure, relative to the mean of the training views.
+pub(crate) fn add_exposed(metrics: &mut Value, scored: &[ViewScore]) {
+    if scored.iter().any(|view| view.exposed.is_some()) {
+        let what = "at each test view's own exposure, from EXIF or exposures.csv: the render is brighter by those \
+                    stops of linear light; no pixel of a test view is used";
+        metrics["at_own_exposure"] = other_scores(what, scored, |view| view.exposed);
+    }
+}
+
+/// A second kind of scores of some views, with its description.
+fn other_scores(
+    what: &str,
+    scored: &[ViewScore],
+    of: impl Fn(&ViewScore) -> Option<Scores>,
+) -> Value {
+    let all = || scored.iter().filter_map(|view| Some((&view.name, of(view)?)));
+    let scores: Vec<Scores> = all().map(|(_, scores)| scores).collect();
+    let views: Map<String, Value> =
+        all().map(|(name, scores)| (name.clone(), entry(&scores, None))).collect();
+    let mean = Scores::mean(&scores).map(|mean| entry(&mean, None));
+    json!({ "what": what, "mean": mean, "views": views })
+}
+
+/// Adds to `metrics.json` the scores of renders in the light of the photographs, against these.
+pub(crate) fn add_photographs(metrics: &mut Value, scored: &[ViewScore]) {
+    let entry = |[psnr, stops]: [f64; 2]| json!({ "psnr": psnr, "stops": stops });
+    let all = || scored.iter().filter_map(|view| Some((&view.name, view.photograph?)));
+    let views: Map<String, Value> = all().map(|(name, own)| (name.clone(), entry(own))).collect();
+    metrics["as_photographs"] = json!({
+        "what": "renders through the inverse of the tone curve, against the dark photographs",
+        "mean": mean_photograph(scored).map(entry),
         "views": views,
     });
+}
+
+/// The mean scores against the photographs, if there are any.
+pub(crate) fn mean_photograph(scored: &[ViewScore]) -> Option<[f64; 2]> {
+    let all: Vec<[f64; 2]> = scored.iter().filter_map(|view| view.photograph).collect();
+    let mean = |at: usize| all.iter().map(|own| own[at]).sum::<f64>() / all.len() as f64;
+    (!all.is_empty()).then(|| [mean(0), mean(1)])
 }
 
 /// The mean scores, and the mean scores of R_0 if the model has a denoiser.

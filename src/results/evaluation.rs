@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::eval::{ResidualTransmittance, ScoredImages, ViewScore, label, means};
+use super::eval::{ResidualTransmittance, ScoredImages, ViewScore, label, mean_photograph, means};
 use super::report::{Best, Column, Comparison, Picture, Report, Series, Table, plot};
 use super::run::load_progress;
 use crate::networks::lpips::Measure;
@@ -39,9 +39,30 @@ pub(crate) fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> Tab
         columns
             .extend(["residual transmittance", "99 %"].map(|name| column(name, 4, Best::Unmarked)));
     }
+    let aligned: Vec<Scores> = scored.iter().filter_map(|view| view.aligned).collect();
+    let mean_aligned = Scores::mean(&aligned);
+    if mean_aligned.is_some() {
+        columns.extend(
+            [("PSNR, aligned", 2), ("SSIM, aligned", 4)]
+                .map(|(name, digits)| column(name, digits, Best::Unmarked)),
+        );
+    }
+    let mean_photograph = mean_photograph(scored);
+    if mean_photograph.is_some() {
+        columns.extend(
+            [("PSNR, dark", 2), ("stops", 3)]
+                .map(|(name, digits)| column(name, digits, Best::Unmarked)),
+        );
+    }
+    let exposed: Vec<Scores> = scored.iter().filter_map(|view| view.exposed).collect();
+    let mean_exposed = Scores::mean(&exposed);
+    if mean_exposed.is_some() {
+        columns.push(column("PSNR, own exposure", 2, Best::Unmarked));
+    }
     let row = |name: &str,
                scores: &Scores,
-               r0: Option<&Scores>,
+               [r0, aligned, exposed]: [Option<&Scores>; 3],
+               photograph: Option<[f64; 2]>,
                residual_transmittance: Option<ResidualTransmittance>| {
         let Scores { psnr, psnr_channel_mean, ssim, lpips } = *scores;
         let mut values = vec![Some(psnr), Some(psnr_channel_mean), Some(ssim)];
@@ -55,13 +76,24 @@ pub(crate) fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> Tab
                 residual_transmittance.map(|own| own.q99),
             ]);
         }
+        if mean_aligned.is_some() {
+            values.extend([aligned.map(|own| own.psnr), aligned.map(|own| own.ssim)]);
+        }
+        if mean_photograph.is_some() {
+            values.extend([photograph.map(|own| own[0]), photograph.map(|own| own[1])]);
+        }
+        if mean_exposed.is_some() {
+            values.push(exposed.map(|own| own.psnr));
+        }
         (name.to_owned(), values)
     };
     let of_view = |view: &ViewScore| {
-        row(&view.name, &view.scores, view.r0.as_ref(), view.residual_transmittance)
+        let others = [view.r0.as_ref(), view.aligned.as_ref(), view.exposed.as_ref()];
+        row(&view.name, &view.scores, others, view.photograph, view.residual_transmittance)
     };
     let mut rows: Vec<_> = scored.iter().map(of_view).collect();
-    rows.extend(mean.map(|mean| row("mean", &mean, mean_r0.as_ref(), mean_transmittance)));
+    let others = [mean_r0.as_ref(), mean_aligned.as_ref(), mean_exposed.as_ref()];
+    rows.extend(mean.map(|mean| row("mean", &mean, others, mean_photograph, mean_transmittance)));
     Table { title: "Test views".to_owned(), label: "view".to_owned(), columns, rows }
 }
 

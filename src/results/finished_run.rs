@@ -142,5 +142,6 @@ pub(crate) fn config_of_file(
         ..TrainConfig::default()
     };
     config.model.raw_colors = facts.raw_colors.unwrap_or(config.model.raw_colors);
+    config.antialiasing.compensation = facts.antialiased;
     config
 }

@@ -69,4 +69,10 @@ fn warn_of(path: &Path, facts: &Facts) {
     if facts.near.is_none() {
         tracing::warn!("{}: does not state its near plane; the default is used", path.display());
     }
+    if let Some(stops) = facts.linear {
+        let path = path.display();
+        tracing::warn!(
+            "{path}: its colours are linear light, raised by {stops} stops, and are shown as they are"
+        );
+    }
 }

@@ -36,6 +36,26 @@ pub fn sh_basis(degree: u32, d: DVec3) -> [f64; 16] {
     basis
 }
 
+/// Directions and weights of the integral over the sphere, exact for polynomials of degree 7: Gauss-Legendre quadrature
+/// with four rings of eight directions.
+pub(crate) fn quadrature() -> impl Iterator<Item = (DVec3, f64)> + Clone {
+    const RINGS: [(f64, f64); 4] = [
+        (-0.861_136_311_594_052_6, 0.347_854_845_137_453_85),
+        (-0.339_981_043_584_856_26, 0.652_145_154_862_546_1),
+        (0.339_981_043_584_856_26, 0.652_145_154_862_546_1),
+        (0.861_136_311_594_052_6, 0.347_854_845_137_453_85),
+    ];
+    const DIRECTIONS: u32 = 8;
+    let ring = |(z, weight): (f64, f64)| {
+        (0..DIRECTIONS).map(move |index| {
+            let (sin, cos) = (TAU * f64::from(index) / f64::from(DIRECTIONS)).sin_cos();
+            let ring = (1.0 - z * z).sqrt();
+            (DVec3::new(ring * cos, ring * sin, z), weight * TAU / f64::from(DIRECTIONS))
+        })
+    };
+    RINGS.into_iter().flat_map(ring)
+}
+
 /// The rotation of coefficients above degree 0: row k, column j is the contribution of coefficient j to the new
 /// coefficient k. Degrees do not mix.
 #[derive(Clone, Debug, PartialEq)]
@@ -45,30 +65,16 @@ impl HarmonicRotation {
     /// The matrix of a rotation of directions.
     ///
     /// The basis is orthonormal over the sphere, so an entry is the integral of the product of a rotated basis function
-    /// and another one. These are polynomials of degree 6, for which Gauss-Legendre quadrature with four rings of eight
-    /// directions is exact.
+    /// and another one, polynomials of degree 6.
     pub(crate) fn new(rotation: DMat3) -> Self {
-        const RINGS: [(f64, f64); 4] = [
-            (-0.861_136_311_594_052_6, 0.347_854_845_137_453_85),
-            (-0.339_981_043_584_856_26, 0.652_145_154_862_546_1),
-            (0.339_981_043_584_856_26, 0.652_145_154_862_546_1),
-            (0.861_136_311_594_052_6, 0.347_854_845_137_453_85),
-        ];
-        const DIRECTIONS: u32 = 8;
         let mut parts = [[0.0; 15]; 15];
-        for (z, weight) in RINGS {
-            for index in 0..DIRECTIONS {
-                let (sin, cos) = (TAU * f64::from(index) / f64::from(DIRECTIONS)).sin_cos();
-                let ring = (1.0 - z * z).sqrt();
-                let direction = DVec3::new(ring * cos, ring * sin, z);
-                let (turned, own) = (sh_basis(3, rotation * direction), sh_basis(3, direction));
-                let weight = weight * TAU / f64::from(DIRECTIONS);
-                for degree in 1..=3 {
-                    let own_degree = sh_count(degree - 1)..sh_count(degree);
-                    for k in own_degree.clone() {
-                        for j in own_degree.clone() {
-                            parts[k - 1][j - 1] += weight * turned[k] * own[j];
-                        }
+        for (direction, weight) in quadrature() {
+            let (turned, own) = (sh_basis(3, rotation * direction), sh_basis(3, direction));
+            for degree in 1..=3 {
+                let own_degree = sh_count(degree - 1)..sh_count(degree);
+                for k in own_degree.clone() {
+                    for j in own_degree.clone() {
+                        parts[k - 1][j - 1] += weight * turned[k] * own[j];
                     }
                 }
             }

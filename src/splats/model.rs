@@ -29,13 +29,16 @@ pub struct Model {
     pub max_alpha: f32,
     /// Colours are the raw SH sum, which can be negative, instead of max(SH + 0.5, 0).
     pub raw_colors: bool,
+    /// Opacities are those of a renderer that compensates them for the dilation.
+    pub antialiased: bool,
 }
 
 /// With the near plane, the alpha limit and the colours that a file has which does not state them.
 impl From<Gaussians> for Model {
     fn from(gaussians: Gaussians) -> Self {
-        let RenderSettings { near, max_alpha, raw_colors, .. } = RenderSettings::default();
-        Self { gaussians, near, max_alpha, raw_colors }
+        let RenderSettings { near, max_alpha, raw_colors, antialiased, .. } =
+            RenderSettings::default();
+        Self { gaussians, near, max_alpha, raw_colors, antialiased }
     }
 }
 
@@ -47,6 +50,7 @@ impl Model {
             near: facts.near.unwrap_or(defaults.near),
             max_alpha: facts.max_alpha.unwrap_or(defaults.max_alpha),
             raw_colors: facts.raw_colors.unwrap_or(defaults.raw_colors),
+            antialiased: facts.antialiased,
             ..defaults
         }
     }
@@ -71,11 +75,12 @@ impl Model {
     /// # Ok::<(), nightsplat::Error>(())
     /// ```
     pub fn render_settings(&self) -> RenderSettings {
-        let Self { gaussians, near, max_alpha, raw_colors } = self;
+        let Self { gaussians, near, max_alpha, raw_colors, antialiased } = self;
         RenderSettings {
             near: *near,
             max_alpha: *max_alpha,
             raw_colors: *raw_colors,
+            antialiased: *antialiased,
             shape: gaussians.shape,
             ..RenderSettings::default()
         }
@@ -101,8 +106,9 @@ impl Model {
             if deviation_from_rigid(pose).is_some() {
                 return refuse("has a pose that is not rigid; take scale and reflection out");
             }
-            if part.raw_colors != first.raw_colors || part.max_alpha != first.max_alpha {
-                return refuse("has other colours or another alpha limit than the first");
+            let look = |part: &Self| (part.raw_colors, part.max_alpha, part.antialiased);
+            if look(part) != look(first) {
+                return refuse("has other colours, alpha limit or antialiasing than the first");
             }
             let shown = part.gaussians.with_features(Features::NONE);
             let moved = shown
@@ -139,6 +145,8 @@ impl Model {
             near: Some(self.near),
             max_alpha: Some(self.max_alpha),
             raw_colors: Some(self.raw_colors),
+            antialiased: self.antialiased,
+            linear: None,
             origin: self.gaussians.origin,
         }
     }

@@ -178,6 +178,10 @@ pub struct Adam {
     gpu: Gpu,
     /// Kernels for 32-bit moments and, built on first use, for 16-bit ones.
     floats: [OnceLock<Pipeline<adam::Kernel>>; 2],
+    /// The same without the frozen columns.
+    trained: [OnceLock<Pipeline<adam::Kernel>>; 2],
+    /// The columns of the Gaussians, from the first, that do not change.
+    frozen_columns: u32,
     /// The kernels for packed SH coefficients.
     halves: [OnceLock<Pipeline<adam_rest::Kernel>>; 2],
     /// The kernels for whole Gaussians, by stored SH degree.
@@ -202,18 +206,32 @@ pub(crate) struct GaussianStep<'a> {
 }
 
 impl Adam {
-    /// Builds the kernel; those for packed coefficients are built on first use.
+    /// [`Adam::with_frozen`] without frozen columns.
+    ///
+    /// # Errors
+    /// The device refuses a kernel.
+    #[cfg(any(test, feature = "testing"))]
+    pub fn new(gpu: &Gpu) -> Result<Self> {
+        Self::with_frozen(gpu, 0)
+    }
+
+    /// Builds the kernel, which leaves the first columns of Gaussians as they are; those for packed coefficients are built
+    /// on first use.
     ///
     /// # Errors
     /// The device refuses it.
-    pub fn new(gpu: &Gpu) -> Result<Self> {
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn with_frozen(gpu: &Gpu, frozen_columns: u32) -> Result<Self> {
         let adam = Self {
             gpu: gpu.clone(),
             floats: Default::default(),
+            trained: Default::default(),
+            frozen_columns,
             halves: Default::default(),
             gaussians: Default::default(),
         };
-        adam.pipeline(&adam.floats, 0, &adam::Constants { half_moments: false })?;
+        let constants = adam::Constants { half_moments: false, frozen_columns: 0 };
+        adam.pipeline(&adam.floats, 0, &constants)?;
         Ok(adam)
     }
 
@@ -228,14 +246,45 @@ impl Adam {
         step: u64,
         rates: &LearningRates,
         planes: PlaneCounts,
+        buffers: AdamBuffers<'_>,
+        status: &Buffer<u32>,
+    ) -> Result<()> {
+        self.record_from(0, pass, (step, rates), planes, buffers, status)
+    }
+
+    /// [`Adam::record`] without the frozen columns of Gaussians, whose gradients and moments it does not access.
+    ///
+    /// # Errors
+    /// Those of [`Adam::record`].
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn record_trained(
+        &self,
+        pass: &mut Recorder<'_>,
+        step: u64,
+        rates: &LearningRates,
+        planes: PlaneCounts,
+        buffers: AdamBuffers<'_>,
+        status: &Buffer<u32>,
+    ) -> Result<()> {
+        self.record_from(self.frozen_columns, pass, (step, rates), planes, buffers, status)
+    }
+
+    fn record_from(
+        &self,
+        frozen_columns: u32,
+        pass: &mut Recorder<'_>,
+        (step, rates): (u64, &LearningRates),
+        planes: PlaneCounts,
         AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
         status: &Buffer<u32>,
     ) -> Result<()> {
         let len = planes.total();
         check(step, status, [(parameters.as_slice(), len), (gradients, len)], (&moments, len))?;
         let half_moments = moments.bits() == StorageFormat::Half;
-        let constants = adam::Constants { half_moments };
-        let pipeline = self.pipeline(&self.floats, half_moments.into(), &constants)?;
+        let constants = adam::Constants { half_moments, frozen_columns };
+        let pipelines = if frozen_columns == 0 { &self.floats } else { &self.trained };
+        let pipeline = self.pipeline(pipelines, half_moments.into(), &constants)?;
+        let first_quad = frozen_columns * planes.gaussians as u32 / 4;
         let [first_moments, second_moments, both_moments] = moments.bindings()?;
         let (uncorrected, second_correction) = corrections(step);
         pass.dispatch(
@@ -256,7 +305,7 @@ impl Adam {
                 both_moments: both_moments.words(),
                 status: status.slice(),
             },
-            Threads::Exactly([(len as u32).div_ceil(4), 1, 1]),
+            Threads::Exactly([(len as u32).div_ceil(4).saturating_sub(first_quad), 1, 1]),
         )
     }
 
@@ -324,7 +373,9 @@ impl Adam {
         };
         let ([sh_degree, used], feature_count) = (sh_degrees, planes.features as u32);
         let rest_by_column = rest_by_column(&self.gpu);
-        let constants = adam_gaussian::Constants { sh_degree, feature_count, rest_by_column };
+        let frozen_columns = self.frozen_columns;
+        let constants =
+            adam_gaussian::Constants { sh_degree, feature_count, rest_by_column, frozen_columns };
         let pipeline = self.pipeline(&self.gaussians, sh_degree as usize, &constants)?;
         let (uncorrected, second_correction) = corrections(step);
         pass.dispatch(

@@ -88,6 +88,8 @@ pub struct Renderer {
     gpu: Gpu,
     settings: RenderSettings,
     gradients: GradientKind,
+    /// The columns of the parameters, from the first, whose gradients are not written.
+    frozen_columns: u32,
     tile: Tile,
     /// The most splats of one tile that the blending kernels can process.
     longest_run: u32,

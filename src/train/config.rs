@@ -1,6 +1,8 @@
 //! Everything that a training run depends on, the same on the command line, in a TOML file and in the run directory.
 
+mod antialiasing;
 mod exposure;
+mod freeze;
 mod stop;
 
 use std::ops::Bound;
@@ -32,7 +34,9 @@ use crate::splats::scene::init::Initialization;
 use crate::splats::scene::{Facts, MAX_SH_DEGREE, Shape};
 use crate::{Error, Result};
 
+pub use antialiasing::AntialiasingConfig;
 pub use exposure::{ExposureConfig, OnOff};
+pub use freeze::Freeze;
 pub use stop::{NotFinite, StopConfig};
 
 /// Pixels of a patch; smaller ones have more border than content.
@@ -79,6 +83,9 @@ pub struct TrainConfig {
     /// Initial Gaussians from a PLY in the dataset's coordinates, instead of the dataset's points; all SH degrees are
     /// in use from the first step.
     init: Option<PathBuf> = None, "the dataset's points" => Rule::PATH, "--init MODEL.ply";
+    /// Leave these attributes of the initial model as they are: with means,quats,scales,opacities, only its colours
+    /// learn, without density control, and leading attributes cost no pass. For night colours on geometry from day.
+    freeze: Option<Freeze> = None, "nothing" => FREEZE, "--freeze PLANES";
     /// Masks (masks/NAME.png or masks/NAME.jpg.png) hide white instead of black.
     invert_masks: bool = false => Rule::Flag, "--invert-masks";
     /// Mask black borders and corners that the photographs have in the same place, as undistorting leaves them.
@@ -177,6 +184,8 @@ sections {
     stop: StopConfig;
     /// Gain and bias of each training view.
     exposure: ExposureConfig;
+    /// Filters against aliasing.
+    antialiasing: AntialiasingConfig;
     /// Storage precision.
     precision: PrecisionConfig;
 }
@@ -187,6 +196,8 @@ const MEMORY: Rule =
     Rule::Text("a size of memory with its unit, such as 512M, 4G or 1.5G", |text| {
         text.parse::<CacheSize>().is_ok()
     });
+
+const FREEZE: Rule = Rule::Text(Freeze::FORM, |text| text.parse::<Freeze>().is_ok());
 
 const WHITE_BALANCE: Rule =
     Rule::Text(WhiteBalance::FORM, |text| text.parse::<WhiteBalance>().is_ok());
@@ -354,6 +365,7 @@ impl TrainConfig {
         RenderSettings {
             shape: Shape { sh_degree: self.sh_degree, features: self.model.features() },
             raw_colors: self.model.raw_colors,
+            antialiased: self.antialiasing.compensation,
             detach_geometry: self.model.network.variant == NetworkVariant::Identity,
             tile: self.tile,
             patch_pixels: self.patch_pixels,
@@ -364,15 +376,22 @@ impl TrainConfig {
 
     /// What the file of a model of this configuration states, in the world of its training frame.
     pub(crate) fn facts(&self, frame: &TrainingFrame) -> Facts {
-        let RenderSettings { near, max_alpha, raw_colors, .. } = self.render_settings();
+        let RenderSettings { near, max_alpha, raw_colors, antialiased, .. } =
+            self.render_settings();
         let near = (f64::from(near) / frame.scale) as f32;
         Facts {
             // The unit of some worlds is too large or too small for the number.
             near: Some(near).filter(|near| near.is_normal()),
             max_alpha: Some(max_alpha),
             raw_colors: Some(raw_colors),
+            antialiased,
             ..Facts::default()
         }
+    }
+
+    /// The columns of the Gaussians' attributes, from the first, that no pass updates.
+    pub(super) fn frozen_columns(&self) -> u32 {
+        self.freeze.as_ref().map_or(0, Freeze::leading_columns)
     }
 
     /// The configuration of the loss.
@@ -404,6 +423,7 @@ impl TrainConfig {
         self.stop.check_rows()?;
         self.exposure.check_rows()?;
         self.exposure.rates.check_rows()?;
+        self.antialiasing.check_rows()?;
         self.precision.check_rows()?;
         if let Some(frame) = self.frame {
             frame.check_rows()?;
@@ -413,6 +433,14 @@ impl TrainConfig {
             return Err(Error::Setting {
                 key: "up".to_owned(),
                 value: "no direction".to_owned(),
+                rule,
+            });
+        }
+        if let Some(freeze) = self.freeze.as_ref().filter(|_| self.init.is_none()) {
+            let rule = "of a given model: name one with init".to_owned();
+            return Err(Error::Setting {
+                key: "freeze".to_owned(),
+                value: freeze.to_string(),
                 rule,
             });
         }
@@ -447,6 +475,17 @@ mod tests {
             message.starts_with("exposure.learn is on; it must be off with a tonemapper"),
             "{message}"
         );
+    }
+
+    #[test]
+    fn frozen_attributes_are_those_of_a_given_model() {
+        let freeze = Some("means".parse().unwrap());
+        let mut config = TrainConfig { freeze, ..Default::default() };
+        let refused = config.check().unwrap_err().to_string();
+        assert!(refused.contains("freeze is means; it must be of a given model"), "{refused}");
+        config.init = Some("day.ply".into());
+        config.check().unwrap();
+        assert_eq!(toml::from_str::<TrainConfig>(&config.to_toml().unwrap()).unwrap(), config);
     }
 
     #[test]

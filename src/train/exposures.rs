@@ -1,7 +1,7 @@
 //! Learned exposures of the training views, and their initial values.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::views::Views;
 use super::{OnOff, TrainConfig, Trainer};
@@ -23,6 +23,43 @@ impl Trainer {
         let names = self.supervision.views.names().map(str::to_owned);
         Ok(Some(names.zip(exposures.affines()?).collect()))
     }
+}
+
+/// The stops of linear light by which photographs are brighter than the mean of the training views, by view: from the
+/// table of the configuration or the dataset, else from EXIF. Empty where no exposure is known, or all are alike.
+///
+/// # Errors
+/// The table cannot be read.
+pub(crate) fn known_stops(
+    dataset: &Dataset,
+    config: &TrainConfig,
+) -> Result<BTreeMap<String, f64>> {
+    /// The smallest difference that counts.
+    const ALIKE: f64 = 0.01;
+    let mut stops: BTreeMap<String, f64> = match table_of(dataset, config) {
+        Some(path) => {
+            table::load(&path)?.into_iter().filter_map(|own| Some((own.name, own.ev?))).collect()
+        }
+        None => {
+            let photographs = Dataset::photographs(&dataset.root, &config.load_options());
+            let stops = |own: &Photograph| Some((own.name.clone(), exposure_value(&own.input)?));
+            photographs.unwrap_or_default().iter().filter_map(stops).collect()
+        }
+    };
+    let training: Vec<f64> =
+        dataset.train_views().filter_map(|view| stops.get(&view.name).copied()).collect();
+    let mean = training.iter().sum::<f64>() / training.len().max(1) as f64;
+    if training.is_empty() || stops.values().all(|own| (own - mean).abs() < ALIKE) {
+        return Ok(BTreeMap::new());
+    }
+    stops.values_mut().for_each(|own| *own -= mean);
+    Ok(stops)
+}
+
+/// The table of exposures of the configuration, or of the dataset.
+fn table_of(dataset: &Dataset, config: &TrainConfig) -> Option<PathBuf> {
+    let beside = Some(dataset.root.join("exposures.csv")).filter(|path| path.is_file());
+    config.exposure.start.clone().or(beside)
 }
 
 /// The initial exposure of a view.
@@ -51,8 +88,7 @@ impl Views {
         if config.exposure.learn == OnOff::Off {
             return Ok(None);
         }
-        let beside = Some(dataset.root.join("exposures.csv")).filter(|path| path.is_file());
-        let starts = match config.exposure.start.clone().or(beside) {
+        let starts = match table_of(dataset, config) {
             Some(path) => self.starts_of_table(&path, dataset)?,
             None => self.initial_exposures(dataset, &config.load_options())?,
         };

@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use glam::{DVec3, Vec3};
 
@@ -84,6 +85,28 @@ impl Views {
             begin_as_identity(&mut gaussians, &colors, &low);
         }
         Ok(gaussians)
+    }
+
+    /// Warns if hardly any Gaussian of a given model (in the training frame) is in sight of a camera: it is probably of
+    /// another world.
+    pub(super) fn warn_of_another_world(&self, gaussians: &Gaussians, path: &Path) {
+        /// The smallest share that is seen.
+        const SEEN: f64 = 0.1;
+        /// The most Gaussians that are looked at.
+        const MOST: usize = 10_000;
+        let looked: Vec<usize> = scattered(gaussians.count).take(MOST).collect();
+        let is_seen = |at: &&usize| {
+            let mean = gaussians.means()[**at].as_dvec3();
+            self.photographs().any(|view| view.patch.camera.sees(mean).is_some())
+        };
+        let (seen, count) = (looked.iter().filter(is_seen).count(), looked.len());
+        if (seen as f64) < SEEN * count as f64 {
+            let model = path.display();
+            tracing::warn!(
+                "{model}: {} of {count} Gaussians are out of sight of every camera; is the model of this dataset's world?",
+                count - seen
+            );
+        }
     }
 
     /// Warns of every view that contains the mean of none of the first Gaussians (in the training frame): its pose is

@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -62,10 +63,18 @@ pub(super) fn tone_mapped(
         let mappings = measured.iter().map(|own| settings.tone_mapping(&scene, own)).collect();
         return Ok((scene, mappings));
     };
-    let scene = SceneTone::recorded(ToneLaw::load(path)?.check(path, settings)?);
+    let scene = recorded(path, settings)?;
     let mapping = |(_, view): (usize, &View)| scene.recorded_mapping(&view.name).transpose();
     let mappings = photographs(dataset).filter_map(mapping).collect::<Result<_>>()?;
     Ok((scene, mappings))
+}
+
+/// The scene of a recorded law.
+///
+/// # Errors
+/// The law cannot be read, or was measured for another curve.
+pub(super) fn recorded(path: &Path, settings: &ToneSettings) -> Result<SceneTone> {
+    Ok(SceneTone::recorded(ToneLaw::load(path)?.check(path, settings)?))
 }
 
 /// The tone mapping of a photograph of the scene: as recorded, or measured.
@@ -111,7 +120,7 @@ pub(crate) fn law_of(settings: &ToneSettings, dataset: &Dataset) -> Result<ToneL
 ///
 /// # Errors
 /// Every photograph is black and their exposure is needed, or a photograph can no longer be read.
-fn measured(
+pub(super) fn measured(
     settings: &ToneSettings,
     dataset: &Dataset,
 ) -> Result<(SceneTone, Vec<MeasuredPhotograph>)> {
@@ -131,7 +140,10 @@ fn measured(
 ///
 /// # Errors
 /// Those of [`tone_map_source`].
-fn measured_of(view: &View, full_resolution: bool) -> Result<Option<MeasuredPhotograph>> {
+pub(super) fn measured_of(
+    view: &View,
+    full_resolution: bool,
+) -> Result<Option<MeasuredPhotograph>> {
     let size = if full_resolution { MeasuredSize::Own } else { MeasuredSize::Loaded };
     let read_anew = view.original.as_ref().filter(|_| full_resolution || view.image.is_none());
     let measured = match read_anew.and_then(|original| original.measured(size)) {

@@ -176,7 +176,7 @@ impl Model {
             let columns =
                 if sh_degree == 0 || is_half { planes.before_rest() } else { planes.columns };
             let floats = PlaneCounts { columns, ..planes };
-            adam.record(pass, step, rates, floats, buffers.reborrow(), status)?;
+            adam.record_trained(pass, step, rates, floats, buffers.reborrow(), status)?;
             if sh_degree == 0 || !is_half {
                 return Ok(());
             }

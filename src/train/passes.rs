@@ -11,6 +11,7 @@ use crate::splats::densify::Densifier;
 use crate::splats::optimizer::{Adam, FiniteCheck};
 use crate::splats::render::{RenderSettings, Renderer};
 use crate::splats::scene::Shape;
+use crate::splats::smoothing::SmoothingFloor;
 
 /// Kernels that depend only on the device and the settings.
 pub(super) struct Kernels {
@@ -18,6 +19,7 @@ pub(super) struct Kernels {
     pub(super) losses: Losses,
     pub(super) adam: Adam,
     pub(super) finite: FiniteCheck,
+    pub(super) floor: Option<SmoothingFloor>,
     pub(super) densifier: Densifier,
 }
 
@@ -30,13 +32,26 @@ impl Kernels {
                 gpu,
                 RenderSettings { rest, shape, ..own },
                 GradientKind::on(gpu, [rest, config.precision.moments]),
+                config.frozen_columns(),
             )?,
             losses: Losses::new(gpu, &config.loss())?,
-            adam: Adam::new(gpu)?,
+            adam: Adam::with_frozen(gpu, config.frozen_columns())?,
             finite: FiniteCheck::new(gpu)?,
+            floor: floor(gpu, config, dataset)?,
             densifier: growth::densifier(gpu, config, dataset)?,
         })
     }
+}
+
+/// The smoothing floor of the training views, in the frame, if it is on.
+fn floor(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Option<SmoothingFloor>> {
+    let (variance, near) = (config.antialiasing.smoothing, config.render_settings().near);
+    if variance == 0.0 {
+        return Ok(None);
+    }
+    let frame = config.frame.unwrap_or_default();
+    let cameras = dataset.train_views().map(|view| frame.camera(&view.camera));
+    Ok(Some(SmoothingFloor::new(gpu, variance, near, &cameras.collect::<Vec<_>>())?))
 }
 
 /// The SH degree of the first step.

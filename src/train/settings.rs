@@ -5,8 +5,8 @@ use std::sync::LazyLock;
 use toml::{Table, Value};
 
 use super::{
-    CheckConfig, DensityConfig, ExposureConfig, ModelConfig, NetworkRates, PrecisionConfig,
-    StopConfig, TrainConfig,
+    AntialiasingConfig, CheckConfig, DensityConfig, ExposureConfig, ModelConfig, NetworkRates,
+    PrecisionConfig, StopConfig, TrainConfig,
 };
 use crate::Error;
 use crate::base::settings::{Rule, Setting};
@@ -37,6 +37,7 @@ pub static SETTINGS: LazyLock<Vec<Setting>> = LazyLock::new(|| {
         ParameterWeights::SETTINGS,
         StopConfig::SETTINGS,
         ExposureConfig::SETTINGS,
+        AntialiasingConfig::SETTINGS,
         ExposureRates::SETTINGS,
         PrecisionConfig::SETTINGS,
     ]
@@ -160,6 +161,7 @@ mod tests {
         let mut set = set.to_vec();
         set.extend(["cache", "max_vram", "max_ram"].map(|key| format!("{key}=1G")));
         let rest = [
+            "freeze=means",
             "patch_pixels=512",
             "test_every=8",
             "tile=[16,8]",

@@ -145,6 +145,9 @@ impl Trainer {
             }
         };
         views.warn_of_empty_views(&gaussians);
+        if let Some(path) = &config.init {
+            views.warn_of_another_world(&gaussians, path);
+        }
         let masks = Masks::new(gpu, dataset, &views)?;
         let exposures = starts.map(|starts| Exposures::new(gpu, config.exposure.rates, &starts));
         let mut exposures = exposures.transpose()?;
@@ -152,7 +155,7 @@ impl Trainer {
             sizes.iter().try_for_each(|&size| exposures.reserve(size))?;
         }
         dataset.views.iter().filter_map(|view| view.original.as_ref()).for_each(Original::release);
-        let (Kernels { renderer, mut losses, adam, finite, densifier }, fingerprint) =
+        let (Kernels { renderer, mut losses, adam, finite, floor, densifier }, fingerprint) =
             beside.join().unwrap_or_else(|panic| resume_unwind(panic))?;
         losses.prepare(&views.sources(gpu, &pseudo_gt, dataset))?;
         let networks = NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?;
@@ -187,7 +190,7 @@ impl Trainer {
             supervision,
             model: Model::upload(gpu, &gaussians, degree, &config.precision)?,
             renderer,
-            optimizer: Optimizer { adam, finite, checked: 0 },
+            optimizer: Optimizer { adam, finite, floor, checked: 0 },
             growth: Growth { densifier, probes, has_logged_capacity: false },
             convergence,
             submissions: Submissions::default(),

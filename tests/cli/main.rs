@@ -385,6 +385,7 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
         "pack_weights",
         "parameter_terms",
         "self_test",
+        "smoothing_floor",
     ];
     assert_eq!(everywhere, elsewhere);
     let mut named = [keys(&printed["errors"]), not_covered].concat();

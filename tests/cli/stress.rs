@@ -16,7 +16,8 @@ use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{CheckReport, Gpu};
 use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::gaussian::Planes;
-use nightsplat::reference::project::project_gaussian;
+use nightsplat::reference::project::{ProjectionSettings, project_gaussian};
+use nightsplat::splats::render::RenderSettings;
 use nightsplat::splats::scene::{ATTRIBUTES, Gaussians};
 use nightsplat::train::{TrainConfig, Trainer};
 use nightsplat::{kernels, reference};
@@ -249,7 +250,9 @@ fn render_error(
     let (near, alpha_max) = (settings.near.into(), settings.max_alpha.into());
     let project = |i| {
         let gaussian = planes.load(&gaussians.parameters, i);
-        project_gaussian(&camera, near, sh_degree, settings.raw_colors, &gaussian)
+        let RenderSettings { raw_colors, antialiased, .. } = settings;
+        let own = ProjectionSettings { near, sh_degree, raw_colors, antialiased };
+        project_gaussian(&camera, own, &gaussian)
     };
     let mut seen: Vec<_> = (0..count).filter_map(project).collect();
     seen.sort_by(|a, b| a.depth.total_cmp(&b.depth));

@@ -6,10 +6,10 @@ use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::camera::Camera;
 use nightsplat::reference::camera_backward::camera_backward;
-use nightsplat::reference::project::{Projection, project_gaussian};
+use nightsplat::reference::project::{Projection, ProjectionSettings, project_gaussian};
 use nightsplat::reference::project_backward::{DSplat, project_gaussian_backward, splat_gradient};
 use nightsplat::reference::splat::Splat;
-use nightsplat::splats::render::CameraGradient;
+use nightsplat::splats::render::{CameraGradient, RenderSettings};
 
 use super::setup::{Rendered, Setup};
 use super::{Random, assert_close};
@@ -66,9 +66,10 @@ impl<'a> Chain<'a> {
         let Setup { settings, options, .. } = self.setup;
         let one = |i| -> Option<(usize, Projection, Vec<f64>)> {
             let gaussian = self.setup.planes().load(parameters, i);
-            let (near, degree) = (settings.near.into(), options.sh_degree);
-            let projection =
-                project_gaussian(camera, near, degree, settings.raw_colors, &gaussian)?;
+            let RenderSettings { near, raw_colors, antialiased, .. } = *settings;
+            let (near, sh_degree) = (near.into(), options.sh_degree);
+            let own = ProjectionSettings { near, sh_degree, raw_colors, antialiased };
+            let projection = project_gaussian(camera, own, &gaussian)?;
             Some((i, projection, gaussian.features))
         };
         let mut visible: Vec<_> = (0..self.setup.count).filter_map(one).collect();
@@ -147,14 +148,18 @@ impl<'a> Chain<'a> {
             results.transmittances.push(transmittance);
         }
         let planes = self.setup.planes();
+        let Setup { settings, options, .. } = self.setup;
         for (j, &i) in ids.iter().enumerate() {
             let (own, color) = (&gradient_records[record * j..][..record], &colors[channels * j..]);
             let d_splat = self.d_splat(&splats[j], own, color);
             let gaussian = planes.load(parameters, i);
-            let degree = self.setup.options.sh_degree;
-            let d = project_gaussian_backward(&camera, degree, &gaussian, &splats[j], &d_splat);
+            let (degree, antialiased) = (options.sh_degree, settings.antialiased);
+            let splat = &splats[j];
+            let d =
+                project_gaussian_backward(&camera, degree, antialiased, &gaussian, splat, &d_splat);
             planes.store(&d, i, |at, value| results.gradient[at] = value);
-            let arriving = (d_splat.mean2d, d_splat.conic);
+            let dimming = if antialiased { d_splat.opacity * splat.opacity } else { 0.0 };
+            let arriving = (d_splat.mean2d, d_splat.conic, dimming);
             let share = camera_backward(&camera, &gaussian, d.mean, splats[j].conic, arriving);
             results.camera.iter_mut().zip(share).for_each(|(sum, share)| *sum += share);
             let damping = Rendered::DAMPING;

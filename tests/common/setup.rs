@@ -325,7 +325,7 @@ pub(crate) fn fisheye() -> CameraModel {
 }
 
 /// Edge cases of size, channel count, tile and SH degree (stored, in use) for the kernels; with many channels, colours
-/// are raw.
+/// are raw; every second variant is antialiased.
 pub(crate) fn variants() -> Vec<Setup> {
     type Row = (usize, [u32; 2], [u32; 2], usize, ([u32; 2], u32));
     let rows: [Row; 11] = [
@@ -349,6 +349,7 @@ pub(crate) fn variants() -> Vec<Setup> {
         let mut setup = Setup::seen_by(model, count, size, shape, count as u64);
         setup.options.sh_degree = used;
         setup.settings.raw_colors = channels > 4;
+        setup.settings.antialiased = i % 2 == 1;
         // A device replaces tiles that it does not support by its own.
         setup.settings.tile =
             Some(tile_of(tile)).filter(|&tile| gpu().properties().suits_tile(tile));

@@ -11,6 +11,7 @@ mod edit;
 mod export;
 mod floaters;
 mod injected;
+mod light;
 mod lost_work;
 mod model_files;
 mod profile;

@@ -34,13 +34,16 @@ fn moved(camera: &Camera, number: usize, by: f64) -> Camera {
     camera
 }
 
-fn setups() -> [Setup; 4] {
+fn setups() -> [Setup; 5] {
     let shape = Shape { sh_degree: 1, features: features(5) };
+    let mut antialiased = Setup::new(7, [26, 19], 2, 23);
+    antialiased.settings.antialiased = true;
     [
         Setup::new(7, [26, 19], 2, 23),
         Setup::seen_by(fisheye(), 7, [26, 19], 2, 23),
         Setup::new(6, [26, 19], shape, 61),
         Setup::seen_by(fisheye(), 6, [26, 19], shape, 61),
+        antialiased,
     ]
 }
 

@@ -113,6 +113,12 @@ fn every_pass_of_a_step_agrees_with_its_reference_for_every_part_of_the_model() 
     }
     let raw = TrainConfig { ssim_weight: 0.0, sh_degree: 2, ..config(&[]) };
     assert!(assert_steps_agree("L1 alone", &raw).contains("l1"));
+    let mut smooth = config(&[]);
+    (smooth.antialiasing.compensation, smooth.antialiasing.smoothing) = (true, 9.0);
+    // The floor follows the last step.
+    smooth.steps = 3;
+    assert!(assert_steps_agree("antialiased", &smooth).contains("smoothing_floor"));
+    assert!(!plain.contains("smoothing_floor"), "off, it is no pass");
     for (part, kernel) in [
         (Part::Structure, "structure_l1"),
         (Part::Depth, "depth_correlation"),

@@ -1,6 +1,7 @@
 //! The backward pass: central differences of the f64 chain, the renderer against the chain, the same bits every time.
 
 use glam::{DVec2, DVec3};
+use nightsplat::camera::CameraModel;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::reference::camera::Model;
 use nightsplat::reference::gaussian::Gaussian;
@@ -68,6 +69,21 @@ fn the_chain_s_gradients_agree_with_central_differences_through_a_fisheye() {
     for degree in [0, 2] {
         let setup = Setup::seen_by(fisheye(), 7, SIZE, degree, 21 + u64::from(degree));
         check(&setup, &format!("fisheye, degree {degree}"));
+    }
+}
+
+/// The scales of a test are about a pixel, where most of the gradient is the compensation's.
+#[test]
+fn the_gradient_of_compensated_opacities_agrees_with_central_differences() {
+    for model in [CameraModel::Pinhole, fisheye()] {
+        let mut setup = Setup::seen_by(model, 7, SIZE, 1, 23);
+        setup.settings.antialiased = true;
+        for i in 0..7 {
+            let gaussian = setup.get(i);
+            let log_scale = gaussian.log_scale - 0.1 * i as f64;
+            setup.set(i, &Gaussian { raw_opacity: 1.5, log_scale, ..gaussian });
+        }
+        check(&setup, &format!("compensated, {model:?}"));
     }
 }
 

@@ -6,6 +6,7 @@
 #[path = "../common/mod.rs"]
 mod common;
 
+mod antialiasing;
 mod batches;
 mod camera_gradient;
 mod checked;

@@ -289,12 +289,14 @@ fn assert_golden(name: &str, setup: &Setup, golden: &[f32], tolerance: f32) {
 }
 
 /// The scenes of `tests/fixtures/golden`; its README describes the files.
-fn golden_setups() -> [(&'static str, Setup); 2] {
+fn golden_setups() -> [(&'static str, Setup); 3] {
     let plain = Setup::new(16, [24, 16], 2, 90);
     let shape = Shape { sh_degree: 0, features: Features::ALL };
     let mut features = Setup::new(12, [16, 12], shape, 91);
     features.settings.raw_colors = true;
-    [("plain", plain), ("features", features)]
+    let mut antialiased = Setup::new(16, [24, 16], 1, 92);
+    antialiased.settings.antialiased = true;
+    [("plain", plain), ("features", features), ("antialiased", antialiased)]
 }
 
 /// The rounding error of a render: dozens of operations on values of a few units.

@@ -9,6 +9,7 @@ mod bad_data;
 mod curve_training;
 mod diagnose;
 mod few_points;
+mod freeze;
 mod holes;
 mod parts;
 mod patches;

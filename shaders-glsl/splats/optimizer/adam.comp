@@ -24,6 +24,7 @@ layout(push_constant) uniform Params {
 };
 
 layout(constant_id = 0) const bool HALF_MOMENTS = false;
+layout(constant_id = 15) const uint FROZEN_COLUMNS = 0;  // from the first: not updated, nor their moments read
 
 layout(binding = 0)           buffer Parameters    { vec4 parameters[]; };      // planes
 layout(binding = 1) readonly  buffer Gradients     { vec4 gradients[]; };       // planes
@@ -43,12 +44,13 @@ vec4 rates_at(uvec4 i) {
 }
 
 void main() {
-    uint quad = THREAD_INDEX;
+    uint begin = FROZEN_COLUMNS * gaussian_count;
+    uint quad = begin / 4 + THREAD_INDEX;
     uint end = column_count * gaussian_count;
     if (4 * quad >= end || status[0] != 0) return;
     uvec4 i = 4 * quad + uvec4(0, 1, 2, 3);
-    // The last quad can extend into a column that is not updated.
-    bvec4 takes_part = lessThan(i, uvec4(end));
+    // The first and the last quad can extend into a column that is not updated. Unsigned: before `begin`, it wraps.
+    bvec4 takes_part = lessThan(i - begin, uvec4(end - begin));
     vec4 gradient = clamp_gradient(gradients[quad]);
     Moments moments;
     if (HALF_MOMENTS) moments = from_halves(both_moments[quad]);

@@ -27,6 +27,7 @@ layout(push_constant) uniform Params {
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 1) const uint FEATURE_COUNT = 0;
+layout(constant_id = 15) const uint FROZEN_COLUMNS = 0;  // from the first: not updated, nor their moments read
 const bool HALF_REST = false;
 
 layout(binding = 0)           buffer Parameters    { float parameters[]; };      // planes
@@ -77,6 +78,7 @@ void main() {
     vec3 offset = offset_from_camera(mean, camera.view_from_world);
     [[unroll]] for (uint plane = 0; plane < PLANE_COUNT - 1; plane++) {
         uint column = plane_column(plane, FEATURE_COUNT, 0);
+        if (column < FROZEN_COLUMNS) continue;
         uint width = plane + 2 == PLANE_COUNT ? FEATURE_COUNT : plane_column(plane + 1, FEATURE_COUNT, 0) - column;
         [[unroll]] for (uint first = 0; first < width; first += 4) update_plane(i, plane, column, width, first);
     }

@@ -21,6 +21,8 @@ layout(push_constant, scalar) uniform Params {
     uint gaussian_count;
 };
 
+layout(constant_id = 14) const bool ANTIALIASED = false;  // opacities are compensated for the dilation
+
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // planes
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
 layout(binding = 2) readonly  buffer TileCounts { uint tile_counts[]; };
@@ -64,7 +66,13 @@ void main() {
     for (uint k = 0; k < 3; k++) view_axes[k] *= scale[k];
     Jacobian jacobian = camera_jacobian(mean_in_view, camera);
     vec3 row0 = jacobian.scale.x * jacobian.row0, row1 = jacobian.scale.y * jacobian.row1;
-    ConicGradient d = conic_backward(conic, row0 * view_axes, row1 * view_axes, d_conic);
+    vec3 u0 = row0 * view_axes, u1 = row1 * view_axes;
+    ConicGradient d = conic_backward(conic, u0, u1, d_conic);
+    if (ANTIALIASED) {
+        ConicGradient by = compensation_backward(u0, u1);
+        float weight = opacity_gradient(splats[i].opacity, record[0]) * splats[i].opacity;
+        d = ConicGradient(d.u0 + weight * by.u0, d.u1 + weight * by.u1, d.log_scale);
+    }
     vec3 d_row0 = view_axes * d.u0, d_row1 = view_axes * d.u1;
     vec3 d_mean_in_view = camera_backward(mean_in_view, camera, d_mean2d, d_row0, d_row1);
 

@@ -11,8 +11,10 @@
 //!
 //! EWA: cov2d = U U^T + 0.3 I with U = J W R S, where J is the camera's Jacobian at the mean, so it is positive
 //! definite by construction, and its determinant is
-//! |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel. Colour is max(SH + 0.5, 0), what every viewer shows, or
-//! the bare SH sum of LITA-GS; features are taken as they are. The last channel can be the depth in the view.
+//! |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel. Compensation multiplies the opacity by the square root of
+//! det(U U^T) / det(cov2d), so that dilation does not add light (Yu et al. 2024, Mip-Splatting, section 5.2). Colour is
+//! max(SH + 0.5, 0), what every viewer shows, or the bare SH sum of LITA-GS; features are taken as they are. The last
+//! channel can be the depth in the view.
 //! A culled Gaussian gets the last depth key and covers no tile.
 
 layout(local_size_x = 64) in;
@@ -28,6 +30,7 @@ layout(push_constant, scalar) uniform Params {
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 5) const bool RAW_COLORS = false;
 layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in the format of include/half.glsl
+layout(constant_id = 14) const bool ANTIALIASED = false;  // opacities are compensated for the dilation
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // planes
 layout(binding = 1) writeonly buffer Splats     { ProjectedSplat splats[]; };
@@ -95,6 +98,10 @@ void main() {
     vec2 mean2d = camera_project(mean_in_view, camera);
     // Positive phrasing: an overflow or a NaN is culled.
     if (!(det < 1e30 && all(lessThan(abs(mean2d), vec2(1e30))))) return;
+    if (ANTIALIASED) {
+        opacity *= sqrt(dot(normal, normal) / det);
+        if (!(opacity > ALPHA_MIN)) return;
+    }
 
     ProjectedSplat splat;
     splat.mean2d = mean2d;

@@ -34,7 +34,11 @@ layout(constant_id = 5) const bool RAW_COLORS = false;
 layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in the format of include/half.glsl
 // Of the gradients of SH above degree 0, only that of the colour is written, as `adam_gaussian` reads it; it requires
 // REST_BY_COLUMN.
+// Columns of the parameters, from the first, that are not trained: their gradients are not written, and neither are the
+// statistics of density control.
+layout(constant_id = 15) const uint FROZEN_COLUMNS = 0;
 layout(constant_id = 13) const bool COLOR_GRADIENTS = false;
+layout(constant_id = 14) const bool ANTIALIASED = false;  // opacities are compensated for the dilation
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // planes
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
@@ -65,6 +69,8 @@ const uint FEATURE_COUNT = CHANNELS - 3;
 // The place of the gradient of an SH coefficient above degree 0.
 uint rest_gradient(uint i, uint k) { return rest_word(REST_COLUMN, rest_width(), gaussian_count, i, k); }
 
+bool is_trained(uint column) { return column >= FROZEN_COLUMNS; }
+
 // Those that are written, of each Gaussian.
 uint written_rest() { return COLOR_GRADIENTS ? min(rest_width(), 3) : rest_width(); }
 
@@ -87,7 +93,7 @@ vec3 sh_backward(uint i, vec3 offset, vec3 d_color) {
     vec3 basis_gradient[16];
     sh_basis(sh_degree, direction, basis);
     sh_basis_gradient(sh_degree, direction, basis_gradient);
-    STORE_VEC3(DC_COLUMN, i, basis[0] * d_color);
+    if (is_trained(DC_COLUMN)) STORE_VEC3(DC_COLUMN, i, basis[0] * d_color);
     vec3 d_direction = vec3(0.0);
     for (uint k = 1; k < sh_count(SH_DEGREE); k++) {
         d_direction += dot(rest_coefficient(i, k), d_color) * basis_gradient[k];
@@ -107,11 +113,11 @@ uint largest_bits(vec3 v) {
 }
 
 void store_zero(uint i) {
-    STORE_VEC3(MEANS_COLUMN, i, vec3(0.0));
-    STORE_VEC4(QUATS_COLUMN, i, vec4(0.0));
-    STORE_VEC3(LOG_SCALES_COLUMN, i, vec3(0.0));
-    gradients[RAW_OPACITIES_COLUMN * gaussian_count + i] = 0.0;
-    STORE_VEC3(DC_COLUMN, i, vec3(0.0));
+    if (is_trained(MEANS_COLUMN)) STORE_VEC3(MEANS_COLUMN, i, vec3(0.0));
+    if (is_trained(QUATS_COLUMN)) STORE_VEC4(QUATS_COLUMN, i, vec4(0.0));
+    if (is_trained(LOG_SCALES_COLUMN)) STORE_VEC3(LOG_SCALES_COLUMN, i, vec3(0.0));
+    if (is_trained(RAW_OPACITIES_COLUMN)) gradients[RAW_OPACITIES_COLUMN * gaussian_count + i] = 0.0;
+    if (is_trained(DC_COLUMN)) STORE_VEC3(DC_COLUMN, i, vec3(0.0));
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
     for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = 0.0;
     for (uint k = 0; k < written_rest(); k++) gradients[rest_gradient(i, k)] = 0.0;
@@ -163,6 +169,11 @@ void main() {
     vec3 u0 = t0 * scaled_axes, u1 = t1 * scaled_axes;
 
     ConicGradient d = conic_backward(splat.conic, u0, u1, d_conic);
+    if (ANTIALIASED) {
+        ConicGradient by = compensation_backward(u0, u1);
+        float weight = d_opacity * splat.opacity;
+        d = ConicGradient(d.u0 + weight * by.u0, d.u1 + weight * by.u1, d.log_scale + weight * by.log_scale);
+    }
 
     // U = (J W) (R S)
     mat3 d_scaled_axes = outerProduct(t0, d.u0) + outerProduct(t1, d.u1);
@@ -179,17 +190,20 @@ void main() {
     vec3 offset = offset_from_camera(mean, camera.view_from_world);
     vec3 d_mean = world_from_view * d_mean_in_view + sh_backward(i, offset, d_color);
 
-    STORE_VEC3(MEANS_COLUMN, i, d_mean);
-    STORE_VEC4(QUATS_COLUMN, i, d_quat);
-    STORE_VEC3(LOG_SCALES_COLUMN, i, d.log_scale);
+    if (is_trained(MEANS_COLUMN)) STORE_VEC3(MEANS_COLUMN, i, d_mean);
+    if (is_trained(QUATS_COLUMN)) STORE_VEC4(QUATS_COLUMN, i, d_quat);
+    if (is_trained(LOG_SCALES_COLUMN)) STORE_VEC3(LOG_SCALES_COLUMN, i, d.log_scale);
     uint raw_opacity = RAW_OPACITIES_COLUMN * gaussian_count + i;
     // Of an opaque Gaussian 1 - opacity is rounding; its complement is not.
     float d_raw_opacity = d_opacity * splat.opacity * sigmoid(-parameters[raw_opacity]);
-    gradients[raw_opacity] = d_raw_opacity;
+    if (is_trained(RAW_OPACITIES_COLUMN)) gradients[raw_opacity] = d_raw_opacity;
 
-    uint bits = max(max(largest_bits(d_mean), largest_bits(d_quat.xyz)), largest_bits(d.log_scale));
     // No basis function is beyond 8.
-    bits = max(max(bits, largest_bits(vec3(d_quat.w, d_raw_opacity, 0.0))), largest_bits(8.0 * d_color));
+    uint bits = largest_bits(8.0 * d_color);
+    if (is_trained(MEANS_COLUMN)) bits = max(bits, largest_bits(d_mean));
+    if (is_trained(QUATS_COLUMN)) bits = max(bits, max(largest_bits(d_quat.xyz), largest_bits(d_quat.www)));
+    if (is_trained(LOG_SCALES_COLUMN)) bits = max(bits, largest_bits(d.log_scale));
+    if (is_trained(RAW_OPACITIES_COLUMN)) bits = max(bits, largest_bits(vec3(d_raw_opacity)));
     [[unroll]] for (uint k = 0; k < FEATURE_COUNT; k++)
         bits = max(bits, largest_bits(vec3(record[RECORD_HEAD + 3 + k])));
     uint flags = status[3];
@@ -197,7 +211,7 @@ void main() {
         if ((flags & ~STATUS_GRADIENT) == 0) atomicOr(status[0], STATUS_GRADIENT);
         return;
     }
-    if (flags == 0) {
+    if (flags == 0 && FROZEN_COLUMNS == 0) {
         float nearness = min(1.0, camera_depth(mean_in_view, camera) / damping_depth);
         float damping = damping_weight * nearness * nearness + 1.0 - damping_weight;
         grad_norm_sums[i] += damping * length(half_view * d_mean2d);

@@ -272,7 +272,19 @@ impl Image {
     /// # Errors
     /// [`Error::Output`] if the file cannot be written; no partial file is left.
     pub fn save_exr(&self, path: impl AsRef<Path>) -> Result<()> {
-        exr_file::save(self, path.as_ref(), linear_from_srgb)
+        self.save_exr_with(path, &[])
+    }
+
+    /// [`Image::save_exr`] with these numbers in the header.
+    ///
+    /// # Errors
+    /// Those of [`Image::save_exr`].
+    pub(crate) fn save_exr_with(
+        &self,
+        path: impl AsRef<Path>,
+        header: &[(&str, f32)],
+    ) -> Result<()> {
+        exr_file::save(self, path.as_ref(), linear_from_srgb, header)
     }
 
     /// [`Image::save_exr`] for values that are not colours, without conversion.
@@ -281,7 +293,7 @@ impl Image {
     /// Those of [`Image::save_exr`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn save_exr_as_stored(&self, path: impl AsRef<Path>) -> Result<()> {
-        exr_file::save(self, path.as_ref(), |value| value)
+        exr_file::save(self, path.as_ref(), |value| value, &[])
     }
 
     fn interleaved(&self) -> impl Iterator<Item = f32> + '_ {

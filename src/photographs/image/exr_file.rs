@@ -3,6 +3,7 @@
 use std::io::Cursor;
 use std::path::Path;
 
+use exr::meta::attribute::AttributeValue;
 use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableImage};
 
 use super::colour::{self, Chromaticities, Conversion};
@@ -94,18 +95,26 @@ fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>
     Ok((Image { width, height, data }, chromaticities))
 }
 
-/// Writes R, G and B as 32-bit floats, each value through `to_exr_value`.
+/// Writes R, G and B as 32-bit floats, each value through `to_exr_value`, with these numbers in the header.
 ///
 /// # Errors
 /// [`Error::Output`] if the file cannot be written; no partial file is left.
-pub(super) fn save(image: &Image, path: &Path, to_exr_value: fn(f32) -> f32) -> Result<()> {
+pub(super) fn save(
+    image: &Image,
+    path: &Path,
+    to_exr_value: fn(f32) -> f32,
+    header: &[(&str, f32)],
+) -> Result<()> {
     let channels = SpecificChannels::rgb(|Vec2(x, y): Vec2<usize>| {
         let [red, green, blue] = image.pixel(x as u32, y as u32).map(to_exr_value);
         (red, green, blue)
     });
     let size = (image.width as usize, image.height as usize);
     let mut file = Cursor::new(Vec::new());
-    exr::image::Image::from_channels(size, channels)
+    let mut image = exr::image::Image::from_channels(size, channels);
+    let named = header.iter().map(|&(name, value)| (name.into(), AttributeValue::F32(value)));
+    image.layer_data.attributes.other.extend(named);
+    image
         .write()
         .to_buffered(&mut file)
         .map_err(|error| Error::output(path, format!("cannot be encoded: {error}")))?;

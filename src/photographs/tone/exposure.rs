@@ -200,6 +200,11 @@ impl Exposure {
         (share * own + (1.0 - share) * other).exp()
     }
 
+    /// k of what a camera sees, without a photograph of it: the mean of its neighbours, or the scene's.
+    pub(crate) fn gain_around(&self, camera: &Camera) -> f64 {
+        self.around.as_ref().map_or(self.gain, |around| around.ln_gain(camera).exp())
+    }
+
     /// The mean brightness of the targets over that of the photographs.
     pub fn brightening(&self) -> f64 {
         self.target / self.mean

@@ -106,9 +106,38 @@ impl ToneSettings {
             return ToneMapping { parameters, gain: None };
         };
         let gain = exposure.gain_of(&photograph.luminance, photograph.camera.as_ref());
+        self.exposed(exposure, parameters, &photograph.luminance, gain)
+    }
+
+    /// The tone mapping of what a camera sees, without a photograph of it: `together` are the measurements of all
+    /// training photographs.
+    pub(crate) fn tone_mapping_at(
+        &self,
+        scene: &SceneTone,
+        camera: &Camera,
+        together: &MeasuredPhotograph,
+    ) -> ToneMapping {
+        let parameters = self.parameters(scene.statistics.as_ref().unwrap_or(&together.statistics));
+        match &scene.exposure {
+            None => ToneMapping { parameters, gain: None },
+            Some(exposure) => {
+                let gain = exposure.gain_around(camera);
+                self.exposed(exposure, parameters, &together.luminance, gain)
+            }
+        }
+    }
+
+    /// The tone mapping at a gain that follows from the exposure.
+    fn exposed(
+        &self,
+        exposure: &Exposure,
+        parameters: ToneParameters,
+        luminance: &LuminanceHistogram,
+        gain: f64,
+    ) -> ToneMapping {
         let strength = match self.curve {
             ToneCurve::Auto | ToneCurve::Profile => gain,
-            _ => self.strength(&parameters, &photograph.luminance, gain),
+            _ => self.strength(&parameters, luminance, gain),
         };
         // A profile applies to bright photographs, too.
         let weight = if self.profile.is_some() { 1.0 } else { exposure.weight() };

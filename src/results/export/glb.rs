@@ -26,7 +26,7 @@ struct Plane {
 /// [`Error::Usage`] if the file would exceed 4 GiB, the limit of the format.
 pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>> {
     let gaussians = half_turn(gaussians);
-    let planes = planes(&gaussians);
+    let planes = planes(&gaussians, provenance.facts.linear.is_some());
     let json = description(&gaussians, &planes, provenance).to_string();
     let body: usize = planes.iter().map(|plane| 4 * plane.values.len()).sum();
     let text = json.len().next_multiple_of(4);
@@ -48,7 +48,7 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>>
     Ok(file)
 }
 
-fn planes(gaussians: &Gaussians) -> Vec<Plane> {
+fn planes(gaussians: &Gaussians, are_linear: bool) -> Vec<Plane> {
     let plane =
         |name: &str, kind, values| Plane { name: format!("{EXTENSION}:{name}"), kind, values };
     let floats = |vectors: &[glam::Vec3]| bytemuck::cast_slice::<_, f32>(vectors).to_vec();
@@ -56,7 +56,8 @@ fn planes(gaussians: &Gaussians) -> Vec<Plane> {
     let rotation =
         gaussians.quats().iter().map(|&quat| unit(quat)).flat_map(|[w, x, y, z]| [x, y, z, w]);
     // Point colours for readers without the extension, in the linear light of glTF.
-    let seen = |dc: f32| linear_from_srgb((0.5 + SH_C0 * dc).clamp(0.0, 1.0));
+    let light = |own: f32| if are_linear { own } else { linear_from_srgb(own) };
+    let seen = |dc: f32| light((0.5 + SH_C0 * dc).clamp(0.0, 1.0));
     let colors = gaussians.dc().iter().zip(&opacity);
     let colors = colors.flat_map(|(dc, &opacity)| [seen(dc.x), seen(dc.y), seen(dc.z), opacity]);
 
@@ -103,6 +104,10 @@ fn description(gaussians: &Gaussians, planes: &[Plane], provenance: &Provenance)
     accessors[0]["max"] = json!(bound(f32::NEG_INFINITY, f32::max));
     let mut lines = provenance.lines();
     lines.extend(provenance.world_line(gaussians, true));
+    let color_space = match provenance.facts.linear {
+        Some(_) => "lin_rec709_display",
+        None => "srgb_rec709_display",
+    };
     let facts = provenance.facts_of(gaussians).json();
     json!({
         "asset": {
@@ -121,7 +126,7 @@ fn description(gaussians: &Gaussians, planes: &[Plane], provenance: &Provenance)
             "mode": 0,
             "extensions": { EXTENSION: {
                 "kernel": "ellipse",
-                "colorSpace": "srgb_rec709_display",
+                "colorSpace": color_space,
                 "sortingMethod": "cameraDistance",
                 "projection": "perspective",
             } },

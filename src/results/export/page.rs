@@ -15,7 +15,7 @@ use crate::kernels::splat::{ALPHA_MIN, DILATION};
 use crate::photographs::image::Image;
 use crate::results::report::{base64, escape, jpeg};
 use crate::splats::render::RenderSettings;
-use crate::splats::scene::Gaussians;
+use crate::splats::scene::{Facts, Gaussians};
 use crate::{Error, Result};
 
 /// The scripts of the page, in one scope.
@@ -92,15 +92,15 @@ impl Page<'_> {
         });
         let packed = |gaussians: &Gaussians| Ok::<_, Error>(base64(&gzip(&packed(gaussians))?));
         let model = gaussians.map(packed).transpose()?.unwrap_or_default();
-        let stated = provenance.facts.max_alpha;
+        let Facts { max_alpha: stated, antialiased, .. } = provenance.facts;
         let max_alpha = stated.unwrap_or_else(|| RenderSettings::default().max_alpha);
         let parts = [
             ("@TITLE@", escape(title)),
             ("@STYLE@", include_str!("viewer/style.css").to_owned()),
             // No `<` in the data may end its script element.
             ("@SCENE@", scene.to_string().replace('<', "\\u003c")),
-            ("@VERTEX@", shader(include_str!("viewer/splat.vert"), max_alpha)),
-            ("@FRAGMENT@", shader(include_str!("viewer/splat.frag"), max_alpha)),
+            ("@VERTEX@", shader(include_str!("viewer/splat.vert"), max_alpha, antialiased)),
+            ("@FRAGMENT@", shader(include_str!("viewer/splat.frag"), max_alpha, antialiased)),
             ("@VIEWER@", VIEWER.concat()),
             ("@MODEL@", model),
         ];
@@ -127,14 +127,15 @@ pub(crate) fn moved(camera: &Camera, origin: DVec3) -> Camera {
 }
 
 /// A shader of the page, with the constants and functions that it shares with the kernels.
-fn shader(text: &str, max_alpha: f32) -> String {
+fn shader(text: &str, max_alpha: f32, antialiased: bool) -> String {
     let constants = [
         ("ALPHA_MIN", ALPHA_MIN),
         ("ALPHA_MAX", max_alpha.into()),
         ("DILATION", DILATION),
         ("JACOBIAN_MARGIN", JACOBIAN_MARGIN),
     ];
-    let constants = constants.map(|(name, value)| format!("const float {name} = {value:?};"));
+    let floats = constants.map(|(name, value)| format!("const float {name} = {value:?};"));
+    let constants = [floats.join("\n"), format!("const bool ANTIALIASED = {antialiased};")];
     let harmonics = include_str!("../../../shaders-glsl/include/sh.glsl");
     text.replace("@CONSTANTS@", &constants.join("\n")).replace("@HARMONICS@", harmonics)
 }
@@ -220,6 +221,11 @@ mod tests {
         let constant = |name: &str, value: f64| format!("const float {name} = {value:?};");
         assert!(html.contains(&constant("DILATION", DILATION)) && html.contains("void sh_basis("));
         assert_eq!(html.matches(&constant("ALPHA_MIN", ALPHA_MIN)).count(), 2);
+        assert!(html.contains("const bool ANTIALIASED = false;"));
+        let facts = Facts { antialiased: true, ..Facts::default() };
+        let provenance = Provenance { facts, ..Provenance::default() };
+        let compensated = Page { provenance, ..page.clone() }.html().unwrap();
+        assert!(compensated.contains("const bool ANTIALIASED = true;"));
         assert_eq!(html.matches("<script").count(), html.matches("</script>").count());
         for outside in ["http://", "https://", "src=\"/", "@import"] {
             assert!(!html.contains(outside), "{outside}");

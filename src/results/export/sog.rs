@@ -418,6 +418,8 @@ mod tests {
                 near: Some(0.1),
                 max_alpha: Some(0.999),
                 raw_colors: Some(true),
+                antialiased: true,
+                linear: None,
                 origin: model.origin,
             };
             let provenance = Provenance { facts, ..Provenance::default() };

@@ -18,6 +18,8 @@ use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE, rest_coefficients};
 use crate::{Error, Result};
 
 const MAGIC: u32 = 0x5053_474e;
+/// The flag of a model whose opacities are those of a renderer that compensates them for the dilation.
+const ANTIALIASED: u8 = 1;
 /// Bits of a position, a signed integer.
 const POSITION_BITS: u32 = 24;
 /// A colour coefficient c of degree 0 is the byte 127.5 + 0.15 * 255 c.
@@ -55,19 +57,20 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) 
     let mut lines: Vec<String> = provenance.world_line(&gaussians, true).into_iter().collect();
     lines.extend(provenance.facts_of(&gaussians).lines());
     let text = lines.join("\n");
+    let flags = if provenance.facts.antialiased { ANTIALIASED } else { 0 };
     let mut file = vec![];
     for word in [MAGIC, if version == Version::V4 { 4 } else { 3 }, count] {
         file.extend(word.to_le_bytes());
     }
     match version {
         Version::V3 => {
-            file.extend([degree, fraction, 0, 0]);
+            file.extend([degree, fraction, flags, 0]);
             streams.iter().for_each(|stream| file.extend(stream));
             gzip_with(&file, Some(text).filter(|text| !text.is_empty()))
         }
         Version::V4 => {
             const HEADER: u32 = 32;
-            file.extend([degree, fraction, 0, streams.len() as u8]);
+            file.extend([degree, fraction, flags, streams.len() as u8]);
             file.extend(HEADER.to_le_bytes());
             file.resize(HEADER as usize, 0);
             let compressed = streams
@@ -117,7 +120,7 @@ pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
         };
     }
     let mut gaussians = half_turn(&gaussians);
-    let mut facts = Facts::default();
+    let mut facts = Facts { antialiased: header.antialiased, ..Facts::default() };
     String::from_utf8_lossy(&text).lines().try_for_each(|line| facts.set_line(line))?;
     gaussians.origin = facts.origin;
     Ok((gaussians, facts))
@@ -129,6 +132,7 @@ struct Header {
     count: usize,
     degree: u32,
     fraction: u8,
+    antialiased: bool,
 }
 
 /// Positions, opacities, colours, scales, rotations, higher coefficients.
@@ -142,12 +146,13 @@ impl Header {
         if word(0)? != MAGIC {
             return Err("is not an SPZ".to_owned());
         }
-        let [degree, fraction, ..] = word(12)?.to_le_bytes();
+        let [degree, fraction, flags, _] = word(12)?.to_le_bytes();
         if u32::from(degree) > MAX_SH_DEGREE {
             return Err(format!("has SH degree {degree}; {MAX_SH_DEGREE} is the highest"));
         }
         let count = word(8)? as usize;
-        Ok(Self { version: word(4)?, count, degree: degree.into(), fraction })
+        let antialiased = flags & ANTIALIASED != 0;
+        Ok(Self { version: word(4)?, count, degree: degree.into(), fraction, antialiased })
     }
 
     fn rotation_width(&self) -> usize {
@@ -375,11 +380,17 @@ mod tests {
             near: Some(0.1),
             max_alpha: Some(0.999),
             raw_colors: Some(true),
+            antialiased: true,
+            linear: None,
             origin: model.origin,
         };
         let provenance = Provenance { facts, ..Provenance::default() };
         for version in [Version::V3, Version::V4] {
-            let (back, stated) = decode(&encode(&model, &provenance, version).unwrap()).unwrap();
+            let file = encode(&model, &provenance, version).unwrap();
+            if version == Version::V4 {
+                assert_eq!(file[14], ANTIALIASED, "the flag that other readers know");
+            }
+            let (back, stated) = decode(&file).unwrap();
             assert_eq!((stated, back.origin, back.shape), (facts, model.origin, model.shape));
             let error = |own: &[f32], back: &[f32]| {
                 own.iter().zip(back).fold(0.0_f32, |most, (a, b)| most.max((a - b).abs()))

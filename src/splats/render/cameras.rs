@@ -84,6 +84,7 @@ impl CameraGradient {
             tile_width,
             tile_height,
             camera_model: model.number(),
+            antialiased: settings.antialiased,
         };
         Ok(Self {
             model,

@@ -22,10 +22,10 @@ impl Renderer {
     /// # Errors
     /// The driver refuses a kernel, or the tile does not suit the device.
     pub fn new(gpu: &Gpu, settings: RenderSettings) -> Result<Self> {
-        Self::with_gradients(gpu, settings, GradientKind::All)
+        Self::with_gradients(gpu, settings, GradientKind::All, 0)
     }
 
-    /// [`Renderer::new`] whose backward pass writes such gradients.
+    /// [`Renderer::new`] whose backward pass writes such gradients, but not those of the first `frozen_columns`.
     ///
     /// # Errors
     /// Those of [`Renderer::new`].
@@ -33,10 +33,11 @@ impl Renderer {
         gpu: &Gpu,
         settings: RenderSettings,
         gradients: GradientKind,
+        frozen_columns: u32,
     ) -> Result<Self> {
         let tile = settings.tile_on(gpu)?;
         let segment = segment_length(gpu.properties(), settings.purpose, tile);
-        Self::build(gpu, settings, gradients, tile, segment)
+        Self::build(gpu, settings, (gradients, frozen_columns), tile, segment)
     }
 
     /// [`Renderer::new`] with segments of `segment` splats, a multiple of the subgroup size; 0: a run has one segment.
@@ -45,13 +46,13 @@ impl Renderer {
     /// Those of [`Renderer::new`].
     #[cfg(feature = "testing")]
     pub fn with_segments(gpu: &Gpu, settings: RenderSettings, segment: u32) -> Result<Self> {
-        Self::build(gpu, settings, GradientKind::All, settings.tile_on(gpu)?, segment)
+        Self::build(gpu, settings, (GradientKind::All, 0), settings.tile_on(gpu)?, segment)
     }
 
     fn build(
         gpu: &Gpu,
         settings: RenderSettings,
-        gradients: GradientKind,
+        (gradients, frozen_columns): (GradientKind, u32),
         tile: Tile,
         segment: u32,
     ) -> Result<Self> {
@@ -59,7 +60,8 @@ impl Renderer {
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
         let pinhole = (CameraModel::Pinhole.number(), false);
-        let projections = Projections::new(gpu, &settings, tile.size, pinhole, gradients)?;
+        let written = (gradients, frozen_columns);
+        let projections = Projections::new(gpu, &settings, tile.size, pinhole, written)?;
         let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         let blend_backward = match settings.purpose {
@@ -84,6 +86,7 @@ impl Renderer {
             gpu: gpu.clone(),
             settings,
             gradients,
+            frozen_columns,
             tile,
             longest_run: longest_run(gpu),
             projections: BTreeMap::from([(pinhole, projections)]),
@@ -112,7 +115,8 @@ impl Renderer {
         let key = (model, view_depths);
         if !self.projections.contains_key(&key) {
             let (settings, tile) = (&self.settings, self.tile.size);
-            let own = Projections::new(&self.gpu, settings, tile, key, self.gradients)?;
+            let written = (self.gradients, self.frozen_columns);
+            let own = Projections::new(&self.gpu, settings, tile, key, written)?;
             self.projections.insert(key, own);
         }
         Ok(())
@@ -138,8 +142,8 @@ impl Renderer {
         let shape = Shape { sh_degree, ..self.settings.shape };
         let settings = RenderSettings { shape, ..self.settings };
         let own = |&key: &(u32, bool)| {
-            let (tile, gradients) = (self.tile.size, self.gradients);
-            Ok((key, Projections::new(&self.gpu, &settings, tile, key, gradients)?))
+            let (tile, written) = (self.tile.size, (self.gradients, self.frozen_columns));
+            Ok((key, Projections::new(&self.gpu, &settings, tile, key, written)?))
         };
         self.projections = self.projections.keys().map(own).collect::<Result<_>>()?;
         #[cfg(feature = "io")]
@@ -163,12 +167,13 @@ impl Projections {
         settings: &RenderSettings,
         [tile_width, tile_height]: [u32; 2],
         (camera_model, has_depths): (u32, bool),
-        gradients: GradientKind,
+        (gradients, frozen_columns): (GradientKind, u32),
     ) -> Result<Self> {
         let color_gradients = gradients == GradientKind::Colors;
         let (view_depths, alpha_max) = (u32::from(has_depths), settings.max_alpha);
         let channels = settings.channels() as u32 + view_depths;
-        let (sh_degree, raw_colors) = (settings.shape.sh_degree, settings.raw_colors);
+        let RenderSettings { raw_colors, antialiased, .. } = *settings;
+        let sh_degree = settings.shape.sh_degree;
         let half_rest = settings.rest == StorageFormat::Half;
         let rest_by_column = rest_by_column(gpu);
         macro_rules! pipeline {
@@ -180,6 +185,7 @@ impl Projections {
                     tile_height,
                     sh_degree,
                     raw_colors,
+                    antialiased,
                     half_rest,
                     rest_by_column,
                     camera_model,
@@ -188,8 +194,11 @@ impl Projections {
             };
         }
         let has_gradients = settings.purpose == Purpose::Train && !has_depths;
-        let backward =
-            if has_gradients { Some(pipeline!(project_backward, color_gradients)) } else { None };
+        let backward = if has_gradients {
+            Some(pipeline!(project_backward, color_gradients, frozen_columns))
+        } else {
+            None
+        };
         Ok(Self { forward: pipeline!(project, view_depths), backward })
     }
 }

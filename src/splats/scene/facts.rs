@@ -15,6 +15,10 @@ pub struct Facts {
     pub max_alpha: Option<f32>,
     /// Whether colours are the raw SH sum. Files contain the colours that viewers show, which are 0.5 lower.
     pub raw_colors: Option<bool>,
+    /// Opacities are those of a renderer that compensates them for the dilation.
+    pub antialiased: bool,
+    /// Colours are linear light, the photographs' raised by this many stops; `None`: as displayed.
+    pub linear: Option<f32>,
     /// The world position that positions are relative to.
     pub origin: DVec3,
 }
@@ -23,14 +27,17 @@ impl Facts {
     /// Prefix of a line of text that states a fact.
     pub(crate) const PREFIX: &str = "nightsplat ";
 
-    /// Keys and values; without the origin if it is the world's.
+    /// Keys and values; without the origin if it is the world's, and of antialiasing only where it is on.
     fn entries(&self) -> Vec<(&'static str, String)> {
-        let Self { near, max_alpha, raw_colors, origin: DVec3 { x, y, z } } = self;
+        let Self { near, max_alpha, raw_colors, antialiased, linear, origin } = self;
+        let DVec3 { x, y, z } = origin;
         let entry = |key, value: Option<&dyn Display>| Some((key, value?.to_string()));
         let entries = [
             entry("near", near.as_ref().map(|value| value as _)),
             entry("max_alpha", max_alpha.as_ref().map(|value| value as _)),
             entry("raw_colors", raw_colors.as_ref().map(|value| value as _)),
+            antialiased.then(|| ("antialiased", antialiased.to_string())),
+            entry("linear", linear.as_ref().map(|value| value as _)),
             (self.origin != DVec3::ZERO).then(|| ("origin", format!("{x} {y} {z}"))),
         ];
         entries.into_iter().flatten().collect()
@@ -86,10 +93,10 @@ impl Facts {
                 self.max_alpha = Some(number(key, value, "between 0 and 1", is_valid)?);
             }
             "raw_colors" => {
-                let refused =
-                    |_| format!("states {key} `{}`, which is neither true nor false", value.trim());
-                self.raw_colors = Some(value.trim().parse().map_err(refused)?);
+                self.raw_colors = Some(flag(key, value)?);
             }
+            "antialiased" => self.antialiased = flag(key, value)?,
+            "linear" => self.linear = Some(number(key, value, "of stops", |_| true)?),
             "origin" => self.origin = origin(value)?,
             _ => {}
         }
@@ -105,6 +112,12 @@ impl Facts {
         let (key, value) = fact.split_once(' ').unwrap_or((fact, ""));
         self.set(key, value)
     }
+}
+
+/// true or false.
+fn flag(key: &str, text: &str) -> Result<bool, String> {
+    let refused = |_| format!("states {key} `{}`, which is neither true nor false", text.trim());
+    text.trim().parse().map_err(refused)
 }
 
 /// A finite number that satisfies the rule.

@@ -53,12 +53,18 @@ void main() {
     float xx = dot(u, covariance * u) + DILATION, xy = dot(u, covariance * v), yy = dot(v, covariance * v) + DILATION;
     float determinant = xx * yy - xy * xy;
     if (!(determinant > 0.0)) return;
+    float opacity = a.w;
+    if (ANTIALIASED) {
+        float undilated = determinant - DILATION * (xx + yy) + DILATION * DILATION;
+        opacity *= sqrt(max(undilated, 0.0) / determinant);
+        if (!(opacity > ALPHA_MIN)) return;
+    }
     conic = vec3(yy, -xy, xx) / determinant;
 
-    vec2 reach = sqrt(2.0 * log(a.w / ALPHA_MIN) * vec2(xx, yy)) + 0.5;
+    vec2 reach = sqrt(2.0 * log(opacity / ALPHA_MIN) * vec2(xx, yy)) + 0.5;
     fromMean = corner * reach;
     vec2 pixel = focal * mean.xy / mean.z + principalPoint + fromMean;
     depth = mean.z;
-    color = vec4(shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye)), a.w);
+    color = vec4(shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye)), opacity);
     gl_Position = vec4((pixel + offset) * scale + vec2(-1.0, 1.0), 0.0, 1.0);
 }

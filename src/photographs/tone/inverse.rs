@@ -1,0 +1,247 @@
+//! The inverse of a tone curve: from the values of a target back to those of the photograph.
+//!
+//! Most curves map each value separately, and increase: the inverse of a value is found by bisection. The automatic
+//! curve scales a part of each channel by the curve of the luminance Y, s(Y) / Y. For a given Y it increases in each
+//! channel, and a larger Y gives larger values; so the Y that its own values have is found by iteration from below.
+//! Where a curve is flat, no inverse is accurate: values within half a code of 8 bits of its maximum become those of
+//! that limit, and are counted.
+
+use super::law::{clamped, curve_at};
+use super::real::Real;
+use super::{ToneCurve, ToneParameters, ToneSettings};
+use crate::photographs::image::{linear_from_srgb, srgb_from_linear};
+use crate::{Error, Result};
+
+/// The values of a target whose inverse the curve does not determine: half a code of 8 bits below its maximum.
+const FLAT: f64 = 0.5 / 255.0;
+/// The largest encoded value of a photograph: that of an EXR in half floats.
+const LARGEST: f64 = 65_504.0;
+/// Relative precision of a solution.
+const PRECISION: f64 = 1e-7;
+const TRIALS: usize = 60;
+
+/// The inverse of the curve of a photograph.
+#[derive(Clone, Debug)]
+pub struct InverseTone {
+    settings: ToneSettings,
+    curve: u32,
+    white: f64,
+    offset: f64,
+    gain: f64,
+    weight: f64,
+    constants: [f64; crate::kernels::curves::MAX_CONSTANTS as usize],
+    /// The largest value of a target of each channel that is inverted.
+    largest: [f64; 3],
+}
+
+/// A colour of a photograph, and whether the curve is flat where it was found.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Inverted {
+    /// sRGB-encoded; above 1 where the curve allows.
+    pub rgb: [f64; 3],
+    /// A channel is that of the largest value that is inverted.
+    pub is_clipped: bool,
+}
+
+impl InverseTone {
+    /// The inverse of this curve with the parameters of a photograph.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a camera profile, which mixes channels and has no inverse.
+    pub fn new(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {
+        if settings.curve == ToneCurve::Profile {
+            let problem = "a camera profile mixes and bends channels, and has no inverse; train with a curve for \
+                           linear light";
+            return Err(Error::Usage(problem.to_owned()));
+        }
+        let ToneParameters { white, offset, gain, weight, constants } = *parameters;
+        let [white, offset, gain, weight] = [white, offset, gain, weight].map(f64::from);
+        let mut inverse = Self {
+            curve: settings.curve.constant(),
+            settings: settings.clone(),
+            white,
+            offset,
+            gain,
+            weight,
+            constants: constants.map(f64::from),
+            largest: [1.0; 3],
+        };
+        inverse.largest =
+            [0, 1, 2].map(|channel| inverse.channel(LARGEST, channel, 0.0).min(1.0) - FLAT);
+        Ok(inverse)
+    }
+
+    /// The target of one channel. `factor`: s(Y) / Y of the pixel's luminance, if the curve uses it.
+    fn channel(&self, x: f64, channel: usize, factor: f64) -> f64 {
+        let t = x / self.white;
+        let curved = match self.settings.curve {
+            ToneCurve::Auto => {
+                let share = self.constants[0];
+                let own = (1.0 - share) * t.one_minus_exp() + share * t * factor;
+                self.offset + (1.0 - self.offset) * own
+            }
+            ToneCurve::Table => {
+                self.settings.table.as_ref().map_or(t, |table| table.value(t, channel))
+            }
+            // A pixel's gain is that of its luminance, up to 1e-6 of it.
+            ToneCurve::LumPreserve => self.gain * x,
+            ToneCurve::PerChannel => x / self.constants[channel],
+            _ => clamped(curve_at(self.curve, t, [self.offset, self.gain], &self.constants)),
+        };
+        if self.weight < 1.0 { x.min(1.0) + self.weight * (curved - x.min(1.0)) } else { curved }
+    }
+
+    /// The factor s(Y) / Y of the automatic curve.
+    fn factor(&self, rgb: [f64; 3]) -> f64 {
+        let y = (luminance(rgb) / self.white).max(1e-20);
+        y.one_minus_exp() / y
+    }
+
+    /// The value of a photograph whose target is `value`.
+    fn solved(&self, value: f64, channel: usize, factor: f64) -> f64 {
+        // Written so that a NaN is black.
+        let is_lit = value > self.channel(0.0, channel, factor);
+        if !is_lit {
+            return 0.0;
+        }
+        let (mut low, mut high) = (0.0, self.white.min(1.0));
+        while high < LARGEST && self.channel(high, channel, factor) < value {
+            (low, high) = (high, 2.0 * high);
+        }
+        for _ in 0..TRIALS {
+            let middle = 0.5 * (low + high);
+            if self.channel(middle, channel, factor) < value {
+                low = middle;
+            } else {
+                high = middle;
+            }
+            if high - low <= PRECISION * high {
+                break;
+            }
+        }
+        0.5 * (low + high)
+    }
+
+    /// The colour of a photograph whose target is this one.
+    pub fn of(&self, target: [f64; 3]) -> Inverted {
+        let is_clipped = (0..3).any(|channel| target[channel] > self.largest[channel]);
+        let bounded = [0, 1, 2].map(|channel| target[channel].min(self.largest[channel]));
+        let solved =
+            |factor: f64| [0, 1, 2].map(|channel| self.solved(bounded[channel], channel, factor));
+        // The factor is 1 for black, where the result is the darkest.
+        let mut rgb = solved(1.0);
+        if self.settings.curve != ToneCurve::Auto || self.constants[0] == 0.0 {
+            return Inverted { rgb, is_clipped };
+        }
+        // Secants of Y - luminance(rgb(Y)), which is negative below the solution.
+        let step = |y: f64| luminance(solved(self.factor([y; 3])));
+        let mut y = luminance(rgb);
+        let mut before: Option<[f64; 2]> = None;
+        for _ in 0..TRIALS {
+            let error = step(y) - y;
+            if error.abs() <= PRECISION * y {
+                break;
+            }
+            let next = match before {
+                Some([other, known]) if (known - error).abs() > f64::MIN_POSITIVE => {
+                    y + error * (y - other) / (known - error)
+                }
+                _ => y + error,
+            };
+            before = Some([y, error]);
+            y = if next.is_finite() && next > 0.0 { next } else { y + error };
+        }
+        rgb = solved(self.factor([y; 3]));
+        Inverted { rgb, is_clipped }
+    }
+
+    /// By how many stops linear light has to be raised for the brightness of the target: for a grey that reflects 18 %.
+    pub fn stops_to_target(&self) -> f64 {
+        const GREY: f32 = 0.18;
+        let grey = self.of([srgb_from_linear(GREY).into(); 3]).rgb[1] as f32;
+        f64::from(GREY / linear_from_srgb(grey)).log2()
+    }
+
+    /// The target of a colour of a photograph, unclamped above.
+    #[cfg(any(test, feature = "testing"))]
+    pub fn target(&self, rgb: [f64; 3]) -> [f64; 3] {
+        let factor = self.factor(rgb);
+        [0, 1, 2].map(|channel| self.channel(rgb[channel], channel, factor))
+    }
+}
+
+/// The BT.601 luminance, as the kernels weigh it.
+fn luminance([r, g, b]: [f64; 3]) -> f64 {
+    0.299 * r + 0.587 * g + 0.114 * b
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::photographs::tone::{MeasuredPhotograph, Profile};
+
+    /// Dark colours, and some near and above white.
+    fn colours() -> Vec<[f64; 3]> {
+        let value = |i: usize| 1.2 * (i as f64 / 40.0).powi(3) + 1e-4;
+        (0..40).map(|i| [value(i), value((7 * i + 3) % 40), value((11 * i + 5) % 40)]).collect()
+    }
+
+    fn inverse(settings: &ToneSettings) -> InverseTone {
+        let dark: Vec<f32> = (0..3000).map(|i| 0.2 * (i as f32 / 3000.0).powi(2)).collect();
+        let photograph = MeasuredPhotograph::of(&dark);
+        let scene = settings.scene(std::slice::from_ref(&photograph)).unwrap();
+        let mapping = settings.tone_mapping(&scene, &photograph);
+        InverseTone::new(settings, &mapping.parameters).unwrap()
+    }
+
+    /// In stops of linear light: an eighth of a code value of the target, and what a flat curve makes of it.
+    #[test]
+    fn the_round_trip_through_a_curve_restores_linear_light_to_a_thousandth_of_a_stop() {
+        let linear = |x: f64| f64::from(linear_from_srgb(x as f32));
+        for curve in [ToneCurve::Auto, ToneCurve::Ase, ToneCurve::Linear, ToneCurve::None] {
+            let inverse = inverse(&ToneSettings::new(curve));
+            let mut restored = 0;
+            for rgb in colours() {
+                let target = inverse.target(rgb);
+                let Inverted { rgb: back, is_clipped } = inverse.of(target);
+                if is_clipped {
+                    continue;
+                }
+                restored += 1;
+                for (own, back) in rgb.into_iter().zip(back) {
+                    let stops = (linear(back) / linear(own)).log2().abs();
+                    assert!(stops < 1e-3, "{curve}: {own} becomes {back}, {stops} stops");
+                }
+            }
+            assert!(restored > 10, "{curve}: {restored}");
+        }
+    }
+
+    #[test]
+    fn values_in_the_flat_part_are_counted_and_stay_finite() {
+        let inverse = inverse(&ToneSettings::new(ToneCurve::Auto));
+        for flat in [[1.0; 3], [2.0, 0.3, 0.3], [0.9999, 0.1, 0.1]] {
+            let Inverted { rgb, is_clipped } = inverse.of(flat);
+            assert!(is_clipped && rgb.iter().all(|x| x.is_finite()), "{rgb:?}");
+        }
+        let dark = inverse.of([f64::NAN, -1.0, 0.0]);
+        assert_eq!(dark, Inverted { rgb: [0.0; 3], is_clipped: false });
+    }
+
+    #[test]
+    fn a_camera_profile_has_no_inverse() {
+        let bent: Vec<f64> = (0..=16).map(|i| f64::from(i) / 16.0).collect();
+        let profile = Profile {
+            reference: "a scene".to_owned(),
+            pairs: 1,
+            matrix: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            gain: [1.0; 3],
+            bias: [0.0; 3],
+            segments: [bent.clone(), bent.clone(), bent],
+        };
+        let settings = ToneSettings::of_profile(profile);
+        let parameters = ToneParameters::default();
+        let refused = InverseTone::new(&settings, &parameters).unwrap_err().to_string();
+        assert!(refused.contains("has no inverse"), "{refused}");
+    }
+}

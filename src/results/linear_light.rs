@@ -1,0 +1,166 @@
+//! Images in the light of the photographs.
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use crate::photographs::image::{Image, linear_from_srgb};
+use crate::photographs::tone::{InverseTone, Inverted};
+use crate::splats::harmonics::{quadrature, sh_basis};
+use crate::splats::scene::{Gaussians, rest_coefficients};
+
+/// The number in the header of an EXR: the stops by which its light is raised to the brightness of the target.
+pub(crate) const STOPS: &str = "nightsplatStops";
+
+/// An image as a photograph, sRGB-encoded, and the number of its pixels that the curve does not determine.
+pub(crate) fn photograph_of(target: &Image, inverse: &InverseTone) -> (Image, usize) {
+    let pixels = target.pixel_count();
+    let inverted: Vec<Inverted> = (0..pixels)
+        .into_par_iter()
+        .map(|pixel| inverse.of([0, 1, 2].map(|plane| target.data[plane * pixels + pixel].into())))
+        .collect();
+    let plane = |plane: usize| inverted.iter().map(move |pixel| pixel.rgb[plane] as f32);
+    let data = (0..3).flat_map(plane).collect();
+    (Image { data, ..*target }, inverted.iter().filter(|pixel| pixel.is_clipped).count())
+}
+
+/// The Gaussians with colours in the linear light of the photographs, raised by `stops`, and the number of them with a
+/// colour that the curve does not determine.
+///
+/// The colours of a Gaussian are converted in the directions of a quadrature, and harmonics of the same degree are
+/// fitted to them. A renderer then blends light, not display values: soft edges become slightly brighter.
+pub(crate) fn linear_gaussians(
+    gaussians: &Gaussians,
+    inverse: &InverseTone,
+    stops: f64,
+) -> (Gaussians, usize) {
+    let (mut linear, raised) = (gaussians.clone(), stops.exp2());
+    let degree = gaussians.shape.sh_degree;
+    let rest = rest_coefficients(degree);
+    let directions: Vec<([f64; 16], f64)> =
+        quadrature().map(|(direction, weight)| (sh_basis(degree, direction), weight)).collect();
+    let converted = |i: usize| {
+        let own = &gaussians.rest()[rest * i..][..rest];
+        let own: Vec<DVec3> =
+            std::iter::once(&gaussians.dc()[i]).chain(own).map(|value| value.as_dvec3()).collect();
+        let mut fitted = vec![DVec3::ZERO; own.len()];
+        let mut is_clipped = false;
+        for (basis, weight) in &directions {
+            let color: DVec3 = own.iter().zip(basis).map(|(value, basis)| *value * *basis).sum();
+            let found = inverse.of((color + 0.5).max(DVec3::ZERO).to_array());
+            is_clipped |= found.is_clipped;
+            let light = found.rgb.map(|x| raised * f64::from(linear_from_srgb(x as f32)));
+            for (sum, basis) in fitted.iter_mut().zip(basis) {
+                *sum += (DVec3::from_array(light) - 0.5) * *basis * *weight;
+            }
+        }
+        (fitted, is_clipped)
+    };
+    let all: Vec<_> = (0..gaussians.count).into_par_iter().map(converted).collect();
+    for (i, (fitted, _)) in all.iter().enumerate() {
+        linear.dc_mut()[i] = fitted[0].as_vec3();
+        for (to, own) in linear.rest_mut()[rest * i..][..rest].iter_mut().zip(&fitted[1..]) {
+            *to = own.as_vec3();
+        }
+    }
+    (linear, all.iter().filter(|(_, is_clipped)| *is_clipped).count())
+}
+
+/// The stops by which one image of linear light is brighter than another, over all pixels; NaN if one is black.
+pub(crate) fn stops_between(own: &Image, other: &Image) -> f64 {
+    let light = |image: &Image| image.data.iter().map(|&x| f64::from(linear_from_srgb(x))).sum();
+    let [own, other]: [f64; 2] = [own, other].map(light);
+    (own / other).log2()
+}
+
+/// Counts the pixels where a curve is flat.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Clipped {
+    clipped: usize,
+    pixels: usize,
+}
+
+impl Clipped {
+    /// Counts those of an image, which it returns.
+    pub(crate) fn add(&mut self, (image, clipped): (Image, usize)) -> Image {
+        self.clipped += clipped;
+        self.pixels += image.pixel_count();
+        image
+    }
+
+    /// Warns if there are any.
+    pub(crate) fn warn(&self) {
+        let Self { clipped, pixels } = self;
+        if *clipped > 0 {
+            let share = 100.0 * *clipped as f64 / *pixels as f64;
+            tracing::warn!(
+                "{clipped} of {pixels} pixels ({share:.2} %) are as bright as the tone curve gets: their light is \
+                 at least what is written"
+            );
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::photographs::image::srgb_from_linear;
+    use crate::photographs::tone::{MeasuredPhotograph, ToneCurve, ToneSettings};
+
+    #[test]
+    fn the_colours_of_gaussians_become_their_light_in_every_direction() {
+        let settings = ToneSettings::new(ToneCurve::Auto);
+        let dark = MeasuredPhotograph::of(&[0.05; 300]);
+        let scene = settings.scene(std::slice::from_ref(&dark)).unwrap();
+        let mapping = settings.tone_mapping(&scene, &dark);
+        let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
+        for degree in [0, 3] {
+            let mut gaussians = Gaussians::zeros(2, degree);
+            gaussians.dc_mut()[0] = glam::Vec3::new(0.2, -0.3, 0.0);
+            gaussians.dc_mut()[1] = glam::Vec3::splat(9.0);
+            let varied = gaussians.rest_mut().iter_mut().take(15).enumerate();
+            varied.for_each(|(k, value)| *value = glam::Vec3::splat(0.01 * (k as f32 - 7.0)));
+            let (linear, clipped) = linear_gaussians(&gaussians, &inverse, 3.0);
+            assert_eq!(clipped, 1);
+            for (direction, _) in quadrature() {
+                let basis = sh_basis(degree, direction);
+                let of = |model: &Gaussians| {
+                    let rest = &model.rest()[..rest_coefficients(degree)];
+                    let all = std::iter::once(&model.dc()[0]).chain(rest).zip(basis);
+                    (all.map(|(c, b)| c.as_dvec3() * b).sum::<DVec3>() + 0.5).to_array()
+                };
+                let expected = inverse.of(of(&gaussians)).rgb;
+                let expected = expected.map(|x| 8.0 * f64::from(linear_from_srgb(x as f32)));
+                for (own, expected) in of(&linear).into_iter().zip(expected) {
+                    assert!((own - expected).abs() < 0.03 * expected + 1e-4, "{own} {expected}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_target_becomes_its_photograph_and_clipped_pixels_are_counted() {
+        let settings = ToneSettings::new(ToneCurve::Auto);
+        let dark = Image::from_fn(16, 9, |x, y| [0.01 + 0.01 * x as f32, 0.02 * y as f32, 0.05]);
+        let photograph = MeasuredPhotograph::of(&dark.data);
+        let scene = settings.scene(std::slice::from_ref(&photograph)).unwrap();
+        let mapping = settings.tone_mapping(&scene, &photograph);
+        let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
+        let mut target = Image::from_fn(16, 9, |x, y| {
+            inverse.target(dark.pixel(x, y).map(f64::from)).map(|value| value as f32)
+        });
+        let mut clipped = Clipped::default();
+        let back = clipped.add(photograph_of(&target, &inverse));
+        assert_eq!(clipped.clipped, 0);
+        let off = |(a, b): (&f32, &f32)| (a - b).abs();
+        assert!(back.data.iter().zip(&dark.data).map(off).fold(0.0, f32::max) < 1e-5);
+        assert!(stops_between(&back, &dark).abs() < 1e-3);
+        target.data[7] = 1.0;
+        clipped.add(photograph_of(&target, &inverse));
+        assert_eq!((clipped.clipped, clipped.pixels), (1, 2 * 144));
+        // Grey of 18 % is raised to 18 %.
+        let grey = 0.18 * (-inverse.stops_to_target()).exp2();
+        let encoded = srgb_from_linear(grey as f32);
+        let shown = inverse.target([encoded.into(); 3])[1] as f32;
+        assert!((linear_from_srgb(shown) - 0.18).abs() < 1e-4, "{shown}");
+    }
+}

@@ -1,0 +1,75 @@
+//! The light of a scene's photographs: the inverse of the curves that made the targets.
+
+use super::measuring::{measured, measured_of, recorded};
+use crate::Result;
+use crate::camera::Camera;
+use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::tone::{
+    InverseTone, LuminanceHistogram, MeasuredPhotograph, SceneTone, Statistics, ToneSettings,
+};
+
+/// From the values of a model to those of its photographs.
+#[derive(Clone, Debug)]
+pub struct SceneLight {
+    settings: ToneSettings,
+    scene: SceneTone,
+    /// All training photographs as one.
+    together: MeasuredPhotograph,
+}
+
+impl SceneLight {
+    /// Measures the training photographs.
+    ///
+    /// # Errors
+    /// Every photograph is black and their exposure is needed, or one can no longer be read.
+    pub fn of(settings: &ToneSettings, dataset: &Dataset) -> Result<Self> {
+        let (scene, training) = measured(settings, dataset)?;
+        let mut luminance = LuminanceHistogram::default();
+        training.iter().for_each(|one| luminance.add(&one.luminance));
+        let scene = match &settings.law {
+            Some(path) => recorded(path, settings)?,
+            None => scene,
+        };
+        let statistics: Vec<Statistics> = training.iter().map(|one| one.statistics).collect();
+        let statistics = Statistics::mean_of(&statistics).unwrap_or_default();
+        let together = MeasuredPhotograph { statistics, luminance, camera: None };
+        Ok(Self { settings: settings.clone(), scene, together })
+    }
+
+    /// The inverse for a view: that of the curve of its photograph; of a view without one, [`SceneLight::at`] its
+    /// camera.
+    ///
+    /// # Errors
+    /// The curve has no inverse, or the photograph can no longer be read.
+    pub fn of_view(&self, view: &View) -> Result<InverseTone> {
+        if let Some(mapping) = self.scene.recorded_mapping(&view.name)? {
+            return InverseTone::new(&self.settings, &mapping.parameters);
+        }
+        match measured_of(view, self.settings.full_resolution)? {
+            Some(photograph) => {
+                let mapping = self.settings.tone_mapping(&self.scene, &photograph);
+                InverseTone::new(&self.settings, &mapping.parameters)
+            }
+            None => self.at(&view.camera),
+        }
+    }
+
+    /// The inverse of the whole scene, at the exposure of all photographs together.
+    ///
+    /// # Errors
+    /// The curve has no inverse.
+    pub fn of_scene(&self) -> Result<InverseTone> {
+        let mapping = self.settings.tone_mapping(&self.scene, &self.together);
+        InverseTone::new(&self.settings, &mapping.parameters)
+    }
+
+    /// The inverse for a camera, at the exposure of the photographs around it: all cameras share one unit of light, as
+    /// far as the photographs share an exposure.
+    ///
+    /// # Errors
+    /// The curve has no inverse.
+    pub fn at(&self, camera: &Camera) -> Result<InverseTone> {
+        let mapping = self.settings.tone_mapping_at(&self.scene, camera, &self.together);
+        InverseTone::new(&self.settings, &mapping.parameters)
+    }
+}

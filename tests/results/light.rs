@@ -1,0 +1,139 @@
+//! Light out of a run: the photographs' light, linear files, another size, exposures that vary.
+
+use nightsplat::photographs::image::Image;
+use nightsplat::splats::scene::ply;
+use serde_json::Value;
+
+use crate::common::command::{refused, run, succeed};
+use crate::common::place::Place;
+
+fn json(arguments: &str) -> Value {
+    serde_json::from_str(&succeed(arguments)).unwrap()
+}
+
+/// The arguments for training with the default curve into `run`.
+fn training(place: &Place, options: &str) -> String {
+    let (set, out) = (place.path("set").display().to_string(), place.path("run"));
+    format!("train {set} --out {} --sh-degree 1 --plan none {options}", out.display())
+}
+
+#[test]
+fn renders_are_written_and_scored_in_the_light_of_the_photographs() {
+    let place = Place::new();
+    succeed(&training(&place, "--steps 60 --set antialiasing.compensation=true"));
+    let at = |name: &str| place.path(name).display().to_string();
+    let run_at = at("run");
+
+    let scored = json(&format!("eval {run_at} --photographs --align --json"));
+    let dark = &scored["as_photographs"]["mean"];
+    // Sixty steps: the light is about right, and so are dark values.
+    assert!(dark["psnr"].as_f64().unwrap() > 25.0, "{dark}");
+    assert!(dark["stops"].as_f64().unwrap().abs() < 1.0, "{dark}");
+    let aligned = scored["aligned_with_reference"]["mean"]["psnr"].as_f64().unwrap();
+    assert!(aligned >= scored["mean"]["psnr"].as_f64().unwrap() - 0.01);
+    let half = json(&format!("eval {run_at} --downscale 2 --json"));
+    assert_ne!(half["mean"]["psnr"], scored["mean"]["psnr"]);
+    let table = succeed(&format!("eval {run_at} --photographs --align"));
+    for column in ["PSNR, aligned", "PSNR, dark", "stops"] {
+        assert!(table.contains(column), "{table}");
+    }
+    refused(&format!("eval {run_at} --downscale 0.5"), 2, &["downscale is 0.5", "at least 1"]);
+
+    let render = |out: &str, options: &str| {
+        let out = at(out);
+        succeed(&format!("render {run_at} --split test --out {out} {options}"));
+        let file = std::fs::read_dir(&out).unwrap().next().unwrap().unwrap().path();
+        (std::fs::read(&file).unwrap(), Image::load(&file).unwrap())
+    };
+    let mean = |image: &Image| image.data.iter().sum::<f32>() / image.data.len() as f32;
+    let (_, target) = render("target", "");
+    let (_, photograph) = render("photograph", "--as photograph");
+    let (bytes, linear) = render("linear", "--as linear --format exr");
+    assert!(mean(&target) > 3.0 * mean(&photograph), "the photograph is dark");
+    assert!((mean(&linear) / mean(&photograph) - 1.0).abs() < 0.3, "one exposure");
+    let is_in = |name: &[u8]| bytes.windows(name.len()).any(|window| window == name);
+    assert!(is_in(b"nightsplatStops"), "the header states the exposure");
+    let split = format!("render {run_at} --split test --out {}", at("no"));
+    refused(&format!("{split} --as linear"), 2, &["--as linear", "--format exr"]);
+    refused(&format!("{split} --as photograph --layer depth"), 2, &["--layer"]);
+}
+
+#[test]
+fn a_model_in_linear_light_states_it_and_has_other_colours() {
+    let place = Place::new();
+    succeed(&training(&place, "--steps 40 --antialiasing on"));
+    let at = |name: &str| place.path(name).display().to_string();
+    let export = |format: &str, out: &str| {
+        format!("export {} --linear --format {format} --out {}", at("run"), at(out))
+    };
+    succeed(&export("ply", "linear.ply"));
+    let [own, linear] =
+        ["run/model.ply", "linear.ply"].map(|name| ply::load(place.path(name)).unwrap());
+    assert_eq!(own.means(), linear.means());
+    assert_eq!(own.raw_opacities(), linear.raw_opacities());
+    assert!(own.dc() != linear.dc() && linear.dc().iter().all(|dc| dc.is_finite()));
+    let header = String::from_utf8_lossy(&place.read("linear.ply")[..2000]).into_owned();
+    for fact in ["nightsplat linear ", "nightsplat antialiased true"] {
+        assert!(header.contains(fact), "{header}");
+    }
+    succeed(&export("glb", "linear.glb"));
+    let text = String::from_utf8_lossy(&place.read("linear.glb")).into_owned();
+    assert!(text.contains("lin_rec709_display"));
+    refused(&export("spz", "linear.spz"), 2, &["--linear needs floats", "ply or glb"]);
+    let of_file = format!("export {} --linear --format glb", at("linear.ply"));
+    refused(&of_file, 2, &["is a model file", "pass the run directory"]);
+    let (_, warned) = run(&format!("export {} --format glb", at("linear.ply")), 0);
+    assert!(warned.contains("its colours are linear light, raised by"), "{warned}");
+}
+
+#[test]
+fn a_set_of_varying_exposure_has_its_clean_references_and_the_same_bytes_for_a_seed() {
+    let place = Place::new();
+    let at = |name: &str| place.path(name).display().to_string();
+    // References of the dark set are in normal light.
+    std::fs::rename(place.path("set/high"), place.path("high")).unwrap();
+    std::fs::remove_dir_all(place.path("set/low")).unwrap();
+    std::fs::rename(place.path("high"), place.path("set/low")).unwrap();
+    let list = place.path("set/transforms_test.json");
+    let text = std::fs::read_to_string(&list).unwrap().replace("high/", "low/");
+    std::fs::write(&list, text).unwrap();
+    let vary = |out: &str, options: &str| {
+        run(&format!("vary {} --out {} --gamma 0.8,1.25 {options}", at("set"), at(out)), 0).1
+    };
+    assert!(!vary("a", "--seed 3").contains("are dark"));
+    vary("b", "--seed 3");
+    vary("c", "--seed 4");
+    let bytes = |set: &str| {
+        ["low/001.png", "images/001.png", "varied.csv", "test.txt", "sparse/0/points3D.txt"]
+            .map(|file| place.read(&format!("{set}/{file}")))
+    };
+    assert!(bytes("a") == bytes("b") && bytes("a") != bytes("c"));
+    let [varied, clean] =
+        ["a/low/001.png", "a/images/001.png"].map(|file| Image::load(place.path(file)).unwrap());
+    assert_ne!(varied.data, clean.data);
+    let out = format!("train {} --out {} --steps 5 --plan none", at("a"), at("run"));
+    succeed(&out);
+    let scored = json(&format!("eval {} --json", at("run")));
+    assert!(scored.get("against").is_none(), "scored against the clean photographs: {scored}");
+    assert!(scored.get("at_own_exposure").is_none(), "no exposure is known");
+    // Told that test view 000 is two stops brighter than the others, the render is, too.
+    let known: String =
+        (0..9).map(|i| format!("{i:03},{}\n", if i == 0 { 2 } else { 0 })).collect();
+    std::fs::write(place.path("a/exposures.csv"), format!("name,ev\n{known}")).unwrap();
+    let told = json(&format!("eval {} --json", at("run")));
+    let psnr = |scores: &Value, view: &str| scores["views"][view]["psnr"].as_f64().unwrap();
+    assert_ne!(psnr(&told["at_own_exposure"], "000"), psnr(&told, "000"));
+    assert_eq!(psnr(&told["at_own_exposure"], "008"), psnr(&told, "008"));
+    assert!(succeed(&format!("eval {}", at("run"))).contains("PSNR, own exposure"));
+    let refused_gamma = format!("vary {} --out {} --gamma 2,1", at("set"), at("d"));
+    refused(&refused_gamma, 2, &["a gamma of 2,1", "the lower first"]);
+    refused(&format!("vary {} --out {}", at("set"), at("a")), 1, &["is not empty", "--overwrite"]);
+}
+
+#[test]
+fn varied_exposures_of_a_dark_set_are_warned_of() {
+    let place = Place::new();
+    let (set, out) = (place.path("set"), place.path("out"));
+    let (_, warned) = run(&format!("vary {} --out {}", set.display(), out.display()), 0);
+    assert!(warned.contains("photographs are dark"), "{warned}");
+}

@@ -1,0 +1,103 @@
+//! Frozen attributes: other colours on given geometry.
+
+use nightsplat::gpu::testing::{gpu, gpu_with};
+use nightsplat::splats::packed_sh::StorageFormat;
+use nightsplat::splats::scene::Gaussians;
+use nightsplat::train::{TrainConfig, Trainer};
+
+use crate::common::log::warnings;
+use crate::common::train::{advance, dataset, train};
+
+const GEOMETRY: &str = "means,quats,scales,opacities";
+
+/// A model of a few steps, as a file.
+fn day(folder: &tempfile::TempDir) -> (std::path::PathBuf, Gaussians) {
+    let (_, gaussians) =
+        train(&TrainConfig { steps: 30, ..TrainConfig::bare() }, &dataset(6, [40, 30]));
+    let path = folder.path().join("day.ply");
+    gaussians.save(&path).unwrap();
+    (path, gaussians)
+}
+
+fn config(init: std::path::PathBuf, freeze: &str) -> TrainConfig {
+    let mut config = TrainConfig {
+        steps: 40,
+        init: Some(init),
+        freeze: Some(freeze.parse().unwrap()),
+        ..TrainConfig::bare()
+    };
+    // Rounds of density control would be due.
+    (config.schedule.densify_after, config.schedule.densify_interval) = (5, 10);
+    config
+}
+
+#[test]
+fn frozen_geometry_keeps_its_bits_and_colours_learn_on_any_device() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, day) = day(&folder);
+    let dataset = dataset(6, [40, 30]);
+    for gpu in [gpu(), gpu_with(|own| own.is_cpu = false)] {
+        for format in [StorageFormat::Single, StorageFormat::Half] {
+            let mut config = config(path.clone(), GEOMETRY);
+            (config.precision.rest, config.precision.moments) = (format, format);
+            let mut trainer = Trainer::new(&gpu, config, &dataset).unwrap();
+            let before = trainer.gaussians().unwrap();
+            let (reports, report) = trainer.check_step();
+            reports.unwrap();
+            report.agree().unwrap();
+            let reports = advance(&mut trainer, 40);
+            // Of as many steps on each of the five views.
+            let loss = |steps: std::ops::Range<usize>| {
+                reports[steps].iter().map(|step| step.loss).sum::<f64>()
+            };
+            let after = trainer.gaussians().unwrap();
+            assert_eq!(after.count, day.count, "no density control");
+            for (before, after) in [
+                (bytes(before.means()), bytes(after.means())),
+                (bytes(before.quats()), bytes(after.quats())),
+                (bytes(before.log_scales()), bytes(after.log_scales())),
+                (bytes(before.raw_opacities()), bytes(after.raw_opacities())),
+            ] {
+                assert!(before == after);
+            }
+            assert!(before.dc() != after.dc() && before.rest() != after.rest());
+            assert!(loss(24..39) < loss(0..15), "{} {}", loss(24..39), loss(0..15));
+            let gradients = trainer.gradients().unwrap();
+            assert!(gradients.means().iter().all(|own| *own == glam::Vec3::ZERO), "not written");
+        }
+    }
+}
+
+fn bytes<T: bytemuck::NoUninit>(values: &[T]) -> Vec<u8> {
+    bytemuck::cast_slice(values).to_vec()
+}
+
+#[test]
+fn a_frozen_attribute_between_trained_ones_does_not_change() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, _) = day(&folder);
+    let dataset = dataset(6, [40, 30]);
+    let mut trainer = Trainer::new(&gpu(), config(path, "dc,scales"), &dataset).unwrap();
+    let before = trainer.gaussians().unwrap();
+    advance(&mut trainer, 20);
+    let after = trainer.gaussians().unwrap();
+    assert_eq!((before.dc(), before.log_scales()), (after.dc(), after.log_scales()));
+    assert!(before.means() != after.means() && before.rest() != after.rest());
+}
+
+#[test]
+fn a_model_of_another_world_is_warned_of_with_the_count() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, mut day) = day(&folder);
+    let dataset = dataset(6, [40, 30]);
+    let new = |path: std::path::PathBuf| {
+        warnings(|| drop(Trainer::new(&gpu(), config(path, GEOMETRY), &dataset).unwrap()))
+    };
+    assert!(!new(path).contains("out of sight"));
+    day.means_mut().iter_mut().for_each(|mean| *mean += 1e4);
+    let elsewhere = folder.path().join("elsewhere.ply");
+    day.save(&elsewhere).unwrap();
+    let warned = new(elsewhere);
+    let count = format!("{0} of {0} Gaussians are out of sight of every camera", day.count);
+    assert!(warned.contains(&count) && warned.contains("elsewhere.ply"), "{warned}");
+}
