@@ -8,7 +8,7 @@ use glam::DVec3;
 use crate::photographs::dataset::block::Cell;
 
 /// The halo reaches this share of the core's side beyond each face of the core.
-const HALO: f64 = 0.3;
+const HALO: f64 = 0.2;
 /// A halo with fewer points in addition to those of the core is widened, up to [`WIDEST`].
 const HALO_POINTS: usize = 200;
 /// The largest share of the core's side that a halo reaches.

@@ -186,14 +186,18 @@ impl Schedule {
         if left > 0.0 { self.initial_rate_factor.powf(left) } else { 1.0 }
     }
 
-    /// What is left of the schedule after `step`, at another pace: `factor` steps for each of this schedule's.
+    /// What is left of the schedule after `step`, at another pace: `factor` steps for each of this schedule's. Each step
+    /// of a faster pace shows a Gaussian more often, so that Adam, which divides by the root mean square of gradients
+    /// with those of the steps that do not show it, goes less far with each: rates rise by the root of that.
     #[cfg(feature = "cli")]
     pub(crate) fn from_step(&self, step: u64, factor: f64) -> Self {
         let scaled = |steps: u64| (steps as f64 * factor).round() as u64;
         let left = |until: u64| scaled(until.saturating_sub(step));
+        let by = factor.sqrt().recip();
         let mut initial_rates = self.initial_rates;
         initial_rates[Attribute::Means] = self.means_rate(step);
         Self {
+            final_means_rate: by * self.final_means_rate,
             means_rate_steps: left(self.means_rate_steps),
             initial_rate_factor: self.rate_factor(step),
             initial_rate_steps: left(self.initial_rate_steps),
@@ -205,7 +209,7 @@ impl Schedule {
             cooldown_steps: scaled(self.cooldown_steps),
             resolution_steps: self.resolution_steps.map(left),
             damping_steps: self.damping_steps.map(left),
-            initial_rates,
+            initial_rates: initial_rates.scaled(by),
             ..self.clone()
         }
     }
@@ -291,7 +295,8 @@ mod tests {
                 let own = rest.learning_rates((f64::from(later) * factor) as u64, 3.0);
                 let expected = whole.learning_rates(step + u64::from(later), 3.0);
                 for (own, expected) in own.0.into_iter().zip(expected.0) {
-                    assert!((own / expected - 1.0).abs() < 1e-9, "{step} {factor} {later}");
+                    let by = factor.sqrt().recip();
+                    assert!((own / expected / by - 1.0).abs() < 1e-9, "{step} {factor} {later}");
                 }
             }
             assert_eq!(rest.sh_degree(0, 3), whole.sh_degree(step, 3));
