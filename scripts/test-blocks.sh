@@ -235,27 +235,37 @@ three_idle() { [ "$(sinfo -h -o '%T %D')" = "idle 3" ]; }
 
 no_jobs() { squeue -h > "$scratch/jobs" && [ ! -s "$scratch/jobs" ]; }
 
+# job_under_way PLAN: sets `job` and `node` to those of a training under way, other than of the job $lost.
+job_under_way() {
+    local environment
+    under_way "$1" && environment=$(tr '\0' '\n' < "/proc/$process/environ") || return
+    job=$(sed -n 's/^SLURM_JOB_ID=//p' <<< "$environment")
+    node=$(sed -n 's/^SLURMD_NODENAME=//p' <<< "$environment")
+    [ -n "$job" ] && [ "$job" != "$lost" ]
+}
+
 on_slurm() {
     cluster
     cp -r plan nodes
     GPU="" "$root/examples/schedulers/blocks_slurm.sh" nodes > "$log" 2>&1 || fail "sbatch"
-    waits 200 "a block to be trained" under_way nodes
-    local node own job
-    node=$(tr '\0' '\n' < "/proc/$process/environ" | sed -n 's/^SLURMD_NODENAME=//p')
+    local own job node lost="" killed
+    waits 200 "a block to be trained" job_under_way nodes
+    lost=$job killed=$node
     # The node, the steps that it runs, and what they started; what ends after its parent does is gone already.
-    mapfile -t own < <(with "SLURMD_NODENAME=$node")
+    mapfile -t own < <(with "SLURMD_NODENAME=$killed")
     # shellcheck disable=SC2046
-    kill -9 $(with "NODE=$node") $(steps_of "${own[@]}") "${own[@]}" 2>> "$log" || true
+    kill -9 $(with "NODE=$killed") $(steps_of "${own[@]}") "${own[@]}" 2>> "$log" || true
     [ ! -e "nodes/blocks/$block/run/done.json" ] || fail "block $block was done before its node was killed"
-    # As at the end of a job's time: another training saves, and its job is queued again.
-    waits 200 "another block to be trained" under_way nodes
-    job=$(tr '\0' '\n' < "/proc/$process/environ" | sed -n 's/^SLURM_JOB_ID=//p')
-    scancel --signal=TERM "$job" 2>> "$log" || fail "scancel"
+    # As at the end of a job's time: another training saves, and its job is queued again; the next, if it was done.
+    until grep -q "Requeuing JobId=$job" slurm/slurmctld.log && [ "$job" != "$lost" ]; do
+        waits 200 "another block to be trained" job_under_way nodes
+        scancel --signal=TERM "$job" 2>> "$log" || true
+        sleep 3
+    done
     waits 300 "the jobs of Slurm" no_jobs
     cat slurm/slurmctld.log nodes/logs/* >> "$log"
-    grep -q "requeue job .* failure of node $node" slurm/slurmctld.log || fail "Slurm noticed no lost node"
-    grep -q "Requeuing JobId=$job" slurm/slurmctld.log || fail "job $job was not queued again"
-    same nodes "Slurm, 3 nodes, $node killed and a job queued again"
+    grep -q "requeue job .* failure of node $killed" slurm/slurmctld.log || fail "Slurm noticed no lost node"
+    same nodes "Slurm, 3 nodes, $killed killed and job $job queued again"
 }
 
 if has_slurm; then
