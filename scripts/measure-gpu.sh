@@ -198,7 +198,8 @@ equal() {
 }
 
 run_tests() {
-    local root program name code begin left result log=$work/test.log all=0 passed=0 tests_end=$((SECONDS + $1 * patience))
+    local root program name code begin left result log=$work/test.log all=0 passed=0 most=$((90 * patience))
+    local tests_end=$((SECONDS + $1 * patience))
     tests_end=$((tests_end < end ? tests_end : end))
     { read -r root && read -r program; } < "$work/paths"
     if ! place "$work/source" "$root" || ! place "$work/nightsplat" "$program" || ! cd "$root"; then
@@ -214,7 +215,7 @@ run_tests() {
             rm "$test"
             continue
         fi
-        timeout --kill-after=3 $((left < 90 * patience ? left : 90 * patience)) "$test" > "$log" 2>&1 || code=$?
+        timeout --kill-after=3 $((left < most ? left : most)) "$test" > "$log" 2>&1 || code=$?
         rm "$test"
         result=$(grep '^test result' "$log" || echo 'no result')
         echo "$name: exit code $code, $((SECONDS - begin)) s; $result" >> "$out/tests.txt"
@@ -326,7 +327,7 @@ run() {
         python3 "$work/source/scripts/gsplat-rasteriser.py" --ply "$work/bench.ply"
     train plain 40 --curve ap3 ${LOM:-}
     # The rest of the time is for the networks and for growth.
-    train lita $(((end - SECONDS) / 2)) --curve ap3 --model lita ${LOM:-}
+    train lita $(((end - SECONDS) / 2 / patience)) --curve ap3 --model lita ${LOM:-}
     step growth growth.txt 60 "$work/growth" ${software:+64 48 100}
     results | tee -a "$out/summary.txt"
 }
