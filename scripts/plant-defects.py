@@ -95,7 +95,7 @@ DEFECTS = [
     ("a split may change the view of a camera", "shaders-glsl/splats/densify/densify_score.comp",
      "is_candidate && is_safe_to_split(i) ?", "is_candidate ?", "--test splats densify::"),
     ("halves along the ray are not nearer", "shaders-glsl/splats/densify/densify_score.comp",
-     "SPLIT_OFFSET * abs(camera_depth_change(mean_in_view, view_axes[axis], camera));", "0.0;",
+     "SPLIT_OFFSET * abs(camera_depth_change(mean_in_view, axis_of(view_axes, axis), camera));", "0.0;",
      "--test splats densify::"),
     ("a repeated round makes as many splits", "shaders-glsl/splats/densify/densify_decide.comp",
      "return min(max_added, ", "return min(max_added | ~0u, ", "--test splats densify::"),

@@ -76,7 +76,7 @@ under_way() {
     local place task
     while read -r process place task; do
         block=${task#blocks/}
-        if [ "$place" = "$scratch/$1" ] && [ "$block" != "$task" ] && [ -e "/proc/$process" ] &&
+        if [ "$place" = "$scratch/$1" ] && [ "$block" != "$task" ] && [ -e "/proc/$process/exe" ] &&
             [ -e "$1/$task/run/checkpoint.safetensors" ] && [ ! -e "$1/$task/run/done.json" ]; then
             return 0
         fi
@@ -88,13 +88,13 @@ under_way() {
 kills() {
     block=
     until [ -n "$block" ] && [ ! -e "$1/blocks/$block/run/done.json" ]; do
-        waits 120 "a block to be trained" under_way "$1"
+        waits 200 "a block to be trained" under_way "$1"
         kill -9 "$process" 2>> "$log" || true
     done
 }
 
 # The checksums of the joined model.
-model() { (cd "$1" && sha256sum model/manifest.json model/*/*); }
+model() { (cd "$1" && find model -type f | sort | xargs -r sha256sum); }
 
 # same PLAN ENGINE: fails unless the joined model is that of the blocks trained one after another.
 same() {
@@ -134,7 +134,7 @@ on_snakemake() {
     local engine=$!
     kills two
     # This one outlives Snakemake, and is waited for by the next.
-    waits 120 "another block to be trained" under_way two
+    waits 200 "another block to be trained" under_way two
     kill -9 "$engine"
     wait "$engine" 2> /dev/null || true
     snakemake two 2 --unlock || fail "Snakemake --unlock"
@@ -221,41 +221,51 @@ PartitionName=all Nodes=w[1-3] Default=YES State=UP
 CONF
     munged -F --key-file="$slurm/key" --socket="$slurm/munge/socket" --pid-file="$slurm/munge/pid" \
         --log-file="$slurm/munge/log" --seed-file="$slurm/munge/seed" > "$slurm/munge.log" 2>&1 &
-    waits 20 munged [ -S "$slurm/munge/socket" ]
+    waits 60 munged [ -S "$slurm/munge/socket" ]
     slurmctld -D > "$slurm/slurmctld.log" 2>&1 &
     for node in w1 w2 w3; do
         NODE=$node slurmd -D -N "$node" > "$slurm/$node.log" 2>&1 &
         # The shell does not report its end.
         disown
     done
-    waits 60 "three nodes of Slurm" three_idle
+    waits 120 "three nodes of Slurm" three_idle
 }
 
 three_idle() { [ "$(sinfo -h -o '%T %D')" = "idle 3" ]; }
 
 no_jobs() { squeue -h > "$scratch/jobs" && [ ! -s "$scratch/jobs" ]; }
 
+# job_under_way PLAN: sets `job` and `node` to those of a training under way, other than of the job $lost.
+job_under_way() {
+    local environment
+    under_way "$1" && environment=$(tr '\0' '\n' < "/proc/$process/environ") || return
+    job=$(sed -n 's/^SLURM_JOB_ID=//p' <<< "$environment")
+    node=$(sed -n 's/^SLURMD_NODENAME=//p' <<< "$environment")
+    [ -n "$job" ] && [ "$job" != "$lost" ]
+}
+
 on_slurm() {
     cluster
     cp -r plan nodes
     GPU="" "$root/examples/schedulers/blocks_slurm.sh" nodes > "$log" 2>&1 || fail "sbatch"
-    waits 120 "a block to be trained" under_way nodes
-    local node own job
-    node=$(tr '\0' '\n' < "/proc/$process/environ" | sed -n 's/^SLURMD_NODENAME=//p')
+    local own job node lost="" killed
+    waits 200 "a block to be trained" job_under_way nodes
+    lost=$job killed=$node
     # The node, the steps that it runs, and what they started; what ends after its parent does is gone already.
-    mapfile -t own < <(with "SLURMD_NODENAME=$node")
+    mapfile -t own < <(with "SLURMD_NODENAME=$killed")
     # shellcheck disable=SC2046
-    kill -9 $(with "NODE=$node") $(steps_of "${own[@]}") "${own[@]}" 2>> "$log" || true
+    kill -9 $(with "NODE=$killed") $(steps_of "${own[@]}") "${own[@]}" 2>> "$log" || true
     [ ! -e "nodes/blocks/$block/run/done.json" ] || fail "block $block was done before its node was killed"
-    # As at the end of a job's time: another training saves, and its job is queued again.
-    waits 60 "another block to be trained" under_way nodes
-    job=$(tr '\0' '\n' < "/proc/$process/environ" | sed -n 's/^SLURM_JOB_ID=//p')
-    scancel --signal=TERM "$job" 2>> "$log" || fail "scancel"
-    waits 200 "the jobs of Slurm" no_jobs
+    # As at the end of a job's time: another training saves, and its job is queued again; the next, if it was done.
+    until grep -q "Requeuing JobId=$job" slurm/slurmctld.log && [ "$job" != "$lost" ]; do
+        waits 200 "another block to be trained" job_under_way nodes
+        scancel --signal=TERM "$job" 2>> "$log" || true
+        sleep 3
+    done
+    waits 300 "the jobs of Slurm" no_jobs
     cat slurm/slurmctld.log nodes/logs/* >> "$log"
-    grep -q "requeue job .* failure of node $node" slurm/slurmctld.log || fail "Slurm noticed no lost node"
-    grep -q "Requeuing JobId=$job" slurm/slurmctld.log || fail "job $job was not queued again"
-    same nodes "Slurm, 3 nodes, $node killed and a job queued again"
+    grep -q "requeue job .* failure of node $killed" slurm/slurmctld.log || fail "Slurm noticed no lost node"
+    same nodes "Slurm, 3 nodes, $killed killed and job $job queued again"
 }
 
 if has_slurm; then
@@ -302,7 +312,7 @@ for attempt in {1..20}; do
     [ "$attempt" = 1 ] || rm -r serial/model
     "$program" blocks join serial > "$scratch/join" 2>&1 &
     first=$!
-    until [ -e serial/.lock ] || [ ! -e "/proc/$first" ]; do :; done
+    until [ -e serial/.lock ] || [ ! -e "/proc/$first/exe" ]; do :; done
     kill -STOP "$first" 2>> "$log" || true
     [ -e serial/model/manifest.json ] || break
     kill -CONT "$first" 2>> "$log" || true

@@ -3,7 +3,8 @@
 
     scripts/time-page.py PAGE PAGE... [--rounds 5] [--frames 8] [--size 1280x720]
 
-Each round opens every page in turn, moves the camera in every frame, and takes time and the browser's processor time. Prints the median frames a second, and processor time a frame, of each page, and the ratios to the first.
+Each round opens every page in turn, moves the camera in every frame, and takes time and the browser's processor time.
+Prints the median frames a second, and processor time a frame, of each page, and the ratios to the first.
 """
 
 import argparse

@@ -52,8 +52,8 @@ const RGB: u32 = 3;
 /// The columns and rows of pixels per lane of `conv3x3`.
 ///
 /// On a CPU, loads cost most, and the neighbouring columns of a lane share them; on a GPU, neighbouring lanes read
-/// neighbouring pixels, and registers limit the block: narrow subgroups have fewer for a lane's share of the weights, and
-/// would spill (compiled by Mesa 25 for Arc).
+/// neighbouring pixels, and registers limit the block: narrow subgroups have fewer for a lane's share of the weights,
+/// and would spill (compiled by Mesa 25 for Arc).
 const CPU_SHAPE: [u32; 2] = [4, 4];
 const GPU_SHAPE: [u32; 2] = [1, 8];
 const NARROW_GPU_SHAPE: [u32; 2] = [1, 6];

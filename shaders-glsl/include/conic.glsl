@@ -20,8 +20,9 @@ ConicGradient conic_backward(vec3 conic, vec3 u0, vec3 u1, vec3 d_conic) {
     return ConicGradient(-2.0 * (a * g0 + b * g1), -2.0 * (b * g0 + c * g1), -2.0 * (w0 * g0 + w1 * g1));
 }
 
-// The gradient of the logarithm of the compensation, sqrt(det(U U^T) / det(cov2d)). The large terms of both determinants
-// are cancelled by hand: of a wide splat only rounding would be left. A seen splat's det(U U^T) is not tiny.
+// The gradient of the logarithm of the compensation, sqrt(det(U U^T) / det(cov2d)). The large terms of both
+// determinants are cancelled by hand: of a wide splat only rounding would be left. A seen splat's det(U U^T) is not
+// tiny.
 ConicGradient compensation_backward(vec3 u0, vec3 u1) {
     float xx = dot(u0, u0), xy = dot(u0, u1), yy = dot(u1, u1);
     vec3 normal = cross(u0, u1);

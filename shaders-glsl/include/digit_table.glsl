@@ -1,8 +1,8 @@
 // Radix sort: the counts of the keys of a workgroup by digit, and their prefix sums.
 //
 // A workgroup has SUBGROUPS partitions of consecutive keys, its counters of one subgroup each after those of another in
-// `keys_with_digit`. The last workgroup of a dispatch turns a table (workgroups, digits) of counts into exclusive prefix
-// sums over the workgroups, and finds where the keys of each digit begin.
+// `keys_with_digit`. The last workgroup of a dispatch turns a table (workgroups, digits) of counts into exclusive
+// prefix sums over the workgroups, and finds where the keys of each digit begin.
 //
 // The includer declares `coherent buffer` with `uint table[]` and with `uint arrivals[]`, `buffer` with
 // `uint digit_begins[]`, the kernel's `keys`, and the size of subgroups.

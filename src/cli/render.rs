@@ -82,9 +82,9 @@ pub struct RenderArgs {
     /// Depths at the ends of the colours, in world units [default: of each image its own]
     #[arg(long, value_name = "NEAR,FAR")]
     pub depth_range: Option<DepthRange>,
-    /// Light of the images: target, as trained; photograph, as dark as the photographs; linear, the photographs' linear
-    /// light at the exposure of the scene, for --format exr: 1 is where they clip, and the header has the stops to raise
-    /// it by for the brightness of the target
+    /// Light of the images: target, as trained; photograph, as dark as the photographs; linear, the photographs'
+    /// linear light at the exposure of the scene, for --format exr: 1 is where they clip, and the header has the stops
+    /// to raise it by for the brightness of the target
     #[arg(long = "as", value_name = "LIGHT", value_enum, default_value_t)]
     pub light: Light,
     /// Render each training view at the exposure of its target, not at the model's

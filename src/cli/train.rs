@@ -64,8 +64,8 @@ pub struct TrainArgs {
     pub view: Option<live::Listen>,
     /// Show the model in a window of this machine while it trains; needs a build with the feature `window`
     ///
-    /// Show the model in a window of this machine while it trains, drawn by the same device from its own memory; needs a
-    /// build with the feature `window`. Space pauses the training, Esc closes the window and lets the training go on;
+    /// Show the model in a window of this machine while it trains, drawn by the same device from its own memory; needs
+    /// a build with the feature `window`. Space pauses the training, Esc closes the window and lets the training go on;
     /// `nightsplat view --help` has the other keys. Watching changes no bit of the model.
     #[arg(long)]
     pub window: bool,

@@ -10,9 +10,9 @@ use crate::photographs::dataset::{Dataset, LoadOptions};
 
 /// Write a set of varying exposure from one in normal light, with the clean photographs as references.
 ///
-/// Every photograph gets a drawn number of stops, in linear light and clipped at white, and a drawn gamma. The same seed
-/// gives the same bytes. varied.csv has the drawn numbers. The set is nightsplat's own: the pictures of the published
-/// benchmark (Mip-NeRF 360, varying) are of an unpublished generator.
+/// Every photograph gets a drawn number of stops, in linear light and clipped at white, and a drawn gamma. The same
+/// seed gives the same bytes. varied.csv has the drawn numbers. The set is nightsplat's own: the pictures of the
+/// published benchmark (Mip-NeRF 360, varying) are of an unpublished generator.
 #[derive(Clone, Debug, clap::Args)]
 pub struct VaryArgs {
     /// Dataset in normal light

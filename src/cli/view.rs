@@ -50,9 +50,9 @@ pub struct ViewArgs {
     pub dataset: Option<PathBuf>,
     /// Show the model in a window of this machine instead, drawn by the device; needs a build with the feature `window`
     ///
-    /// Show the model in a window of this machine instead, drawn by the device; needs a build with the feature `window`.
-    /// Drag to turn, scroll or press W and S to approach; the arrow keys go through the views, R goes back to one, P
-    /// saves nightsplat.png, Esc closes the window.
+    /// Show the model in a window of this machine instead, drawn by the device; needs a build with the feature
+    /// `window`. Drag to turn, scroll or press W and S to approach; the arrow keys go through the views, R goes back to
+    /// one, P saves nightsplat.png, Esc closes the window.
     #[arg(long)]
     pub window: bool,
     /// Close the window after this number of frames

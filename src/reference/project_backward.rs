@@ -81,8 +81,8 @@ pub fn project_gaussian_backward(
     }
 }
 
-/// From the gradients of a conic and of the logarithm of the compensation to those of the rows of U, where cov2d = U U^T
-/// + 0.3 I, and of the logarithms of the scales.
+/// From the gradients of a conic and of the logarithm of the compensation to those of the rows of U, where cov2d =
+/// U U^T + 0.3 I, and of the logarithms of the scales.
 pub(super) fn rows_backward(
     conic: DVec3,
     [u0, u1]: [DVec3; 2],

@@ -215,8 +215,8 @@ impl Adam {
         Self::with_frozen(gpu, 0)
     }
 
-    /// Builds the kernel, which leaves the first columns of Gaussians as they are; those for packed coefficients are built
-    /// on first use.
+    /// Builds the kernel, which leaves the first columns of Gaussians as they are; those for packed coefficients are
+    /// built on first use.
     ///
     /// # Errors
     /// The device refuses it.

@@ -103,7 +103,8 @@ impl Views {
         if (seen as f64) < SEEN * count as f64 {
             let model = path.display();
             tracing::warn!(
-                "{model}: {} of {count} Gaussians are out of sight of every camera; is the model of this dataset's world?",
+                "{model}: {} of {count} Gaussians are out of sight of every camera; is the model of this dataset's \
+                 world?",
                 count - seen
             );
         }

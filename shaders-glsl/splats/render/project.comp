@@ -10,12 +10,11 @@
 //! Project: one thread per Gaussian, world space to image plane.
 //!
 //! EWA: cov2d = U U^T + 0.3 I with U = J W R S, where J is the camera's Jacobian at the mean, so it is positive
-//! definite by construction, and its determinant is
-//! |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel. Compensation multiplies the opacity by the square root of
-//! det(U U^T) / det(cov2d), so that dilation does not add light (Yu et al. 2024, Mip-Splatting, section 5.2). Colour is
-//! max(SH + 0.5, 0), what every viewer shows, or the bare SH sum of LITA-GS; features are taken as they are. The last
-//! channel can be the depth in the view.
-//! A culled Gaussian gets the last depth key and covers no tile.
+//! definite by construction, and its determinant is |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel.
+//! Compensation multiplies the opacity by the square root of det(U U^T) / det(cov2d), so that dilation does not add
+//! light (Yu et al. 2024, Mip-Splatting, section 5.2). Colour is max(SH + 0.5, 0), what every viewer shows, or the
+//! bare SH sum of LITA-GS; features are taken as they are. The last channel can be the depth in the view. A culled
+//! Gaussian gets the last depth key and covers no tile.
 
 layout(local_size_x = 64) in;
 

@@ -60,8 +60,8 @@ impl Pictures {
         Ok(Self::new(dataset.into(), BTreeSet::new(), config, gpu))
     }
 
-    /// The dataset that a training has loaded, unless a lens of it is a fisheye's, which is loaded again for the pinhole
-    /// cameras of the viewer.
+    /// The dataset that a training has loaded, unless it has a fisheye: then it is loaded again for the pinhole cameras
+    /// of the viewer.
     ///
     /// # Errors
     /// Those of [`Dataset::load`].

@@ -1,7 +1,7 @@
 //! A dataset of varying exposure, made from one in normal light.
 //!
 //! ```text
-//! v = encode(min(1, 2^s decode(x)))^g      s uniform within the stops, ln g uniform within ln gamma, for each photograph
+//! v = encode(min(1, 2^s decode(x)))^g        for each photograph: s uniform within the stops, ln g within ln gamma
 //! ```
 //!
 //! The paper's third benchmark, Mip-NeRF 360 with varying exposure, cannot be repeated: neither its pictures' generator

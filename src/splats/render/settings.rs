@@ -16,8 +16,8 @@ pub struct RenderSettings {
     pub shape: Shape,
     /// Colours are the raw SH sum, which can be negative, as in LITA-GS, instead of max(SH + 0.5, 0).
     pub raw_colors: bool,
-    /// Opacities are compensated for the dilation, so that a splat smaller than a pixel does not gain light: the 2D filter
-    /// of Mip-Splatting. Only for a model that was trained so.
+    /// Opacities are compensated for the dilation, so that a splat smaller than a pixel does not gain light: the 2D
+    /// filter of Mip-Splatting. Only for a model that was trained so.
     pub antialiased: bool,
     /// The storage format of the SH coefficients above degree 0: 32 bits after
     /// [`Gaussians::upload`](crate::splats::scene::Gaussians::upload) and by default, 16

@@ -214,7 +214,7 @@ impl Default for Lengths {
 #[cfg(feature = "io")]
 impl Lengths {
     const BITS: u32 = 10;
-    /// The bits of an f32 behind the sign and the leading ones.
+    /// The bits of an f32 that follow the sign and the leading ones.
     const REST: u32 = 31 - Self::BITS;
 
     /// Adds a length, 0 or more.

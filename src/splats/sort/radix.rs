@@ -40,8 +40,8 @@ struct Scratch {
     /// Each pass writes the pairs here; then these and the caller's buffers are swapped.
     keys: Buffer<u32>,
     values: Buffer<u32>,
-    /// (workgroups, digits), in turn that of a pass, of the next and of the one after it; one where each pass counts its
-    /// own keys.
+    /// (workgroups, digits), in turn that of a pass, of the next and of the one after it; one where each pass counts
+    /// its own keys.
     table: Buffer<u32>,
     /// (digits)
     digit_begins: Buffer<u32>,

@@ -20,7 +20,8 @@ fn name(spec: &AttributeSpec) -> &'static str {
 
 impl Freeze {
     /// The syntax.
-    pub(crate) const FORM: &'static str = "some, not all, of means, quats, scales, opacities, dc, features and rest, separated by commas";
+    pub(crate) const FORM: &'static str = "some, not all, of means, quats, scales, opacities, dc, features and rest, \
+        separated by commas";
 
     /// Whether the attribute is frozen.
     pub(crate) fn has(&self, attribute: Attribute) -> bool {

@@ -90,8 +90,8 @@ impl PartFile {
     }
 }
 
-/// Writes a file of `count` Gaussians of the shape and origin of `of`, which `parts` hands over in order; the same bytes
-/// as of [`super::save_with_comments`].
+/// Writes a file of `count` Gaussians of the shape and origin of `of`, which `parts` hands over in order; the same
+/// bytes as of [`super::save_with_comments`].
 ///
 /// # Errors
 /// [`Error::Output`] if the file cannot be written; those of `parts`. No partial file is left.
@@ -127,13 +127,17 @@ pub(crate) fn save_parts(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::results::export::tests::drawn;
+    use crate::base::random::Stream;
 
     #[test]
     fn parts_are_the_whole_and_write_the_same_bytes() {
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
-        let mut model = drawn(23, 2);
+        let mut model = Gaussians::zeros(23, 2);
+        let stream = Stream::new(7, 0);
+        for (index, value) in (0..).zip(&mut model.parameters) {
+            *value = (stream.uniform(index) * 2.0 - 1.0) as f32;
+        }
         model.origin = glam::DVec3::new(1e6, 2.0, -3.0);
         let comments = ["x".repeat(200_000), "nightsplat near 0.1".to_owned()];
         super::super::save_with_comments(&model, path("a.ply"), &comments).unwrap();
