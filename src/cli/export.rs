@@ -1,5 +1,6 @@
 //! `nightsplat export`: writes the model of a run in other formats.
 
+mod tiles;
 mod up;
 
 use std::path::{Path, PathBuf};
@@ -20,6 +21,7 @@ use crate::results::export::page::{Bookmark, Page, Picture, moved};
 use crate::results::export::streamed::{self, Division, MAX_LEVELS, Tile, Written};
 use crate::results::export::{Format, Provenance, spz};
 use crate::results::finished_run::{FinishedRun, config_of_file, is_model, needs_photographs};
+use crate::results::joined::Manifest;
 use crate::results::linear_light::linear_gaussians;
 use crate::results::models;
 use crate::splats::levels;
@@ -131,6 +133,12 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     check_ending(args)?;
     check_levels(args)?;
     check_linear(args)?;
+    if args.to == To::StreamedSog
+        && !is_model(&args.run)
+        && let Some(manifest) = Manifest::at(&args.run)?
+    {
+        return Ok(tiles::write(args, &manifest)?);
+    }
     let (gaussians, facts, config) = opened(args)?;
     let (gaussians, facts) =
         if args.linear { linear(args, &config, gaussians, facts)? } else { (gaussians, facts) };

@@ -125,6 +125,13 @@ fn the_joined_tiles_are_those_of_the_cores_and_are_opened_like_a_run() {
     succeed(&format!("export {} --format ply --out {}", folder.display(), exported.display()));
     let exported = String::from_utf8_lossy(&fs::read(exported).unwrap()).into_owned();
     assert!(exported.contains(&format!("element vertex {counts}\n")));
+    // Tile by tile, in two levels of the same cells.
+    let streamed = city.path("streamed");
+    let options = "--format streamed-sog --levels 2 --chunk 1000";
+    succeed(&format!("export {} {options} --out {}", folder.display(), streamed.display()));
+    let index: Value =
+        serde_json::from_slice(&fs::read(streamed.join("lod-meta.json")).unwrap()).unwrap();
+    assert_eq!(index["lodLevels"].as_u64(), Some(2), "{index}");
 }
 
 #[test]
