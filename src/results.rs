@@ -12,7 +12,6 @@
 //! - [`evaluation`]: scores as a table, and the page of a run
 //! - [`linear_light`]: renders and colours in the light of the photographs
 //! - [`models`]: model files and run directories, read
-//! - `joined`: a model in tiles, of a scene that was trained in blocks
 //! - [`finished_run`]: a finished run or a model file, opened for rendering
 //! - [`view_exposures`]: renders at the exposure of their targets
 //! - [`video`]: frames as a video
@@ -27,7 +26,6 @@ pub mod eval;
 pub mod evaluation;
 pub mod export;
 pub mod finished_run;
-pub mod joined;
 pub mod linear_light;
 pub mod models;
 pub mod report;

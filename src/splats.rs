@@ -13,6 +13,7 @@
 //! - [`optimizer`]: Adam, learned parameters other than the Gaussians, and learning-rate schedules
 //! - [`render`]: the differentiable rasteriser
 //! - [`densify`]: density control: clone, split, prune
+//! - `joined`: a model in tiles, of a scene that was trained in blocks
 //! - [`levels`]: levels of detail: neighbours merged
 //! - [`smoothing`]: no Gaussian smaller than training views resolve
 
@@ -21,6 +22,8 @@ pub mod batches;
 #[cfg(feature = "io")]
 pub mod densify;
 pub mod harmonics;
+#[cfg(feature = "io")]
+pub mod joined;
 #[cfg(feature = "io")]
 pub mod levels;
 pub mod model;

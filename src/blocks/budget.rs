@@ -6,7 +6,7 @@ use crate::splats::packed_sh::StorageFormat;
 use crate::train::{CacheSize, TrainConfig};
 
 /// The program, the driver and its compiled kernels, bytes.
-const PROGRAM: f64 = 300.0 * 1024.0 * 1024.0;
+const PROGRAM: f64 = 165.0 * 1024.0 * 1024.0;
 /// The factor of capacity that a growing model allocates.
 const HEADROOM: f64 = 1.5;
 /// Floats of a Gaussian without spherical harmonics above degree 0.

@@ -2,22 +2,23 @@
 //! are taken in the order of the plan: neither who trained them nor when enters.
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
-use super::plan::{BLOCKS, PlanFile};
+use super::folder::{model_of, place};
+use super::plan::PlanFile;
 use crate::base::{input, output};
 use crate::photographs::dataset::block::{Block, Cell};
 use crate::results::export::{Format, Provenance};
-use crate::results::joined::{MANIFEST, Manifest, Tile, VERSION};
 use crate::results::models;
 use crate::results::run::{self, RunDirectory, TRAINED_WITH};
+use crate::splats::joined::{MANIFEST, Manifest, Tile, VERSION};
 use crate::splats::scene::{Gaussians, ply};
 use crate::{Error, Result};
 
-/// The folder of the tiles at full detail.
-const TILES: &str = "model/0";
+/// The folder of the tiles, beside the manifest.
+const TILES: &str = "0";
 
 /// The end of a join.
 #[derive(Clone, Debug)]
@@ -27,46 +28,62 @@ pub(crate) struct Joined {
     pub(crate) cropped: usize,
 }
 
-/// Joins the blocks of the plan in a folder. With `same_device`, blocks of several devices are refused; else they are
-/// recorded. `observe` is called with the name of every tile that is written.
+/// Joins the blocks of a round of the plan in a folder, by default of the last. With `same_device`, blocks of several
+/// devices are refused; else they are recorded. `observe` is called with every tile that is written.
 ///
 /// # Errors
-/// The folder contains no plan, its photographs have changed, a block is missing, not done or of another plan, another
-/// process joins, or a file cannot be read or written.
+/// The folder contains no plan, or no such round; its photographs have changed; a block is missing, not done or of
+/// another plan; another process joins; or a file cannot be read or written.
 pub(crate) fn join(
     folder: &Path,
+    round: Option<u8>,
     same_device: bool,
     mut observe: impl FnMut(&Tile),
 ) -> Result<Joined> {
     let plan = PlanFile::load(folder)?;
+    let last = plan.rounds();
+    let round = round.unwrap_or(last);
+    if !(1..=last).contains(&round) {
+        return Err(Error::input(folder, format!("has no round {round}; its last is {last}")));
+    }
     let _lock = RunDirectory::lock(folder)?;
     plan.check_photographs(&run::load_config(folder)?)?;
-    let blocks = plan.blocks.iter().map(|row| checked(folder, &row.id, &plan.checksum));
+    let blocks = plan.round(round).map(|row| checked(folder, &row.id, &plan.checksum));
     let blocks = blocks.collect::<Result<Vec<Block>>>()?;
     let devices = devices(folder, &blocks, same_device)?;
-    output::create_folder(&folder.join(TILES))?;
+    let model = folder.join(model_of(round, last));
+    output::create_folder(&model.join(TILES))?;
     let mut tiles = vec![];
     let (mut cropped, mut origin) = (0, [0.0; 3]);
     for block in &blocks {
-        let (tile, left_out, own) = write_tile(folder, block)?;
+        let (tile, left_out, own) = write_tile(folder, &model, block)?;
         observe(&tile);
         tiles.push(tile);
         cropped += left_out;
         origin = own;
     }
     let count = tiles.iter().map(|tile| tile.count).sum();
-    let manifest =
-        Manifest { version: VERSION, plan: plan.checksum.clone(), origin, count, devices, tiles };
-    save_metrics(folder, &plan, &manifest)?;
+    let manifest = Manifest {
+        version: VERSION,
+        plan: plan.checksum.clone(),
+        origin,
+        count,
+        devices,
+        tiles,
+        folder: model.clone(),
+    };
+    if round == last {
+        save_metrics(folder, &plan, &manifest)?;
+    }
     let text =
         serde_json::to_string_pretty(&manifest).map_err(|error| Error::Usage(error.to_string()))?;
-    output::write_whole(&folder.join(MANIFEST), (text + "\n").as_bytes())?;
+    output::write_whole(&model.join(MANIFEST), (text + "\n").as_bytes())?;
     Ok(Joined { manifest, cropped })
 }
 
 /// A block that is done.
 fn checked(folder: &Path, id: &str, plan: &str) -> Result<Block> {
-    let place = folder.join(BLOCKS).join(id);
+    let place = folder.join(place(id));
     let missing = || Error::input(&place, "is missing; plan anew, or copy it here");
     let block = Block::at(&place)?.ok_or_else(missing)?;
     if block.plan != plan {
@@ -84,10 +101,15 @@ fn checked(folder: &Path, id: &str, plan: &str) -> Result<Block> {
     Ok(block)
 }
 
+/// The run of a block.
+fn run_of(folder: &Path, id: &str) -> PathBuf {
+    folder.join(place(id)).join("run")
+}
+
 /// The devices on which the blocks were trained, ascending.
 fn devices(folder: &Path, blocks: &[Block], same_device: bool) -> Result<Vec<String>> {
     let device = |block: &Block| {
-        let run = folder.join(BLOCKS).join(&block.id).join("run");
+        let run = run_of(folder, &block.id);
         let with = &run::load_metrics(&run)[TRAINED_WITH];
         let text = |key: &str| with[key].as_str().unwrap_or("unknown").to_owned();
         format!("{}, {}", text("device"), text("driver"))
@@ -111,15 +133,15 @@ fn devices(folder: &Path, blocks: &[Block], same_device: bool) -> Result<Vec<Str
 }
 
 /// Writes the tile of a block; also returns the number of Gaussians left out, and the origin of its positions.
-fn write_tile(folder: &Path, block: &Block) -> Result<(Tile, usize, [f64; 3])> {
+fn write_tile(folder: &Path, model: &Path, block: &Block) -> Result<(Tile, usize, [f64; 3])> {
     let id = &block.id;
-    let (mut gaussians, facts) = models::read(&folder.join(BLOCKS).join(id).join("run"))?;
+    let (mut gaussians, facts) = models::read(&run_of(folder, id))?;
     let before = gaussians.count;
     let inside: Vec<bool> =
         (0..before).map(|index| block.core.contains(gaussians.position(index))).collect();
     gaussians.retain(&inside);
     let file = Path::new(TILES).join(format!("{id}.ply"));
-    let path = folder.join(&file);
+    let path = model.join(&file);
     let origin = gaussians.origin.to_array();
     let provenance = Provenance { facts, ..Provenance::default() };
     Format::Ply.write(&gaussians, &provenance, &path)?;
@@ -134,7 +156,7 @@ fn write_tile(folder: &Path, block: &Block) -> Result<(Tile, usize, [f64; 3])> {
     }
     let sha256 = hex(&Sha256::digest(input::bytes(&path)?));
     let bounds = bounds(&written);
-    let tile = Tile { id: id.clone(), level: 0, file, count: written.count, bounds, sha256 };
+    let tile = Tile { id: id.clone(), file, count: written.count, bounds, sha256 };
     Ok((tile, before - written.count, origin))
 }
 
@@ -153,9 +175,10 @@ fn hex(bytes: &[u8]) -> String {
 /// The numbers that `eval` and others print of a run.
 fn save_metrics(folder: &Path, plan: &PlanFile, manifest: &Manifest) -> Result<()> {
     let steps: u64 = plan.blocks.iter().map(|row| row.steps).sum();
-    let seconds = plan.blocks.iter().map(|row| {
-        run::load_metrics(&folder.join(BLOCKS).join(&row.id).join("run"))["seconds"].as_f64()
-    });
+    let seconds = plan
+        .blocks
+        .iter()
+        .map(|row| run::load_metrics(&run_of(folder, &row.id))["seconds"].as_f64());
     let metrics = serde_json::json!({
         "steps": steps + plan.coarse.steps,
         "seconds": seconds.sum::<Option<f64>>(),

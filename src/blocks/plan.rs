@@ -5,38 +5,31 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::budget::Budget;
+use super::draft::{Draft, block_id};
 use super::partition::{Part, Until, WeightedPoint, partition};
-use super::task::{self, TASKS, Task};
 use super::visibility::Visibility;
 use crate::base::hash::{self, Hasher};
-use crate::base::random::Stream;
-use crate::base::{input, output};
+use crate::base::input;
 use crate::photographs::dataset::Dataset;
-use crate::photographs::dataset::block::{Block, Cell};
+use crate::photographs::dataset::block::Block;
 use crate::photographs::tone::ToneLaw;
-use crate::results::joined::MANIFEST;
-use crate::splats::optimizer::Schedule;
-use crate::train::{CacheSize, OnOff, PlannedRun, StopConfig, TrainConfig, law_of};
+use crate::train::{OnOff, PlannedRun, StopConfig, TrainConfig, law_of};
 use crate::{Error, Result};
 
 /// The file of the plan's numbers.
-const PLAN: &str = "plan.toml";
+pub(super) const PLAN: &str = "plan.toml";
 /// The file of the tone law.
 pub(crate) const LAW: &str = "law.toml";
-/// The file of the scene's frame.
-const FRAME: &str = "frame.toml";
-/// The settings that the tasks share, and with which the joined model is shown.
-const CONFIG: &str = "config.toml";
 /// The folder of the coarse model.
 pub(crate) const COARSE: &str = "coarse";
 /// The folder of the blocks.
 pub(crate) const BLOCKS: &str = "blocks";
 
 const VERSION: u32 = 1;
-/// The share of the steps that the coarse model takes.
-const COARSE_STEPS: f64 = 0.125;
 /// Blocks whose mean share of the views is larger do not pay.
 const MOST_SHARED: f64 = 0.75;
+/// The most rounds.
+pub(crate) const MAX_ROUNDS: u8 = 3;
 /// The fewest views of a block.
 const LEAST_VIEWS: usize = 3;
 
@@ -47,6 +40,8 @@ pub(crate) struct Request {
     pub(crate) memory: u64,
     /// The number of blocks, in place of as many as the memory asks for.
     pub(crate) blocks: Option<usize>,
+    /// How often every block trains: from the second time on, its neighbours are those of the round before.
+    pub(crate) rounds: u8,
 }
 
 /// The numbers of a task that trains.
@@ -54,6 +49,8 @@ pub(crate) struct Request {
 #[serde(deny_unknown_fields)]
 pub(crate) struct Row {
     pub(crate) id: String,
+    /// The number of the round, from 1; 0: the coarse model.
+    pub(crate) round: u8,
     pub(crate) views: usize,
     pub(crate) points: usize,
     pub(crate) steps: u64,
@@ -80,8 +77,21 @@ pub(crate) struct PlanFile {
     /// Memory of a worker, bytes.
     pub(crate) memory: u64,
     pub(crate) coarse: Row,
+    /// Round by round.
     #[serde(rename = "block")]
     pub(crate) blocks: Vec<Row>,
+}
+
+impl PlanFile {
+    /// The number of rounds.
+    pub(crate) fn rounds(&self) -> u8 {
+        self.blocks.iter().map(|row| row.round).max().unwrap_or_default()
+    }
+
+    /// The blocks of a round, from 1.
+    pub(crate) fn round(&self, round: u8) -> impl Iterator<Item = &Row> {
+        self.blocks.iter().filter(move |row| row.round == round)
+    }
 }
 
 /// A plan, before it is written.
@@ -90,10 +100,11 @@ pub(crate) struct BlockPlan {
     pub(crate) file: PlanFile,
     /// The mean share of the views that a block has.
     pub(crate) shared: f64,
-    config: TrainConfig,
-    law: ToneLaw,
-    coarse: Block,
-    blocks: Vec<Block>,
+    /// The settings that the tasks share.
+    pub(super) config: TrainConfig,
+    pub(super) law: ToneLaw,
+    /// That of the coarse model, and those of the rows.
+    pub(super) blocks: Vec<Block>,
 }
 
 /// Plans the blocks of a dataset. Nothing is written.
@@ -118,38 +129,20 @@ pub(crate) fn plan(planned: PlannedRun, request: &Request) -> Result<BlockPlan> 
     let law = law_of(&config.tone, &dataset)?;
     settle(&mut config, &dataset);
     let stamp = Dataset::stamp(root, &config.load_options())?;
-    let drawn =
+    let draft =
         Draft { dataset: &dataset, visibility: &visibility, config: &config, budget, request };
-    let coarse = drawn.coarse();
-    let rows = drawn.rows(&parts, &serving);
-    let settings = config.checksum()?;
     let mut file = PlanFile {
         version: VERSION,
         checksum: String::new(),
         stamp,
-        settings,
+        settings: config.checksum()?,
         memory: request.memory,
-        coarse,
-        blocks: rows,
+        coarse: draft.coarse(),
+        blocks: draft.rows(&parts, &serving),
     };
     file.checksum = checksum(&file, &parts)?;
-    let coarse = drawn.block(COARSE, &file.checksum, [Cell::WORLD; 2], &drawn.coarse_views());
-    let mut blocks: Vec<Block> = file
-        .blocks
-        .iter()
-        .zip(&parts)
-        .zip(&serving)
-        .map(|((row, part), views)| {
-            drawn.block(&row.id, &file.checksum, [part.core, part.halo], views)
-        })
-        .collect();
-    let halos: Vec<(String, Cell)> =
-        blocks.iter().map(|block| (block.id.clone(), block.halo)).collect();
-    for block in &mut blocks {
-        let others = halos.iter().filter(|(id, halo)| *id != block.id && block.halo.overlaps(halo));
-        block.neighbours = others.map(|(id, _)| id.clone()).collect();
-    }
-    Ok(BlockPlan { file, shared, config, law, coarse, blocks })
+    let blocks = draft.blocks(&file, &parts, &serving);
+    Ok(BlockPlan { file, shared, config, law, blocks })
 }
 
 /// The parts of the scene, of as much weight each as the memory allows.
@@ -243,82 +236,6 @@ fn settle(config: &mut TrainConfig, dataset: &Dataset) {
     }
 }
 
-/// The name of a block.
-fn block_id(number: usize) -> String {
-    format!("{number:04}")
-}
-
-/// What the numbers of the tasks follow from.
-struct Draft<'a> {
-    dataset: &'a Dataset,
-    visibility: &'a Visibility<'a>,
-    config: &'a TrainConfig,
-    budget: Budget,
-    request: &'a Request,
-}
-
-impl Draft<'_> {
-    fn row(&self, id: String, views: usize, points: usize, steps: u64, gaussians: f64) -> Row {
-        let fits = self.budget.gaussians(self.request.memory as f64);
-        let gaussians = if self.request.blocks.is_some() { gaussians } else { gaussians.min(fits) };
-        let bytes = self.budget.memory(gaussians, views as f64, self.request.memory as f64);
-        let key = hash::of(id.as_bytes());
-        // Settings are whole numbers of 63 bits.
-        let seed = Stream::new(self.config.seed, key).bits(0) >> 1;
-        Row {
-            id,
-            views,
-            points,
-            steps: steps.max(1),
-            gaussians: (gaussians as usize).max(1),
-            memory: bytes as u64,
-            disk: self.budget.disk(gaussians) as u64,
-            seed,
-        }
-    }
-
-    fn coarse(&self) -> Row {
-        let steps = (COARSE_STEPS * self.config.steps as f64).round() as u64;
-        let gaussians = self.config.max_gaussians as f64;
-        self.row(
-            COARSE.to_owned(),
-            self.coarse_views().len(),
-            self.dataset.points.len(),
-            steps,
-            gaussians,
-        )
-    }
-
-    fn coarse_views(&self) -> Vec<usize> {
-        self.visibility.thinned()
-    }
-
-    /// The rows of the blocks, which share the steps by their views.
-    fn rows(&self, parts: &[Part], serving: &[Vec<usize>]) -> Vec<Row> {
-        let all: usize = serving.iter().map(Vec::len).sum();
-        let left = (1.0 - COARSE_STEPS) * self.config.steps as f64;
-        let row = |(number, (part, views)): (usize, (&Part, &Vec<usize>))| {
-            let points = self.dataset.points.iter();
-            let points = points.filter(|point| part.halo.contains(point.position)).count();
-            let steps = (left * views.len() as f64 / all.max(1) as f64).round() as u64;
-            let gaussians = part.share * self.config.max_gaussians as f64;
-            self.row(block_id(number), views.len(), points, steps, gaussians)
-        };
-        parts.iter().zip(serving).enumerate().map(row).collect()
-    }
-
-    /// The block on these views; its dataset's path is set where it is written.
-    fn block(&self, id: &str, plan: &str, cells: [Cell; 2], views: &[usize]) -> Block {
-        let mut block = Block::new(id, plan, self.dataset.root.clone(), cells);
-        let name = |&view: &usize| self.dataset.views[self.visibility.training[view]].name.clone();
-        block.views = views.iter().map(name).collect();
-        let points = (0..).zip(&self.dataset.points);
-        let inside = points.filter(|(_, point)| block.halo.contains(point.position));
-        block.points = inside.map(|(number, _)| number).collect();
-        block
-    }
-}
-
 /// The checksum of a plan's numbers and cells.
 fn checksum(file: &PlanFile, parts: &[Part]) -> Result<String> {
     let text = toml::to_string(file).map_err(|error| Error::Usage(error.to_string()))?;
@@ -329,119 +246,6 @@ fn checksum(file: &PlanFile, parts: &[Part]) -> Result<String> {
         hasher.write_numbers(&cell.to);
     }
     Ok(hash::text(hasher.finish()))
-}
-
-impl BlockPlan {
-    /// Writes the plan into a folder, `tasks.jsonl` last. The same plan may be written again.
-    ///
-    /// # Errors
-    /// The folder contains another plan, or cannot be written.
-    pub(crate) fn save(mut self, folder: &Path) -> Result<Vec<Task>> {
-        let path = folder.join(PLAN);
-        if path.is_file() && PlanFile::load(folder)? != self.file {
-            let problem = format!(
-                "{} contains a plan with other settings or photographs; choose another folder",
-                folder.display()
-            );
-            return Err(Error::Usage(problem));
-        }
-        output::create_folder(folder)?;
-        let root = absolute(&self.coarse.dataset)?;
-        self.config.dataset = relative(&root, folder)?;
-        let tasks = self.tasks();
-        self.law.save(&folder.join(LAW))?;
-        write(&folder.join(CONFIG), self.config.to_toml())?;
-        write(&folder.join(FRAME), frame_file(&self.config))?;
-        let coarse = (self.coarse_settings(), &self.coarse);
-        let others = self.file.blocks.iter().map(|row| self.block_settings(row)).zip(&self.blocks);
-        for (settings, block) in std::iter::once(coarse).chain(others) {
-            let place = folder.join(place(&block.id));
-            output::create_folder(&place)?;
-            let mut block = block.clone();
-            block.dataset = relative(&root, &place)?;
-            block.save(&place)?;
-            write(&place.join(CONFIG), settings.to_toml())?;
-        }
-        let text = toml::to_string(&self.file).map_err(|error| Error::Usage(error.to_string()));
-        write(&path, text)?;
-        write(&folder.join(TASKS), task::lines(&tasks))?;
-        Ok(tasks)
-    }
-
-    fn tasks(&self) -> Vec<Task> {
-        let PlanFile { coarse, blocks, .. } = &self.file;
-        let mut tasks = vec![self.training(coarse, vec![])];
-        tasks.extend(blocks.iter().map(|row| self.training(row, vec![COARSE.to_owned()])));
-        let largest = blocks.iter().map(|row| row.disk).max().unwrap_or_default();
-        tasks.push(Task {
-            id: "join".to_owned(),
-            needs: blocks.iter().map(|row| row.id.clone()).collect(),
-            argv: ["nightsplat", "blocks", "join", "."].map(str::to_owned).to_vec(),
-            memory: 2 * largest,
-            disk: blocks.iter().map(|row| row.disk).sum(),
-            gpu: 0,
-            done: MANIFEST.to_owned(),
-        });
-        tasks
-    }
-
-    fn training(&self, row: &Row, needs: Vec<String>) -> Task {
-        let place = place(&row.id);
-        let [config, run] = [CONFIG, "run"].map(|name| format!("{place}/{name}"));
-        let argv = ["nightsplat", "train", &place, "--config", &config, "--out", &run, "--resume"];
-        let argv = argv.map(str::to_owned).to_vec();
-        let done = format!("{run}/done.json");
-        Task {
-            id: row.id.clone(),
-            needs,
-            argv,
-            memory: self.file.memory,
-            disk: row.disk,
-            gpu: 1,
-            done,
-        }
-    }
-
-    /// The settings of a task, with paths from the plan's folder.
-    fn settings(&self, row: &Row) -> TrainConfig {
-        let memory = Some(CacheSize(self.file.memory));
-        TrainConfig {
-            dataset: place(&row.id).into(),
-            steps: row.steps,
-            seed: row.seed,
-            max_gaussians: row.gaussians,
-            max_vram: memory,
-            max_ram: memory,
-            ..self.config.clone()
-        }
-    }
-
-    /// The coarse model is trained at half size. Blocks go on from it, so it has no cooldown.
-    fn coarse_settings(&self) -> TrainConfig {
-        let settings = self.settings(&self.file.coarse);
-        let schedule = Schedule { cooldown_steps: 0, ..settings.schedule.clone() };
-        TrainConfig {
-            schedule,
-            downscale: 2.0 * settings.downscale,
-            max_resolution: settings.max_resolution.div_ceil(2),
-            ..settings
-        }
-    }
-
-    /// A block goes on where the coarse model ends. Its views are fewer, so that a step of it stands for several of the
-    /// whole scene: the schedule is as much faster.
-    fn block_settings(&self, row: &Row) -> TrainConfig {
-        let done = self.file.coarse.steps;
-        let left = self.config.steps.saturating_sub(done).max(1);
-        let schedule = self.config.schedule.from_step(done, row.steps as f64 / left as f64);
-        let init = Some(format!("{COARSE}/run/model.ply").into());
-        TrainConfig { init, schedule, ..self.settings(row) }
-    }
-}
-
-/// The folder of a task that trains, relative to the plan's.
-fn place(id: &str) -> String {
-    if id == COARSE { id.to_owned() } else { format!("{BLOCKS}/{id}") }
 }
 
 impl PlanFile {
@@ -471,32 +275,4 @@ impl PlanFile {
         let problem = "has changed since the plan was made; plan anew in another folder";
         Err(Error::input(&config.dataset, problem))
     }
-}
-
-/// What `train --frame` reads.
-fn frame_file(config: &TrainConfig) -> Result<String> {
-    #[derive(Serialize)]
-    struct Frame {
-        extent: Option<f64>,
-        up: Option<[f64; 3]>,
-        near: f64,
-        frame: Option<crate::camera::TrainingFrame>,
-    }
-    let TrainConfig { extent, up, near, frame, .. } = *config;
-    toml::to_string(&Frame { extent, up, near, frame })
-        .map_err(|error| Error::Usage(error.to_string()))
-}
-
-fn write(path: &Path, text: Result<String>) -> Result<()> {
-    output::write_whole(path, text?.as_bytes())
-}
-
-fn absolute(path: &Path) -> Result<PathBuf> {
-    let unreadable = |error| Error::input(path, format!("cannot be found: {error}"));
-    path.canonicalize().or_else(|_| std::path::absolute(path)).map_err(unreadable)
-}
-
-/// A path from an existing folder, so that both may move together.
-fn relative(path: &Path, folder: &Path) -> Result<PathBuf> {
-    Ok(pathdiff::diff_paths(path, absolute(folder)?).unwrap_or_else(|| path.to_owned()))
 }

@@ -13,7 +13,7 @@ use super::train::TrainOptions;
 use super::{driver, finish, table, word};
 use crate::Error;
 use crate::base::output::{check_writable, printable};
-use crate::blocks::{self, BlockPlan, Request, Row};
+use crate::blocks::{self, BlockPlan, MAX_ROUNDS, Request, Row};
 use crate::gpu::DeviceChoice;
 use crate::train::{CacheSize, PlanSource};
 
@@ -39,7 +39,7 @@ enum BlocksCommand {
 
 /// Measure the photographs once, and cut the scene into blocks that fit the memory of a worker.
 ///
-/// --steps counts the steps of all blocks together: a quarter is for a coarse model, from which every block starts, the
+/// --steps counts the steps of all blocks together: an eighth is for a coarse model, from which every block starts, the
 /// rest is shared by views. --max-gaussians counts the Gaussians of the whole scene.
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = "Example:
@@ -57,6 +57,11 @@ pub struct PlanArgs {
     /// Number of blocks, in place of as many as the memory asks for
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(2..=9999))]
     pub blocks: Option<u16>,
+    /// How often every block trains; from the second time on, its neighbours are those of the round before, so that they
+    /// fit together
+    #[arg(long, value_name = "N", default_value_t = 2,
+        value_parser = clap::value_parser!(u8).range(1..=i64::from(MAX_ROUNDS)))]
+    pub rounds: u8,
     /// Settings that `nightsplat diagnose --plan` wrote; none: defaults [default: diagnose the photographs]
     #[arg(long, value_name = "FILE|none")]
     pub plan: Option<PathBuf>,
@@ -85,6 +90,9 @@ pub struct RunArgs {
 pub struct JoinArgs {
     /// Folder of the plan
     pub city: PathBuf,
+    /// Join the blocks of this round instead of the last
+    #[arg(long, value_name = "N")]
+    pub round: Option<u8>,
     /// Refuse blocks that were trained on several devices or drivers, whose bits may differ
     #[arg(long)]
     pub same_device: bool,
@@ -125,7 +133,7 @@ fn plan(args: &PlanArgs) -> Result<()> {
         Some(CacheSize(bytes)) => bytes,
         None => gpu.properties().memory,
     };
-    let request = Request { memory, blocks: args.blocks.map(usize::from) };
+    let request = Request { memory, blocks: args.blocks.map(usize::from), rounds: args.rounds };
     let plan = blocks::plan(planned, &request)?;
     if args.json {
         writeln!(std::io::stdout(), "{:#}", serde_json::json!(plan.file))?;
@@ -173,16 +181,16 @@ fn run_tasks(args: &RunArgs) -> Result<()> {
 }
 
 fn join(args: &JoinArgs) -> Result<()> {
-    let joined = blocks::join(&args.city, args.same_device, |tile| {
+    let joined = blocks::join(&args.city, args.round, args.same_device, |tile| {
         tracing::info!("{}: {} Gaussians", tile.file.display(), tile.count);
     })?;
     let (count, tiles) = (joined.manifest.count, joined.manifest.tiles.len());
-    let cropped = joined.cropped;
+    let (cropped, model) = (joined.cropped, &joined.manifest.folder);
     writeln!(
         std::io::stdout(),
         "{count} Gaussians in {tiles} tiles; {cropped} of the blocks lie outside their cores and are left out"
     )?;
-    finish(&format!("{}/model/manifest.json", args.city.display()), &next(&args.city))
+    finish(&model.join("manifest.json").display().to_string(), &next(&args.city))
 }
 
 fn next(city: &Path) -> String {

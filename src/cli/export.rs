@@ -21,9 +21,9 @@ use crate::results::export::page::{Bookmark, Page, Picture, moved};
 use crate::results::export::streamed::{self, Division, MAX_LEVELS, Tile, Written};
 use crate::results::export::{Format, Provenance, spz};
 use crate::results::finished_run::{FinishedRun, config_of_file, is_model, needs_photographs};
-use crate::results::joined::Manifest;
 use crate::results::linear_light::linear_gaussians;
 use crate::results::models;
+use crate::splats::joined::Manifest;
 use crate::splats::levels;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE};
@@ -135,7 +135,7 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     check_linear(args)?;
     if args.to == To::StreamedSog
         && !is_model(&args.run)
-        && let Some(manifest) = Manifest::at(&args.run)?
+        && let Some(manifest) = Manifest::of_scene(&args.run)?
     {
         return Ok(tiles::write(args, &manifest)?);
     }

@@ -6,6 +6,7 @@ use super::TrainConfig;
 use crate::camera::Camera;
 use crate::photographs::dataset::Dataset;
 use crate::photographs::dataset::block::{Block, Cell};
+use crate::splats::joined::{MANIFEST, Manifest};
 use crate::splats::scene::Gaussians;
 use crate::{Error, Result};
 
@@ -23,40 +24,35 @@ pub(super) struct Initial {
 }
 
 impl Initial {
-    /// The Gaussians of [`TrainConfig::init`], divided by the halo of the dataset's block if it is one.
+    /// The Gaussians of [`TrainConfig::init`], divided by the halo of the dataset's block if it is one. A model in tiles
+    /// is read one tile after the other.
     ///
     /// # Errors
-    /// The file cannot be read or does not fit the model, or none of its Gaussians is in the halo.
+    /// A file cannot be read or does not fit the model, or none of its Gaussians is in the halo.
     pub(super) fn of(config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
-        let Some(gaussians) = config.initial_model()? else { return Ok(Self::default()) };
+        let Some(path) = &config.init else { return Ok(Self::default()) };
+        let files = match path.join(MANIFEST).is_file() {
+            true => Manifest::load(path)?.files(),
+            false => vec![path.clone()],
+        };
         let block = Block::at(&dataset.root)?.filter(|block| block.halo != Cell::WORLD);
-        let Some(Block { id, halo, .. }) = block else {
-            return Ok(Self { gaussians: Some(gaussians), context: None });
-        };
-        let positions = (0..gaussians.count).map(|index| gaussians.position(index));
-        let is_own: Vec<bool> = positions.map(|position| halo.contains(position)).collect();
-        if !is_own.contains(&true) {
-            let problem =
-                format!("has no Gaussian in the halo of block {id}; it is of another scene");
-            let path = config.init.clone().unwrap_or_default();
-            return Err(Error::input(path, problem));
-        }
         let cameras: Vec<Camera> = dataset.train_views().map(|view| view.camera).collect();
-        let is_seen = |index: usize| {
-            let position = gaussians.position(index);
-            !is_own[index]
-                && cameras.iter().any(|camera| camera.sees_within(position, MARGIN).is_some())
-        };
-        let is_context: Vec<bool> = (0..gaussians.count).into_par_iter().map(is_seen).collect();
-        let mut context = gaussians.clone();
-        context.retain(&is_context);
-        let mut own = gaussians;
-        own.retain(&is_own);
-        tracing::info!("{} Gaussians around the block are rendered and not trained", context.count);
-        Ok(Self {
-            gaussians: Some(own),
-            context: Some(context).filter(|context| context.count > 0),
-        })
+        let mut initial = Self::default();
+        for file in files {
+            let mut own = config.initial_model(&file)?;
+            if let Some(Block { halo, .. }) = &block {
+                Gaussians::add(&mut initial.context, around(&mut own, halo, &cameras));
+            }
+            Gaussians::add(&mut initial.gaussians, own);
+        }
+        match (&block, &initial.gaussians) {
+            (Some(Block { id, .. }), None) => {
+                let problem =
+                    format!("has no Gaussian in the halo of block {id}; it is of another scene");
+                Err(Error::input(path, problem))
+            }
+            _ => Ok(initial),
+        }
     }
 
     /// The context alone, for a training whose Gaussians come from a checkpoint. Where there is no block,
@@ -70,4 +66,21 @@ impl Initial {
             Some(_) => Ok(Self { gaussians: None, ..Self::of(config, dataset)? }),
         }
     }
+}
+
+/// Removes the Gaussians outside the halo, and returns those of them that a camera sees.
+fn around(gaussians: &mut Gaussians, halo: &Cell, cameras: &[Camera]) -> Gaussians {
+    let places = 0..gaussians.count;
+    let is_own: Vec<bool> =
+        places.clone().map(|index| halo.contains(gaussians.position(index))).collect();
+    let is_seen = |index: usize| {
+        let position = gaussians.position(index);
+        let sees = |camera: &Camera| camera.sees_within(position, MARGIN).is_some();
+        !is_own[index] && cameras.iter().any(sees)
+    };
+    let is_context: Vec<bool> = places.into_par_iter().map(is_seen).collect();
+    let mut context = gaussians.clone();
+    context.retain(&is_context);
+    gaussians.retain(&is_own);
+    context
 }

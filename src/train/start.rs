@@ -1,6 +1,7 @@
 //! Construction of a trainer from a configuration and a dataset.
 
 use std::panic::resume_unwind;
+use std::path::Path;
 use std::thread::{self, ScopedJoinHandle};
 
 use glam::UVec2;
@@ -30,12 +31,12 @@ use crate::splats::scene::{FEATURES, Gaussians, Shape, ply};
 use crate::{Error, Result};
 
 impl TrainConfig {
-    /// The Gaussians of [`TrainConfig::init`] in the shape of the configured model; further features are dropped.
+    /// The Gaussians of a file of [`TrainConfig::init`] in the shape of the configured model; further features are
+    /// dropped.
     ///
     /// # Errors
     /// The file is not a model, has a higher SH degree, or lacks a feature of the configured model.
-    pub(super) fn initial_model(&self) -> Result<Option<Gaussians>> {
-        let Some(path) = &self.init else { return Ok(None) };
+    pub(super) fn initial_model(&self, path: &Path) -> Result<Gaussians> {
         let mut gaussians = ply::load(path)?;
         let (Shape { sh_degree, features }, own) = (self.render_settings().shape, gaussians.shape);
         if own.sh_degree > sh_degree {
@@ -56,7 +57,7 @@ impl TrainConfig {
         if self.model.raw_colors {
             gaussians.shift_colors(0.5);
         }
-        Ok(Some(gaussians.with_features(features)))
+        Ok(gaussians.with_features(features))
     }
 
     /// The SH degree in use at a step, at most `highest`.

@@ -7,8 +7,8 @@ use super::{ExportArgs, own_file, provenance, streamed_line, up};
 use crate::Result;
 use crate::results::export::Provenance;
 use crate::results::export::streamed::{self, Division, Tile};
-use crate::results::joined::Manifest;
 use crate::results::run;
+use crate::splats::joined::Manifest;
 
 /// Writes the tiles of a manifest, and returns the folder and a line on its contents.
 pub(super) fn write(args: &ExportArgs, manifest: &Manifest) -> Result<(PathBuf, String)> {
@@ -17,11 +17,12 @@ pub(super) fn write(args: &ExportArgs, manifest: &Manifest) -> Result<(PathBuf, 
     let facts = config.facts(&config.frame.unwrap_or_default());
     let provenance = Provenance { rotation, facts, ..provenance(args, &config) };
     let tiles: Vec<Tile<'_>> = manifest
-        .level(0)
+        .tiles
+        .iter()
         .map(|tile| Tile {
-            name: args.run.join(&tile.file),
+            name: manifest.folder.join(&tile.file),
             count: tile.count,
-            load: Box::new(move || Ok(Cow::Owned(up::turned(tile.load(&args.run)?, rotation)))),
+            load: Box::new(move || Ok(Cow::Owned(up::turned(manifest.read(tile)?, rotation)))),
         })
         .collect();
     let out = args.out.clone().unwrap_or_else(|| own_file(args));

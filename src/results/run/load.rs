@@ -11,7 +11,7 @@ use super::generations;
 use crate::gpu::Gpu;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::Dataset;
-use crate::results::joined::Manifest;
+use crate::splats::joined::Manifest;
 use crate::splats::scene::{Features, Gaussians, ply};
 use crate::train::{ModelConfig, Networks, TrainConfig};
 use crate::{Error, Result};
@@ -67,8 +67,8 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
 /// The run neither finished nor reached a checkpoint, or a file is missing or truncated.
 pub fn load_gaussians(run: &Path) -> Result<Gaussians> {
     let path = run.join("model.ply");
-    if let Some(manifest) = Manifest::at(run)? {
-        return manifest.gaussians(run);
+    if let Some(manifest) = Manifest::of_scene(run)? {
+        return manifest.gaussians();
     }
     if !path.is_file() {
         let problem = "has no model.ply: the run neither finished nor reached a checkpoint; train it again, or \

@@ -156,6 +156,20 @@ impl Gaussians {
         })
     }
 
+    /// Appends Gaussians of the same features to those that there are, if any; the higher SH degree is that of both.
+    #[cfg(feature = "io")]
+    pub(crate) fn add(to: &mut Option<Self>, more: Self) {
+        match to {
+            _ if more.count == 0 => {}
+            None => *to = Some(more),
+            Some(own) => {
+                let degree = own.shape.sh_degree.max(more.shape.sh_degree);
+                *own = own.with_sh_degree(degree);
+                own.append(&more.with_sh_degree(degree));
+            }
+        }
+    }
+
     /// The position of a Gaussian in the world.
     #[cfg(feature = "io")]
     pub(crate) fn position(&self, index: usize) -> DVec3 {

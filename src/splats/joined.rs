@@ -1,0 +1,117 @@
+//! A model in tiles: `manifest.json` lists the files, `0/0007.ply` is the tile of block 0007. The tiles are disjoint, and
+//! together they are the model.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::base::input;
+use crate::photographs::dataset::block::Cell;
+use crate::splats::scene::{Gaussians, ply};
+use crate::{Error, Result};
+
+/// The file that lists the tiles.
+pub(crate) const MANIFEST: &str = "manifest.json";
+/// The folder of the joined model in that of a scene.
+pub(crate) const MODEL: &str = "model";
+
+pub(crate) const VERSION: u32 = 1;
+
+/// The tiles of a model.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Manifest {
+    pub(crate) version: u32,
+    /// The checksum of the plan of blocks.
+    pub(crate) plan: String,
+    /// The origin of the positions in the tiles, in the dataset's world.
+    pub(crate) origin: [f64; 3],
+    /// The number of Gaussians.
+    pub(crate) count: usize,
+    /// The devices on which the blocks were trained, by name and driver.
+    pub(crate) devices: Vec<String>,
+    /// In the order of the blocks.
+    pub(crate) tiles: Vec<Tile>,
+    /// The folder that it was read from.
+    #[serde(skip)]
+    pub(crate) folder: PathBuf,
+}
+
+/// A file of a model.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Tile {
+    /// The name of its block.
+    pub(crate) id: String,
+    /// The file, relative to the manifest's folder.
+    pub(crate) file: PathBuf,
+    pub(crate) count: usize,
+    /// Corners of the box of the means, in the dataset's world; empty tiles have none.
+    pub(crate) bounds: Option<Cell>,
+    /// Of the file.
+    pub(crate) sha256: String,
+}
+
+impl Manifest {
+    /// The manifest of the model of a scene; `None` if it is not in tiles.
+    ///
+    /// # Errors
+    /// Those of [`Self::load`].
+    pub(crate) fn of_scene(folder: &Path) -> Result<Option<Self>> {
+        let model = folder.join(MODEL);
+        if model.join(MANIFEST).is_file() { Self::load(&model).map(Some) } else { Ok(None) }
+    }
+
+    /// The manifest in a folder.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if there is none, or it is damaged or of another version.
+    pub(crate) fn load(folder: &Path) -> Result<Self> {
+        let path = folder.join(MANIFEST);
+        let wrong =
+            |problem: String| Error::input(&path, format!("{problem}; join the blocks anew"));
+        let mut manifest: Self = serde_json::from_str(&input::text(&path)?)
+            .map_err(|error| wrong(format!("is not a manifest: {error}")))?;
+        if manifest.version != VERSION {
+            let version = manifest.version;
+            return Err(wrong(format!("has version {version}, this program reads {VERSION}")));
+        }
+        folder.clone_into(&mut manifest.folder);
+        Ok(manifest)
+    }
+
+    /// The files of the tiles.
+    pub(crate) fn files(&self) -> Vec<PathBuf> {
+        self.tiles.iter().map(|tile| self.folder.join(&tile.file)).collect()
+    }
+
+    /// The whole model.
+    ///
+    /// # Errors
+    /// A tile is missing or damaged, or has another number of Gaussians.
+    pub(crate) fn gaussians(&self) -> Result<Gaussians> {
+        let mut whole: Option<Gaussians> = None;
+        for tile in &self.tiles {
+            Gaussians::add(&mut whole, self.read(tile)?);
+        }
+        let problem = "has no Gaussians; join the blocks anew";
+        whole.ok_or_else(|| Error::input(self.folder.join(MANIFEST), problem))
+    }
+
+    /// Reads a tile.
+    ///
+    /// # Errors
+    /// Those of [`Self::gaussians`].
+    pub(crate) fn read(&self, tile: &Tile) -> Result<Gaussians> {
+        let path = self.folder.join(&tile.file);
+        let gaussians = ply::load(&path)?;
+        if gaussians.count == tile.count {
+            return Ok(gaussians);
+        }
+        let problem = format!(
+            "has {} Gaussians, the manifest states {}; join the blocks anew",
+            gaussians.count, tile.count
+        );
+        Err(Error::input(&path, problem))
+    }
+}
