@@ -246,7 +246,7 @@ results() {
     echo "step, ms: 1 000 000 at 1080p: $(tr '\n' ' ' <<< "$many")"
     members many.json kernels | head -n 5 | while read -r name ms; do
         members many.json gb_per_s_at_most | awk -v name="$name" -v ms="$ms" -v copy="${copy:-0}" \
-            '$1 == name { printf "%s %.3f ms, %.0f %% of the copy; ", name, ms, copy > 0 ? 100 * $2 / copy : 0 }'
+            '$1 == name { printf "%s %.3f ms, %.0f %% of the copy; ", name, ms, (copy > 0 ? 100 * $2 / copy : 0) }'
     done
     echo
     echo "tiles: $(cat "$work/tiles.json" 2> /dev/null | tr -d ' \n' | sed 's/.*"tiles"://')"
