@@ -30,12 +30,16 @@ const FADED: f64 = 0.5;
 /// Standard deviations of the views' error, over what a Gaussian adds, that are no chance.
 const DEVIATIONS: f64 = 4.0;
 /// The most rounds in which candidates come back or are removed.
-const SETTLING_ROUNDS: usize = 8;
+const SETTLING_ROUNDS: usize = 12;
+/// Opacities follow the error this many times: what many floaters hid is seen when those are gone.
+const PASSES: usize = 2;
 /// The share of its opacity at which a candidate is rendered, and one at which nothing is.
 const FAINT: f64 = 0.1;
 const ABSENT: f64 = 1e-6;
 /// The standard deviations by which the views fit worse with a floater; lower, as faint candidates add to the error.
 const RETURN_DEVIATIONS: f64 = 3.0;
+/// The first rounds decide on the surest floaters: by this many times the deviations, which is halved in every round.
+const SUREST: f64 = 32.0;
 /// The squared light below which no view sees a Gaussian: a hundredth of one value of one pixel.
 const UNSEEN: f64 = 1e-4;
 /// An unseen Gaussian stands alone from this many times the median distance to its neighbours.
@@ -62,8 +66,14 @@ pub(super) fn found<'a>(
     measured: impl Fn(&Gaussians) -> Measured<'a>,
 ) -> Result<Found> {
     let evidence_of = |shares: &[f64]| measured(&faded(gaussians, shares)).evidence(targets);
-    let shares = fade(gaussians.count, evidence_of)?;
-    let mut keep = settled(&shares, evidence_of)?;
+    let mut keep = vec![true; gaussians.count];
+    for _ in 0..PASSES {
+        let shares = fade(&keep, evidence_of)?;
+        let before = std::mem::replace(&mut keep, settled(&shares, evidence_of)?);
+        if keep == before {
+            break;
+        }
+    }
     let contradicted = keep.iter().filter(|keep| !**keep).count();
     let unseen = drop_unseen(gaussians, &mut keep, (cameras, near), |rest| {
         measured(rest).evidence(targets)
@@ -71,9 +81,10 @@ pub(super) fn found<'a>(
     Ok(Found { keep, contradicted, unseen })
 }
 
-/// Lets opacities follow the error; returns the share of each that is left.
-fn fade(count: usize, evidence_of: impl Fn(&[f64]) -> Result<Evidence>) -> Result<Vec<f64>> {
-    let mut shares = vec![1.0; count];
+/// Lets opacities of what is kept follow the error; returns the share of each that is left.
+fn fade(keep: &[bool], evidence_of: impl Fn(&[f64]) -> Result<Evidence>) -> Result<Vec<f64>> {
+    let mut shares: Vec<f64> = keep.iter().map(|keep| if *keep { 1.0 } else { ABSENT }).collect();
+    let first = shares.clone();
     let mut best: Option<(Vec<f64>, Evidence)> = None;
     let [mut step, least_step] = STEPS;
     for round in 0..FADE_ROUNDS {
@@ -94,13 +105,16 @@ fn fade(count: usize, evidence_of: impl Fn(&[f64]) -> Result<Evidence>) -> Resul
         }
         let Some((from, evidence)) = &best else { break };
         let stepped = |(index, share): (usize, &f64)| {
+            if !keep[index] {
+                return *share;
+            }
             let [most, longest] = GROWTH;
             let change = step * share * evidence.best_step(index, longest);
             (share - change.max(-most)).clamp(LEAST_SHARE, 1.0)
         };
         shares = from.iter().enumerate().map(stepped).collect();
     }
-    Ok(best.map_or_else(|| vec![1.0; count], |(shares, _)| shares))
+    Ok(best.map_or(first, |(shares, _)| shares))
 }
 
 /// What is known of a Gaussian.
@@ -116,11 +130,13 @@ enum Verdict {
 
 /// Decides on what has faded; returns which Gaussians are no floaters.
 fn settled(shares: &[f64], evidence_of: impl Fn(&[f64]) -> Result<Evidence>) -> Result<Vec<bool>> {
-    let first = |share: &f64| match *share < FADED {
-        true => Verdict::Candidate,
-        false => Verdict::Supported,
+    let first = |share: &f64| match *share {
+        share if share < LEAST_SHARE => Verdict::Floater,
+        share if share < FADED => Verdict::Candidate,
+        _ => Verdict::Supported,
     };
     let mut verdicts: Vec<Verdict> = shares.iter().map(first).collect();
+    let mut surest = SUREST;
     for round in 0..SETTLING_ROUNDS {
         let share = |verdict: &Verdict| match verdict {
             Verdict::Supported | Verdict::Returned => 1.0,
@@ -132,7 +148,7 @@ fn settled(shares: &[f64], evidence_of: impl Fn(&[f64]) -> Result<Evidence>) -> 
         let next: Vec<Verdict> = (0..)
             .zip(&verdicts)
             .map(|(index, verdict)| match verdict {
-                Verdict::Candidate => evidence.of_candidate(index),
+                Verdict::Candidate => evidence.of_candidate(index, surest),
                 Verdict::Returned if evidence.contradicts(index) => Verdict::Floater,
                 verdict => *verdict,
             })
@@ -141,11 +157,14 @@ fn settled(shares: &[f64], evidence_of: impl Fn(&[f64]) -> Result<Evidence>) -> 
         let [candidates, floaters] = [Verdict::Candidate, Verdict::Floater].map(count);
         let error = evidence.error;
         tracing::debug!("round {round}: {candidates} open, {floaters} floaters, error {error:.6}");
-        if std::mem::replace(&mut verdicts, next) == verdicts {
+        if std::mem::replace(&mut verdicts, next) == verdicts && surest <= 1.0 {
             break;
         }
+        surest = (surest / 2.0).max(1.0);
     }
-    Ok(verdicts.iter().map(|verdict| *verdict != Verdict::Floater).collect())
+    // What is refused to the end is a floater, whatever else adds to the error there.
+    let stays = |verdict: &Verdict| matches!(verdict, Verdict::Supported | Verdict::Returned);
+    Ok(verdicts.iter().map(stays).collect())
 }
 
 impl Evidence {
@@ -161,14 +180,19 @@ impl Evidence {
         }
     }
 
-    /// What the views say of a candidate, which was rendered at [`FAINT`].
-    fn of_candidate(&self, index: usize) -> Verdict {
+    /// What the views say of a candidate, which was rendered at [`FAINT`], if only the surest floaters are decided on.
+    fn of_candidate(&self, index: usize, surest: f64) -> Verdict {
         let [product, square] = [self.product[index] / FAINT, self.square[index] / (FAINT * FAINT)];
-        if product + square <= RETURN_DEVIATIONS * 2.0 * (self.error * square).sqrt() {
+        let chance = RETURN_DEVIATIONS * 2.0 * (self.error * square).sqrt();
+        if product + square <= chance {
             return Verdict::Returned;
         }
         // More than all of it would have to go: others cause that, which may be floaters themselves.
-        if product > 2.0 * square { Verdict::Candidate } else { Verdict::Floater }
+        let is_caused_by_others = product > 2.0 * square;
+        if is_caused_by_others || product + square <= surest * chance {
+            return Verdict::Candidate;
+        }
+        Verdict::Floater
     }
 
     /// Whether the views would fit better without a Gaussian, and without just about all of it.
