@@ -57,7 +57,10 @@ impl FinishedRun {
         if let Some(dataset) = dataset {
             config.move_dataset(dataset);
         }
+        let trained_at = config.downscale;
         change(&mut config);
+        // At another size, every view is another one.
+        let is_comparable = config.downscale == trained_at;
         let facts = config.facts(&config.frame.unwrap_or_default());
         let model = Model::of_shown(run::load_gaussians(folder)?, &facts);
         if !config.dataset.is_dir() {
@@ -76,7 +79,7 @@ impl FinishedRun {
             None => (opener.open)(&config.device.parse()?)?,
         };
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
-        if let Some(difference) = run::other_views(folder, &dataset) {
+        if let Some(difference) = run::other_views(folder, &dataset).filter(|_| is_comparable) {
             let root = dataset.root.display();
             tracing::warn!("{root} differs from the dataset of {}: {difference}", folder.display());
         }

@@ -37,7 +37,7 @@ fn renders_are_written_and_scored_in_the_light_of_the_photographs() {
     for column in ["PSNR, aligned", "PSNR, dark", "stops"] {
         assert!(table.contains(column), "{table}");
     }
-    refused(&format!("eval {run_at} --downscale 0.5"), 2, &["downscale is 0.5", "at least 1"]);
+    refused(&format!("eval {run_at} --downscale 0.5"), 2, &["is 0.5", "at least 1"]);
 
     let render = |out: &str, options: &str| {
         let out = at(out);
