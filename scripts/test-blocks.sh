@@ -291,15 +291,15 @@ cp -r serial/model first
 plan other --blocks 4 --steps 1000 --max-gaussians 4000 --memory 1G --seed 2
 for model in joined none; do
     [ "$model" = joined ] || rm -r serial/model
-    mv serial/blocks/0001 away
-    refused 3 "0001: is missing"
-    cp -r other/blocks/0001 serial/blocks/
+    mv serial/blocks/0001-2 away
+    refused 3 "0001-2: is missing"
+    cp -r other/blocks/0001-2 serial/blocks/
     refused 3 "another plan"
-    rm -r serial/blocks/0001
-    mv away serial/blocks/0001
-    mv serial/blocks/0003/run/done.json away
-    refused 3 "block 0003 is not done"
-    mv away serial/blocks/0003/run/done.json
+    rm -r serial/blocks/0001-2
+    mv away serial/blocks/0001-2
+    mv serial/blocks/0003-2/run/done.json away
+    refused 3 "block 0003-2 is not done"
+    mv away serial/blocks/0003-2/run/done.json
 done
 photograph=$(find street/low -type f | head -n 1)
 touch -r "$photograph" before

@@ -140,7 +140,9 @@ fn write_tile(folder: &Path, model: &Path, block: &Block) -> Result<(Tile, usize
     let inside: Vec<bool> =
         (0..before).map(|index| block.core.contains(gaussians.position(index))).collect();
     gaussians.retain(&inside);
-    let file = Path::new(TILES).join(format!("{id}.ply"));
+    // Without the number of the round.
+    let name = id.split('-').next().unwrap_or(id);
+    let file = Path::new(TILES).join(format!("{name}.ply"));
     let path = model.join(&file);
     let origin = gaussians.origin.to_array();
     let provenance = Provenance { facts, ..Provenance::default() };
@@ -156,7 +158,7 @@ fn write_tile(folder: &Path, model: &Path, block: &Block) -> Result<(Tile, usize
     }
     let sha256 = hex(&Sha256::digest(input::bytes(&path)?));
     let bounds = bounds(&written);
-    let tile = Tile { id: id.clone(), file, count: written.count, bounds, sha256 };
+    let tile = Tile { id: name.to_owned(), file, count: written.count, bounds, sha256 };
     Ok((tile, before - written.count, origin))
 }
 

@@ -88,7 +88,7 @@ fn a_plan_has_the_same_bytes_on_any_number_of_threads_and_may_be_made_again() {
     }
     succeed(&city.plan("two", PLAN));
     let [one, two] = ["one", "two"].map(|out| files(&city.path(out)));
-    assert_eq!(one.len(), 3 * 3 + 5, "{:?}", one.iter().map(|(name, _)| name).collect::<Vec<_>>());
+    assert_eq!(one.len(), 5 * 3 + 5, "{:?}", one.iter().map(|(name, _)| name).collect::<Vec<_>>());
     assert!(one == two, "another plan");
 }
 
@@ -99,10 +99,10 @@ fn a_dry_run_writes_nothing() {
     assert!(text.contains("2 blocks, each with"), "{text}");
     let json = succeed(&city.plan("dry", &format!("{PLAN} --dry-run --json")));
     let json: Value = serde_json::from_str(&json).unwrap();
-    assert_eq!(json["block"].as_array().unwrap().len(), 2);
+    assert_eq!(json["block"].as_array().unwrap().len(), 4);
     let steps = |row: &Value| row["steps"].as_u64().unwrap();
     let blocks: u64 = json["block"].as_array().unwrap().iter().map(steps).sum();
-    assert_eq!((steps(&json["coarse"]), blocks), (30, 90));
+    assert_eq!((steps(&json["coarse"]), blocks), (15, 105));
     assert!(!city.path("dry").exists());
 }
 
@@ -147,7 +147,7 @@ fn a_view_has_the_same_gain_in_every_block_and_in_a_run_on_all_views() {
     succeed(&format!("train {} --out {} --steps 1 --plan none", street.display(), whole.display()));
     let whole = gains(&whole);
     let mut shared = 0;
-    for block in ["coarse", "blocks/0000", "blocks/0001"] {
+    for block in ["coarse", "blocks/0000", "blocks/0001-2"] {
         let own = gains(&city.path("city").join(block).join("run"));
         assert_eq!(own["model_gain"], whole["model_gain"], "{block}");
         for (view, gain) in own["gains"].as_object().unwrap() {
@@ -164,14 +164,14 @@ fn what_is_done_is_not_done_again_and_what_was_killed_gives_the_same_model() {
     let copy = city.copied();
     let before = manifest(copy.path());
     // As if the second training had been killed before its first checkpoint, and the join had not begun.
-    for gone in ["blocks/0001/run", "model"] {
+    for gone in ["blocks/0001-2/run", "model"] {
         fs::remove_dir_all(copy.path().join(gone)).unwrap();
     }
     let text = succeed(&format!("blocks run {}", copy.path().display()));
-    assert!(text.contains("[2/4] 0000 is done") && !text.contains("0001 is done"), "{text}");
+    assert!(text.contains("[2/7] 0000 is done") && !text.contains("0001-2 is done"), "{text}");
     assert_eq!(manifest(copy.path()), before);
     let again = succeed(&format!("blocks run {}", copy.path().display()));
-    assert!(again.contains("[4/4] join is done"), "{again}");
+    assert!(again.contains("[7/7] join is done"), "{again}");
 }
 
 /// Joins a damaged copy of the plan, which must fail with one line and leave the joined model as it is.
@@ -185,18 +185,20 @@ fn refuses_to_join(parts: &[&str], damage: impl FnOnce(&Path)) {
 
 #[test]
 fn blocks_that_are_missing_unfinished_or_of_another_plan_are_refused_by_name() {
-    refuses_to_join(&["blocks/0001", "is missing"], |city| {
-        fs::remove_dir_all(city.join("blocks/0001")).unwrap();
+    refuses_to_join(&["blocks/0001-2", "is missing"], |city| {
+        fs::remove_dir_all(city.join("blocks/0001-2")).unwrap();
     });
-    refuses_to_join(&["block 0000 is not done", "blocks run"], |city| {
-        fs::remove_file(city.join("blocks/0000/run/done.json")).unwrap();
+    refuses_to_join(&["block 0000-2 is not done", "blocks run"], |city| {
+        fs::remove_file(city.join("blocks/0000-2/run/done.json")).unwrap();
     });
-    refuses_to_join(&["blocks/0000", "of another plan"], |city| {
-        let path = city.join("blocks/0000/block.toml");
+    refuses_to_join(&["blocks/0000-2", "of another plan"], |city| {
+        let path = city.join("blocks/0000-2/block.toml");
         let text = fs::read_to_string(&path).unwrap();
         let other = text.replacen("plan = \"", "plan = \"0", 1);
         fs::write(path, other).unwrap();
     });
+    let copy = city().copied();
+    refused(&format!("blocks join {} --round 3", copy.path().display()), 3, &["no round 3"]);
     refuses_to_join(&["plan.toml", "is not a plan"], |city| {
         fs::write(city.join("plan.toml"), "x = [").unwrap()
     });
@@ -233,7 +235,7 @@ fn two_joins_at_once_and_blocks_of_two_devices_are_refused() {
     lock.lock().unwrap();
     refused(&format!("blocks join {}", copy.path().display()), 1, &["another process"]);
     drop(lock);
-    let metrics = copy.path().join("blocks/0001/run/metrics.json");
+    let metrics = copy.path().join("blocks/0001-2/run/metrics.json");
     let text = fs::read_to_string(&metrics).unwrap();
     assert!(text.contains("\"driver\": \""), "{text}");
     fs::write(&metrics, text.replace("\"driver\": \"", "\"driver\": \"another, ")).unwrap();

@@ -75,7 +75,7 @@ fn taken(run: &Path, path: &Path) -> Error {
     };
     Error::output(
         run,
-        format!("{process} trains in it; wait until that ends, or name another folder"),
+        format!("{process} works in it; wait until that ends, or name another folder"),
     )
 }
 
@@ -104,7 +104,7 @@ mod tests {
             [RunLock::take(folder.path()).unwrap_err(), RunLock::check(folder.path()).unwrap_err()]
         {
             let message = error.to_string();
-            let process = format!("process {} trains in it", std::process::id());
+            let process = format!("process {} works in it", std::process::id());
             assert!(
                 message.contains(&process) && message.contains(folder.path().to_str().unwrap()),
                 "{message}"

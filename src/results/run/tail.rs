@@ -15,7 +15,7 @@ use super::lock::RunLock;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Phase {
-    /// A process trains in its directory.
+    /// A process works in its directory.
     Training,
     /// Its directory is complete.
     Finished,
