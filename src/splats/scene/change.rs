@@ -252,7 +252,7 @@ impl Lengths {
 mod tests {
     use super::*;
     use crate::base::random::Stream;
-    use crate::splats::scene::{Attribute, Features, Shape, width};
+    use crate::splats::scene::{Features, Shape, width};
 
     fn drawn(count: usize, seed: u64) -> Gaussians {
         let shape = Shape { sh_degree: 2, features: Features { noise: true, ..Features::NONE } };

@@ -242,7 +242,6 @@ function renderer(gl, changed) {
     gl.uniform2f(uniform('offset'), fit.left, fit.top);
     gl.uniform2f(uniform('scale'), 2 / width, -2 / height);
     gl.uniform1i(uniform('layer'), fine ? layer : 0);
-    gl.uniform1f(uniform('counts'), fine && layer === 3 ? 1 : 0);
     gl.bindFramebuffer(gl.FRAMEBUFFER, fine ? sums : null);
     gl.viewport(0, 0, width, height);
     if (layer && fine) gl.clearColor(0, 0, 0, 0); else gl.clearColor(grey, grey, grey, 1);

@@ -5,8 +5,9 @@ precision highp float;
 in vec2 fromMean;
 flat in vec3 conic;
 flat in vec4 color;
+flat in float depth;
 
-uniform float counts;  // 1: splats are counted, else 0
+uniform int layer;  // 0: colours, 1: depths, 2: alphas, 3: numbers
 
 out vec4 fragment;
 
@@ -17,6 +18,6 @@ void main() {
     float sigma = 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
     float alpha = min(ALPHA_MAX, color.a * exp(-sigma));
     if (!(sigma >= 0.0 && alpha >= ALPHA_MIN)) discard;
-    // Branches would cost software devices more.
-    fragment = vec4(color.rgb * max(alpha, counts), alpha * (1.0 - counts));
+    if (layer == 3) fragment = vec4(1.0, 0.0, 0.0, 0.0);
+    else fragment = vec4((layer == 1 ? vec3(depth) : color.rgb) * alpha, alpha);
 }

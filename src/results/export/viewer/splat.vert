@@ -12,7 +12,6 @@ uniform vec2 focal, principalPoint, size;  // pixels of the view
 uniform vec2 offset, scale;                // pixels of the view to clip space
 uniform float near;
 uniform uint degree;  // of the harmonics
-uniform int layer;    // 0: colours, 1: depths, 2: alphas, 3: numbers
 
 in vec2 corner;
 in uint id;
@@ -20,6 +19,7 @@ in uint id;
 out vec2 fromMean;  // pixels
 flat out vec3 conic;
 flat out vec4 color;
+flat out float depth;
 
 @CONSTANTS@
 @HARMONICS@
@@ -64,8 +64,7 @@ void main() {
     vec2 reach = sqrt(2.0 * log(opacity / ALPHA_MIN) * vec2(xx, yy)) + 0.5;
     fromMean = corner * reach;
     vec2 pixel = focal * mean.xy / mean.z + principalPoint + fromMean;
-    if (layer == 1) color = vec4(vec3(mean.z), opacity);
-    else if (layer == 3) color = vec4(1.0, 0.0, 0.0, opacity);
-    else color = vec4(shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye)), opacity);
+    depth = mean.z;
+    color = vec4(shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye)), opacity);
     gl_Position = vec4((pixel + offset) * scale + vec2(-1.0, 1.0), 0.0, 1.0);
 }
