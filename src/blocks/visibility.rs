@@ -7,9 +7,9 @@ use super::partition::Part;
 use crate::photographs::dataset::{Dataset, Point, View};
 
 /// A view serves a block that contains this share of its points.
-const SHARE: f64 = 0.15;
+const SHARE: f64 = 0.05;
 /// A view from a direction that a block lacks serves it from this share on.
-const LEAST_SHARE: f64 = 0.05;
+const LEAST_SHARE: f64 = 0.02;
 /// The views of a block from each quarter of the horizon, if there are as many.
 const OF_QUARTER: usize = 3;
 /// The views of the coarse model that see each point, if there are as many.

@@ -166,7 +166,7 @@ fn summary(plan: &BlockPlan) -> String {
     let mut rows = vec![head.map(str::to_owned).to_vec()];
     rows.extend(std::iter::once(&plan.file.coarse).chain(&plan.file.blocks).map(row));
     let (table, count, percent) =
-        (table::aligned(&rows), plan.file.blocks.len(), 100.0 * plan.shared);
+        (table::aligned(&rows), plan.file.round(1).count(), 100.0 * plan.shared);
     format!("{table}{count} blocks, each with {percent:.0} % of the views on average\n")
 }
 
