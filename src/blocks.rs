@@ -8,8 +8,9 @@
 //! - `visibility`: which views show a cell
 //! - `budget`: the memory of a block's training
 //! - `task`: what schedulers read
-//! - `draft`: the numbers of the tasks, and the views and points of the blocks
 //! - `plan`: everything that is measured and decided once
+//! - `draft`: the numbers of the tasks, and the views and points of the blocks
+//! - `planning`: makes a plan
 //! - `folder`: the files of a plan, its tasks and the settings of each
 //! - `join`: the tiles of the joined model
 
@@ -19,9 +20,11 @@ mod folder;
 mod join;
 mod partition;
 mod plan;
+mod planning;
 mod task;
 mod visibility;
 
 pub(crate) use join::join;
-pub(crate) use plan::{BlockPlan, MAX_ROUNDS, Request, Row, plan};
+pub(crate) use plan::{BlockPlan, MAX_ROUNDS, Request, Row};
+pub(crate) use planning::plan;
 pub(crate) use task::{Task, load as load_tasks};

@@ -127,13 +127,13 @@ impl BlockPlan {
         }
     }
 
-    /// The schedule goes on where the round before ends. The views of a block are fewer, so that a step of it stands for
-    /// several of the whole scene: it is as much faster. Only the last round has the cooldown.
+    /// The schedule goes on where the round before ends. The views of a block are fewer, so that a step of it stands
+    /// for several of the whole scene: it is as much faster. Only the last round has the cooldown.
     fn schedule(&self, row: &Row) -> Schedule {
         let steps = |round: u8| self.file.round(round).map(|row| row.steps).sum::<u64>();
         let done = self.file.coarse.steps + (1..row.round).map(steps).sum::<u64>();
-        let pace = row.steps as f64 / steps(row.round).max(1) as f64;
-        let rest = self.config.schedule.from_step(done, pace);
+        let rate = row.steps as f64 / steps(row.round).max(1) as f64;
+        let rest = self.config.schedule.from_step(done, rate);
         match row.round == self.file.rounds() {
             true => rest,
             false => Schedule { cooldown_steps: 0, ..rest },

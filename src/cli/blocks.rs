@@ -57,8 +57,7 @@ pub struct PlanArgs {
     /// Number of blocks, in place of as many as the memory asks for
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(2..=9999))]
     pub blocks: Option<u16>,
-    /// How often every block trains; from the second time on, its neighbours are those of the round before, so that they
-    /// fit together
+    /// How often every block trains; from the second time on, beside its neighbours of the round before, to fit them
     #[arg(long, value_name = "N", default_value_t = 2,
         value_parser = clap::value_parser!(u8).range(1..=i64::from(MAX_ROUNDS)))]
     pub rounds: u8,

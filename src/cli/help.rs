@@ -37,7 +37,10 @@ const GROUPS: [(&str, &str); 6] = [
         "Time, memory and checkpoints",
         "steps max-minutes checkpoint-every checkpoint-minutes device max-vram max-ram cache",
     ),
-    ("Logs and checks", "progress view eval-every tensorboard hash-every check-every check-stops"),
+    (
+        "Logs and checks",
+        "progress view window eval-every tensorboard hash-every check-every check-stops",
+    ),
 ];
 
 /// Whether a list of names contains a name.
@@ -168,9 +171,9 @@ mod tests {
             let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
             let default = help.split_once("[default: ").and_then(|(_, rest)| rest.split_once(']'));
             // A default in words depends on the device, the curve or the dataset.
-            let Some((default, _)) =
-                default.filter(|(text, _)| !text.contains(' ') && !["all", "none"].contains(text))
-            else {
+            let Some((default, _)) = default.filter(|(text, _)| {
+                !text.contains(' ') && !["all", "none", "nothing"].contains(text)
+            }) else {
                 continue;
             };
             let option = format!("--{}={default}", arg.get_long().unwrap());

@@ -58,7 +58,7 @@ pub struct Recorder<'g> {
 /// Where a recording has timestamps.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Timestamps {
-    /// At its start and behind every pass, which then does not overlap with the next.
+    /// At its start and after every pass, which then does not overlap with the next.
     OfPasses(vk::QueryPool),
     /// At its start and its end.
     OfAll(vk::QueryPool),

@@ -1,5 +1,5 @@
-//! A model in tiles: `manifest.json` lists the files, `0/0007.ply` is the tile of block 0007. The tiles are disjoint, and
-//! together they are the model.
+//! A model in tiles: `manifest.json` lists the files, `0/0007.ply` is the tile of block 0007. The tiles are disjoint,
+//! and together they are the model.
 
 use std::path::{Path, PathBuf};
 

@@ -24,8 +24,8 @@ pub(super) struct Initial {
 }
 
 impl Initial {
-    /// The Gaussians of [`TrainConfig::init`], divided by the halo of the dataset's block if it is one. A model in tiles
-    /// is read one tile after the other.
+    /// The Gaussians of [`TrainConfig::init`], divided by the halo of the dataset's block if it is one. A model in
+    /// tiles is read one tile after the other.
     ///
     /// # Errors
     /// A file cannot be read or does not fit the model, or none of its Gaussians is in the halo.

@@ -169,6 +169,9 @@ mod tests {
             "up=[0,0,1]",
             "white_balance=5000",
             "tone.brightness=0.5",
+            "tone.law=a",
+            "extent=2",
+            "schedule.first_sh_degree=1",
         ];
         set.extend(rest.map(str::to_owned));
         TrainConfig::default().with(&set).unwrap()

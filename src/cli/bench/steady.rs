@@ -15,7 +15,7 @@ pub(super) struct Steady {
     wall: f64,
     /// From the start of the first pass to the end of the last.
     device: f64,
-    /// Of all passes, each with a timestamp behind it, which keeps it from overlapping with the next.
+    /// Of all passes, each with a timestamp after it, which keeps it from overlapping with the next.
     passes: f64,
     /// User and system time of this process; absent where the system does not report it.
     processor: Option<f64>,

@@ -186,9 +186,9 @@ impl Schedule {
         if left > 0.0 { self.initial_rate_factor.powf(left) } else { 1.0 }
     }
 
-    /// What is left of the schedule after `step`, at another pace: `factor` steps for each of this schedule's. Each step
-    /// of a faster pace shows a Gaussian more often, so that Adam, which divides by the root mean square of gradients
-    /// with those of the steps that do not show it, goes less far with each: rates rise by the root of that.
+    /// What is left of the schedule after `step`, with `factor` steps for each of this schedule's. With fewer views, a
+    /// Gaussian is in more of the steps. Adam divides by the root mean square of the gradients of all steps, also those
+    /// that do not show it, and so moves it less in each: rates rise by the root of `factor`.
     #[cfg(feature = "cli")]
     pub(crate) fn from_step(&self, step: u64, factor: f64) -> Self {
         let scaled = |steps: u64| (steps as f64 * factor).round() as u64;
