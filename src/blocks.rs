@@ -11,6 +11,7 @@
 //! - `plan`: everything that is measured and decided once
 //! - `draft`: the numbers of the tasks, and the views and points of the blocks
 //! - `planning`: makes a plan
+//! - `speed`: the time of a step, for the hours of a plan
 //! - `folder`: the files of a plan, its tasks and the settings of each
 //! - `join`: the tiles of the joined model
 
@@ -21,10 +22,12 @@ mod join;
 mod partition;
 mod plan;
 mod planning;
+mod speed;
 mod task;
 mod visibility;
 
 pub(crate) use join::join;
 pub(crate) use plan::{BlockPlan, MAX_ROUNDS, Request, Row};
 pub(crate) use planning::plan;
+pub(crate) use speed::speed;
 pub(crate) use task::{Task, load as load_tasks};

@@ -6,7 +6,7 @@ use crate::gpu::{DeviceChoice, Gpu, Properties, SUBGROUP_VARIABLE, Threads};
 use crate::kernels::self_test::{
     self, CHECK_BALLOT, CHECK_EXP, CHECK_HALF, CHECK_LANE, CHECK_LAST, CHECK_LOG, CHECK_SHUFFLE,
     CHECK_SIZE, CHECK_SQRT, CHECK_SUBGROUP, CHECK_SUM, CHECK_WORD, CHECKS, Constants,
-    FUNCTION_VALUES, Kernel, Params, WORKGROUPS,
+    FUNCTION_VALUES, Kernel, Params, SUBGROUPS, WORKGROUPS,
 };
 use crate::{Error, Result};
 
@@ -131,7 +131,7 @@ impl Gpu {
         let planted = CHECKS;
         let pipeline = self.pipeline::<Kernel>(&Constants::default())?;
         let numbers = self.buffer("numbers", &NUMBERS)?;
-        let mut sums = self.uninit("sums", WORKGROUPS as usize)?;
+        let mut sums = self.uninit("sums", SUBGROUPS as usize)?;
         let mut arrivals = self.uninit("arrivals", 3)?;
         let mut differing = self.uninit("differing", 2 * CHECKS as usize)?;
         let mut values = self.uninit("values", 3 * COUNT)?;

@@ -33,10 +33,11 @@ const uint CHECK_SQRT      = 11;
 const uint CHECKS          = 12;
 
 const uint WORKGROUPS      = 4096;
+const uint SUBGROUPS       = 2 * WORKGROUPS;
 const uint FUNCTION_VALUES = 8;   // numbers for each function
 
 layout(binding = 0) readonly  buffer Numbers   { float numbers[]; };  // FUNCTION_VALUES, a third, two words
-layout(binding = 1) coherent  buffer Sums      { uint sums[]; };      // (WORKGROUPS,)
+layout(binding = 1) coherent  buffer Sums      { uint sums[]; };      // (SUBGROUPS,)
 layout(binding = 2) coherent  buffer Arrivals  { uint arrivals[]; };  // [1 + turn]: workgroups that were the last
 layout(binding = 3)           buffer Differing { uint differing[]; }; // (CHECKS, 2): lanes, their largest value
 layout(binding = 4) writeonly buffer Values    { float values[]; };   // exp, log and sqrt of the numbers
@@ -79,8 +80,7 @@ void main() {
         float third = numbers[FUNCTION_VALUES];
         compare(CHECK_HALF, packHalf2x16(vec2(third, -third)), 0xb5553555u);
     }
-    if (gl_LocalInvocationID.y != 0) return;
-    if (workgroup == 0) {
+    if (workgroup == 0 && gl_LocalInvocationID.y == 0) {
         for (uint i = lane; i < FUNCTION_VALUES; i += SUBGROUP_SIZE) {
             values[i] = exp(numbers[i]) * factor(CHECK_EXP);
             values[FUNCTION_VALUES + i] = log(numbers[i]) * factor(CHECK_LOG);
@@ -89,10 +89,12 @@ void main() {
         float even = numbers[FUNCTION_VALUES + 1], odd = numbers[FUNCTION_VALUES + 2];
         if (lane < 2) words[lane] = (lane == 0) == (planted != CHECK_WORD) ? odd : even;
     }
-    if (subgroupElect()) sums[workgroup] = number_of(workgroup + turn);
-    if (!is_last_workgroup(WORKGROUPS)) return;
+    // Every subgroup takes part: a barrier after which some of a workgroup are gone is not what kernels rely on.
+    uint subgroup = 2 * workgroup + gl_LocalInvocationID.y;
+    if (subgroupElect()) sums[subgroup] = number_of(subgroup + turn);
+    if (!is_last_workgroup(SUBGROUPS)) return;
     uint seen = 0, expected = 0;
-    for (uint i = lane; i < WORKGROUPS; i += SUBGROUP_SIZE) {
+    for (uint i = lane; i < SUBGROUPS; i += SUBGROUP_SIZE) {
         seen += sums[i];
         expected += number_of(i + turn);
     }

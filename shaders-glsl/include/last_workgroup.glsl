@@ -4,7 +4,8 @@
 //
 // The includer declares `coherent buffer` with `uint arrivals[]`: [0] is zero before the dispatch and after it.
 
-// True in the last workgroup to call it; workgroups have one subgroup each.
+// True in the last workgroup to call it; workgroups have one subgroup each, or each subgroup counts as one. All of them
+// must call it: Mesa 26.2 on a CPU counts none where some of a workgroup are gone before the barrier.
 bool is_last_workgroup(uint workgroup_count) {
     subgroupBarrier();
     memoryBarrierBuffer();

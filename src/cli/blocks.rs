@@ -133,11 +133,18 @@ fn plan(args: &PlanArgs) -> Result<()> {
         None => gpu.properties().memory,
     };
     let request = Request { memory, blocks: args.blocks.map(usize::from), rounds: args.rounds };
+    // What those few views cannot train, such as black ones, is no reason to plan nothing.
+    let speed = blocks::speed(&gpu, &planned).ok();
     let plan = blocks::plan(planned, &request)?;
     if args.json {
         writeln!(std::io::stdout(), "{:#}", serde_json::json!(plan.file))?;
     } else {
-        write!(std::io::stdout(), "{}", printable(&summary(&plan)))?;
+        write!(
+            std::io::stdout(),
+            "{}{}",
+            printable(&summary(&plan)),
+            speed.map(|own| hours(&plan, own)).unwrap_or_default()
+        )?;
     }
     if args.dry_run {
         return Ok(());
@@ -167,6 +174,17 @@ fn summary(plan: &BlockPlan) -> String {
     let (table, count, percent) =
         (table::aligned(&rows), plan.file.round(1).count(), 100.0 * plan.shared);
     format!("{table}{count} blocks, each with {percent:.0} % of the views on average\n")
+}
+
+/// The time of all steps at the speed of those that were measured.
+fn hours(plan: &BlockPlan, (milliseconds, gaussians): (f64, usize)) -> String {
+    let rows = std::iter::once(&plan.file.coarse).chain(&plan.file.blocks);
+    let steps: u64 = rows.map(|row| row.steps).sum();
+    let hours = steps as f64 * milliseconds / 3.6e6;
+    format!(
+        "{steps} steps of {milliseconds:.1} ms, as measured here with {gaussians} Gaussians, take {hours:.2} h on one \
+         worker; more Gaussians take longer\n"
+    )
 }
 
 fn run_tasks(args: &RunArgs) -> Result<()> {

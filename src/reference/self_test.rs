@@ -1,6 +1,6 @@
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::self_test::{
-    Constants, FUNCTION_VALUES, Kernel, Params, Slices, Tolerances, WORKGROUPS,
+    Constants, FUNCTION_VALUES, Kernel, Params, SUBGROUPS, Slices, Tolerances,
 };
 use crate::self_test::functions;
 
@@ -18,7 +18,7 @@ impl Reference for Kernel {
         }
         let own = &numbers[FUNCTION_VALUES as usize + 1..];
         words[..2].copy_from_slice(&[own[1], own[0]]);
-        for i in 0..WORKGROUPS {
+        for i in 0..SUBGROUPS {
             sums[i as usize] = number_of(i + params.turn);
         }
         arrivals[1 + params.turn as usize] += 1;

@@ -96,7 +96,7 @@ fn a_plan_has_the_same_bytes_on_any_number_of_threads_and_may_be_made_again() {
 fn a_dry_run_writes_nothing() {
     let city = city();
     let text = succeed(&city.plan("dry", &format!("{PLAN} --dry-run")));
-    assert!(text.contains("2 blocks, each with"), "{text}");
+    assert!(text.contains("2 blocks, each with") && text.contains("120 steps of"), "{text}");
     let json = succeed(&city.plan("dry", &format!("{PLAN} --dry-run --json")));
     let json: Value = serde_json::from_str(&json).unwrap();
     assert_eq!(json["block"].as_array().unwrap().len(), 4);
