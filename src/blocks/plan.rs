@@ -73,6 +73,13 @@ pub(crate) struct PlanFile {
     pub(crate) blocks: Vec<Row>,
 }
 
+impl BlockPlan {
+    /// The steps of all tasks.
+    pub(crate) fn steps(&self) -> u64 {
+        self.file.coarse.steps + self.file.blocks.iter().map(|row| row.steps).sum::<u64>()
+    }
+}
+
 impl PlanFile {
     /// The number of rounds.
     pub(crate) fn rounds(&self) -> u8 {

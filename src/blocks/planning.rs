@@ -22,25 +22,25 @@ const LEAST_VIEWS: usize = 3;
 /// # Errors
 /// The dataset has no points, or all at one place; blocks do not pay; a block has too few views; the memory is too
 /// small; a photograph can no longer be read.
-pub(crate) fn plan(planned: PlannedRun, request: &Request) -> Result<BlockPlan> {
-    let PlannedRun { mut config, dataset, .. } = planned;
+pub(crate) fn plan(planned: &PlannedRun, request: &Request) -> Result<BlockPlan> {
+    let PlannedRun { config, dataset, .. } = planned;
+    let mut config = config.clone();
     let root = &dataset.root;
     if dataset.points.is_empty() {
         let problem =
             "has no points, by which a scene is divided; find them with `nightsplat pose`";
         return Err(Error::input(root, problem));
     }
-    let visibility = Visibility::of(&dataset);
-    let budget = Budget::of(&config, &dataset);
-    let parts = parts(&dataset, &visibility, &config, &budget, request)?;
+    let visibility = Visibility::of(dataset);
+    let budget = Budget::of(&config, dataset);
+    let parts = parts(dataset, &visibility, &config, &budget, request)?;
     let serving = visibility.serving(&parts);
     let shared = mean_share(&serving, visibility.training.len());
     check_views(root, &serving, shared)?;
-    let law = law_of(&config.tone, &dataset)?;
-    settle(&mut config, &dataset);
+    let law = law_of(&config.tone, dataset)?;
+    settle(&mut config, dataset);
     let stamp = Dataset::stamp(root, &config.load_options())?;
-    let draft =
-        Draft { dataset: &dataset, visibility: &visibility, config: &config, budget, request };
+    let draft = Draft { dataset, visibility: &visibility, config: &config, budget, request };
     let mut file = PlanFile {
         version: VERSION,
         checksum: String::new(),

@@ -133,26 +133,17 @@ fn plan(args: &PlanArgs) -> Result<()> {
         None => gpu.properties().memory,
     };
     let request = Request { memory, blocks: args.blocks.map(usize::from), rounds: args.rounds };
-    // What those few views cannot train, such as black ones, is no reason to plan nothing.
-    let speed = blocks::speed(&gpu, &planned).ok();
-    let plan = blocks::plan(planned, &request)?;
+    let plan = blocks::plan(&planned, &request)?;
+    let (summary, json) = (summary(&plan), serde_json::json!(plan.file));
+    let steps = plan.steps();
+    let tasks = if args.dry_run { None } else { Some(plan.save(&args.out)?) };
     if args.json {
-        writeln!(std::io::stdout(), "{:#}", serde_json::json!(plan.file))?;
-    } else {
-        write!(
-            std::io::stdout(),
-            "{}{}",
-            printable(&summary(&plan)),
-            speed.map(|own| hours(&plan, own)).unwrap_or_default()
-        )?;
+        return Ok(writeln!(std::io::stdout(), "{json:#}")?);
     }
-    if args.dry_run {
-        return Ok(());
-    }
-    let tasks = plan.save(&args.out)?;
-    if args.json {
-        return Ok(());
-    }
+    // What a few views cannot train, such as black ones, is no reason to plan nothing.
+    let hours = blocks::speed(&gpu, &planned).map(|speed| hours(steps, speed));
+    write!(std::io::stdout(), "{}{}", printable(&summary), hours.unwrap_or_default())?;
+    let Some(tasks) = tasks else { return Ok(()) };
     let (city, count) = (args.out.display(), tasks.len());
     let wrote = format!("{city}/plan.toml, law.toml, frame.toml, and {count} tasks in tasks.jsonl");
     finish(&wrote, &format!("nightsplat blocks run {}", word(&args.out)))
@@ -177,9 +168,7 @@ fn summary(plan: &BlockPlan) -> String {
 }
 
 /// The time of all steps at the speed of those that were measured.
-fn hours(plan: &BlockPlan, (milliseconds, gaussians): (f64, usize)) -> String {
-    let rows = std::iter::once(&plan.file.coarse).chain(&plan.file.blocks);
-    let steps: u64 = rows.map(|row| row.steps).sum();
+fn hours(steps: u64, (milliseconds, gaussians): (f64, usize)) -> String {
     let hours = steps as f64 * milliseconds / 3.6e6;
     format!(
         "{steps} steps of {milliseconds:.1} ms, as measured here with {gaussians} Gaussians, take {hours:.2} h on one \
