@@ -133,7 +133,7 @@ impl BlockPlan {
         let steps = |round: u8| self.file.round(round).map(|row| row.steps).sum::<u64>();
         let done = self.file.coarse.steps + (1..row.round).map(steps).sum::<u64>();
         let rate = row.steps as f64 / steps(row.round).max(1) as f64;
-        let rest = self.config.schedule.from_step(done, rate);
+        let rest = self.config.schedule.after_step(done, rate);
         match row.round == self.file.rounds() {
             true => rest,
             false => Schedule { cooldown_steps: 0, ..rest },

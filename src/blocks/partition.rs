@@ -157,9 +157,9 @@ fn sides(points: &[WeightedPoint]) -> [f64; 3] {
 /// The cell, reaching a share of its sides beyond its faces.
 fn widened(core: &Cell, sides: [f64; 3], reach: f64) -> Cell {
     let mut halo = *core;
-    for axis in 0..3 {
-        halo.from[axis] -= reach * sides[axis];
-        halo.to[axis] += reach * sides[axis];
+    for (axis, side) in sides.into_iter().enumerate() {
+        halo.from[axis] -= reach * side;
+        halo.to[axis] += reach * side;
     }
     halo
 }

@@ -20,7 +20,7 @@ use crate::train::{CacheSize, PlanSource};
 /// Train a scene that outgrows a device or a machine, in blocks.
 ///
 /// `plan` measures the photographs once and cuts the scene into blocks, each of which trains as an ordinary run; `run`
-/// trains them here, one after another; `join` joins them. Between plan and join, Snakemake, HyperQueue, Slurm or any
+/// trains them here, one after another; `join` joins them. Between plan and join, Snakemake, `HyperQueue`, Slurm or any
 /// other engine may run the tasks: it reads tasks.jsonl, and nothing else (examples/schedulers). The joined model has
 /// the same bytes for any number and order of workers, and after any interruption. The folder of a plan is
 /// used like a run: `nightsplat eval CITY`, `render`, `export`, `view`.
@@ -183,7 +183,7 @@ fn run_tasks(args: &RunArgs) -> Result<()> {
         // A closed standard output does not stop the work.
         let _ = writeln!(std::io::stdout(), "{line}");
     })?;
-    Ok(finish("", &next(&args.city))?)
+    finish("", &next(&args.city))
 }
 
 fn join(args: &JoinArgs) -> Result<()> {

@@ -200,7 +200,7 @@ fn blocks_that_are_missing_unfinished_or_of_another_plan_are_refused_by_name() {
     let copy = city().copied();
     refused(&format!("blocks join {} --round 3", copy.path().display()), 3, &["no round 3"]);
     refuses_to_join(&["plan.toml", "is not a plan"], |city| {
-        fs::write(city.join("plan.toml"), "x = [").unwrap()
+        fs::write(city.join("plan.toml"), "x = [").unwrap();
     });
 }
 

@@ -109,7 +109,7 @@ impl Block {
         let bytes = input::bytes(&folder.join(POINTS))?;
         let (points, rest) = bytes.as_chunks::<4>();
         if !rest.is_empty() {
-            return Err(Error::input(&folder.join(POINTS), "is cut off; plan anew"));
+            return Err(Error::input(folder.join(POINTS), "is cut off; plan anew"));
         }
         block.points = points.iter().map(|bytes| u32::from_le_bytes(*bytes)).collect();
         Ok(Some(block))

@@ -20,9 +20,8 @@ pub(super) fn select(layout: &Layout, options: &LoadOptions, files: &Files) -> R
     let mut listing = list(layout, options.images.as_deref(), files)?;
     split(&layout.root, &mut listing.frames, options.test_every, files)?;
     exclude(&layout.root, &mut listing.frames, &options.exclude)?;
-    match &layout.block {
-        Some(block) => block.restrict(&mut listing.frames)?,
-        None => {}
+    if let Some(block) = &layout.block {
+        block.restrict(&mut listing.frames)?;
     }
     Ok(listing)
 }

@@ -190,7 +190,7 @@ impl Schedule {
     /// Gaussian is in more of the steps. Adam divides by the root mean square of the gradients of all steps, also those
     /// that do not show it, and so moves it less in each: rates rise by the root of `factor`.
     #[cfg(feature = "cli")]
-    pub(crate) fn from_step(&self, step: u64, factor: f64) -> Self {
+    pub(crate) fn after_step(&self, step: u64, factor: f64) -> Self {
         let scaled = |steps: u64| (steps as f64 * factor).round() as u64;
         let left = |until: u64| scaled(until.saturating_sub(step));
         let by = factor.sqrt().recip();
@@ -290,7 +290,7 @@ mod tests {
     fn the_rest_of_a_schedule_goes_on_where_the_whole_is_at_any_pace() {
         let whole = Schedule { means_rate_steps: 2_000, ..Schedule::default() };
         for (step, factor) in [(400, 0.25), (1_000, 1.0), (2_500, 0.1)] {
-            let rest = whole.from_step(step, factor);
+            let rest = whole.after_step(step, factor);
             for later in [0_u32, 200, 1_000] {
                 let own = rest.learning_rates((f64::from(later) * factor) as u64, 3.0);
                 let expected = whole.learning_rates(step + u64::from(later), 3.0);
@@ -302,8 +302,8 @@ mod tests {
             assert_eq!(rest.sh_degree(0, 3), whole.sh_degree(step, 3));
             assert_eq!(rest.resolution_levels(), 1);
         }
-        assert_eq!(whole.from_step(1_000, 0.1).densify_interval, 10);
-        assert_eq!(whole.from_step(1_000, 0.1).densify_before, 200);
+        assert_eq!(whole.after_step(1_000, 0.1).densify_interval, 10);
+        assert_eq!(whole.after_step(1_000, 0.1).densify_before, 200);
     }
 
     #[test]
