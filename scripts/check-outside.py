@@ -46,7 +46,7 @@ def main() -> None:
     manifest = (ROOT / "Cargo.toml").read_text()
     profile = re.search(r"^\[profile\.dev\].*?(?=^\[profile\.release\])", manifest, re.M | re.S)
     # What the feature `window` adds for its example.
-    needed = re.search(r"^window = \[(.*)\]$", manifest, re.M)[1].replace('"', "").replace("dep:", "").split(", ")
+    needed = re.findall(r'"dep:([^"]*)"', re.search(r"^window = \[(.*)\]$", manifest, re.M)[1])
     window = [re.search(rf"^{name} = .*$", manifest, re.M)[0].replace(", optional = true", "") for name in needed]
 
     def write_manifest(features: str, more: list[str]) -> None:
