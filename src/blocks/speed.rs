@@ -11,6 +11,8 @@ use crate::train::{PlannedRun, Trainer};
 
 /// Views that are trained on: more would take more time to load, and none to measure.
 const VIEWS: usize = 8;
+/// The most points to start from: more would take memory that planning need not have.
+const MAX_POINTS: usize = 100_000;
 /// Steps before the measurement, in which memory is taken, and those that are measured.
 const STEPS: [u64; 2] = [8, 32];
 
@@ -26,6 +28,8 @@ pub(crate) fn speed(gpu: &Gpu, planned: &PlannedRun) -> Result<(f64, usize)> {
     let others = training.iter().enumerate().filter(|(place, _)| !kept.contains(place));
     let others: Vec<String> = others.map(|(_, view)| view.name.clone()).collect();
     dataset.leave_out(&others);
+    let every = dataset.points.len().div_ceil(MAX_POINTS).max(1);
+    dataset.points = dataset.points.into_iter().step_by(every).collect();
     let mut config = planned.config.clone();
     config.steps = STEPS.iter().sum();
     config.stop.views = 0;
