@@ -52,6 +52,12 @@ pub fn text(hash: u64) -> String {
     format!("{hash:016x}")
 }
 
+/// Bytes as two hexadecimal digits each.
+#[cfg(feature = "cli")]
+pub fn hexadecimal(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
 fn folded(a: u64, b: u64) -> u64 {
     let product = u128::from(a) * u128::from(b);
     // A factor of zero would lose the preceding state.

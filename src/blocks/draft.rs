@@ -22,13 +22,15 @@ pub(super) struct Draft<'a> {
     pub(super) config: &'a TrainConfig,
     pub(super) budget: Budget,
     pub(super) request: &'a Request,
+    /// The views of the coarse model, as places in [`Visibility::training`].
+    pub(super) thinned: Vec<usize>,
 }
 
 impl Draft<'_> {
     /// The row of the coarse model.
     pub(super) fn coarse(&self) -> Row {
         let steps = COARSE_STEPS * self.config.steps as f64;
-        let [views, points] = [self.visibility.thinned().len(), self.dataset.points.len()];
+        let [views, points] = [self.thinned.len(), self.dataset.points.len()];
         self.row(COARSE.to_owned(), 0, [views, points], steps, self.config.max_gaussians as f64)
     }
 
@@ -86,8 +88,7 @@ impl Draft<'_> {
         serving: &[Vec<usize>],
     ) -> Vec<Block> {
         let plan = file.checksum.as_str();
-        let mut blocks =
-            vec![self.block(COARSE, plan, [Cell::WORLD; 2], &self.visibility.thinned())];
+        let mut blocks = vec![self.block(COARSE, plan, [Cell::WORLD; 2], &self.thinned)];
         for (row, number) in file.blocks.iter().zip((0..parts.len()).cycle()) {
             let Part { core, halo, .. } = parts[number];
             // In later rounds the surroundings are the neighbours' own.

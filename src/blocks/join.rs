@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 
 use super::folder::{model_of, place};
 use super::plan::PlanFile;
-use crate::base::{input, output};
+use crate::base::{hash, input, output};
 use crate::photographs::dataset::block::{Block, Cell};
 use crate::results::export::{Format, Provenance};
 use crate::results::models;
@@ -147,16 +147,17 @@ fn write_tile(folder: &Path, model: &Path, block: &Block) -> Result<(Tile, usize
     let origin = gaussians.origin.to_array();
     let provenance = Provenance { facts, ..Provenance::default() };
     Format::Ply.write(&gaussians, &provenance, &path)?;
-    let kept = std::mem::take(&mut gaussians.count);
+    let kept = gaussians.count;
     drop(gaussians);
     // What is on the disk is checked, not what is in memory.
-    let written = ply::load(&path)?;
+    let bytes = input::bytes(&path)?;
+    let (written, _) = ply::parse(&bytes).map_err(|problem| Error::output(&path, problem))?;
     let is_whole = written.count == kept
         && (0..written.count).all(|index| block.core.contains(written.position(index)));
     if !is_whole {
         return Err(Error::output(&path, "was not written as a tile of its core; check the disk"));
     }
-    let sha256 = hex(&Sha256::digest(input::bytes(&path)?));
+    let sha256 = hash::hexadecimal(&Sha256::digest(&bytes));
     let bounds = bounds(&written);
     let tile = Tile { id: name.to_owned(), file, count: written.count, bounds, sha256 };
     Ok((tile, before - written.count, origin))
@@ -168,10 +169,6 @@ fn bounds(gaussians: &Gaussians) -> Option<Cell> {
     let first = positions.next()?;
     let (from, to) = positions.fold((first, first), |(from, to), own| (from.min(own), to.max(own)));
     Some(Cell { from: from.to_array(), to: to.to_array() })
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// The numbers that `eval` and others print of a run.

@@ -40,7 +40,9 @@ pub(crate) fn plan(planned: &PlannedRun, request: &Request) -> Result<BlockPlan>
     let law = law_of(&config.tone, dataset)?;
     settle(&mut config, dataset);
     let stamp = Dataset::stamp(root, &config.load_options())?;
-    let draft = Draft { dataset, visibility: &visibility, config: &config, budget, request };
+    let thinned = visibility.thinned();
+    let draft =
+        Draft { dataset, visibility: &visibility, config: &config, budget, request, thinned };
     let mut file = PlanFile {
         version: VERSION,
         checksum: String::new(),

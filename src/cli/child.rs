@@ -6,8 +6,21 @@ use std::time::Duration;
 
 use crate::results::run::Requests;
 
-/// This program; on Linux the running one, even if its file was replaced, so that all points use the same version.
-pub(super) fn this_program() -> std::io::Result<PathBuf> {
+/// A process of this program, to be waited for by [`ended`]. Signals of the terminal reach the waiting process only,
+/// which passes them on once.
+pub(super) fn command() -> std::io::Result<Command> {
+    #[cfg_attr(not(unix), expect(unused_mut, reason = "groups are of Unix"))]
+    let mut command = Command::new(this_program()?);
+    #[cfg(unix)]
+    {
+        use std::os::unix::process::CommandExt;
+        command.process_group(0).arg0("nightsplat");
+    }
+    Ok(command)
+}
+
+/// This program; on Linux the running one, even if its file was replaced, so that all processes are of one version.
+fn this_program() -> std::io::Result<PathBuf> {
     let running = Path::new("/proc/self/exe");
     if running.exists() { Ok(running.to_owned()) } else { std::env::current_exe() }
 }

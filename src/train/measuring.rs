@@ -69,6 +69,17 @@ pub(super) fn tone_mapped(
     Ok((scene, mappings))
 }
 
+/// The scene's tone alone, measured or recorded.
+///
+/// # Errors
+/// Those of [`tone_mapped`].
+pub(super) fn scene_of(settings: &ToneSettings, dataset: &Dataset) -> Result<SceneTone> {
+    match &settings.law {
+        Some(path) => recorded(path, settings),
+        None => Ok(measured(settings, dataset)?.0),
+    }
+}
+
 /// The scene of a recorded law.
 ///
 /// # Errors

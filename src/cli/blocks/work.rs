@@ -1,10 +1,11 @@
 //! Runs the tasks of a plan one after another, each in a process of its own.
 
 use std::path::Path;
-use std::process::{Command, ExitStatus};
+use std::process::ExitStatus;
 
 use crate::blocks::{Task, load_tasks};
 use crate::cli::{child, signals};
+use crate::results::run::Requests;
 use crate::{Error, Result, Stop};
 
 /// Runs the tasks of the plan in a folder that are not done, in order; `begin` is called before each, with its number,
@@ -39,20 +40,10 @@ pub(super) fn work(folder: &Path, mut begin: impl FnMut(&Task, [usize; 2], bool)
     Ok(())
 }
 
-fn run(
-    folder: &Path,
-    task: &Task,
-    requests: &crate::results::run::Requests,
-) -> std::io::Result<ExitStatus> {
-    let mut command = Command::new(child::this_program()?);
-    command.args(task.argv.iter().skip(1)).current_dir(folder);
-    // Signals of the terminal reach this process only, which passes them on once.
-    #[cfg(unix)]
-    {
-        use std::os::unix::process::CommandExt;
-        command.process_group(0).arg0("nightsplat");
-    }
-    child::ended(&mut command.spawn()?, requests)
+fn run(folder: &Path, task: &Task, requests: &Requests) -> std::io::Result<ExitStatus> {
+    let mut process =
+        child::command()?.args(task.argv.iter().skip(1)).current_dir(folder).spawn()?;
+    child::ended(&mut process, requests)
 }
 
 /// How a process ended, in words.

@@ -21,6 +21,7 @@ use tokio::sync::{Semaphore, oneshot};
 
 use super::listen::Listen;
 use super::site::{Answer, Site};
+use crate::base::hash;
 use crate::{Error, Result};
 
 /// The most connections at a time; others are closed at once.
@@ -122,7 +123,7 @@ fn token() -> Result<String> {
     let mut bytes = [0; 16];
     getrandom::fill(&mut bytes)
         .map_err(|error| Error::input("random numbers", format!("of the system: {error}")))?;
-    Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
+    Ok(hash::hexadecimal(&bytes))
 }
 
 async fn accept(listener: TcpListener, prefix: String, site: Arc<Site>) {

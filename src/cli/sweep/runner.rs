@@ -7,7 +7,7 @@
 use std::fs::{File, TryLockError};
 use std::io::Write;
 use std::path::Path;
-use std::process::{Command, ExitStatus};
+use std::process::ExitStatus;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -128,19 +128,14 @@ fn attempt(run: &Run, waits: bool, requests: &Requests) -> Result<Outcome> {
     let log = run.folder.join("log.txt");
     let mut output = File::create(&log).map_err(unusable)?;
     writeln!(output, "{}", run.command_line()?).map_err(unusable)?;
-    let mut command = Command::new(child::this_program().map_err(unusable)?);
-    command
+    let mut process = child::command()
+        .map_err(unusable)?
         .args(&run.arguments)
         .stdin(lock.try_clone().map_err(unusable)?)
         .stdout(output.try_clone().map_err(unusable)?)
-        .stderr(output);
-    // Signals of the terminal reach this process only, which passes them on once.
-    #[cfg(unix)]
-    {
-        use std::os::unix::process::CommandExt;
-        command.process_group(0).arg0("nightsplat");
-    }
-    let mut process = command.spawn().map_err(unusable)?;
+        .stderr(output)
+        .spawn()
+        .map_err(unusable)?;
     let status = child::ended(&mut process, requests).map_err(unusable)?;
     if status.success() && run.is_finished()? {
         return Ok(Outcome::Finished);
