@@ -1,6 +1,7 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
+#include "finite.glsl"
 
 //! The gradient of mean|clamp(p, 0, 1) - s| with respect to one plane p of the render, s the structure of the
 //! pseudo-GT, and partial sums of the difference.
@@ -32,8 +33,7 @@ void main() {
         uint i = start + k * SUBGROUP_SIZE;
         if (i < pixel_count) {
             float p = render[first + i];
-            // Not clamp(), which may turn a NaN into a bound.
-            float difference = (p < 0.0 ? 0.0 : p > 1.0 ? 1.0 : p) - structure[i];
+            float difference = within_unit(p) - structure[i];
             bool passes = p >= 0.0 && p <= 1.0;
             d_render[first + i] = passes ? scale * sign(difference) : 0.0;
             sum += abs(difference);

@@ -1,6 +1,7 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
+#include "finite.glsl"
 
 //! A 3x3 convolution with stride 1 and zero padding 1, and the gradient of its input, which is also a convolution.
 //!
@@ -39,8 +40,7 @@ const uint WEIGHT_LOADS = (TAPS * OUT_BLOCK + SUBGROUP_SIZE - 1) / SUBGROUP_SIZE
 
 float activate(float x) {
     uint activation = ACTIVATION;
-    // Written so that a NaN stays one.
-    if (activation == RELU) return x < 0.0 ? 0.0 : x;
+    if (activation == RELU) return not_below_zero(x);
     if (activation == SIGMOID) return 1.0 / (1.0 + exp(-x));
     return x;
 }

@@ -1,6 +1,7 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
+#include "finite.glsl"
 
 //! A convolution with a square window of any size, a stride and zero padding, followed by a ReLU.
 //!
@@ -54,8 +55,7 @@ void main() {
         }
     }
     [[unroll]] for (uint o = 0; o < OUT_BLOCK; ++o) {
-        // Written so that a NaN stays one.
         if (first_channel + o < out_channels)
-            target[first_channel * pixels + o * pixels + i % pixels] = sum[o] < 0.0 ? 0.0 : sum[o];
+            target[first_channel * pixels + o * pixels + i % pixels] = not_below_zero(sum[o]);
     }
 }

@@ -1,6 +1,7 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
+#include "finite.glsl"
 #include "norm.glsl"
 
 //! f' = f + relu(gamma (z - mean) / deviation + beta): norm, activation and shortcut of a repeat.
@@ -21,7 +22,6 @@ void main() {
     for (uint i = chunk_begin(); i < chunk_end(); i += SUBGROUP_SIZE) {
         float normalised = (source[plane + i] - of_channel.mean) * of_channel.inverse_deviation;
         float y = gamma * normalised + beta;
-        // Written so that a NaN stays one.
-        target[plane + i] = shortcut[plane + i] + (y < 0.0 ? 0.0 : y);
+        target[plane + i] = shortcut[plane + i] + not_below_zero(y);
     }
 }

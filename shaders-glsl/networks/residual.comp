@@ -1,6 +1,7 @@
 #version 460
 #extension GL_GOOGLE_include_directive : require
 #include "kernel.glsl"
+#include "finite.glsl"
 
 //! The end of a denoiser stage, one thread per value: N = I + u, R = clamp(R_0 - N, 0, 1); in the identity variant R =
 //! I - u.
@@ -27,6 +28,5 @@ void main() {
         return;
     }
     float difference = render[i] - (stage_input[i] + update[i]);
-    // Written so that a NaN stays one.
-    denoised[i] = difference < 0.0 ? 0.0 : difference > 1.0 ? 1.0 : difference;
+    denoised[i] = within_unit(difference);
 }

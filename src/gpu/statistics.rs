@@ -78,13 +78,15 @@ impl Resources {
                 "STP Count",
                 "LDP Count",
             ]),
+            // The upper half of NVIDIA's number is no part of it (580.159: 16 in every kernel).
             scratch: sum(&[
                 "Scratch size",
                 "SLM size",
                 "Scratch Memory Size",
                 "Local Memory Size",
                 "scratchMemUsageInBytes",
-            ]),
+            ])
+            .map(|bytes| bytes % 2f64.powi(32)),
             shared: sum(&[
                 "LDS size",
                 "Workgroup Memory Size",
@@ -237,6 +239,13 @@ mod tests {
             Resources::of(&told(&anv)),
             resources([84.0, 7.0, 1024.0, 256.0, 862.0].map(Some))
         );
+        let nvidia = [
+            ("Register Count", 44.0),
+            ("Local Memory Size", 16.0 * 2f64.powi(32) + 16.0),
+            ("Shared Memory Size", 0.0),
+        ];
+        let expected = resources([Some(44.0), None, Some(16.0), Some(0.0), None]);
+        assert_eq!(Resources::of(&told(&nvidia)), expected);
         assert_eq!(Resources::of(&[]), Resources::default());
     }
 

@@ -16,6 +16,9 @@ static GPU: OnceLock<Gpu> = OnceLock::new();
 /// The variable with what tests must not go without, separated by commas: lavapipe, validation, colmap, ffmpeg, ...
 const REQUIRE_VARIABLE: &str = "NIGHTSPLAT_REQUIRE";
 
+/// If set, devices run the passes and layouts that a GPU has, on a CPU too: what differs is found before there is one.
+const AS_A_GPU_VARIABLE: &str = "NIGHTSPLAT_AS_A_GPU";
+
 /// Prints that a test, or the rest of it, is not run for lack of `need`, and why.
 ///
 /// The harness captures the output of `println!` and `eprintln!` in a passing test, but not that of the handle of
@@ -121,6 +124,7 @@ fn open(adapt: impl FnOnce(&mut Shared)) -> Gpu {
     let choice: DeviceChoice = choice.parse().unwrap_or_else(|error| panic!("{error}"));
     let mut gpu = Gpu::with_validation(&choice).unwrap_or_else(|error| panic!("{error}"));
     if let Some(shared) = Arc::get_mut(&mut gpu.shared) {
+        shared.properties.is_cpu &= std::env::var_os(AS_A_GPU_VARIABLE).is_none();
         adapt(shared);
     }
     gpu

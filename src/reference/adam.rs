@@ -37,6 +37,7 @@ pub(super) fn moments_after(step: u32, [p, g, m, v]: [f32; 4]) -> ([f32; 2], u32
     let g = clamp_gradient(g);
     let m = BETA1 as f32 * m + (1.0 - BETA1) as f32 * g;
     let v = BETA2 as f32 * v + (1.0 - BETA2) as f32 * g * g;
+    let [m, v] = [m, v].map(|x: f32| if x.is_subnormal() { 0.0 } else { x });
     ([m, v], random_bits((p.to_bits() ^ v.to_bits()).wrapping_add(random_bits(step))))
 }
 

@@ -51,9 +51,11 @@ impl Rounded {
         Self { value: value.into(), error: 0.0 }
     }
 
-    /// After `count` more roundings.
+    /// After `count` more roundings. A subnormal result may be flushed to zero: NVIDIA's devices do.
     pub(super) fn rounded(self, count: f64) -> Self {
-        Self { error: self.error + count * UNIT * (self.value.abs() + self.error), ..self }
+        let magnitude = self.value.abs();
+        let flushed = if magnitude < f64::from(f32::MIN_POSITIVE) { magnitude } else { 0.0 };
+        Self { error: self.error + flushed + count * UNIT * (magnitude + self.error), ..self }
     }
 
     /// The same value, with the error of an argument magnified by `slope`.
@@ -297,5 +299,14 @@ mod tests {
             loosest = loosest.max(bound.error / UNIT);
         }
         assert!(largest > 0.02 && loosest < 1e3, "{largest} {loosest}");
+    }
+
+    #[test]
+    fn a_subnormal_number_may_be_zero() {
+        let x = Rounded::exact(1e-20);
+        assert!((x * x).error >= (x * x).value && (x * x).value > 0.0);
+        let root = (x * x).sqrt();
+        assert!(root.error >= root.value);
+        assert!((x * Rounded::exact(1e10)).error < 1e-16);
     }
 }

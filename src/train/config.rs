@@ -389,6 +389,14 @@ impl TrainConfig {
         }
     }
 
+    /// Steps from one score of the held-out views to the next. Colours on frozen geometry converge within some hundred
+    /// steps.
+    pub(super) fn scored_every(&self) -> u64 {
+        const FROZEN: u64 = 50;
+        let is_frozen = self.freeze.as_ref().is_some_and(Freeze::has_geometry);
+        if is_frozen { self.stop.every.min(FROZEN) } else { self.stop.every }
+    }
+
     /// The columns of the Gaussians' attributes, from the first, that no pass updates.
     pub(super) fn frozen_columns(&self) -> u32 {
         self.freeze.as_ref().map_or(0, Freeze::leading_columns)

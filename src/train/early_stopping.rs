@@ -136,12 +136,12 @@ impl Trainer {
     }
 
     /// Whether the held-out views are scored after this step: at the end, and every
-    /// [`StopConfig::every`](super::StopConfig::every) steps but not right after a round of density control.
+    /// [`TrainConfig::scored_every`] steps but not right after a round of density control.
     pub(super) fn scores_at(&self, step: u64) -> bool {
         if self.convergence.held_out.is_empty() {
             return false;
         }
-        let due = step - step % self.config.stop.every;
+        let due = step - step % self.config.scored_every();
         let is_first = due > 0 && (due..step).all(|earlier| self.is_unsettled(earlier));
         step == self.last_step() || is_first && !self.is_unsettled(step)
     }

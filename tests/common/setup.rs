@@ -11,6 +11,7 @@ use nightsplat::reference::camera::pinhole::Pinhole;
 use nightsplat::reference::camera::{Camera, Model};
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
+use nightsplat::splats::batches::Batches;
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::{DeviceGaussians, Features, Gaussians, Shape};
 
@@ -297,8 +298,9 @@ impl<'a> Rendered<'a> {
             )
         })
         .unwrap();
+        let batches = Batches::new(&gpu, gaussians.layout.floats());
         Gradients {
-            parameters: gpu.read(&parameters).unwrap(),
+            parameters: batches.read(&gpu, &parameters).unwrap(),
             grad_norm_sums: gpu.read(&grad_norm_sums).unwrap(),
             visit_counts: gpu.read(&visit_counts).unwrap(),
         }

@@ -401,7 +401,9 @@ fn constant_images_have_the_ssim_of_their_means_away_from_the_border() {
         let map = ssim(size[0] as usize, size[1] as usize, &plane[0], &plane[1]);
         assert!((map[24 * 64 + 32].value - inside).abs() < 1e-6);
         let mean = map.iter().map(|ssim| ssim.value).sum::<f64>() / map.len() as f64;
-        assert!((f64::from(outcome.ssim) - mean).abs() < 1e-5, "{} {mean}", outcome.ssim);
+        // A variance is the difference of two numbers of up to 1/4, of which each may be rounded twice, over C2 = 9e-4.
+        let rounding = 4.0 * 0.25 * f64::from(f32::EPSILON) / 2.0 / 9e-4;
+        assert!((f64::from(outcome.ssim) - mean).abs() < rounding, "{} {mean}", outcome.ssim);
     });
 }
 
@@ -477,8 +479,6 @@ fn a_view_that_does_not_fit_is_refused() {
             (0.2, [17, 16], 0),
             (0.0, [17, 16], 0),
             (0.2, [0, 8], 0),
-            // As many values, but more subgroups than there are partial sums.
-            (0.2, [256, 1], 0),
             (0.2, [16, 16], 3),
             (0.2, [u32::MAX, u32::MAX], 0),
         ] {
@@ -494,6 +494,17 @@ fn a_view_that_does_not_fit_is_refused() {
             });
             assert!(result.is_err(), "{weight} {size:?} {slot}");
         }
+        // As many values, but more subgroups than there are partial sums, if subgroups are narrow.
+        let mut loss = Loss::new(gpu, settings(0.2)).unwrap();
+        loss.reserve(UVec2::splat(16)).unwrap();
+        let mut d_render = gpu.zeros("d_render", 3 * 256).unwrap();
+        let result = log_step(gpu, |pass, log| {
+            let size = UVec2::new(256, 1);
+            let loss_region = LossRegion::whole(size);
+            let inputs = LossInputs { size, loss_region, render: &image, target: &image };
+            loss.record(pass, inputs, &mut d_render, log)
+        });
+        assert!(result.is_err() || gpu.properties().subgroup_size > 8);
     });
 }
 

@@ -87,9 +87,14 @@ fn assert_agrees(what: &str, report: &CheckReport) {
     );
 }
 
+/// A device that takes the passes of a CPU, whatever it is.
+fn as_a_cpu() -> Gpu {
+    gpu_with(|own| own.is_cpu = true)
+}
+
 /// Runs three checked steps, including density control; returns the kernels that ran.
 fn assert_steps_agree(name: &str, config: &TrainConfig) -> BTreeSet<String> {
-    assert_steps_agree_on(&gpu(), name, config)
+    assert_steps_agree_on(&as_a_cpu(), name, config)
 }
 
 fn assert_steps_agree_on(gpu: &Gpu, name: &str, config: &TrainConfig) -> BTreeSet<String> {
@@ -324,7 +329,7 @@ fn with_wrong_param(gpu: &Gpu, kernel: &'static str, word: usize, bits: u32) -> 
 
 #[test]
 fn a_wrong_parameter_is_reported_at_the_pass_that_uses_it() {
-    let gpu = gpu();
+    let gpu = as_a_cpu();
     // The near plane, the tile's columns, the scale of L1, Adam's rate for the means.
     for (kernel, word, bits, buffer) in [
         ("project", 1, 0x4000_0000, "splats"),
@@ -360,7 +365,7 @@ fn a_panic_ends_the_checks_and_removes_the_defect() {
 
 #[test]
 fn data_that_is_not_finite_gives_no_difference_and_no_panic() {
-    let gpu = gpu();
+    let gpu = as_a_cpu();
     let mut dataset = dataset(&config(&[]));
     for view in &mut dataset.views {
         if let Some(image) = &mut view.image {

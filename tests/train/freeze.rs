@@ -1,6 +1,7 @@
 //! Frozen attributes: other colours on given geometry.
 
 use nightsplat::gpu::testing::{gpu, gpu_with};
+use nightsplat::photographs::dataset::Split;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{TrainConfig, Trainer};
@@ -100,4 +101,19 @@ fn a_model_of_another_world_is_warned_of_with_the_count() {
     let warned = new(elsewhere);
     let count = format!("{0} of {0} Gaussians are out of sight of every camera", day.count);
     assert!(warned.contains(&count) && warned.contains("elsewhere.ply"), "{warned}");
+}
+
+#[test]
+fn colours_on_frozen_geometry_are_scored_every_fifty_steps() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, _) = day(&folder);
+    let config = TrainConfig { steps: 110, ..config(path, GEOMETRY) };
+    let mut dataset = dataset(6, [40, 30]);
+    dataset.views[1].split = Split::HeldOut;
+    let mut trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
+    while trainer.steps_done() < 110 && !trainer.has_ended() {
+        trainer.advance(110).unwrap();
+    }
+    let scored: Vec<u64> = trainer.held_out_scores().map(|(step, _)| step).collect();
+    assert_eq!(scored[..2], [50, 100]);
 }

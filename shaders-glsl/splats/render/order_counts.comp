@@ -74,9 +74,10 @@ void main() {
             if (i < partition_count) sums[i] = total + inclusive - sum_of_part;
             uint sum_of_lanes = subgroupShuffle(inclusive, SUBGROUP_SIZE - 1);
             total += sum_of_lanes;
-            wraps = wraps || subgroupAny(inclusive < sum_of_part) || total < sum_of_lanes;
+            wraps = wraps || inclusive < sum_of_part || total < sum_of_lanes;
         }
     }
+    wraps = subgroupAny(wraps);
     if (wraps) total = 0xffffffffu;
     if (subgroupElect()) {
         bool fits = total <= capacity;

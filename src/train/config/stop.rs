@@ -12,8 +12,8 @@ settings! {
 pub struct StopConfig {
     /// Hold out this many training views, an eighth of them at most; 0: none, and no run stops early.
     views: usize = 8 => Rule::COUNT, in "views";
-    /// Score them every N steps. A score due within 50 steps after a round of density control is taken at the end of
-    /// these.
+    /// Score them every N steps; with frozen geometry, every 50 at most. A score due within 50 steps after a round of
+    /// density control is taken at the end of these.
     every: u64 = 250 => Rule::at_least(1), in "steps";
     /// The run has converged once two scores in a row do not exceed the best before by this much; it then cools down
     /// and ends.

@@ -5,6 +5,7 @@ use nightsplat::camera::{Camera, CameraModel, Patch};
 use nightsplat::gpu::{Gpu, Reference};
 use nightsplat::kernels::densify_action::{KEY_KEEP, KEY_PRUNE};
 use nightsplat::kernels::{self, densify_decide, densify_moments, densify_scatter, densify_score};
+use nightsplat::splats::batches::Batches;
 use nightsplat::splats::densify::{
     Densifier, DensifyInputs, DensifyReport, DensifySettings, DensityControl, LARGEST_CHANGE, Round,
 };
@@ -155,14 +156,15 @@ impl Host {
         round: Round,
         mut keeps: impl FnMut(usize) -> f64,
     ) -> (Self, DensifyReport) {
-        let planes = |data: &[f32]| gpu.buffer("planes", data).unwrap();
         let mut gaussians = room_for(gpu, self.count);
+        let batches = Batches::new(gpu, gaussians.layout.floats());
+        let planes = |data: &[f32]| batches.upload(gpu, "planes", data).unwrap();
         gaussians.parameters = planes(&self.parameters);
         let mut moments =
             Moments::Single { first: planes(&self.first), second: planes(&self.second) };
         let inputs = DensifyInputs {
             moments: &mut moments,
-            grad_norm_sums: &mut planes(&self.grad_norm_sums),
+            grad_norm_sums: &mut gpu.buffer("grad_norm_sums", &self.grad_norm_sums).unwrap(),
             visit_counts: &mut gpu.buffer("visit_counts", &self.visit_counts).unwrap(),
             gradients: &mut planes(&vec![f32::NAN; self.count * COLUMNS]),
         };
@@ -174,9 +176,9 @@ impl Host {
         let report = densifier.densify(&mut gaussians, inputs, round, keeps).unwrap();
         assert_eq!(report.count, gaussians.layout.count);
         let Moments::Single { first, second } = &moments else { panic!() };
+        let batches = Batches::new(gpu, gaussians.layout.floats());
         let read = |buffer| {
-            let mut planes = gpu.read(buffer).unwrap();
-            planes.truncate(report.count * COLUMNS);
+            let planes = batches.read(gpu, buffer).unwrap();
             assert_eq!(planes.len(), report.count * COLUMNS);
             planes
         };
