@@ -6,13 +6,14 @@ use std::str::FromStr;
 use super::{finish, word};
 use crate::Error;
 use crate::photographs::dataset::varied::{self, Variation};
-use crate::photographs::dataset::{Dataset, LoadOptions};
+use crate::photographs::dataset::{Dataset, LoadOptions, bright_folder};
 
 /// Write a set of varying exposure from one in normal light, with the clean photographs as references.
 ///
 /// Every photograph gets a drawn number of stops, in linear light and clipped at white, and a drawn gamma. The same
-/// seed gives the same bytes. varied.csv has the drawn numbers. The set is nightsplat's own: the pictures of the
-/// published benchmark (Mip-NeRF 360, varying) are of an unpublished generator.
+/// seed gives the same bytes. varied.csv has the drawn numbers. Of a dataset that also has dark photographs, those in
+/// `high` or `images` are taken. The set is nightsplat's own: the pictures of the published benchmark (Mip-NeRF 360,
+/// varying) are of an unpublished generator.
 #[derive(Clone, Debug, clap::Args)]
 pub struct VaryArgs {
     /// Dataset in normal light
@@ -68,6 +69,7 @@ pub fn run(args: &VaryArgs) -> anyhow::Result<()> {
         return Err(Error::output(out, problem).into());
     }
     let options = LoadOptions {
+        images: bright_folder(bright),
         downscale: *downscale,
         test_every: *test_every,
         mask_borders: false,

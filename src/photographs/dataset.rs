@@ -263,6 +263,13 @@ const NORMAL_FOLDERS: [&str; 4] = ["high", "val", "test", "images"];
 /// Folders that may contain depth maps.
 const DEPTH_FOLDERS: [&str; 2] = ["depth", "depth_maps"];
 
+/// The folder of the photographs in normal light, of a dataset that also has dark ones of the same names.
+pub(crate) fn bright_folder(root: &Path) -> Option<PathBuf> {
+    let folder = |name: &str| Some(root.join(name)).filter(|folder| folder.is_dir());
+    DARK_FOLDERS.into_iter().find_map(folder)?;
+    ["high", "images"].into_iter().find_map(folder)
+}
+
 impl Dataset {
     /// Loads the dataset below `root`.
     ///
