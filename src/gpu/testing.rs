@@ -124,7 +124,8 @@ fn open(adapt: impl FnOnce(&mut Shared)) -> Gpu {
     let choice: DeviceChoice = choice.parse().unwrap_or_else(|error| panic!("{error}"));
     let mut gpu = Gpu::with_validation(&choice).unwrap_or_else(|error| panic!("{error}"));
     if let Some(shared) = Arc::get_mut(&mut gpu.shared) {
-        shared.properties.is_cpu &= std::env::var_os(AS_A_GPU_VARIABLE).is_none();
+        shared.properties.is_cpu &=
+            std::env::var_os(AS_A_GPU_VARIABLE).is_none_or(|value| value.is_empty());
         adapt(shared);
     }
     gpu
