@@ -11,6 +11,7 @@ mod diagnose;
 mod few_points;
 mod freeze;
 mod holes;
+mod lamp;
 mod parts;
 mod patches;
 mod precision;
