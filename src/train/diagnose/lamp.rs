@@ -18,7 +18,7 @@ use self::fit::{ALL, ANGLE, LOG_LINEAR, NOTHING, Rows};
 use super::geometry::Observation;
 
 /// A lamp is learned if it explains at least this fraction of the variance that exposures leave.
-const MIN_SHARE: f64 = 0.15;
+const MIN_SHARE: f64 = 0.2;
 /// And at least these stops, as a standard deviation.
 const MIN_STOPS: f64 = 0.15;
 /// And distance at least these stops of them: a vignette depends on the angle alone.

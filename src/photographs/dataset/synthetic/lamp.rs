@@ -14,7 +14,7 @@ const OFFSET: DVec3 = DVec3::new(0.05, -0.09, 0.0);
 const AXIS: DVec3 = DVec3::new(-0.02, 0.04, 1.0);
 
 /// The distance at which the irradiance on the axis is [`COLOUR`].
-const REACH: f64 = 2.8;
+const REACH: f64 = 2.5;
 
 /// The lamp's light on a surface that faces it at the reach.
 const COLOUR: DVec3 = DVec3::new(0.96, 0.98, 1.0);
