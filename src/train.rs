@@ -14,6 +14,7 @@ mod epochs;
 mod exposures;
 mod first_gaussians;
 mod growth;
+mod lamp;
 mod layers;
 mod masks;
 mod measuring;
@@ -57,14 +58,15 @@ use crate::{Error, Result, splats};
 pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
 pub use config::{
-    AntialiasingConfig, Background, CheckConfig, DensityConfig, ExposureConfig, Freeze, NotFinite,
-    OnOff, StopConfig, TrainConfig,
+    AntialiasingConfig, Background, CheckConfig, DensityConfig, ExposureConfig, Freeze, LampConfig,
+    LampRates, NotFinite, OnOff, StopConfig, TrainConfig,
 };
 use context::Initial;
 use early_stopping::Convergence;
 pub use early_stopping::{EndReason, Ended};
 pub(crate) use exposures::known_stops;
 use growth::Growth;
+use lamp::LampLearning;
 pub use layers::{Origin, Settings, SettingsLayer, values};
 pub use measuring::TargetExposure;
 pub(crate) use measuring::law_of;
@@ -173,6 +175,8 @@ struct Optimizer {
     finite: FiniteCheck,
     /// `None`: off.
     floor: Option<SmoothingFloor>,
+    /// `None`: off.
+    lamp: Option<LampLearning>,
     /// The step of the last check of the parameters.
     checked: u64,
 }
@@ -386,7 +390,8 @@ impl Trainer {
         if let Some(floor) = optimizer.floor.as_ref().filter(|_| is_floored) {
             floor.record(pass, &mut model.gaussians, status)?;
         }
-        supervision.update(pass, &optimizer.adam, step, cooldown_factor, status)
+        supervision.update(pass, &optimizer.adam, step, cooldown_factor, status)?;
+        optimizer.update_lamp(pass, renderer, (step, cooldown_factor))
     }
 
     /// The networks, if the model has any.
@@ -415,6 +420,17 @@ impl Trainer {
     pub fn render(&mut self, camera: &Camera) -> Result<Rendered> {
         let camera = self.frame.camera(camera);
         self.render_of_degree(&camera, self.sh_degree_in_use())
+    }
+
+    /// [`Trainer::render`] in even light, each Gaussian in its own colour, if the model has a lamp.
+    ///
+    /// # Errors
+    /// Those of [`Trainer::render`].
+    pub(crate) fn render_in_even_light(&mut self, camera: &Camera) -> Result<Rendered> {
+        self.renderer.set_even_light(true);
+        let rendered = self.render(camera);
+        self.renderer.set_even_light(false);
+        rendered
     }
 
     /// [`Trainer::render`] for a camera in the training frame.

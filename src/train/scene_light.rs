@@ -4,9 +4,12 @@ use super::measuring::{measured, measured_of, recorded};
 use crate::Result;
 use crate::camera::Camera;
 use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::image::{Image, linear_from_srgb};
+use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
     InverseTone, LuminanceHistogram, MeasuredPhotograph, SceneTone, Statistics, ToneSettings,
 };
+use crate::splats::lamp::Lamp;
 
 /// From the values of a model to those of its photographs.
 #[derive(Clone, Debug)]
@@ -61,6 +64,30 @@ impl SceneLight {
     pub fn of_scene(&self) -> Result<InverseTone> {
         let mapping = self.settings.tone_mapping(&self.scene, &self.together);
         InverseTone::new(&self.settings, &mapping.parameters)
+    }
+
+    /// The slope of the tone law for all photographs together, at the median of their targets: d ln target / d ln light
+    /// of grey, light being linear.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn slope(&self, pseudo_gt: &PseudoGt) -> Result<f64> {
+        /// The difference of the values of two photographs of grey, in units of either.
+        const STEP: f32 = 0.02;
+        /// Of a law that is flat there, and of one that is steeper than light.
+        const BOUNDS: [f64; 2] = [0.1, 2.0];
+        let luminance = &self.together.luminance;
+        // A curve does not decrease: the median of its values is the value of the median.
+        let median = Some(luminance.quantile(0.5)).filter(|&median| median > 0.0);
+        let median = median.unwrap_or_else(|| luminance.mean()) as f32;
+        let values = [median * (1.0 - STEP), median * (1.0 + STEP)];
+        let grey = Image { width: 2, height: 1, data: values.repeat(3) };
+        let mapping = self.settings.tone_mapping(&self.scene, &self.together);
+        let target = pseudo_gt.tone_mapped(&grey, &mapping)?.data;
+        let rise = |values: [f32; 2]| f64::from(values[1] / values[0]).ln();
+        let slope = rise([target[0], target[1]]) / rise(values.map(linear_from_srgb));
+        let [least, most] = BOUNDS;
+        Ok(if slope.is_finite() { slope.clamp(least, most) } else { Lamp::AT_CAMERA.slope })
     }
 
     /// The inverse for a camera, at the exposure of the photographs around it: all cameras share one unit of light, as

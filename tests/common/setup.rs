@@ -11,6 +11,7 @@ use nightsplat::reference::camera::pinhole::Pinhole;
 use nightsplat::reference::camera::{Camera, Model};
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
+use nightsplat::splats::lamp::Lamp;
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::{DeviceGaussians, Features, Gaussians, Shape};
 
@@ -324,8 +325,21 @@ pub(crate) fn fisheye() -> CameraModel {
     CameraModel::Fisheye(KannalaBrandt { coefficients })
 }
 
+/// A lamp beside the camera whose every number counts.
+pub(crate) fn lamp() -> Lamp {
+    Lamp {
+        position: [0.1, -0.2, 0.05],
+        axis: [0.1, 0.2],
+        ambient: 0.1,
+        exponent: 1.7,
+        falloffs: [3.0, 0.5],
+        reference_distance: 2.0,
+        slope: 0.45,
+    }
+}
+
 /// Edge cases of size, channel count, tile and SH degree (stored, in use) for the kernels; with many channels, colours
-/// are raw; every second variant is antialiased.
+/// are raw; every second variant is antialiased, every third lit by a lamp.
 pub(crate) fn variants() -> Vec<Setup> {
     type Row = (usize, [u32; 2], [u32; 2], usize, ([u32; 2], u32));
     let rows: [Row; 11] = [
@@ -350,6 +364,7 @@ pub(crate) fn variants() -> Vec<Setup> {
         setup.options.sh_degree = used;
         setup.settings.raw_colors = channels > 4;
         setup.settings.antialiased = i % 2 == 1;
+        setup.settings.lamp = (i % 3 == 2).then(lamp);
         // A device replaces tiles that it does not support by its own.
         setup.settings.tile =
             Some(tile_of(tile)).filter(|&tile| gpu().properties().suits_tile(tile));

@@ -58,6 +58,26 @@ pub struct PlannedNumber {
     pub why: String,
 }
 
+/// The decision on a lamp at the camera, with the numbers from which its learning begins and its reason.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlannedLamp {
+    /// Whether the model has it.
+    pub on: bool,
+    /// The power of the distance by which its light falls.
+    #[serde(default)]
+    pub exponent: f64,
+    /// Its fall with u = 1 - cos of the angle off its axis, and with the square of u.
+    #[serde(default)]
+    pub falloff: [f64; 2],
+    /// The share of light that does not move with the camera.
+    #[serde(default)]
+    pub ambient: f64,
+    /// The reason with its figure, as a sentence.
+    #[serde(default)]
+    pub why: String,
+}
+
 /// Identifies the dataset of a plan by the names and loaded sizes of its training views.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -89,7 +109,7 @@ impl PlannedViews {
 }
 
 /// The plan of a capture's model, with its reasons.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Plan {
     /// The names of training views that are left out.
@@ -101,6 +121,9 @@ pub struct Plan {
     pub curve: PlannedPart,
     /// Whether each view's exposure is learned.
     pub exposure: PlannedPart,
+    /// [`Part::Lamp`](crate::train::Part::Lamp).
+    #[serde(default)]
+    pub lamp: PlannedLamp,
     /// [`Part::Denoiser`](crate::train::Part::Denoiser).
     pub denoiser: PlannedPart,
     /// [`Part::Tonemapper`](crate::train::Part::Tonemapper).
@@ -130,6 +153,7 @@ impl Plan {
             dataset: diagnosis.fingerprint.clone(),
             curve,
             exposure: spread.exposure(),
+            lamp: PlannedLamp::default(),
             denoiser: denoiser(scene),
             tonemapper: tonemapper(scene, spread.is_wide),
             structure: spread.structure(scene),
@@ -150,6 +174,13 @@ impl Plan {
             say("tone.curve", ToneCurve::None.name().into())?;
         }
         say("exposure.learn", if self.exposure.on { "on" } else { "off" }.into())?;
+        say("model.lamp", self.lamp.on.into())?;
+        if self.lamp.on {
+            say("lamp.exponent", self.lamp.exponent.into())?;
+            say("lamp.falloff", self.lamp.falloff[0].into())?;
+            say("lamp.falloff_squared", self.lamp.falloff[1].into())?;
+            say("lamp.ambient", self.lamp.ambient.into())?;
+        }
         say("model.denoiser", self.denoiser.on.into())?;
         say("model.tonemapper", self.tonemapper.on.into())?;
         say("model.structure", self.structure.on.into())?;
@@ -173,6 +204,7 @@ impl Plan {
         let named = [
             (switch("curve", &self.curve), &self.curve.why),
             (switch("exposure", &self.exposure), &self.exposure.why),
+            (("lamp", if self.lamp.on { "on" } else { "off" }.to_owned()), &self.lamp.why),
             (switch("denoiser", &self.denoiser), &self.denoiser.why),
             (switch("tonemapper", &self.tonemapper), &self.tonemapper.why),
             (switch("structure", &self.structure), &self.structure.why),

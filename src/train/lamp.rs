@@ -1,0 +1,181 @@
+//! A lamp that moves with the camera: where its learning begins, and its steps.
+
+use std::collections::BTreeMap;
+
+use super::LampRates;
+use super::scene_light::SceneLight;
+use super::{OnOff, Optimizer, TrainConfig, Trainer};
+use crate::Result;
+use crate::gpu::{Gpu, Recorder, Slice, SliceMut};
+use crate::kernels::lamp::LAMP_WIDTH;
+use crate::photographs::dataset::{Dataset, Point, View};
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::splats::lamp::Lamp;
+use crate::splats::optimizer::{AdamBuffers, Learnable, Moments};
+use crate::splats::render::{DeviceLamp, Renderer};
+
+/// The most points whose distances are measured.
+const MAX_POINTS: usize = 20_000;
+/// Of views that tell their exposures from a lamp: distances that differ by a tenth.
+const LEAST_SPREAD: f64 = 0.1;
+/// Fewer views show hardly any surface at two distances.
+const FEWEST_VIEWS: usize = 3;
+
+/// The state of the learning of a lamp's numbers.
+#[derive(Debug)]
+pub(super) struct LampLearning {
+    rates: LampRates,
+    pub(super) moments: Moments,
+}
+
+impl LampLearning {
+    /// # Errors
+    /// The device is out of memory.
+    pub(super) fn new(gpu: &Gpu, rates: LampRates) -> Result<Self> {
+        Ok(Self { rates, moments: Moments::zeros(gpu, LAMP_WIDTH as usize)? })
+    }
+}
+
+/// The learned numbers of a lamp.
+struct LearnedLamp<'a> {
+    numbers: SliceMut<'a, f32>,
+    gradients: Slice<'a, f32>,
+    learning: &'a mut LampLearning,
+}
+
+impl Learnable for LearnedLamp<'_> {
+    fn name(&self) -> &'static str {
+        LEARNED
+    }
+
+    fn learning_rate(&self, step: u64) -> f64 {
+        self.learning.rates.at(step)
+    }
+
+    fn buffers(&mut self) -> AdamBuffers<'_> {
+        AdamBuffers {
+            parameters: self.numbers.reborrow(),
+            gradients: self.gradients,
+            moments: self.learning.moments.slice_mut(),
+        }
+    }
+}
+
+/// The prefix of its tensors in a checkpoint.
+pub(super) const LEARNED: &str = "lamp";
+
+impl Optimizer {
+    /// Records a step of the lamp, if one is learned.
+    ///
+    /// # Errors
+    /// A pass exceeds the device's launch limits.
+    pub(super) fn update_lamp(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        renderer: &mut Renderer,
+        (step, factor): (u64, f64),
+    ) -> Result<()> {
+        let Some((learning, (lamp, status))) = self.lamp.as_mut().zip(renderer.lamp_and_status())
+        else {
+            return Ok(());
+        };
+        let DeviceLamp { numbers, gradients, .. } = lamp;
+        let mut learned = LearnedLamp {
+            numbers: numbers.slice_mut().range(0..LAMP_WIDTH as usize)?,
+            gradients: gradients.slice(),
+            learning,
+        };
+        self.adam.update(pass, step, factor, &mut learned, status)
+    }
+}
+
+impl Trainer {
+    /// The lamp as learned so far, in units of the dataset's world; `None` without one.
+    ///
+    /// # Errors
+    /// The device was lost.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn lamp(&self) -> Result<Option<Lamp>> {
+        let lamp = self.renderer.lamp()?;
+        Ok(lamp.map(|lamp| lamp.scaled(1.0 / self.frame.scale)))
+    }
+}
+
+/// The lamp of the first step, in the training frame: that of the configuration, at the distances and the tone law of
+/// the dataset.
+///
+/// # Errors
+/// A photograph can no longer be read, or the device is out of memory or lost.
+pub(super) fn start(pseudo_gt: &PseudoGt, dataset: &Dataset, config: &TrainConfig) -> Result<Lamp> {
+    let views = dataset.train_views().count();
+    if views < FEWEST_VIEWS {
+        tracing::warn!(
+            "{views} training views do not tell a lamp from the surfaces that it lights; without the part lamp, all \
+             light is the surfaces'"
+        );
+    }
+    if !config.tone.scene_statistics && config.tone.takes_exposure() {
+        tracing::warn!(
+            "every photograph has a gain of its own, which follows the lamp: set tone.scene_statistics to true"
+        );
+    }
+    let scale = config.frame.unwrap_or_default().scale;
+    let distances = distances(dataset);
+    if config.exposure.learn == OnOff::On && spread(&distances) < LEAST_SPREAD {
+        tracing::warn!(
+            "all views are at about the same distance from what they show: exposures of views can take the lamp's \
+             place; --exposure off leaves it the light"
+        );
+    }
+    let all = distances.into_values().flatten().collect();
+    let reference_distance = median(all).unwrap_or_else(|| config.extent_of(dataset));
+    let slope = SceneLight::of(&config.tone, dataset)?.slope(pseudo_gt)?;
+    let lamp = Lamp {
+        ambient: config.lamp.ambient,
+        exponent: config.lamp.exponent,
+        falloffs: [config.lamp.falloff, config.lamp.falloff_squared],
+        reference_distance,
+        slope,
+        ..Lamp::AT_CAMERA
+    };
+    tracing::info!(
+        "a lamp at the camera: reference distance {reference_distance:.3}, slope of the tone law {slope:.3}"
+    );
+    Ok(lamp.scaled(scale))
+}
+
+/// The distances of points from the training cameras that triangulated them, by the index of the view; if the dataset
+/// does not list these, from those that see them.
+fn distances(dataset: &Dataset) -> BTreeMap<usize, Vec<f64>> {
+    let Dataset { views, points, .. } = dataset;
+    let has_tracks = points.iter().any(|point| !point.views.is_empty());
+    let is_seen = |point: &Point, (index, view): (usize, &View)| match has_tracks {
+        true => point.views.binary_search(&(index as u32)).is_ok(),
+        false => view.camera.sees(point.position).is_some(),
+    };
+    let stride = points.len().div_ceil(MAX_POINTS).max(1);
+    let mut distances = BTreeMap::<usize, Vec<f64>>::new();
+    for point in points.iter().step_by(stride) {
+        let training = views.iter().enumerate().filter(|(_, view)| view.is_train());
+        for (index, view) in training.filter(|own| is_seen(point, *own)) {
+            let distance = view.camera.center().distance(point.position);
+            distances.entry(index).or_default().push(distance);
+        }
+    }
+    distances
+}
+
+/// The standard deviation of the logarithm of the views' median distances.
+fn spread(distances: &BTreeMap<usize, Vec<f64>>) -> f64 {
+    let own = distances.values().filter_map(|own| Some(median(own.clone())?.ln()));
+    let own: Vec<f64> = own.collect();
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
+    let middle = mean(&own);
+    mean(&own.iter().map(|value| (value - middle).powi(2)).collect::<Vec<_>>()).sqrt()
+}
+
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.retain(|value| value.is_normal() && *value > 0.0);
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
+}
