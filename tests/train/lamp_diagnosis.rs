@@ -9,7 +9,8 @@ use std::path::Path;
 use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions};
 use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
-use nightsplat::train::diagnose::{Diagnosis, LampDiagnosis, SceneDiagnosis};
+use nightsplat::train::TrainConfig;
+use nightsplat::train::diagnose::{Diagnosis, LampDiagnosis, Plan, SceneDiagnosis};
 
 use crate::common::command::succeed;
 
@@ -29,9 +30,13 @@ fn written(options: &SyntheticOptions, capture: &Capture) -> tempfile::TempDir {
     folder
 }
 
-fn scene(folder: &Path) -> SceneDiagnosis {
+fn diagnosis(folder: &Path) -> Diagnosis {
     let options = LoadOptions::default();
-    Diagnosis::of(&Dataset::load(folder, &options).unwrap(), &options).unwrap().scene
+    Diagnosis::of(&Dataset::load(folder, &options).unwrap(), &options).unwrap()
+}
+
+fn scene(folder: &Path) -> SceneDiagnosis {
+    diagnosis(folder).scene
 }
 
 fn lamp_of(options: &SyntheticOptions, capture: &Capture) -> LampDiagnosis {
@@ -170,11 +175,67 @@ fn clipped_photographs_few_views_and_one_position_measure_no_lamp() {
 }
 
 #[test]
+fn the_plan_has_a_lamp_and_exposures_each_where_its_cause_is() {
+    let plan = |lamp, capture: &Capture| {
+        let folder = written(&set(lamp), capture);
+        let found = diagnosis(folder.path());
+        let mut config = TrainConfig::default();
+        config.tone.scene_statistics = true;
+        let plan = Plan::new(&found, &config, 8 << 30);
+        config.freeze = Some("means,quats,scales,opacities,dc".parse().unwrap());
+        let frozen = Plan::new(&found, &config, 8 << 30).lamp;
+        assert!(
+            !frozen.on && frozen.why.contains("colours are frozen") == plan.lamp.on,
+            "{frozen:?}"
+        );
+        (found.scene.lamp.unwrap(), plan)
+    };
+    for (lamp, capture, expected) in [
+        (None, Capture::default(), [false, false]),
+        (None, varying(), [false, true]),
+        (Some(16.0), Capture::default(), [true, false]),
+        (Some(16.0), varying(), [true, true]),
+    ] {
+        let (found, plan) = plan(lamp, &capture);
+        assert_eq!(
+            [plan.lamp.on, plan.exposure.on],
+            expected,
+            "{:?} {:?}",
+            plan.lamp,
+            plan.exposure
+        );
+        assert!(plan.lamp.why.contains("threshold"), "{:?}", plan.lamp);
+        let begins = match lamp {
+            Some(_) => (found.exponent, found.falloff, found.ambient),
+            None => (2.0, [0.0; 2], 0.05),
+        };
+        assert_eq!((plan.lamp.exponent, plan.lamp.falloff, plan.lamp.ambient), begins);
+    }
+}
+
+#[test]
+fn a_run_learns_the_lamp_that_was_found_and_none_where_there_is_none() {
+    for (lamp, learned) in [(Some(16.0), "lamp = true"), (None, "lamp = false")] {
+        let folder = written(&set(lamp), &Capture::default());
+        let out = folder.path().join("run");
+        succeed(&format!("train {} --out {} --steps 2", folder.path().display(), out.display()));
+        let config = fs::read_to_string(out.join("config.toml")).unwrap();
+        assert!(config.contains(learned), "no `{learned}` in {config}");
+        assert_eq!(config.contains("scene_statistics = true"), lamp.is_some(), "{config}");
+        let plan: toml::Value =
+            toml::from_str(&fs::read_to_string(out.join("plan.toml")).unwrap()).unwrap();
+        let exponent = plan["lamp"]["exponent"].as_float().unwrap();
+        assert!((exponent - 2.0).abs() < 0.5 && config.contains(&format!("exponent = {exponent}")));
+    }
+}
+
+#[test]
 fn the_command_reports_the_lamp_as_text_json_and_page() {
     let folder = written(&set(Some(16.0)), &Capture::default());
     let (root, page) = (folder.path().display(), folder.path().join("page.html"));
     let text = succeed(&format!("diagnose {root} --report {}", page.display()));
     let line = text.lines().find(|line| line.starts_with("lamp ")).unwrap();
+    assert!(text.lines().any(|line| line.starts_with("lamp ") && line.contains(" on ")), "{text}");
     for part in ["moves with the camera", "exponent", "beyond exposures", "by distance"] {
         assert!(line.contains(part), "{line}");
     }
