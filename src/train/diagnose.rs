@@ -356,6 +356,7 @@ impl SceneDiagnosis {
         let mean = |of: fn(&ViewDiagnosis) -> f64| {
             lit.iter().map(|view| of(view)).sum::<f64>() / lit.len().max(1) as f64
         };
+        let lamp = LampDiagnosis::of(&shared.observations, views.len());
         let measured = deviation(lit.iter().filter_map(|view| view.exposure));
         let light = mean(|view| view.light);
         Self {
@@ -384,8 +385,8 @@ impl SceneDiagnosis {
             overlap: mean(|view| view.overlap),
             views_per_point: shared.views_per_point,
             points,
-            lamp: shared.lamp.as_ref().ok().cloned(),
-            lamp_unknown: shared.lamp.as_ref().err().cloned(),
+            lamp_unknown: lamp.as_ref().err().cloned(),
+            lamp: lamp.ok(),
         }
     }
 }

@@ -10,7 +10,7 @@ use nightsplat::photographs::image::{Image, linear_from_srgb};
 
 use crate::common::command::{refused, run};
 
-fn room() -> SyntheticOptions {
+fn set() -> SyntheticOptions {
     let lamp = Some(16.0);
     SyntheticOptions { views: 17, width: 80, height: 60, seed: 2, lamp, ..Default::default() }
 }
@@ -45,9 +45,9 @@ fn stops(folder: &Path, view: &str) -> Vec<f64> {
 
 #[test]
 fn a_view_is_lit_over_about_eight_stops() {
-    let set = written(&room(), &Capture::clean());
+    let folder = written(&set(), &Capture::clean());
     let street = written(&SyntheticOptions { lamp: Some(16.0), ..street() }, &Capture::clean());
-    for (folder, views) in [(&set, ["000", "008", "016"]), (&street, ["000", "008", "016"])] {
+    for (folder, views) in [(&folder, ["000", "008", "016"]), (&street, ["000", "008", "016"])] {
         let spread = views.map(|view| {
             let stops = stops(folder.path(), view);
             stops[stops.len() - 1 - stops.len() / 200] - stops[stops.len() / 200]
@@ -60,17 +60,17 @@ fn a_view_is_lit_over_about_eight_stops() {
 
 #[test]
 fn a_lit_test_view_is_what_its_photograph_would_be_without_darkening_and_noise() {
-    let set = written(&room(), &Capture::clean());
+    let folder = written(&set(), &Capture::clean());
     for view in ["000", "008", "016"] {
-        let [low, lit] = ["low", "lit"].map(|of| image(set.path(), &format!("{of}/{view}.png")));
+        let [low, lit] = ["low", "lit"].map(|of| image(folder.path(), &format!("{of}/{view}.png")));
         assert!(low.data == lit.data, "{view}");
         let mean = lit.data.iter().sum::<f32>() / lit.data.len() as f32;
         assert!((0.2..0.6).contains(&mean), "{view}: {mean}");
         let white = lit.data.iter().filter(|&&value| value >= 1.0).count();
         assert!(white < lit.data.len() / 50, "{view}: {white} values are white");
     }
-    assert!(!set.path().join("lit/001.png").exists());
-    let dark = written(&room(), &Capture::default());
+    assert!(!folder.path().join("lit/001.png").exists());
+    let dark = written(&set(), &Capture::default());
     for view in ["000", "008"] {
         let [low, lit] =
             ["low", "lit"].map(|of| green(&image(dark.path(), &format!("{of}/{view}.png"))));
@@ -92,7 +92,7 @@ fn the_references_of_a_street_do_not_depend_on_the_lamp() {
 
 #[test]
 fn a_point_is_brighter_from_nearby_and_on_the_axis() {
-    let set = written(&SyntheticOptions { lamp: Some(30.0), ..room() }, &Capture::clean());
+    let set = written(&SyntheticOptions { lamp: Some(30.0), ..set() }, &Capture::clean());
     let dataset = Dataset::load(set.path(), &LoadOptions::default()).unwrap();
     let images: Vec<Image> = (dataset.views.iter())
         .map(|view| image(set.path(), &format!("low/{}.png", view.name)))

@@ -155,7 +155,7 @@ fn clipped_photographs_few_views_and_one_position_measure_no_lamp() {
     let path = folder.path().join("transforms_train.json");
     let points = Dataset::load(folder.path(), &LoadOptions::default()).unwrap().points;
     fs::remove_dir_all(folder.path().join("colmap_sparse")).unwrap();
-    unknown(folder.path(), "no points");
+    unknown(folder.path(), "0 points in 0 views");
     let mut still = list();
     let pose = still["frames"][0]["transform_matrix"].clone();
     for frame in still["frames"].as_array_mut().unwrap() {

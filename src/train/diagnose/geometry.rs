@@ -3,7 +3,6 @@
 use glam::DVec2;
 use rayon::prelude::*;
 
-use super::lamp::LampDiagnosis;
 use crate::Result;
 use crate::camera::Camera;
 use crate::photographs::dataset::{Dataset, Point, View};
@@ -38,7 +37,7 @@ pub(super) struct Observation {
 }
 
 /// Measurements across the cameras of the training views.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Shared {
     /// The number of points of each view: those that it helped to triangulate, if the dataset lists them.
     pub(super) points: Vec<usize>,
@@ -48,8 +47,8 @@ pub(super) struct Shared {
     pub(super) views_per_point: f64,
     /// log2 exposure of each view at shared points, with mean 0; `None` if it shares too few.
     pub(super) exposures: Vec<Option<f64>>,
-    /// The lamp that moves with the camera, or why it is not measured.
-    pub(super) lamp: Result<LampDiagnosis, String>,
+    /// Those of each point that two views see, unless the points are random.
+    pub(super) observations: Vec<Vec<Observation>>,
 }
 
 impl Shared {
@@ -100,11 +99,7 @@ impl Shared {
             overlaps: shares.iter().map(|&(sum, count)| sum / count.max(1) as f64).collect(),
             views_per_point: sum as f64 / visible.max(1) as f64,
             exposures: exposures(&observations, views.len()),
-            lamp: if dataset.points.is_empty() {
-                Err("the dataset has no points".to_owned())
-            } else {
-                LampDiagnosis::of(&observations, views.len())
-            },
+            observations,
         })
     }
 }

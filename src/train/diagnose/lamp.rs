@@ -43,8 +43,8 @@ pub struct LampDiagnosis {
     pub ambient: f64,
     /// The median distance of a point from the cameras that see it, world units.
     pub d_ref: f64,
-    /// The fraction of the variance of a point's log brightness over its views that lamp and exposures explain together,
-    /// on points that they were not fitted to; below 0 if they predict worse than nothing.
+    /// The fraction of the variance of a point's log brightness over its views that lamp and exposures explain
+    /// together, on points that they were not fitted to; below 0 if they predict worse than nothing.
     pub r_squared: f64,
     /// The standard deviation that the lamp explains beyond exposures, stops.
     pub stops: f64,
