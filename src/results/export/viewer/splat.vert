@@ -12,6 +12,10 @@ uniform vec2 focal, principalPoint, size;  // pixels of the view
 uniform vec2 offset, scale;                // pixels of the view to clip space
 uniform float near;
 uniform uint degree;  // of the harmonics
+uniform bool isLit;   // by a lamp at the camera
+uniform vec3 lampPosition, lampAxis;  // in the view
+uniform vec2 lampFalloffs;
+uniform vec4 lampLight;  // ambient, exponent, reference distance, slope of the tone law
 
 in vec2 corner;
 in uint id;
@@ -35,6 +39,15 @@ vec3 shaded(int first, vec3 direction) {
     vec3 sum = vec3(0.5);
     for (uint k = 0u; k < sh_count(degree); k++) sum += basis[k] * texel(harmonics, first + int(k)).rgb;
     return max(sum, vec3(0.0));
+}
+
+// The law of include/lamp.glsl at a point in the view.
+float lampFactor(vec3 point) {
+    vec3 offset = (point - lampPosition) / lampLight.z;
+    float d = clamp(length(offset), LAMP_NEAREST, LAMP_FARTHEST);
+    float away = 1.0 - clamp(dot(offset / d, lampAxis), -1.0, 1.0);
+    float beam = exp(-lampLight.y * log(d) - (lampFalloffs.x + lampFalloffs.y * away) * away);
+    return pow(lampLight.x + (1.0 - lampLight.x) * beam, lampLight.w);
 }
 
 void main() {
@@ -66,5 +79,6 @@ void main() {
     vec2 pixel = focal * mean.xy / mean.z + principalPoint + fromMean;
     depth = mean.z;
     color = vec4(shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye)), opacity);
+    if (isLit) color.rgb *= lampFactor(mean);
     gl_Position = vec4((pixel + offset) * scale + vec2(-1.0, 1.0), 0.0, 1.0);
 }
