@@ -401,6 +401,11 @@ impl TrainConfig {
         self.freeze.as_ref().map_or(0, Freeze::leading_columns)
     }
 
+    /// Whether the colours are frozen.
+    pub(super) fn learns_no_colour(&self) -> bool {
+        self.frozen_columns() as usize > Attribute::Dc.column(0)
+    }
+
     /// The configuration of the loss.
     pub(crate) fn loss(&self) -> LossConfig {
         LossConfig {
@@ -453,7 +458,7 @@ impl TrainConfig {
                 rule,
             });
         }
-        if self.model.lamp && self.frozen_columns() as usize > Attribute::Dc.column(0) {
+        if self.model.lamp && self.learns_no_colour() {
             let rule = "off where the colours are frozen, whose gradients it learns from";
             let (key, value) = ("model.lamp".to_owned(), "true".to_owned());
             return Err(Error::Setting { key, value, rule: rule.to_owned() });

@@ -12,6 +12,7 @@ mod few_points;
 mod freeze;
 mod holes;
 mod lamp;
+mod lamp_diagnosis;
 mod parts;
 mod patches;
 mod precision;

@@ -10,8 +10,8 @@ use crate::base::input;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::tone::ToneCurve;
 use crate::splats::scene::{Features, Shape, width};
-use crate::train::TrainConfig;
 use crate::train::layers::{Origin, SettingsLayer};
+use crate::train::{LampConfig, TrainConfig};
 use crate::{Error, Result};
 
 /// Below this brightening, targets are the photographs themselves, as in `--curve auto`.
@@ -153,7 +153,7 @@ impl Plan {
             dataset: diagnosis.fingerprint.clone(),
             curve,
             exposure: spread.exposure(),
-            lamp: PlannedLamp::default(),
+            lamp: lamp(scene, config),
             denoiser: denoiser(scene),
             tonemapper: tonemapper(scene, spread.is_wide),
             structure: spread.structure(scene),
@@ -285,9 +285,17 @@ struct Spread {
 impl Spread {
     /// A curve that follows each view compensates most of the photographs' spread.
     fn of(scene: &SceneDiagnosis, follows_views: bool, views: usize) -> Self {
-        let SceneDiagnosis { exposure_spread: spread, exposure_share: share, .. } = *scene;
+        let SceneDiagnosis { exposure_share: share, spread_is_measured, .. } = *scene;
+        // With a lamp, all views have one curve, and what it explains is not the exposures'.
+        let beside_lamp = scene.lamp.as_ref().filter(|lamp| lamp.is_found());
+        let spread = beside_lamp.map_or(scene.exposure_spread, |lamp| lamp.exposure_spread);
+        let follows_views = follows_views && beside_lamp.is_none();
         let left = if follows_views { (1.0 - share) * spread } else { spread };
-        let by = if scene.spread_is_measured { "at shared points" } else { "by the views' gains" };
+        let by = match (beside_lamp, spread_is_measured) {
+            (Some(_), _) => "beside the lamp",
+            (None, true) => "at shared points",
+            (None, false) => "by the views' gains",
+        };
         Self {
             is_wide: left >= MIN_SPREAD && views > 2,
             found: format!("exposures spread by {spread:.2} stops {by}, {left:.2} in the targets"),
@@ -303,6 +311,30 @@ impl Spread {
         let why =
             format!("{} (threshold {MIN_SPREAD}); edges do not depend on exposure", self.found);
         PlannedPart { on, why }
+    }
+}
+
+/// Without a lamp, a plan that is edited to have one begins at the configuration's.
+fn lamp(scene: &SceneDiagnosis, config: &TrainConfig) -> PlannedLamp {
+    let LampConfig { exponent, ambient, falloff, falloff_squared, .. } = config.lamp;
+    let falloff = [falloff, falloff_squared];
+    let usual = |why: String| PlannedLamp { on: false, exponent, ambient, falloff, why };
+    match &scene.lamp {
+        None => {
+            let why = scene.lamp_unknown.as_deref().unwrap_or("not measured");
+            usual(format!("a lamp that moves with the camera is not measurable: {why}"))
+        }
+        Some(lamp) if !lamp.is_found() => usual(lamp.why()),
+        Some(lamp) if config.learns_no_colour() => {
+            usual(format!("{}; the colours are frozen", lamp.why()))
+        }
+        Some(lamp) => PlannedLamp {
+            on: true,
+            exponent: lamp.exponent,
+            falloff: lamp.falloff,
+            ambient: lamp.ambient,
+            why: lamp.why(),
+        },
     }
 }
 
