@@ -231,8 +231,8 @@ impl Trainer {
         self.model_of(&self.gaussians_in_frame()?)
     }
 
-    /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world. If the model has a
-    /// lamp, their colours are those in its light at the median of the points that the views see.
+    /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world. If the model has
+    /// a lamp, their colours are those in its light at the median of the points that the views see.
     ///
     /// # Errors
     /// The device was lost.

@@ -1,6 +1,8 @@
 //! A lamp that moves with the camera, on the host; `include/lamp.glsl` has its law.
 
-use glam::{DVec3, Vec3};
+use glam::DVec3;
+#[cfg(feature = "io")]
+use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use crate::kernels::lamp::{
@@ -93,12 +95,14 @@ impl Lamp {
     }
 
     /// The colour of a Gaussian without the light at a point in view space.
-    pub fn unlit(&self, color: Vec3, point: DVec3) -> Vec3 {
+    #[cfg(feature = "io")]
+    pub(crate) fn unlit(&self, color: Vec3, point: DVec3) -> Vec3 {
         let black = self.black as f32;
         black + (color - black) / self.factor(point) as f32
     }
 
     /// The same lamp with this light as the unit; colours then have the factor light^slope above black.
+    #[cfg(feature = "io")]
     #[must_use]
     pub(crate) fn with_unit(&self, light: f64) -> Self {
         Self { gain: self.gain / light, ..*self }

@@ -53,7 +53,8 @@ impl Part {
         [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth, Self::Lamp];
 
     /// The parts of LITA-GS.
-    pub const LITA: [Self; 4] = [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth];
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) const LITA: [Self; 4] = [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth];
 
     /// The name on the command line.
     pub fn name(self) -> &'static str {

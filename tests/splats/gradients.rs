@@ -122,14 +122,14 @@ fn the_gradient_of_lit_colors_and_of_their_lamp_agrees_with_central_differences(
 
 /// Within the lamp, where distances are bounded, nothing depends on the distance, but the angle counts.
 #[test]
-fn the_gradient_is_correct_at_the_lamp_and_behind_it() {
+fn the_gradient_is_correct_at_the_lamp_and_opposite_to_its_axis() {
     let mut setup = Setup::new(7, SIZE, 1, 23);
     let in_view = setup.camera().view(setup.get(0).mean);
     let position = (in_view + DVec3::new(0.02, -0.01, 0.03)).to_array();
     setup.settings.lamp = Some(Lamp { position, ..lamp() });
     check(&setup, "at the lamp");
     setup.settings.lamp = Some(Lamp { position: [0.0, 0.0, 4.0], ..lamp() });
-    check(&setup, "behind the lamp");
+    check(&setup, "opposite to the axis");
 }
 
 #[test]

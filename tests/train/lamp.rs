@@ -128,8 +128,8 @@ fn config(parts: &[Part]) -> TrainConfig {
     config
 }
 
-/// Mean PSNR of the test views in the light of the photographs, and evenly lit, there with the gain of least squares for
-/// all: the brightness of even light is a matter of definition.
+/// Mean PSNR of the test views in the light of the photographs, and evenly lit, there with the gain of least squares
+/// for all: the brightness of even light is a matter of definition.
 fn scores(trainer: &mut Trainer, dataset: &Dataset, even: &[Image]) -> [f64; 2] {
     let (mut sums, mut count) = ([0.0; 2], 0.0);
     let mut products = [0.0_f32; 2];
@@ -271,10 +271,10 @@ fn a_lamp_that_cannot_be_told_from_something_else_is_warned_of() {
     let command = format!(
         "train {set} --parts lamp --exposure on --steps 2 --set tone.scene_statistics=false --out {out}"
     );
-    let (_, said) = run(&command, 0);
+    let (_, warnings) = run(&command, 0);
     for part in
         ["2 training views do not tell a lamp", "a gain of its own", "exposures of views can take"]
     {
-        assert!(said.contains(part), "no `{part}` in {said}");
+        assert!(warnings.contains(part), "no `{part}` in {warnings}");
     }
 }
