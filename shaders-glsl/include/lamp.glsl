@@ -11,8 +11,8 @@
 // light), with black = f(0). A factor k of linear light multiplies t - black by k^slope to first order in ln k, with
 // slope = d ln(f - black) / d ln light, and exactly where f - black is a power.
 //
-// Bounds: distances count from LAMP_NEAREST to LAMP_FARTHEST, u is at most 2, opposite to the axis, and the ambient light is
-// at least LAMP_LEAST_AMBIENT: all is finite, and the light is above 0.
+// Bounds: distances count from LAMP_NEAREST to LAMP_FARTHEST, u is at most 2, opposite to the axis, and the ambient
+// light is at least LAMP_LEAST_AMBIENT: all is finite, and the light is above 0.
 
 // The learned numbers: position, tangents of the axis, ambient, exponent, and two falloffs, before their functions.
 const uint LAMP_WIDTH = 9;

@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn the_light_is_finite_and_positive_at_the_lamp_behind_it_and_far_away() {
+    fn the_light_is_finite_and_positive_at_the_lamp_and_far_away() {
         let own =
             Lamp { ambient: LAMP_LEAST_AMBIENT, exponent: 4.0, falloffs: [50.0; 2], ..lamp() };
         let position = DVec3::from(own.position);

@@ -54,7 +54,8 @@ impl Part {
 
     /// The parts of LITA-GS.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) const LITA: [Self; 4] = [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth];
+    pub(crate) const LITA: [Self; 4] =
+        [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth];
 
     /// The name on the command line.
     pub fn name(self) -> &'static str {
