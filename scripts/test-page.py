@@ -6,7 +6,8 @@
 Trains a small synthetic set, opens the page from disk at the size of its views and at twice that, and requires 30 dB
 or more for every view. Turns the background grey by its key and black again by its control: grey must show where the
 model is empty, and not where it is opaque. Shows the other layers, and the difference to a photograph; touches move
-the camera. Opens the page of a training under way: a new model must be shown within two seconds of its checkpoint, and
+the camera. The page of a set lit by a lamp at the camera, with the lamp on, must be the render that has it. Opens the
+page of a training under way: a new model must be shown within two seconds of its checkpoint, and
 the page pauses, continues and stops the training. Edits the model in the page: `edit` with the saved list, rendered,
 must be the page's picture, and so must a keyframe, rendered by `render --path`. No console message may appear. Then
 opens the page in a browser without WebGL, which it must report. Needs Python and Chromium, which it controls by the
@@ -322,6 +323,28 @@ def edits(browser, run, page, folder, size):
     return is_right
 
 
+def lamp(browser, run, folder, size):
+    """With its lamp on, the page of a lamp-lit set is the render whose camera carries it. Other pages have no lamp."""
+    absent = browser.evaluate("document.getElementById('lamp').parentElement.hidden")
+    width, height = size
+    dataset, out = folder / "lit", folder / "run-lit"
+    run("synth", dataset, "--lamp", "--views", 16, "--width", width, "--height", height)
+    run("train", dataset, "--out", out, "--steps", 200, "--parts", "lamp", "--progress", "none")
+    run("export", out, "--format", "html")
+    run("render", out, "--split", "test", "--out", folder / "renders-lit", "--lamp")
+    failed = 0
+    for view, picture in enumerate(sorted((folder / "renders-lit").rglob("*.png"))):
+        browser.open((out / "model.html").as_uri(), view)
+        browser.fit_canvas(width, height)
+        even = psnr(browser, picture)
+        select(browser, "lamp", True)
+        lit = psnr(browser, picture)
+        is_right = absent and lit >= ENOUGH and even < ENOUGH
+        print(f"{'ok' if is_right else 'BAD':3} lamp: {lit:.1f} dB with it, {even:.1f} without, {picture.stem}")
+        failed += not is_right
+    return failed
+
+
 def live(browser, nightsplat, dataset, run):
     """A page of a training under way, and of its files."""
     failed = 0
@@ -405,6 +428,8 @@ def main():
             browser.open(page.as_uri())
             failed += not layers(browser)
             failed += not touch(browser)
+            failed += lamp(browser, run, folder, SIZES[0])
+            browser.open(page.as_uri())
             failed += not edits(browser, run, page, folder, SIZES[0])
             failed += bool(browser.complaints)
             print(f"{'BAD' if browser.complaints else 'ok':3} console: {browser.complaints or 'nothing'}")

@@ -202,6 +202,7 @@ pub use gpu::{CheckReport, CheckedPass, Difference, Tolerance};
 // Cameras, Gaussians, and the renderer.
 pub use camera::{Camera, CameraModel, CameraPath, KannalaBrandt};
 pub use photographs::image::Image;
+pub use splats::lamp::Lamp;
 pub use splats::model::Model;
 pub use splats::packed_sh::StorageFormat;
 pub use splats::render::{
@@ -237,8 +238,8 @@ pub mod config {
     pub use crate::splats::optimizer::{LearningRates, Schedule};
     pub use crate::train::{
         AntialiasingConfig, Background, CacheSize, CheckConfig, DensityConfig, EndReason,
-        ExposureConfig, Freeze, ModelConfig, NetworkRates, NotFinite, OnOff, PhotographBits,
-        PrecisionConfig, StopConfig,
+        ExposureConfig, Freeze, LampConfig, LampRates, ModelConfig, NetworkRates, NotFinite, OnOff,
+        PhotographBits, PrecisionConfig, StopConfig,
     };
 }
 

@@ -9,6 +9,7 @@
 //! - [`batches`]: buffers of Gaussians that exceed one binding
 //! - [`scene`]: Gaussians on the host and on the device, PLY
 //! - [`model`]: a model with what a renderer must know of it
+//! - [`lamp`]: a lamp that moves with the camera
 //! - [`sort`]: scan and radix sort on the device
 //! - [`optimizer`]: Adam, learned parameters other than the Gaussians, and learning-rate schedules
 //! - [`render`]: the differentiable rasteriser
@@ -24,6 +25,7 @@ pub mod densify;
 pub mod harmonics;
 #[cfg(feature = "io")]
 pub mod joined;
+pub mod lamp;
 #[cfg(feature = "io")]
 pub mod levels;
 pub mod model;

@@ -14,6 +14,7 @@ mod epochs;
 mod exposures;
 mod first_gaussians;
 mod growth;
+mod lamp;
 mod layers;
 mod masks;
 mod measuring;
@@ -57,14 +58,15 @@ use crate::{Error, Result, splats};
 pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
 pub use config::{
-    AntialiasingConfig, Background, CheckConfig, DensityConfig, ExposureConfig, Freeze, NotFinite,
-    OnOff, StopConfig, TrainConfig,
+    AntialiasingConfig, Background, CheckConfig, DensityConfig, ExposureConfig, Freeze, LampConfig,
+    LampRates, NotFinite, OnOff, StopConfig, TrainConfig,
 };
 use context::Initial;
 use early_stopping::Convergence;
 pub use early_stopping::{EndReason, Ended};
 pub(crate) use exposures::known_stops;
 use growth::Growth;
+use lamp::LampLearning;
 pub use layers::{Origin, Settings, SettingsLayer, values};
 pub use measuring::TargetExposure;
 pub(crate) use measuring::law_of;
@@ -173,6 +175,8 @@ struct Optimizer {
     finite: FiniteCheck,
     /// `None`: off.
     floor: Option<SmoothingFloor>,
+    /// `None`: off.
+    lamp: Option<LampLearning>,
     /// The step of the last check of the parameters.
     checked: u64,
 }
@@ -224,13 +228,23 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub fn model(&self) -> Result<splats::model::Model> {
-        Ok(self.model_of(&self.gaussians_in_frame()?))
+        self.model_of(&self.gaussians_in_frame()?)
     }
 
-    /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world.
-    pub(crate) fn model_of(&self, in_frame: &Gaussians) -> splats::model::Model {
+    /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world. If the model has
+    /// a lamp, their colours are those in its light at the median of the points that the views see.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(crate) fn model_of(&self, in_frame: &Gaussians) -> Result<splats::model::Model> {
         let facts = self.config.facts(&self.frame);
-        splats::model::Model::of(in_frame.to_world(&self.frame), &facts)
+        let mut gaussians = in_frame.to_world(&self.frame);
+        if let Some((lamp, light)) = self.renderer.lamp()?.zip(self.even_light()?) {
+            let shown = if self.config.model.raw_colors { 0.0 } else { 0.5 };
+            let factor = light.powf(lamp.slope) as f32;
+            gaussians.scale_colors(lamp.black as f32 - shown, factor);
+        }
+        Ok(splats::model::Model::of(gaussians, &facts))
     }
 
     /// The Gaussians in [`Trainer::frame`], bit for bit as trained.
@@ -386,7 +400,8 @@ impl Trainer {
         if let Some(floor) = optimizer.floor.as_ref().filter(|_| is_floored) {
             floor.record(pass, &mut model.gaussians, status)?;
         }
-        supervision.update(pass, &optimizer.adam, step, cooldown_factor, status)
+        supervision.update(pass, &optimizer.adam, step, cooldown_factor, status)?;
+        optimizer.update_lamp(pass, renderer, (step, cooldown_factor))
     }
 
     /// The networks, if the model has any.
@@ -415,6 +430,19 @@ impl Trainer {
     pub fn render(&mut self, camera: &Camera) -> Result<Rendered> {
         let camera = self.frame.camera(camera);
         self.render_of_degree(&camera, self.sh_degree_in_use())
+    }
+
+    /// [`Trainer::render`] in even light, as [`Trainer::model`] is, if the model has a lamp.
+    ///
+    /// # Errors
+    /// Those of [`Trainer::render`].
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn render_in_even_light(&mut self, camera: &Camera) -> Result<Rendered> {
+        let light = self.even_light()?;
+        self.renderer.set_even_light(light)?;
+        let rendered = self.render(camera);
+        self.renderer.set_even_light(None)?;
+        rendered
     }
 
     /// [`Trainer::render`] for a camera in the training frame.

@@ -146,6 +146,12 @@ fn settle(config: &mut TrainConfig, dataset: &Dataset) {
         );
         config.exposure.learn = OnOff::Off;
     }
+    if config.model.lamp {
+        tracing::warn!(
+            "a lamp at the camera is not learned in blocks, which would find one each; the surfaces keep its light"
+        );
+        config.model.lamp = false;
+    }
 }
 
 /// The checksum of a plan's numbers and cells.

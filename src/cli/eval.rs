@@ -110,7 +110,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         let (key, rule) = ("downscale".to_owned(), DOWNSCALE.to_string());
         return Err(Error::Setting { key, value: downscale.to_string(), rule }.into());
     }
-    let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer } =
+    let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, lamp } =
         FinishedRun::open_with(
             &args.run,
             args.dataset.as_deref(),
@@ -120,6 +120,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
                 own.downscale = args.downscale.unwrap_or(own.downscale);
             },
         )?;
+    model_renderer.set_lamp(lamp)?;
     let load = |weights| Lpips::load(&gpu, weights, args.lpips_range.into());
     let lpips = args.lpips.as_ref().map(load).transpose()?;
     let measure = lpips.as_ref().map(Lpips::measure);
@@ -132,11 +133,12 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     };
     let mut page = args.report.as_ref().map(|_| EvalPage::default());
     let bar = progress_bar(score_reference.view_count(&dataset));
+    let is_even = score_reference.is_evenly_lit(&dataset);
     let render = |view: &View| {
         bar.set_message(printable(&view.name).into_owned());
-        model_renderer.render(view)
+        model_renderer.render_as(view, is_even)
     };
-    let scored = eval::score_by(&mut score_reference, &dataset, render, |score, compared| {
+    let mut scored = eval::score_by(&mut score_reference, &dataset, render, |score, compared| {
         let lpips = lpips.as_ref().map(|lpips| compared.lpips(&gpu, lpips));
         score.scores.lpips = lpips.transpose()?;
         if args.align || config.exposure.learn == OnOff::On {
@@ -158,6 +160,9 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         Ok(())
     })?;
     bar.finish_and_clear();
+    if lamp.is_some() {
+        eval::score_lit(&mut scored, &dataset, |view| model_renderer.render(view))?;
+    }
     eval::warn_of_holes(&scored, &dataset, config.background, |view| model_renderer.render(view))?;
     if scored.is_empty() {
         let root = dataset.root.display();
@@ -198,6 +203,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
             eval::add_aligned(&mut metrics, &scored);
         }
         eval::add_exposed(&mut metrics, &scored);
+        eval::add_lit(&mut metrics, &scored);
         if args.photographs {
             eval::add_photographs(&mut metrics, &scored);
         }
@@ -206,6 +212,13 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         write!(out, "{}", table::of(&score_table(&scored, measure)))?;
         if let Some(known) = config.tone.knows_references() {
             writeln!(out, "{}", eval::with_reference(&known))?;
+        }
+        if let Some(lit) = eval::mean_lit(&scored) {
+            writeln!(
+                out,
+                "in the lamp's light, against lit/, after gain and bias of each channel: PSNR {:.2} dB, SSIM {:.3}",
+                lit.psnr, lit.ssim
+            )?;
         }
         if let Some(label) = eval::label(&scored) {
             writeln!(out, "{label}")?;

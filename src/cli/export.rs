@@ -387,8 +387,11 @@ fn page(
     let near = provenance.facts.near.or(config.facts(&frame).near);
     let near = near.unwrap_or_else(|| RenderSettings::default().near).into();
     let (origin, fingerprint) = (gaussians.origin, Some(fingerprint(gaussians)));
+    let lamp = if is_model(&args.run) { None } else { run::load_lamp(&args.run)? };
     let gaussians = Some(gaussians);
-    Ok(Page { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up }.html()?)
+    let page =
+        Page { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up, lamp };
+    Ok(page.html()?)
 }
 
 /// What makes the targets of views that have a photograph and no reference image, where there are such views and a

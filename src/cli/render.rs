@@ -90,6 +90,9 @@ pub struct RenderArgs {
     /// Render each training view at the exposure of its target, not at the model's
     #[arg(long)]
     pub view_exposure: bool,
+    /// Let the camera carry the lamp that lit the photographs [default: evenly lit]
+    #[arg(long)]
+    pub lamp: bool,
     /// Image format
     #[arg(long, value_enum, default_value_t)]
     pub format: ImageFormat,
@@ -276,8 +279,16 @@ pub fn run(args: &RenderArgs) -> Result<()> {
         return Err(Error::Usage(problem).into());
     }
     args.video.iter().chain([out]).try_for_each(|path| check_writable(path))?;
-    let FinishedRun { config, dataset, mut model_renderer, .. } =
+    let FinishedRun { config, dataset, mut model_renderer, lamp, .. } =
         FinishedRun::open(run, args.dataset.as_deref(), &driver::opener(device.as_ref()))?;
+    if args.lamp {
+        let missing = || {
+            let problem =
+                "has no lamp (lamp.json): its model has not the part lamp; leave out --lamp";
+            Error::input(run, problem)
+        };
+        model_renderer.set_lamp(Some(lamp.ok_or_else(missing)?))?;
+    }
     let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
     let (shots, fps) = shots(args, &config, &dataset)?;
     let light = match args.light {

@@ -29,6 +29,11 @@ pub struct SynthArgs {
     /// Use a fisheye lens (`OPENCV_FISHEYE`) of 130 degrees across the longer side
     #[arg(long)]
     pub fisheye: bool,
+    /// Light the photographs by a lamp that is fixed to the camera, such as a headlamp, of half its strength this many
+    /// degrees off its axis; `high/` stays evenly lit, and `lit/` has the test views in the lamp's light, bright and
+    /// without noise [of --lamp alone: 16]
+    #[arg(long, value_name = "DEGREES", num_args = 0..=1, require_equals = true, default_missing_value = "16")]
+    pub lamp: Option<f64>,
     /// Write into a folder that is not empty, replacing files of the same names
     #[arg(long)]
     pub overwrite: bool,
@@ -39,7 +44,7 @@ pub struct SynthArgs {
 /// # Errors
 /// [`Error::Output`] if the folder is not empty and `--overwrite` is not given, and those of [`synthetic::write`].
 pub fn run(args: SynthArgs) -> anyhow::Result<()> {
-    let SynthArgs { dir, street, views, width, height, seed, fisheye, overwrite } = args;
+    let SynthArgs { dir, street, views, width, height, seed, fisheye, lamp, overwrite } = args;
     let usual = street.map_or_else(SyntheticOptions::default, SyntheticOptions::street);
     let options = SyntheticOptions {
         views: views.unwrap_or(usual.views),
@@ -47,6 +52,7 @@ pub fn run(args: SynthArgs) -> anyhow::Result<()> {
         height: height.unwrap_or(usual.height),
         seed,
         fisheye,
+        lamp,
         ..usual
     };
     let is_empty = std::fs::read_dir(&dir).map_or(true, |mut entries| entries.next().is_none());

@@ -175,8 +175,9 @@ fn page(
 ) -> Result<Arc<Site>> {
     let title = path.display().to_string();
     let near = provenance.facts.near.unwrap_or_else(|| RenderSettings::default().near).into();
+    let (gaussians, fingerprint, lamp) = (None, None, None);
     let page =
-        Page { title, gaussians: None, provenance, bookmarks, origin, fingerprint: None, near, up };
+        Page { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up, lamp };
     let html = page.html()?;
     Ok(Arc::new(Site { html: html.into(), feed, pictures: pictures.map(Mutex::new) }))
 }

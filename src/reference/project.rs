@@ -4,6 +4,7 @@ use glam::{DMat3, DVec2, DVec3, DVec4, UVec2};
 
 use super::camera::Camera;
 use super::gaussian::{Gaussian, Planes, sigmoid};
+use super::lamp::Lamp;
 use super::rotation::{rotation, unit_quat};
 use super::rounding::{UNIT, sensitivity};
 use super::sh::sh_basis;
@@ -40,6 +41,8 @@ pub struct ProjectionSettings {
     pub raw_colors: bool,
     /// Opacities are compensated for the dilation.
     pub antialiased: bool,
+    /// Lights the colours.
+    pub lamp: Option<Lamp>,
 }
 
 /// Projects one Gaussian; `None` if it is culled.
@@ -48,7 +51,7 @@ pub fn project_gaussian(
     settings: ProjectionSettings,
     gaussian: &Gaussian,
 ) -> Option<Projection> {
-    let ProjectionSettings { near, sh_degree, raw_colors, antialiased } = settings;
+    let ProjectionSettings { near, sh_degree, raw_colors, antialiased, lamp } = settings;
     let mean_in_view = camera.view(gaussian.mean);
     let depth = camera.depth(mean_in_view);
     let mut opacity = sigmoid(gaussian.raw_opacity);
@@ -82,10 +85,12 @@ pub fn project_gaussian(
 
     let basis = sh_basis(sh_degree, (gaussian.mean - camera.center()).normalize());
     let color: DVec3 = gaussian.sh.iter().zip(basis).map(|(&c, b)| b * c).sum();
+    let color = if raw_colors { color } else { color + 0.5 };
+    let color = lamp.map_or(color, |lamp| lamp.lit(color, mean_in_view));
     Some(Projection {
         splat: Splat { mean2d, conic, opacity },
         half_extent,
-        color: if raw_colors { color } else { (color + 0.5).max(DVec3::ZERO) },
+        color: if raw_colors { color } else { color.max(DVec3::ZERO) },
         depth,
         conditioning: if antialiased { (xx * yy).sqrt() / normal.length() } else { 0.0 },
     })
@@ -136,11 +141,17 @@ struct ProjectionInputs<'a> {
     /// Size of the image, pixels.
     size: UVec2,
     camera: Camera,
+    lamp: Option<Lamp>,
     planes: Planes,
 }
 
 impl<'a> ProjectionInputs<'a> {
-    fn new(params: &'a Params, constants: &'a Constants, cameras: &[kernels::Camera]) -> Self {
+    fn new(
+        params: &'a Params,
+        constants: &'a Constants,
+        cameras: &[kernels::Camera],
+        lamp: &[f32],
+    ) -> Self {
         let Constants { channels, sh_degree, view_depths, .. } = *constants;
         let planes = Planes::of(
             params.gaussian_count,
@@ -150,14 +161,15 @@ impl<'a> ProjectionInputs<'a> {
         );
         let camera = &cameras[params.camera_index as usize];
         let (size, camera) = (camera.size, Camera::from(camera));
-        Self { params, constants, size, camera, planes }
+        let lamp = constants.lamp.then(|| Lamp::of(lamp));
+        Self { params, constants, size, camera, lamp, planes }
     }
 
     fn project(&self, gaussian: &Gaussian) -> Option<Projection> {
         let Params { near, sh_degree, .. } = *self.params;
         let Constants { raw_colors, antialiased, .. } = *self.constants;
-        let near = near.into();
-        let settings = ProjectionSettings { near, sh_degree, raw_colors, antialiased };
+        let (near, lamp) = (near.into(), self.lamp);
+        let settings = ProjectionSettings { near, sh_degree, raw_colors, antialiased, lamp };
         project_gaussian(&self.camera, settings, gaussian)
     }
 
@@ -208,6 +220,10 @@ impl<'a> ProjectionInputs<'a> {
         let widest = 64.0 * conic.x.max(conic.z);
         // Sixteen terms, whose basis is a polynomial of magnitude 3 and degree 3.
         let color = 128.0 * (1.0 + gaussian.sh.iter().map(|c| c.abs().max_element()).sum::<f64>());
+        let point = self.camera.view(gaussian.mean);
+        let lit =
+            |lamp: Lamp| lamp.factor(point) * (color + lamp.factor_error(point) / UNIT * color);
+        let color = self.lamp.map_or(color, lit);
         let dimmed = 32.0 * projection.conditioning;
         let level = f64::from(splat_level(opacity as f32));
         let extent =
@@ -253,8 +269,8 @@ impl<'a> ProjectionInputs<'a> {
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { parameters, splats, colors, depth_keys, ids, tile_counts, cameras } = slices;
-        let scene = ProjectionInputs::new(params, constants, cameras);
+        let Slices { parameters, splats, colors, depth_keys, ids, tile_counts, .. } = slices;
+        let scene = ProjectionInputs::new(params, constants, slices.cameras, slices.lamp);
         let (planes, parameters) = scene.planes.floats(parameters, constants.half_rest);
         let stored = stored_color(constants.channels);
         for i in 0..scene.planes.count {
@@ -279,7 +295,7 @@ impl Reference for Kernel {
 
     /// A Gaussian close to the culling limit may be culled; one whose ellipse is close to a tile may cover it.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let scene = ProjectionInputs::new(params, constants, slices.cameras);
+        let scene = ProjectionInputs::new(params, constants, slices.cameras, slices.lamp);
         let (planes, parameters) = scene.planes.floats(slices.parameters, constants.half_rest);
         let (n, stored) = (scene.planes.count, stored_color(constants.channels));
         let [mut splats, mut colors, mut depth_keys, mut tile_counts] =

@@ -4,6 +4,7 @@ use glam::{DMat3, DVec2, DVec3, DVec4, UVec2};
 
 use super::camera::Camera;
 use super::gaussian::{Gaussian, Planes, sigmoid};
+use super::lamp::Lamp;
 use super::rotation::{rotation, unit_quat};
 use super::rounding::{Rounded, UNIT, chain, sensitivity};
 use super::sh::{sh_basis, sh_basis_gradient};
@@ -31,6 +32,15 @@ pub struct DSplat {
     pub features: Vec<f64>,
 }
 
+/// A colour that a lamp lights.
+#[derive(Clone, Copy, Debug)]
+pub struct Lit {
+    /// The lamp.
+    pub lamp: Lamp,
+    /// RGB, lit.
+    pub color: DVec3,
+}
+
 /// The gradients of a splat's mean, conic and opacity from the moments of dL/dsigma that are first in its record.
 pub fn splat_gradient(splat: &Splat, record: &[f64]) -> (DVec2, DVec3, f64) {
     let [a, b, c] = splat.conic.to_array();
@@ -45,7 +55,7 @@ pub fn project_gaussian_backward(
     sh_degree: u32,
     antialiased: bool,
     gaussian: &Gaussian,
-    splat: &Splat,
+    (splat, lit): (&Splat, Option<Lit>),
     d_splat: &DSplat,
 ) -> Gaussian {
     let mean_in_view = camera.view(gaussian.mean);
@@ -66,10 +76,15 @@ pub fn project_gaussian_backward(
     let d_quat = if norm > 1e-12 { (d_unit - unit * unit.dot(d_unit)) / norm } else { DVec4::ZERO };
 
     let d_rows = [d_u0, d_u1].map(|d_u| camera.rotation * (scaled_axes * d_u));
-    let d_mean_in_view = camera.backward(mean_in_view, d_splat.mean2d, d_rows);
+    let mut d_mean_in_view = camera.backward(mean_in_view, d_splat.mean2d, d_rows);
+    let mut d_color = d_splat.color;
+    if let Some(Lit { lamp, color }) = lit {
+        d_mean_in_view += d_color.dot(lamp.above_black(color)) * lamp.point_gradient(mean_in_view);
+        d_color *= lamp.factor(mean_in_view);
+    }
 
     let (d_mean_sh, d_sh) =
-        sh_backward(sh_degree, &gaussian.sh, gaussian.mean - camera.center(), d_splat.color);
+        sh_backward(sh_degree, &gaussian.sh, gaussian.mean - camera.center(), d_color);
     let opacity = if antialiased { splat.opacity } else { sigmoid(gaussian.raw_opacity) };
     Gaussian {
         mean: world_from_view * d_mean_in_view + d_mean_sh,
@@ -149,16 +164,23 @@ struct ProjectionInputs<'a> {
     params: &'a Params,
     constants: &'a Constants,
     camera: Camera,
+    lamp: Option<Lamp>,
     planes: Planes,
 }
 
 impl<'a> ProjectionInputs<'a> {
-    fn new(params: &'a Params, constants: &'a Constants, cameras: &[kernels::Camera]) -> Self {
+    fn new(
+        params: &'a Params,
+        constants: &'a Constants,
+        cameras: &[kernels::Camera],
+        lamp: &[f32],
+    ) -> Self {
         let Constants { channels, sh_degree, .. } = *constants;
         let planes =
             Planes::of(params.gaussian_count, channels, sh_degree, constants.rest_by_column);
         let camera = Camera::from(&cameras[params.camera_index as usize]);
-        Self { params, constants, camera, planes }
+        let lamp = constants.lamp.then(|| Lamp::of(lamp));
+        Self { params, constants, camera, lamp, planes }
     }
 
     /// The gradients in the `record` of Gaussian `i`; clamped colours have none.
@@ -176,16 +198,40 @@ impl<'a> ProjectionInputs<'a> {
         }
     }
 
-    fn backward(&self, gaussian: &Gaussian, splat: &Splat, d_splat: &DSplat) -> Gaussian {
+    /// `color`: of the forward pass.
+    fn backward(&self, gaussian: &Gaussian, splat: (&Splat, DVec3), d_splat: &DSplat) -> Gaussian {
         let (degree, antialiased) = (self.params.sh_degree, self.constants.antialiased);
+        let (splat, color) = splat;
+        let lit = self.lamp.map(|lamp| Lit { lamp, color });
+        let splat = (splat, lit);
         let mut gradient =
             project_gaussian_backward(&self.camera, degree, antialiased, gaussian, splat, d_splat);
         if self.constants.color_gradients {
             let rest = &mut gradient.sh[1..];
             rest.fill(DVec3::ZERO);
-            rest.first_mut().into_iter().for_each(|first| *first = d_splat.color);
+            let d_color = self.factor(gaussian) * d_splat.color;
+            rest.first_mut().into_iter().for_each(|first| *first = d_color);
         }
         gradient
+    }
+
+    /// The colour of Gaussian `i` in the forward pass.
+    fn color(&self, colors: &[f32], i: usize) -> DVec3 {
+        let color = &colors[stored_color(self.constants.channels) * i..];
+        DVec3::from_array([0, 1, 2].map(|c| f64::from(color[c])))
+    }
+
+    /// The factor of the lamp on a colour; 1 without one.
+    fn factor(&self, gaussian: &Gaussian) -> f64 {
+        self.lamp.map_or(1.0, |lamp| lamp.factor(self.camera.view(gaussian.mean)))
+    }
+
+    /// The rounding errors of what the lamp adds to the gradient of the mean, and of its factor, relative.
+    fn lamp_error(&self, gaussian: &Gaussian, d_color: DVec3, color: DVec3) -> [f64; 2] {
+        let Some(lamp) = &self.lamp else { return [0.0; 2] };
+        let point = self.camera.view(gaussian.mean);
+        let d_log_factor = d_color.abs().dot(color.abs() + lamp.above_black(DVec3::ZERO).abs());
+        [d_log_factor * lamp.point_gradient_error(point), lamp.factor_error(point)]
     }
 
     /// Columns of gradients that are written; those of the colour are the first ones of their plane.
@@ -266,7 +312,7 @@ impl Reference for Kernel {
         let Slices { status, gradients, grad_norm_sums, visit_counts, .. } = slices;
         // From before the pass, since the device may process Gaussians in any order.
         let before = status[3];
-        let scene = ProjectionInputs::new(params, constants, slices.cameras);
+        let scene = ProjectionInputs::new(params, constants, slices.cameras, slices.lamp);
         let (planes, parameters) = scene.planes.floats(parameters, constants.half_rest);
         let written = scene.written_columns() * scene.planes.count;
         let frozen = constants.frozen_columns as usize * scene.planes.count;
@@ -277,8 +323,10 @@ impl Reference for Kernel {
             let splat = Splat::from(&splats[i]);
             let d_splat = scene.d_splat(&splat, colors, &values(&record), i);
             let gaussian = planes.load(&parameters, i);
-            let gradient = scene.backward(&gaussian, &splat, &d_splat);
-            let mut is_finite = (8.0 * d_splat.color.as_vec3()).is_finite();
+            let color = scene.color(colors, i);
+            let gradient = scene.backward(&gaussian, (&splat, color), &d_splat);
+            let d_color = scene.factor(&gaussian) * d_splat.color;
+            let mut is_finite = (8.0 * d_color.as_vec3()).is_finite();
             scene.planes.store(&gradient, i, |at, value| {
                 let value = value as f32;
                 is_finite &= value.is_finite() || at < frozen;
@@ -299,7 +347,7 @@ impl Reference for Kernel {
     /// Attributes also pass through sums and exponentials with terms of order one, means through the view.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         const OFF: f64 = 256.0 * UNIT;
-        let scene = ProjectionInputs::new(params, constants, slices.cameras);
+        let scene = ProjectionInputs::new(params, constants, slices.cameras, slices.lamp);
         let (planes, parameters) = scene.planes.floats(slices.parameters, constants.half_rest);
         let one = Planes { count: 1, ..planes };
         let far = scene.camera.center().length();
@@ -307,7 +355,7 @@ impl Reference for Kernel {
             [scene.planes.float_count(), scene.planes.count].map(|len| vec![0.0; len]);
         for i in (0..scene.planes.count).filter(|&i| slices.tile_counts[i] > 0) {
             let gaussian = planes.load(&parameters, i);
-            let splat = Splat::from(&slices.splats[i]);
+            let (splat, color) = (Splat::from(&slices.splats[i]), scene.color(slices.colors, i));
             let mut inputs = vec![0.0; one.float_count()];
             one.store(&gaussian, 0, |at, value| inputs[at] = value);
             inputs.extend(splat.conic.to_array());
@@ -334,18 +382,20 @@ impl Reference for Kernel {
                 let splat = Splat { conic: DVec3::from_slice(rest), ..splat };
                 let (gaussian, d_splat) =
                     (one.load(own, 0), scene.d_splat(&splat, slices.colors, &rest[3..], i));
-                let gradient = scene.backward(&gaussian, &splat, &d_splat);
+                let gradient = scene.backward(&gaussian, (&splat, color), &d_splat);
                 let mut numbers = vec![0.0; one.float_count() + 1];
                 one.store(&gradient, 0, |at, value| numbers[at] = value);
                 numbers[one.float_count()] = scene.damped_norm(&gaussian, &d_splat);
                 numbers
             });
             let d_splat = scene.d_splat(&splat, slices.colors, &values(&record), i);
-            let gradient = scene.backward(&gaussian, &splat, &d_splat);
+            let gradient = scene.backward(&gaussian, (&splat, color), &d_splat);
             scene.planes.store(&gradient, i, |at, value| gradients[at] = OFF * value.abs());
             let mut moved = one.load(&bounds, 0);
             // A basis is a polynomial of magnitude 3 and degree 3, which may vanish.
-            let basis = 64.0 * UNIT * d_splat.color.abs();
+            let [by_lamp, factor] = scene.lamp_error(&gaussian, d_splat.color, color);
+            moved.mean += by_lamp;
+            let basis = (64.0 * UNIT + factor) * scene.factor(&gaussian) * d_splat.color.abs();
             moved.sh.iter_mut().for_each(|bound| *bound += basis);
             moved.quat += scene.quat_error(&gaussian, &splat, &d_splat);
             scene.planes.store(&moved, i, |at, bound| gradients[at] += bound);

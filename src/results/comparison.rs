@@ -62,8 +62,8 @@ impl RunComparison {
         let mut first: Option<(Dataset, ScoreReference)> = None;
         let mut comparison = Self { runs: vec![], measure: None, pictures: vec![] };
         for (path, name) in paths.iter().zip(names) {
-            let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer } =
-                FinishedRun::open(path, options.dataset, &options.opener)?;
+            let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, .. } =
+                FinishedRun::open_lit(path, options.dataset, &options.opener)?;
             if first.is_none() {
                 let reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
                 first = Some((dataset.clone(), reference));
@@ -81,7 +81,8 @@ impl RunComparison {
             comparison.measure = lpips.as_ref().map(Lpips::measure);
             let step = reference.view_count(&dataset).div_ceil(SHOWN).max(1);
             let mut number = 0;
-            let render = |view: &View| model_renderer.render(view);
+            let is_even = reference.is_evenly_lit(&dataset);
+            let render = |view: &View| model_renderer.render_as(view, is_even);
             let pictures = &mut comparison.pictures;
             let scored = eval::score_by(reference, &dataset, render, |score, images| {
                 let distance = lpips.as_ref().map(|lpips| images.lpips(&gpu, lpips)).transpose()?;

@@ -6,7 +6,9 @@ use crate::photographs::tone::{Exposure, LuminanceHistogram, luminance, soft};
 use crate::results::report::{
     Best, Column, Comparison, Distribution, Facts, Picture, Report, Table, distributions,
 };
-use crate::train::diagnose::{Diagnosis, Noise, Plan, SceneDiagnosis, TargetNoise, ViewDiagnosis};
+use crate::train::diagnose::{
+    Diagnosis, LampDiagnosis, Noise, Plan, SceneDiagnosis, TargetNoise, ViewDiagnosis,
+};
 
 /// Width of an image, pixels.
 const PICTURE_WIDTH: u32 = 240;
@@ -111,7 +113,7 @@ pub(crate) fn sizes(views: &[ViewDiagnosis]) -> String {
 }
 
 /// Measurements of the whole set: a name and values in each row.
-pub(crate) fn scene_facts(scene: &SceneDiagnosis) -> [[String; 2]; 5] {
+pub(crate) fn scene_facts(scene: &SceneDiagnosis) -> [[String; 2]; 6] {
     let sensor = match scene.noise {
         Some(Noise { gain, read }) => {
             format!("sensor: gain {gain:.2e}, read noise {read:.2e} of white, linear")
@@ -151,11 +153,39 @@ pub(crate) fn scene_facts(scene: &SceneDiagnosis) -> [[String; 2]; 5] {
     let named = [
         ("brightness", brightness),
         ("exposure", exposure),
+        ("lamp", lamp(scene)),
         ("noise", noise),
         ("detail", detail),
         ("cameras", cameras),
     ];
     named.map(|(name, figures)| [name.to_owned(), figures])
+}
+
+/// What a lamp that moves with the camera explains.
+fn lamp(scene: &SceneDiagnosis) -> String {
+    let Some(lamp) = &scene.lamp else {
+        let why = scene.lamp_unknown.as_deref().unwrap_or("not measured");
+        return format!("not measurable: {why}");
+    };
+    let LampDiagnosis { exponent, falloff: [first, second], ambient, d_ref, .. } = lamp;
+    let found = if lamp.is_found() {
+        format!(
+            "moves with the camera: exponent {exponent:.1}, falloff {first:.1}, {second:.1}, ambient {ambient:.3}, \
+             distance {d_ref:.2}; "
+        )
+    } else {
+        "none that moves with the camera; ".to_owned()
+    };
+    format!(
+        "{found}R^2 of a point's {:.2} stops between views: exposures {:.2}, lamp {:.2}, both {:.2}; {:.2} stops \
+         beyond exposures, {:.2} of them by distance",
+        lamp.spread,
+        lamp.exposure_r_squared,
+        lamp.lamp_r_squared,
+        lamp.r_squared,
+        lamp.stops,
+        lamp.distance_stops
+    )
 }
 
 /// The page: the plan first, then measurements and photographs.

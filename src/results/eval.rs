@@ -2,7 +2,7 @@
 //! targets.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value, json};
 
@@ -14,6 +14,7 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use crate::photographs::metrics::{self, Scores};
 use crate::photographs::tone::{SceneTone, ToneCurve, ToneSettings};
+use crate::splats::lamp::Lamp;
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::{DeviceGaussians, Shape};
@@ -121,6 +122,12 @@ impl ScoreReference {
         }
     }
 
+    /// Whether it is evenly lit where a lamp lights the photographs: the reference images of a dataset that has these
+    /// views in the lamp's light as well.
+    pub(crate) fn is_evenly_lit(&self, dataset: &Dataset) -> bool {
+        self.against == ReferenceKind::References && lit_folder(dataset).is_dir()
+    }
+
     /// The number of test views that can be scored.
     pub fn view_count(&self, dataset: &Dataset) -> usize {
         let has_target = match self.against {
@@ -145,6 +152,11 @@ impl ScoreReference {
     }
 }
 
+/// The test views in the light of the lamp at the camera, bright and without noise, if a dataset has these.
+fn lit_folder(dataset: &Dataset) -> PathBuf {
+    dataset.root.join("lit")
+}
+
 /// The scores of a test view.
 #[derive(Clone, Debug)]
 pub struct ViewScore {
@@ -158,6 +170,9 @@ pub struct ViewScore {
     pub aligned: Option<Scores>,
     /// Scores at the view's own exposure, if it is known.
     pub exposed: Option<Scores>,
+    /// Scores in the light of the lamp, against `lit/NAME.png`, after the least-squares gain and bias of each channel;
+    /// if the model has a lamp and the dataset the image.
+    pub lit: Option<Scores>,
     /// The view as a photograph against its own photograph, if requested: PSNR in dB, and by how many stops of linear
     /// light it is brighter.
     pub photograph: Option<[f64; 2]>,
@@ -275,6 +290,25 @@ impl ModelRenderer {
         })
     }
 
+    /// Lights what is rendered from now on by a lamp at the camera, in units of the dataset's world, or evenly.
+    ///
+    /// # Errors
+    /// A number is out of range, the driver refuses a kernel, or the device is out of memory.
+    pub(crate) fn set_lamp(&mut self, lamp: Option<Lamp>) -> Result<()> {
+        self.renderer.set_lamp(lamp.map(|lamp| lamp.scaled(self.frame.scale)))
+    }
+
+    /// Renders a view as [`ScoreReference`] shows it: in the light of its photograph, or evenly lit.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(crate) fn render_as(&mut self, view: &View, in_even_light: bool) -> Result<Rendered> {
+        self.renderer.set_even_light(in_even_light.then_some(1.0))?;
+        let rendered = self.render(view);
+        self.renderer.set_even_light(None)?;
+        rendered
+    }
+
     /// Renders over this colour, display-referred, from now on; black is the default.
     pub(crate) fn set_background(&mut self, background: [f32; 3]) {
         self.background = background;
@@ -344,6 +378,7 @@ pub fn score_by(
             r0: has_denoiser.then(|| of(&quantized(&rendered.colors))).transpose()?,
             aligned: None,
             exposed: None,
+            lit: None,
             photograph: None,
             residual_transmittance: ResidualTransmittance::of(&rendered, view),
             against,
@@ -352,6 +387,42 @@ pub fn score_by(
         scored.push(score);
     }
     Ok(scored)
+}
+
+/// Adds the scores in the light of the lamp; `render` renders a view so.
+///
+/// # Errors
+/// Those of `render`, or an image of `lit/` cannot be read.
+pub(crate) fn score_lit(
+    scored: &mut [ViewScore],
+    dataset: &Dataset,
+    mut render: impl FnMut(&View) -> Result<Rendered>,
+) -> Result<()> {
+    let folder = lit_folder(dataset);
+    for score in scored {
+        let path = folder.join(format!("{}.png", score.name));
+        let view = dataset.test_views().find(|view| view.name == score.name);
+        let Some(view) = view.filter(|_| path.is_file()) else { continue };
+        let (width, height) = (view.camera.width, view.camera.height);
+        let target = quantized(&Image::load(&path)?.resized(width, height));
+        let compared = ScoredImages { view, render: quantized(render(view)?.output()), target };
+        score.lit = Some(compared.aligned()?);
+    }
+    Ok(())
+}
+
+/// Adds to `metrics.json` the scores in the light of the lamp, if there are any.
+pub(crate) fn add_lit(metrics: &mut Value, scored: &[ViewScore]) {
+    if scored.iter().any(|view| view.lit.is_some()) {
+        let what = "in the light of the lamp at the camera, against the dataset's lit/, after the least-squares gain \
+                    and bias of each channel";
+        metrics["lit_by_lamp"] = other_scores(what, scored, |view| view.lit);
+    }
+}
+
+/// The mean scores in the light of the lamp, if there are any.
+pub(crate) fn mean_lit(scored: &[ViewScore]) -> Option<Scores> {
+    Scores::mean(&scored.iter().filter_map(|view| view.lit).collect::<Vec<_>>())
 }
 
 /// `metrics.json`: means, views, and the resources of the run; unknown values are null. [`add_lpips`] adds LPIPS.

@@ -8,6 +8,7 @@ use crate::photographs::dataset::Dataset;
 use crate::photographs::tone::{ToneCurve, ToneSettings};
 use crate::results::eval::ModelRenderer;
 use crate::results::{models, run};
+use crate::splats::lamp::Lamp;
 use crate::splats::model::Model;
 use crate::splats::scene::{Facts, Gaussians};
 use crate::train::TrainConfig;
@@ -28,6 +29,8 @@ pub(crate) struct FinishedRun {
     pub(crate) dataset: Dataset,
     pub(crate) gaussian_count: usize,
     pub(crate) model_renderer: ModelRenderer,
+    /// The lamp that lit the photographs, in units of the dataset's world; renders are evenly lit.
+    pub(crate) lamp: Option<Lamp>,
 }
 
 impl FinishedRun {
@@ -74,6 +77,7 @@ impl FinishedRun {
             let steps = config.steps;
             tracing::warn!("{}: incomplete, at step {step} of {steps}", folder.display());
         }
+        let lamp = run::load_lamp(folder)?;
         let gpu = match &opener.device {
             Some(device) => (opener.open)(device)?,
             None => (opener.open)(&config.device.parse()?)?,
@@ -92,9 +96,20 @@ impl FinishedRun {
                 &config,
                 run::load_networks(&gpu, folder, &config.model, model.gaussians.shape.features)?,
             )?,
+            lamp,
             config,
             gpu,
         })
+    }
+
+    /// [`Self::open`] with renders in the light of the photographs, for scores.
+    ///
+    /// # Errors
+    /// Those of [`Self::open`].
+    pub(crate) fn open_lit(folder: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
+        let mut own = Self::open(folder, dataset, opener)?;
+        own.model_renderer.set_lamp(own.lamp)?;
+        Ok(own)
     }
 
     /// Opens a model file, which has few settings of its training.
@@ -116,7 +131,8 @@ impl FinishedRun {
         let near = facts.near.or(config.facts(&frame).near);
         let model = Model::of_shown(gaussians, &Facts { near, ..facts });
         let model_renderer = ModelRenderer::new(&gpu, &model, &config, None)?;
-        Ok(Self { gpu, config, dataset, gaussian_count: model.gaussians.count, model_renderer })
+        let gaussian_count = model.gaussians.count;
+        Ok(Self { gpu, config, dataset, gaussian_count, model_renderer, lamp: None })
     }
 }
 

@@ -22,8 +22,8 @@ pub use done::{done_steps, done_steps_by_stamp};
 pub use events::{Event, RunSummary};
 pub(crate) use files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE, TRAINED_WITH};
 pub use load::{
-    is_finished, load_config, load_exposures, load_gaussians, load_metrics, load_networks,
-    other_views, plan_of, stopped_at,
+    is_finished, load_config, load_exposures, load_gaussians, load_lamp, load_metrics,
+    load_networks, other_views, plan_of, stopped_at,
 };
 pub use meter::{ResourceUsage, energy_counters};
 pub use requests::Requests;

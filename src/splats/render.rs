@@ -19,6 +19,7 @@ mod draw;
 #[cfg(feature = "io")]
 mod gradients;
 mod images;
+mod lamp;
 mod limits;
 mod pipelines;
 mod settings;
@@ -49,6 +50,7 @@ pub use draw::Drawn;
 use draw::HostTargets;
 #[cfg(feature = "io")]
 pub(crate) use gradients::ViewGradients;
+pub(crate) use lamp::DeviceLamp;
 use pipelines::Projections;
 pub use settings::{Purpose, RenderSettings};
 pub use target::{DepthConvention, DepthKind, SceneDepth, Target};
@@ -111,6 +113,8 @@ pub struct Renderer {
     /// (H, W): the depths beyond which nothing is seen, where a draw has such.
     limits: Buffer<f32>,
     host_targets: Option<HostTargets>,
+    /// Lights the colours.
+    lamp: Option<DeviceLamp>,
 }
 
 /// How the last channel of a render keeps the depth in the view.
@@ -346,11 +350,12 @@ impl Renderer {
                     grad_norm_sums: batch.rows_mut(&mut *gradients.grad_norm_sums, 1)?,
                     visit_counts: batch.rows_mut(&mut *gradients.visit_counts, 1)?,
                     cameras: view.cameras.unwrap_or(&frame.camera).slice(),
+                    lamp: lamp::bound(self.lamp.as_ref(), parameters)?,
                 },
                 Threads::Exactly([gaussian_count, 1, 1]),
             )?;
         }
-        Ok(())
+        self.record_lamp_backward(pass, gaussians, &view, gradients.parameters)
     }
 
     /// Records the projection of the context, and of the Gaussians of a view, which come after it.
@@ -361,7 +366,7 @@ impl Renderer {
         view: &View<'_>,
         sh_degree: u32,
     ) -> Result<()> {
-        let Self { gpu, settings, projections, frame, context, .. } = self;
+        let Self { gpu, settings, projections, frame, context, lamp, .. } = self;
         let color_floats = color_floats(view.channels);
         let project = &projections[&(view.model, view.view_depths)].forward;
         let context = context.as_ref().map(DeviceGaussians::slice);
@@ -387,6 +392,7 @@ impl Renderer {
                         ids: rendered.rows_mut(&mut frame.ids, 1)?,
                         tile_counts: rendered.rows_mut(&mut frame.tile_counts, 1)?,
                         cameras: view.cameras.unwrap_or(&frame.camera).slice(),
+                        lamp: lamp::bound(lamp.as_ref(), parameters)?,
                     },
                     Threads::Exactly([batch.gaussian_count(), 1, 1]),
                 )?;

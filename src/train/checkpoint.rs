@@ -13,12 +13,14 @@ use serde::{Deserialize, Serialize};
 
 use super::best::{Snapshot, Tensor};
 use super::decisions::Decisions;
+use super::lamp::LEARNED;
 use super::model::Model;
 use super::{TrainConfig, Trainer};
 use crate::base::hash::{self, Hasher};
 use crate::base::input;
 use crate::base::output::write_whole_with;
 use crate::gpu::{Gpu, SliceMut};
+use crate::kernels::lamp::{LAMP_NUMBERS, LAMP_WIDTH};
 use crate::networks::TensorFile;
 use crate::photographs::dataset::Fingerprint;
 use crate::splats::batches::Batches;
@@ -370,6 +372,17 @@ impl Trainer {
                 buffer,
                 batches: None,
             }));
+        }
+        if let Some((learning, (lamp, _))) =
+            self.optimizer.lamp.as_mut().zip(self.renderer.lamp_and_status())
+        {
+            let (numbers, moments) = (lamp.numbers.slice_mut(), learning.moments.slice_mut());
+            state.extend(optimized(LEARNED, numbers, moments).enumerate().map(
+                |(place, (name, buffer))| {
+                    let len = if place == 0 { LAMP_NUMBERS } else { LAMP_WIDTH };
+                    State { name, shape: vec![len as usize], buffer, batches: None }
+                },
+            ));
         }
         state
     }

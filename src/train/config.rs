@@ -3,6 +3,7 @@
 mod antialiasing;
 mod exposure;
 mod freeze;
+mod lamp;
 mod stop;
 
 use std::ops::Bound;
@@ -26,7 +27,9 @@ use crate::photographs::dataset::{
 };
 use crate::photographs::tone::ToneSettings;
 use crate::photographs::white_balance::WhiteBalance;
+use crate::splats::attributes::Attribute;
 use crate::splats::densify::DensityControl;
+use crate::splats::lamp::Lamp;
 use crate::splats::optimizer::Schedule;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::RenderSettings;
@@ -37,6 +40,7 @@ use crate::{Error, Result};
 pub use antialiasing::AntialiasingConfig;
 pub use exposure::{ExposureConfig, OnOff};
 pub use freeze::Freeze;
+pub use lamp::{LampConfig, LampRates};
 pub use stop::{NotFinite, StopConfig};
 
 /// Pixels of a patch; smaller ones have more border than content.
@@ -184,6 +188,8 @@ sections {
     stop: StopConfig;
     /// Gain and bias of each training view.
     exposure: ExposureConfig;
+    /// A lamp that moves with the camera.
+    lamp: LampConfig;
     /// Filters against aliasing.
     antialiasing: AntialiasingConfig;
     /// Storage precision.
@@ -366,6 +372,7 @@ impl TrainConfig {
             shape: Shape { sh_degree: self.sh_degree, features: self.model.features() },
             raw_colors: self.model.raw_colors,
             antialiased: self.antialiasing.compensation,
+            lamp: self.model.lamp.then_some(Lamp::AT_CAMERA),
             detach_geometry: self.model.network.variant == NetworkVariant::Identity,
             tile: self.tile,
             patch_pixels: self.patch_pixels,
@@ -402,6 +409,11 @@ impl TrainConfig {
         self.freeze.as_ref().map_or(0, Freeze::leading_columns)
     }
 
+    /// Whether the colours are frozen.
+    pub(super) fn learns_no_colour(&self) -> bool {
+        self.frozen_columns() as usize > Attribute::Dc.column(0)
+    }
+
     /// The configuration of the loss.
     pub(crate) fn loss(&self) -> LossConfig {
         LossConfig {
@@ -431,6 +443,8 @@ impl TrainConfig {
         self.stop.check_rows()?;
         self.exposure.check_rows()?;
         self.exposure.rates.check_rows()?;
+        self.lamp.check_rows()?;
+        self.lamp.rates.check_rows()?;
         self.antialiasing.check_rows()?;
         self.precision.check_rows()?;
         if let Some(frame) = self.frame {
@@ -452,6 +466,11 @@ impl TrainConfig {
                 rule,
             });
         }
+        if self.model.lamp && self.learns_no_colour() {
+            let rule = "off where the colours are frozen, whose gradients it learns from";
+            let (key, value) = ("model.lamp".to_owned(), "true".to_owned());
+            return Err(Error::Setting { key, value, rule: rule.to_owned() });
+        }
         if self.exposure.learn == OnOff::On && self.model.tonemapper {
             let rule = "off with a tonemapper, which fits the dark photographs: a gain of the targets does not \
                         describe their exposures";
@@ -465,7 +484,6 @@ impl TrainConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::splats::attributes::Attribute;
 
     #[test]
     fn a_configuration_is_read_back_from_its_toml() {
@@ -493,6 +511,15 @@ mod tests {
         assert!(refused.contains("freeze is means; it must be of a given model"), "{refused}");
         config.init = Some("day.ply".into());
         config.check().unwrap();
+        config.model.lamp = true;
+        config.check().unwrap();
+        let all = "means,quats,scales,opacities,dc".parse().unwrap();
+        let frozen = TrainConfig { freeze: Some(all), ..config.clone() };
+        let refused = frozen.check().unwrap_err().to_string();
+        assert!(
+            refused.contains("model.lamp is true; it must be off where the colours"),
+            "{refused}"
+        );
         assert_eq!(toml::from_str::<TrainConfig>(&config.to_toml().unwrap()).unwrap(), config);
     }
 

@@ -99,10 +99,12 @@ impl Trainer {
             shape: 0.into(),
             raw_colors: true,
             rest: StorageFormat::Single,
+            lamp: None,
             ..self.config.render_settings()
         };
         let mut renderer = Renderer::new(&self.gpu, settings)?;
         let exposures = self.supervision.exposures.as_ref().map(Exposures::affines).transpose()?;
+        let lamp = self.renderer.lamp()?;
         let count = self.supervision.views.photographs().count();
         let views = self.supervision.views.photographs().step_by(count.div_ceil(VIEWS).max(1));
         let pixels = PIXELS_EACH * more / count.clamp(1, VIEWS);
@@ -119,7 +121,14 @@ impl Trainer {
             let neutral = exposure.map(Affine::inverse).map(|inverse| inverse.applied(&target));
             let target = neutral.unwrap_or(target).resized(camera.width, camera.height);
             let mask = self.mask_of(view)?.map(|mask| mask.resized(camera.width, camera.height));
-            depth_samples.extend(seen(&camera, &depths, &target, mask.as_ref()));
+            let mut own = seen(&camera, &depths, &target, mask.as_ref());
+            if let Some(lamp) = &lamp {
+                for sample in &mut own {
+                    let in_view = camera.view_from_world.transform_point3(sample.position);
+                    sample.color = lamp.unlit(sample.color, in_view);
+                }
+            }
+            depth_samples.extend(own);
         }
         Ok(depth_samples)
     }

@@ -9,6 +9,7 @@
 //! Only training photographs are measured, never references. It runs on the host, in seconds.
 
 mod geometry;
+mod lamp;
 mod noise;
 mod photograph;
 mod plan;
@@ -29,6 +30,7 @@ use crate::photographs::tone::{Exposure, LuminanceHistogram, is_black};
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 use geometry::Shared;
+pub use lamp::LampDiagnosis;
 pub use noise::Noise;
 use photograph::PhotographStatistics;
 pub use plan::{Plan, PlannedNumber, PlannedPart, PlannedViews};
@@ -122,6 +124,11 @@ pub struct SceneDiagnosis {
     pub views_per_point: f64,
     /// The number of points in the dataset.
     pub points: usize,
+    /// How much a lamp that moves with the camera explains; `None` if the points do not show it.
+    pub lamp: Option<LampDiagnosis>,
+    /// Why they do not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lamp_unknown: Option<String>,
 }
 
 /// The diagnosis of a capture.
@@ -349,6 +356,7 @@ impl SceneDiagnosis {
         let mean = |of: fn(&ViewDiagnosis) -> f64| {
             lit.iter().map(|view| of(view)).sum::<f64>() / lit.len().max(1) as f64
         };
+        let lamp = LampDiagnosis::of(&shared.observations, views.len());
         let measured = deviation(lit.iter().filter_map(|view| view.exposure));
         let light = mean(|view| view.light);
         Self {
@@ -377,6 +385,8 @@ impl SceneDiagnosis {
             overlap: mean(|view| view.overlap),
             views_per_point: shared.views_per_point,
             points,
+            lamp_unknown: lamp.as_ref().err().cloned(),
+            lamp: lamp.ok(),
         }
     }
 }

@@ -26,6 +26,8 @@ pub enum Origin {
     Preset(&'static str),
     /// The plan.
     Plan,
+    /// A lamp at the camera, which needs one gain for all photographs.
+    Lamp,
     /// This configuration file.
     File(PathBuf),
     /// This option of the command.
@@ -42,6 +44,7 @@ impl fmt::Display for Origin {
             Self::Default => out.write_str("default"),
             Self::Preset(name) => write!(out, "preset {name}"),
             Self::Plan => out.write_str("plan"),
+            Self::Lamp => out.write_str("the part lamp"),
             Self::File(path) => write!(out, "{}", path.display()),
             Self::Option(name) => out.write_str(name),
             Self::Set => out.write_str("--set"),

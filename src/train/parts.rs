@@ -1,4 +1,4 @@
-//! Parts of the model in addition to colour: those of LITA-GS, each of which can be on or off.
+//! Parts of the model in addition to colour, each of which can be on or off: those of LITA-GS, and a lamp.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -16,7 +16,7 @@ use crate::{Error, Result};
 pub enum ModelName {
     /// Colour alone: 3DGS.
     Plain,
-    /// Every part: LITA-GS, the paper's backbone.
+    /// Every part of LITA-GS, the paper's backbone.
     Lita,
 }
 
@@ -43,11 +43,19 @@ pub enum Part {
     Structure,
     /// A feature trained against a given depth map.
     Depth,
+    /// A lamp that moves with the camera.
+    Lamp,
 }
 
 impl Part {
-    /// Every part, in the order of the paper.
-    pub const ALL: [Self; 4] = [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth];
+    /// Every part: those of the paper, in its order, and then others.
+    pub const ALL: [Self; 5] =
+        [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth, Self::Lamp];
+
+    /// The parts of LITA-GS.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) const LITA: [Self; 4] =
+        [Self::Denoiser, Self::Tonemapper, Self::Structure, Self::Depth];
 
     /// The name on the command line.
     pub fn name(self) -> &'static str {
@@ -56,6 +64,7 @@ impl Part {
             Self::Tonemapper => "tonemapper",
             Self::Structure => "structure",
             Self::Depth => "depth",
+            Self::Lamp => "lamp",
         }
     }
 }
@@ -84,6 +93,8 @@ pub struct ModelConfig {
     structure: bool = false => Rule::Flag;
     /// A feature trained against a given depth map; not for views without one.
     depth: bool = false => Rule::Flag;
+    /// A lamp that moves with the camera: colours are multiplied by its light, whose numbers are learned.
+    lamp: bool = false => Rule::Flag;
     /// Colour is the SH sum alone, as in LITA-GS, instead of max(SH + 0.5, 0), as in viewers.
     raw_colors: bool = false => Rule::Flag, "--raw-colors on|off";
     /// Train the networks on random crops of at most N x N pixels; 0: on whole views.
@@ -165,6 +176,7 @@ impl ModelConfig {
             Part::Tonemapper => self.tonemapper,
             Part::Structure => self.structure,
             Part::Depth => self.depth,
+            Part::Lamp => self.lamp,
         }
     }
 
@@ -185,6 +197,7 @@ impl ModelConfig {
         self.tonemapper = parts.contains(&Part::Tonemapper);
         self.structure = parts.contains(&Part::Structure);
         self.depth = parts.contains(&Part::Depth);
+        self.lamp = parts.contains(&Part::Lamp);
     }
 
     /// The features of the Gaussians for the enabled parts.

@@ -75,6 +75,16 @@ impl RequestedSettings {
             });
             settings.merge(&layer);
         }
+        // A gain of each photograph would follow the lamp.
+        let has_lamp = get("model.lamp").map_or_else(
+            || plan.is_some_and(|plan| plan.lamp.on),
+            |requested| requested == &Value::Boolean(true),
+        );
+        if has_lamp {
+            let mut layer = SettingsLayer::default();
+            layer.push("tone.scene_statistics", true.into(), Origin::Lamp)?;
+            settings.merge(&layer);
+        }
         for layer in requested {
             settings.merge(layer);
         }

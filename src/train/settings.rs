@@ -5,8 +5,8 @@ use std::sync::LazyLock;
 use toml::{Table, Value};
 
 use super::{
-    AntialiasingConfig, CheckConfig, DensityConfig, ExposureConfig, ModelConfig, NetworkRates,
-    PrecisionConfig, StopConfig, TrainConfig,
+    AntialiasingConfig, CheckConfig, DensityConfig, ExposureConfig, LampConfig, LampRates,
+    ModelConfig, NetworkRates, PrecisionConfig, StopConfig, TrainConfig,
 };
 use crate::Error;
 use crate::base::settings::{Rule, Setting};
@@ -39,6 +39,8 @@ pub static SETTINGS: LazyLock<Vec<Setting>> = LazyLock::new(|| {
         ExposureConfig::SETTINGS,
         AntialiasingConfig::SETTINGS,
         ExposureRates::SETTINGS,
+        LampConfig::SETTINGS,
+        LampRates::SETTINGS,
         PrecisionConfig::SETTINGS,
     ]
     .concat()

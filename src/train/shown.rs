@@ -31,8 +31,12 @@ impl Trainer {
             Ok(())
         })?;
         let shape = own.layout.shape;
-        let settings =
-            RenderSettings { shape, purpose: Purpose::Show, ..self.config.render_settings() };
+        let settings = RenderSettings {
+            shape,
+            purpose: Purpose::Show,
+            lamp: None,
+            ..self.config.render_settings()
+        };
         Ok(ShownModel {
             gaussians,
             settings,

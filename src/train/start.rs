@@ -10,6 +10,7 @@ use super::cache::CacheSize;
 use super::context::Initial;
 use super::early_stopping::Convergence;
 use super::growth::Growth;
+use super::lamp::{self, LampLearning};
 use super::masks::Masks;
 use super::measuring::TargetExposure;
 use super::model::Model;
@@ -138,11 +139,22 @@ impl Trainer {
             tracing::info!("{}", scene.reason());
         }
         config.model.log_parts(&sizes);
+        let lamp =
+            config.model.lamp.then(|| lamp::start(&pseudo_gt, dataset, &config)).transpose()?;
         let starts = views.exposures(&pseudo_gt, dataset, &scene, &config)?;
         let gaussians = match &initial.gaussians {
             Some(gaussians) => given(gaussians, &config)?,
             None => {
-                views.initial_gaussians(gpu, &pseudo_gt, dataset, &config, starts.as_deref())?
+                let lamp = lamp.map(|lamp| lamp.scaled(1.0 / frame.scale));
+                let exposures = starts.as_deref();
+                views.initial_gaussians(
+                    gpu,
+                    &pseudo_gt,
+                    dataset,
+                    &config,
+                    exposures,
+                    lamp.as_ref(),
+                )?
             }
         };
         views.warn_of_empty_views(&gaussians);
@@ -156,8 +168,11 @@ impl Trainer {
             sizes.iter().try_for_each(|&size| exposures.reserve(size))?;
         }
         dataset.views.iter().filter_map(|view| view.original.as_ref()).for_each(Original::release);
-        let (Kernels { renderer, mut losses, adam, finite, floor, densifier }, fingerprint) =
+        let (Kernels { mut renderer, mut losses, adam, finite, floor, densifier }, fingerprint) =
             beside.join().unwrap_or_else(|panic| resume_unwind(panic))?;
+        if lamp.is_some() {
+            renderer.set_lamp(lamp)?;
+        }
         losses.prepare(&views.sources(gpu, &pseudo_gt, dataset))?;
         let networks = NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?;
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
@@ -180,6 +195,9 @@ impl Trainer {
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MAX_STEPS as usize)?,
         };
+        let learning = lamp
+            .map(|_| LampLearning::new(gpu, config.lamp.rates, dataset, frame.scale))
+            .transpose()?;
         let degree = initial.context.as_ref().map_or(0, Gaussians::sh_degree_in_use);
         let degree = degree.max(first_sh_degree(&config));
         let mut trainer = Self {
@@ -191,7 +209,7 @@ impl Trainer {
             supervision,
             model: Model::upload(gpu, &gaussians, degree, &config.precision)?,
             renderer,
-            optimizer: Optimizer { adam, finite, floor, checked: 0 },
+            optimizer: Optimizer { adam, finite, floor, lamp: learning, checked: 0 },
             growth: Growth { densifier, probes, has_logged_capacity: false },
             convergence,
             submissions: Submissions::default(),

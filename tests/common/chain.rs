@@ -6,8 +6,11 @@ use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::camera::Camera;
 use nightsplat::reference::camera_backward::camera_backward;
+use nightsplat::reference::lamp::{self, Lamp};
 use nightsplat::reference::project::{Projection, ProjectionSettings, project_gaussian};
-use nightsplat::reference::project_backward::{DSplat, project_gaussian_backward, splat_gradient};
+use nightsplat::reference::project_backward::{
+    DSplat, Lit, project_gaussian_backward, splat_gradient,
+};
 use nightsplat::reference::splat::Splat;
 use nightsplat::splats::render::{CameraGradient, RenderSettings};
 
@@ -18,6 +21,8 @@ use super::{Random, assert_close};
 pub(crate) struct Chain<'a> {
     setup: &'a Setup,
     pub(crate) d_render: Vec<f64>,
+    /// The lamp of the settings.
+    pub(crate) lamp: Option<Lamp>,
 }
 
 /// The splats of a render, front to back, with the indices of their Gaussians.
@@ -42,6 +47,8 @@ pub(crate) struct Results {
     pub(crate) d_background: Vec<f64>,
     /// With respect to the camera.
     pub(crate) camera: [f64; CameraGradient::WIDTH],
+    /// With respect to the lamp's numbers.
+    pub(crate) lamp: [f64; lamp::WIDTH],
 }
 
 impl<'a> Chain<'a> {
@@ -51,7 +58,8 @@ impl<'a> Chain<'a> {
         let count = setup.channels() * setup.pixels();
         // Values of f32, as on the device.
         let d_render = (0..count).map(|_| f64::from(random.between(-1.0, 1.0) as f32)).collect();
-        Self { setup, d_render }
+        let lamp = setup.settings.lamp.map(|lamp| Lamp::of(&lamp.numbers()));
+        Self { setup, d_render, lamp }
     }
 
     pub(crate) fn parameters(&self) -> Vec<f64> {
@@ -68,7 +76,8 @@ impl<'a> Chain<'a> {
             let gaussian = self.setup.planes().load(parameters, i);
             let RenderSettings { near, raw_colors, antialiased, .. } = *settings;
             let (near, sh_degree) = (near.into(), options.sh_degree);
-            let own = ProjectionSettings { near, sh_degree, raw_colors, antialiased };
+            let lamp = self.lamp;
+            let own = ProjectionSettings { near, sh_degree, raw_colors, antialiased, lamp };
             let projection = project_gaussian(camera, own, &gaussian)?;
             Some((i, projection, gaussian.features))
         };
@@ -133,6 +142,7 @@ impl<'a> Chain<'a> {
             grad_norms: vec![0.0; self.setup.count],
             d_background: vec![0.0; channels],
             camera: [0.0; CameraGradient::WIDTH],
+            lamp: [0.0; lamp::WIDTH],
         };
         let alpha_max = self.alpha_max();
         for (at, (center, d)) in self.pixels().enumerate() {
@@ -155,8 +165,15 @@ impl<'a> Chain<'a> {
             let gaussian = planes.load(parameters, i);
             let (degree, antialiased) = (options.sh_degree, settings.antialiased);
             let splat = &splats[j];
+            let lit = self.lamp.map(|lamp| Lit { lamp, color: DVec3::from_slice(color) });
+            let own = (splat, lit);
             let d =
-                project_gaussian_backward(&camera, degree, antialiased, &gaussian, splat, &d_splat);
+                project_gaussian_backward(&camera, degree, antialiased, &gaussian, own, &d_splat);
+            if let Some(Lit { lamp, color }) = lit {
+                let share = lamp.gradient(camera.view(gaussian.mean));
+                let d_log_factor = d_splat.color.dot(lamp.above_black(color));
+                (results.lamp.iter_mut().zip(share)).for_each(|(sum, d)| *sum += d_log_factor * d);
+            }
             planes.store(&d, i, |at, value| results.gradient[at] = value);
             let dimming = if antialiased { d_splat.opacity * splat.opacity } else { 0.0 };
             let arriving = (d_splat.mean2d, d_splat.conic, dimming);

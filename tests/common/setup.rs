@@ -12,6 +12,7 @@ use nightsplat::reference::camera::{Camera, Model};
 use nightsplat::reference::gaussian::{Gaussian, Planes};
 use nightsplat::reference::sh::sh_count;
 use nightsplat::splats::batches::Batches;
+use nightsplat::splats::lamp::Lamp;
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::{DeviceGaussians, Features, Gaussians, Shape};
 
@@ -198,6 +199,14 @@ impl Setup {
         rendered.download()
     }
 
+    /// The render with these numbers of its lamp.
+    pub(crate) fn render_lit(&self, numbers: &[f32]) -> Rendered<'_> {
+        let mut rendered = Rendered::new(self);
+        rendered.renderer.set_lamp_numbers(numbers).unwrap();
+        rendered.forward();
+        rendered.download()
+    }
+
     /// The render and the status, with memory for this number of intersections, sufficient or not.
     pub(crate) fn render_within(&self, capacity: u32) -> (Rendered<'_>, Status) {
         let mut rendered = Rendered::new(self);
@@ -326,8 +335,23 @@ pub(crate) fn fisheye() -> CameraModel {
     CameraModel::Fisheye(KannalaBrandt { coefficients })
 }
 
+/// A lamp beside the camera whose every number counts.
+pub(crate) fn lamp() -> Lamp {
+    Lamp {
+        position: [0.1, -0.2, 0.05],
+        axis: [0.1, 0.2],
+        ambient: 0.1,
+        exponent: 1.7,
+        falloffs: [3.0, 0.5],
+        reference_distance: 2.0,
+        slope: 0.45,
+        black: 0.07,
+        gain: 1.2,
+    }
+}
+
 /// Edge cases of size, channel count, tile and SH degree (stored, in use) for the kernels; with many channels, colours
-/// are raw; every second variant is antialiased.
+/// are raw; every second variant is antialiased, every third lit by a lamp.
 pub(crate) fn variants() -> Vec<Setup> {
     type Row = (usize, [u32; 2], [u32; 2], usize, ([u32; 2], u32));
     let rows: [Row; 11] = [
@@ -352,6 +376,7 @@ pub(crate) fn variants() -> Vec<Setup> {
         setup.options.sh_degree = used;
         setup.settings.raw_colors = channels > 4;
         setup.settings.antialiased = i % 2 == 1;
+        setup.settings.lamp = (i % 3 == 2).then(lamp);
         // A device replaces tiles that it does not support by its own.
         setup.settings.tile =
             Some(tile_of(tile)).filter(|&tile| gpu().properties().suits_tile(tile));

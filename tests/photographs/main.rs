@@ -12,6 +12,7 @@ mod exposure;
 mod fit;
 mod formats;
 mod hostile_bytes;
+mod lamp;
 mod metrics;
 mod properties;
 mod pseudo_gt;

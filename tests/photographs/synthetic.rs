@@ -13,8 +13,15 @@ use nightsplat::photographs::image::{Image, linear_from_srgb};
 
 use crate::common::command::run;
 
-const SMALL: SyntheticOptions =
-    SyntheticOptions { views: 10, width: 48, height: 36, seed: 5, fisheye: false, street: None };
+const SMALL: SyntheticOptions = SyntheticOptions {
+    views: 10,
+    width: 48,
+    height: 36,
+    seed: 5,
+    fisheye: false,
+    street: None,
+    lamp: None,
+};
 
 /// Every file below a folder, by relative path.
 fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
@@ -206,7 +213,8 @@ mod command {
         let (width, height) = (Some(16), Some(16));
         let (views, seed) = (Some(SMALL.views), SMALL.seed);
         let dir = dir.to_owned();
-        SynthArgs { dir, street: None, views, width, height, seed, fisheye: false, overwrite }
+        let (street, fisheye, lamp) = (None, false, None);
+        SynthArgs { dir, street, views, width, height, seed, fisheye, lamp, overwrite }
     }
 
     #[test]

@@ -3,12 +3,16 @@
 use glam::{DVec2, DVec3};
 use nightsplat::camera::CameraModel;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::reference;
 use nightsplat::reference::camera::Model;
 use nightsplat::reference::gaussian::Gaussian;
+use nightsplat::splats::lamp::Lamp;
 use nightsplat::splats::scene::Shape;
 
 use crate::common::chain::Chain;
-use crate::common::setup::{Gradients, Rendered, Setup, features, fisheye, tile_of, variants};
+use crate::common::setup::{
+    Gradients, Rendered, Setup, features, fisheye, lamp, tile_of, variants,
+};
 
 const SIZE: [u32; 2] = [26, 19];
 
@@ -84,6 +88,73 @@ fn the_gradient_of_compensated_opacities_agrees_with_central_differences() {
             setup.set(i, &Gaussian { raw_opacity: 1.5, log_scale, ..gaussian });
         }
         check(&setup, &format!("compensated, {model:?}"));
+    }
+}
+
+/// Every attribute with a lamp, which also acts on means, and the numbers of the lamp.
+#[test]
+fn the_gradient_of_lit_colors_and_of_their_lamp_agrees_with_central_differences() {
+    for (model, channels) in [(CameraModel::Pinhole, 3), (fisheye(), 11)] {
+        let shape = Shape { sh_degree: 1, features: features(channels) };
+        let mut setup = Setup::seen_by(model, 7, SIZE, shape, 23);
+        setup.settings.lamp = Some(lamp());
+        setup.settings.raw_colors = channels > 3;
+        check(&setup, &format!("lit, {model:?}"));
+        let mut chain = Chain::new(&setup);
+        let (parameters, background) = (chain.parameters(), chain.background());
+        let actual = chain.run(&parameters).lamp;
+        let numbers = lamp().numbers().map(f64::from);
+        let step = 1e-5;
+        for (number, actual) in actual.into_iter().enumerate() {
+            let mut loss = |by: f64| {
+                let mut moved = numbers;
+                moved[number] += by;
+                chain.lamp = Some(reference::lamp::Lamp::of(&moved));
+                chain.loss(&parameters, &background)
+            };
+            let expected = (loss(step) - loss(-step)) / (2.0 * step);
+            let bound = 1e-6 * expected.abs() + 1e-8;
+            assert!(expected.abs() > 1e-4, "number {number} has no gradient");
+            assert!((actual - expected).abs() < bound, "[{number}] {actual}, not {expected}");
+        }
+    }
+}
+
+/// Within the lamp, where distances are bounded, nothing depends on the distance, but the angle counts.
+#[test]
+fn the_gradient_is_correct_at_the_lamp_and_opposite_to_its_axis() {
+    let mut setup = Setup::new(7, SIZE, 1, 23);
+    let in_view = setup.camera().view(setup.get(0).mean);
+    let position = (in_view + DVec3::new(0.02, -0.01, 0.03)).to_array();
+    setup.settings.lamp = Some(Lamp { position, ..lamp() });
+    check(&setup, "at the lamp");
+    setup.settings.lamp = Some(Lamp { position: [0.0, 0.0, 4.0], ..lamp() });
+    check(&setup, "opposite to the axis");
+}
+
+#[test]
+fn the_gradient_of_a_lamp_on_the_device_is_that_of_the_chain_and_has_the_same_bits_every_time() {
+    let gpu = gpu();
+    for (count, channels) in [(0, 3), (7, 3), (1023, 4), (1025, 11), (2600, 3)] {
+        let shape = Shape { sh_degree: 1, features: features(channels) };
+        let mut setup = Setup::new(count, [40, 30], shape, 8);
+        setup.settings.lamp = Some(lamp());
+        let chain = Chain::new(&setup);
+        let expected = chain.run(&chain.parameters()).lamp;
+        let d_render: Vec<f32> = chain.d_render.iter().map(|&d| d as f32).collect();
+        let gradient = || {
+            let mut rendered = setup.render();
+            let (_, report) = gpu.checked(|| rendered.backward(&d_render));
+            report.agree().unwrap();
+            gpu.read(rendered.renderer.lamp_gradients().unwrap()).unwrap()
+        };
+        let actual = gradient();
+        let largest = expected.iter().fold(0.0_f64, |largest, d| largest.max(d.abs()));
+        for (n, (actual, expected)) in actual.iter().zip(expected).enumerate() {
+            let off = (f64::from(*actual) - expected).abs();
+            assert!(off <= 2e-3 * largest, "{count}: [{n}] {actual} {expected}");
+        }
+        assert!((0..3).all(|_| gradient() == actual), "{count}");
     }
 }
 

@@ -240,6 +240,7 @@ fn sums(intersection_ranges: Vec<UVec2>, gradient_records: &[Record]) -> Vec<f32
     let gradients = vec![f32::NAN; parameters.len()];
     let (grad_norm_sums, visit_counts) = (vec![0.0f32; count], vec![0; count]);
     let cameras = vec![kernels::Camera::from(&Patch::from(&setup.camera))];
+    let lamp = vec![0.0f32; 1];
     let (_, gradients, _, _) = run_kernel!(
         project_backward,
         project_backward::Constants { channels: 4, ..Default::default() },
@@ -252,7 +253,16 @@ fn sums(intersection_ranges: Vec<UVec2>, gradient_records: &[Record]) -> Vec<f32
             damping_depth: 1.0,
         },
         Threads::Exactly([count as u32, 1, 1]),
-        [parameters, splats, colors, tile_counts, intersection_ranges, gradient_records, cameras],
+        [
+            parameters,
+            splats,
+            colors,
+            tile_counts,
+            intersection_ranges,
+            gradient_records,
+            cameras,
+            lamp
+        ],
         [status, gradients, grad_norm_sums, visit_counts]
     );
     (0..count).map(|i| setup.planes().load(&gradients, i).features[0] as f32).collect()

@@ -17,8 +17,15 @@ use nightsplat::train::{Preset, TrainConfig, Trainer};
 
 use crate::common::command::{refused, run, succeed};
 
-const SET: SyntheticOptions =
-    SyntheticOptions { views: 12, width: 96, height: 72, seed: 3, fisheye: false, street: None };
+const SET: SyntheticOptions = SyntheticOptions {
+    views: 12,
+    width: 96,
+    height: 72,
+    seed: 3,
+    fisheye: false,
+    street: None,
+    lamp: None,
+};
 const MEMORY: u64 = 8 << 30;
 
 fn written(capture: &Capture) -> tempfile::TempDir {

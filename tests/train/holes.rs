@@ -22,8 +22,15 @@ use serde_json::Value;
 use crate::common::command::{self, succeed};
 use crate::common::train::{advance, train};
 
-const SET: SyntheticOptions =
-    SyntheticOptions { views: 12, width: 64, height: 48, seed: 1, fisheye: false, street: None };
+const SET: SyntheticOptions = SyntheticOptions {
+    views: 12,
+    width: 64,
+    height: 48,
+    seed: 1,
+    fisheye: false,
+    street: None,
+    lamp: None,
+};
 
 /// A room lit by one lamp: everything outside its light, including objects in front of walls, is black and has no
 /// points.

@@ -6,6 +6,7 @@
 #include "rotation.glsl"
 #include "sh.glsl"
 #include "splat.glsl"
+#include "lamp.glsl"
 
 //! Project: one thread per Gaussian, world space to image plane.
 //!
@@ -13,7 +14,8 @@
 //! definite by construction, and its determinant is |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel.
 //! Compensation multiplies the opacity by the square root of det(U U^T) / det(cov2d), so that dilation does not add
 //! light (Yu et al. 2024, Mip-Splatting, section 5.2). Colour is max(SH + 0.5, 0), what every viewer shows, or the
-//! bare SH sum of LITA-GS; features are taken as they are. The last channel can be the depth in the view. A culled
+//! bare SH sum of LITA-GS, in the light of the lamp (include/lamp.glsl) before it is clamped; features are taken as
+//! they are. The last channel can be the depth in the view. A culled
 //! Gaussian gets the last depth key and covers no tile.
 
 layout(local_size_x = 64) in;
@@ -30,6 +32,7 @@ layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 5) const bool RAW_COLORS = false;
 layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in the format of include/half.glsl
 layout(constant_id = 14) const bool ANTIALIASED = false;  // opacities are compensated for the dilation
+layout(constant_id = 16) const bool LAMP = false;  // colours are lit by a lamp at the camera
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };    // planes
 layout(binding = 1) writeonly buffer Splats     { ProjectedSplat splats[]; };
@@ -38,6 +41,7 @@ layout(binding = 3) writeonly buffer DepthKeys  { uint depth_keys[]; };
 layout(binding = 4) writeonly buffer Ids        { uint ids[]; };
 layout(binding = 5) writeonly buffer TileCounts { uint tile_counts[]; };
 layout(binding = 6) readonly  buffer Cameras    { Camera cameras[]; };
+layout(binding = 7) readonly  buffer LampNumbers { float lamp[]; };  // (LAMP_NUMBERS), read with LAMP
 
 // A depth key is how many sixteenfold roundings the depth is beyond `near`: 2e-6 of the depth each, over 32 octaves.
 const uint DEPTH_BITS = 24;
@@ -46,6 +50,7 @@ layout(constant_id = 11) const uint VIEW_DEPTHS = 0;  // 1: the last channel is 
 const uint FEATURE_COUNT = CHANNELS - 3 - VIEW_DEPTHS;
 
 #include "rest.glsl"
+#include "lamp_law.glsl"
 
 // Depth is positive, so its bits sort like its value.
 uint depth_key(float depth) {
@@ -63,7 +68,12 @@ vec3 sh_color(uint i, vec3 direction) {
         if (k < sh_count(SH_DEGREE) && k < sh_count(sh_degree)) color += basis[k] * rest_coefficient(i, k);
     }
     if (RAW_COLORS) return color;
-    return max(color + 0.5, vec3(0.0));
+    return color + 0.5;
+}
+
+vec3 shown(vec3 color) {
+    if (RAW_COLORS) return color;
+    return max(color, vec3(0.0));
 }
 
 void main() {
@@ -112,6 +122,11 @@ void main() {
     vec3 center = -transpose(mat3(camera.view_from_world)) * camera.view_from_world[3];
     vec3 offset = mean - center;
     vec3 rgb = sh_color(i, normalize(offset * finite_scale(length(offset))));
+    if (LAMP) {
+        Lamp own = load_lamp();
+        rgb = own.black + (rgb - own.black) * lamp_factor(own, lamp_at(own, mean_in_view));
+    }
+    rgb = shown(rgb);
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
     [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) {
         vec4 four = vec4(0);

@@ -8,6 +8,7 @@
 #include "splat.glsl"
 #include "status.glsl"
 #include "shared_intersections.glsl"
+#include "lamp.glsl"
 
 //! Project backward: one lane per Gaussian, from the records of its slots to the gradients of its attributes.
 //!
@@ -32,13 +33,14 @@ layout(push_constant, scalar) uniform Params {
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 5) const bool RAW_COLORS = false;
 layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in the format of include/half.glsl
-// Of the gradients of SH above degree 0, only that of the colour is written, as `adam_gaussian` reads it; it requires
-// REST_BY_COLUMN.
 // Columns of the parameters, from the first, that are not trained: their gradients are not written, and neither are the
 // statistics of density control.
 layout(constant_id = 15) const uint FROZEN_COLUMNS = 0;
+// Of the gradients of SH above degree 0, only that of the colour is written, as `adam_gaussian` reads it; it requires
+// REST_BY_COLUMN.
 layout(constant_id = 13) const bool COLOR_GRADIENTS = false;
 layout(constant_id = 14) const bool ANTIALIASED = false;  // opacities are compensated for the dilation
+layout(constant_id = 16) const bool LAMP = false;  // colours are lit by a lamp at the camera
 
 layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // planes
 layout(binding = 1) readonly  buffer Splats     { ProjectedSplat splats[]; };
@@ -52,12 +54,14 @@ layout(binding = 7) writeonly buffer Gradients  { float gradients[]; };   // (co
 layout(binding = 8) buffer GradNormSums { float grad_norm_sums[]; };
 layout(binding = 9) buffer VisitCounts  { uint visit_counts[]; };
 layout(binding = 10) readonly buffer Cameras { Camera cameras[]; };
+layout(binding = 11) readonly buffer LampNumbers { float lamp[]; };  // (LAMP_NUMBERS), read with LAMP
 
 const uint FEATURE_COUNT = CHANNELS - 3;
 
 #include "rest.glsl"
 #include "gradient_records.glsl"
 #include "conic.glsl"
+#include "lamp_law.glsl"
 
 #define STORE_VEC3(column, i, v) { \
     uint at = (column) * gaussian_count + 3 * (i); \
@@ -187,6 +191,12 @@ void main() {
     vec3 d_row0 = view_rotation * (scaled_axes * d.u0);
     vec3 d_row1 = view_rotation * (scaled_axes * d.u1);
     vec3 d_mean_in_view = camera_backward(mean_in_view, camera, d_mean2d, d_row0, d_row1);
+    if (LAMP) {
+        Lamp own = load_lamp();
+        LampPoint at = lamp_at(own, mean_in_view);
+        d_mean_in_view += dot(d_color, color - own.black) * lamp_point_gradient(own, at);
+        d_color *= lamp_factor(own, at);
+    }
     vec3 offset = offset_from_camera(mean, camera.view_from_world);
     vec3 d_mean = world_from_view * d_mean_in_view + sh_backward(i, offset, d_color);
 

@@ -102,7 +102,7 @@ pub fn plain(gpu: &Gpu, scene: &BenchScene) -> Result<Trainer> {
 fn lita(gpu: &Gpu) -> Result<Trainer> {
     let mut config = config();
     config.model.follow_paper();
-    config.model.set_parts(&Part::ALL);
+    config.model.set_parts(&Part::LITA);
     config.ssim_weight = 0.0;
     config.model.denoiser_crop = 24;
     config.model.network.channels = 8;

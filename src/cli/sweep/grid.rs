@@ -82,7 +82,7 @@ impl Grid {
                 vec![gains(&["0"], &["1", "2", "3", "4"]), gains(&["1", "2", "3", "4"], &["1"])]
             }
             Self::Parts => {
-                let [a, b, c, d] = Part::ALL.map(Part::name);
+                let [a, b, c, d] = Part::LITA.map(Part::name);
                 vec![vec![Axis::of(PARTS, &[PLAIN, a, b, c, d, ALL_PARTS])]]
             }
             Self::Presets => {

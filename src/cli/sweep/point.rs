@@ -171,7 +171,7 @@ impl Point {
         let of = |(key, value): &(String, String)| match key.as_str() {
             "curve" => pair(key, &curve(value)),
             PARTS if value == PLAIN => pair("model", PLAIN),
-            PARTS if value == ALL_PARTS => pair(key, &Part::ALL.map(Part::name).join(",")),
+            PARTS if value == ALL_PARTS => pair(key, &Part::LITA.map(Part::name).join(",")),
             PRESET | PARTS | "gain" | "theta" | SEED => pair(key, value),
             OFFSET if value == ADAPTIVE => vec![],
             OFFSET => [set("tone.alpha", value), set("tone.beta", "0")].concat(),

@@ -95,6 +95,7 @@ impl Run {
         let networks =
             run::load_networks(gpu, &self.folder, &config.model, model.gaussians.shape.features)?;
         let mut model_renderer = ModelRenderer::new(gpu, &model, &config, networks)?;
+        model_renderer.set_lamp(run::load_lamp(&self.folder)?)?;
         Ok(model_renderer.render(view)?.output().clone())
     }
 

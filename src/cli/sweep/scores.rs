@@ -28,10 +28,11 @@ pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range)
             continue;
         }
         let FinishedRun { gpu, config, dataset, mut model_renderer, .. } =
-            FinishedRun::open(run, None, &driver::opener(None))?;
+            FinishedRun::open_lit(run, None, &driver::opener(None))?;
         let lpips = Lpips::load(&gpu, weights, range)?;
         let mut reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
-        let render = |view: &View| model_renderer.render(view);
+        let is_even = reference.is_evenly_lit(&dataset);
+        let render = |view: &View| model_renderer.render_as(view, is_even);
         let scored = eval::score_by(&mut reference, &dataset, render, |score, images| {
             score.scores.lpips = Some(images.lpips(&gpu, &lpips)?);
             Ok(())

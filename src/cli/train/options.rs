@@ -337,7 +337,7 @@ impl SeveralSettings {
         };
         match self.model {
             Some(ModelName::Plain) => set_parts(&[], "--model")?,
-            Some(ModelName::Lita) => set_parts(&Part::ALL, "--model")?,
+            Some(ModelName::Lita) => set_parts(&Part::LITA, "--model")?,
             None => {}
         }
         if let Some(parts) = &self.parts {

@@ -3,7 +3,8 @@
 //! The scene is ray-traced in linear light: a corner of a room, or a street. The reference is the encoded render, 2x2
 //! supersampled. The dark photograph is the same light divided by [`DARKENING`], with the shot and read noise of a
 //! small sensor, encoded and quantised to 8 bits: as a camera stores it if the exposure is far too short. In a street
-//! this light also falls eightfold from one end to the other; that of the references does not.
+//! this light also falls eightfold from one end to the other; that of the references does not. With a lamp that is
+//! fixed to the camera, the photographs have its light instead.
 
 use std::f64::consts::PI;
 use std::fs;
@@ -14,6 +15,7 @@ use glam::{DAffine3, DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
+use self::lamp::CameraLamp;
 use self::room::Room;
 use self::street::Street;
 use crate::base::random::Stream;
@@ -22,6 +24,7 @@ use crate::photographs::image::{Image, srgb_from_linear};
 use crate::{Error, Result};
 
 mod colmap;
+mod lamp;
 mod room;
 mod shapes;
 mod street;
@@ -29,8 +32,9 @@ mod street;
 /// What is photographed.
 trait Scene: Sync {
     /// The linear radiance along a ray, in the light of the references, and in that of the photographs before they are
-    /// darkened.
-    fn radiance(&self, origin: DVec3, direction: DVec3) -> [DVec3; 2];
+    /// darkened, which is that of a camera's lamp if it carries one.
+    fn radiance(&self, origin: DVec3, direction: DVec3, carried: Option<&CameraLamp>)
+    -> [DVec3; 2];
 
     /// The first point along a ray.
     fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3>;
@@ -104,11 +108,22 @@ pub struct SyntheticOptions {
     /// A street of this many plots, of one world unit each, instead of the room. Cameras fly along it, and each sees a
     /// stretch of about three.
     pub street: Option<u32>,
+    /// The photographs are lit by a lamp that is fixed to the camera, with half its strength this many degrees off its
+    /// axis, 5 to 80. The cameras of a room then come close and look around.
+    pub lamp: Option<f64>,
 }
 
 impl Default for SyntheticOptions {
     fn default() -> Self {
-        Self { views: 24, width: 160, height: 120, seed: 0, fisheye: false, street: None }
+        Self {
+            views: 24,
+            width: 160,
+            height: 120,
+            seed: 0,
+            fisheye: false,
+            street: None,
+            lamp: None,
+        }
     }
 }
 
@@ -131,6 +146,7 @@ impl SyntheticOptions {
         const SIDES: RangeInclusive<u32> = 16..=8192;
         const PLOTS: RangeInclusive<u32> = 1..=10_000;
         const VIEWS: RangeInclusive<usize> = 2..=99_999;
+        const LAMPS: RangeInclusive<f64> = 5.0..=80.0;
         if !VIEWS.contains(&self.views) {
             return Err(Error::Usage(format!(
                 "{} views cannot be made; ask for 2 to {}",
@@ -156,12 +172,22 @@ impl SyntheticOptions {
             let problem = "a street is not made with a fisheye; ask for one of both";
             return Err(Error::Usage(problem.to_owned()));
         }
+        if let Some(degrees) = self.lamp
+            && !LAMPS.contains(&degrees)
+        {
+            return Err(Error::Usage(format!(
+                "a lamp of half its strength at {degrees} degrees cannot be made; ask for {} to {}",
+                LAMPS.start(),
+                LAMPS.end()
+            )));
+        }
         Ok(())
     }
 }
 
 /// Writes the dataset to `dir` in the layout of the LOM benchmark: `low/` and `high/` (PNG), `transforms_train.json`,
-/// `transforms_test.json`, `transforms_val.json`, and a COLMAP text model in `colmap_sparse/0`.
+/// `transforms_test.json`, `transforms_val.json`, and a COLMAP text model in `colmap_sparse/0`. With a lamp, `lit/` has
+/// the test views in its light, without noise and not darkened: what a render with the lamp should look like.
 ///
 /// The model's points are on surfaces that at least two views see, to the precision of a good reconstruction; their
 /// colours are all grey, because the colours of a real one come from photographs that training must not see. Equal
@@ -185,7 +211,8 @@ pub fn write_captured(
     options.check()?;
     let dir = dir.as_ref();
     let (low, high, sparse) = (dir.join("low"), dir.join("high"), dir.join("colmap_sparse/0"));
-    for folder in [&low, &high, &sparse] {
+    let lit = options.lamp.map(|_| dir.join("lit"));
+    for folder in [&low, &high, &sparse].into_iter().chain(&lit) {
         fs::create_dir_all(folder)
             .map_err(|error| Error::output(folder, format!("cannot be made: {error}")))?;
     }
@@ -200,15 +227,19 @@ pub fn write_captured(
     }
 
     let (scene, draws): (Box<dyn Scene>, u64) = match options.street {
-        None => (Box::new(Room::new(options.seed)), 2400),
+        None => (Box::new(Room::new(options.seed, options.lamp.is_some())), 2400),
         Some(plots) => (Box::new(Street::new(plots, options.seed)), 400 * u64::from(plots)),
     };
     let camera = |view| camera(scene.place(view, options.views), options);
     let cameras: Vec<Camera> = (0..options.views).map(camera).collect();
     for (view, camera) in cameras.iter().enumerate() {
         let name = file_name(view, cameras.len());
-        let [lit, dim] = render(&*scene, camera);
-        reference(&lit, camera).save_png8(high.join(&name))?;
+        let lamp = options.lamp.map(|degrees| CameraLamp::of(camera, degrees));
+        let [even, dim] = render(&*scene, camera, lamp.as_ref());
+        bright_photograph(&even, camera).save_png8(high.join(&name))?;
+        if let Some(lit) = lit.as_ref().filter(|_| is_test(view)) {
+            bright_photograph(&dim, camera).save_png8(lit.join(&name))?;
+        }
         let noise = Stream::new(options.seed, NOISE_STREAM << 32 | view as u64);
         let stops = capture.stops.get(view % capture.stops.len().max(1)).copied();
         let darkening = capture.darkening / stops.unwrap_or(0.0).exp2();
@@ -218,7 +249,7 @@ pub fn write_captured(
         write_file(&sparse.join(name), &text)?;
     }
     let (test, train): (Vec<usize>, Vec<usize>) =
-        (0..options.views).partition(|view| view % TEST_EVERY == 0);
+        (0..options.views).partition(|&view| is_test(view));
     for (split, folder, views) in
         [("train", "low", &train[..]), ("test", "high", &test), ("val", "high", &test[..1])]
     {
@@ -226,6 +257,10 @@ pub fn write_captured(
         write_file(&dir.join(format!("transforms_{split}.json")), &format!("{list:#}\n"))?;
     }
     Ok(())
+}
+
+fn is_test(view: usize) -> bool {
+    view.is_multiple_of(TEST_EVERY)
 }
 
 fn write_file(path: &Path, text: &str) -> Result<()> {
@@ -267,7 +302,7 @@ fn ray(camera: &Camera, pixel: DVec2) -> Option<DVec3> {
 }
 
 /// Linear radiance in row-major order, the mean of 2x2 rays per pixel, in both lights.
-fn render(scene: &dyn Scene, camera: &Camera) -> [Vec<DVec3>; 2] {
+fn render(scene: &dyn Scene, camera: &Camera, lamp: Option<&CameraLamp>) -> [Vec<DVec3>; 2] {
     const OFFSETS: [DVec2; 4] = [
         DVec2::new(0.25, 0.25),
         DVec2::new(0.75, 0.25),
@@ -279,16 +314,16 @@ fn render(scene: &dyn Scene, camera: &Camera) -> [Vec<DVec3>; 2] {
         let corner = DVec2::new((index % camera.width).into(), (index / camera.width).into());
         let rays = OFFSETS.iter().filter_map(|&offset| ray(camera, corner + offset));
         let sums = rays
-            .map(|ray| scene.radiance(center, ray))
+            .map(|ray| scene.radiance(center, ray, lamp))
             .fold([DVec3::ZERO; 2], |sums, own| [sums[0] + own[0], sums[1] + own[1]]);
         (sums[0] / 4.0, sums[1] / 4.0)
     };
-    let (lit, dim) = (0..camera.width * camera.height).into_par_iter().map(radiance).unzip();
-    [lit, dim]
+    let (even, dim) = (0..camera.width * camera.height).into_par_iter().map(radiance).unzip();
+    [even, dim]
 }
 
 /// The normal-light photograph.
-fn reference(radiance: &[DVec3], camera: &Camera) -> Image {
+fn bright_photograph(radiance: &[DVec3], camera: &Camera) -> Image {
     photograph(camera, |pixel, channel| radiance[pixel][channel])
 }
 

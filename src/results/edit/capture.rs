@@ -97,6 +97,10 @@ impl Capture {
             None => None,
         };
         let mut model_renderer = ModelRenderer::new(gpu, &model, &config, networks)?;
+        let lamp = run.map(run::load_lamp).transpose()?.flatten();
+        if !score_reference.is_evenly_lit(dataset) {
+            model_renderer.set_lamp(lamp.map(|lamp| lamp.scaled(placement.scale)))?;
+        }
         let render = |view: &View| model_renderer.render_camera(&placement.camera(&view.camera));
         let scored = eval::score_by(score_reference, dataset, render, |_, _| Ok(()))?;
         Ok(eval::means(&scored).0.map(|mean| mean.psnr))

@@ -11,9 +11,11 @@ use serde_json::json;
 use super::{GENERATOR, Provenance, gzip};
 use crate::camera::{Camera, CameraModel};
 use crate::kernels::camera_pinhole::JACOBIAN_MARGIN;
+use crate::kernels::lamp::{LAMP_FARTHEST, LAMP_NEAREST};
 use crate::kernels::splat::{ALPHA_MIN, DILATION};
 use crate::photographs::image::Image;
 use crate::results::report::{base64, escape, jpeg};
+use crate::splats::lamp::Lamp;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Facts, Gaussians};
 use crate::{Error, Result};
@@ -65,6 +67,8 @@ pub struct Page<'a> {
     pub near: f64,
     /// The up direction, a unit vector in the coordinates of the Gaussians.
     pub up: DVec3,
+    /// The lamp that lit the photographs, which the page's camera can carry.
+    pub lamp: Option<Lamp>,
 }
 
 impl Page<'_> {
@@ -73,7 +77,8 @@ impl Page<'_> {
     /// # Errors
     /// [`Error::Usage`] for a bookmark that is not a pinhole camera.
     pub fn html(&self) -> Result<String> {
-        let Self { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up } = self;
+        let Self { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up, lamp } =
+            self;
         let other = bookmarks.iter().find(|own| own.camera.model != CameraModel::Pinhole);
         if let Some(Bookmark { name, .. }) = other {
             return Err(Error::Usage(format!(
@@ -88,6 +93,7 @@ impl Page<'_> {
             "origin": origin.to_array(),
             "near": near,
             "up": up.to_array(),
+            "lamp": lamp,
             "views": bookmarks.iter().map(view).collect::<Vec<_>>(),
         });
         let packed = |gaussians: &Gaussians| Ok::<_, Error>(base64(&gzip(&packed(gaussians))?));
@@ -133,6 +139,8 @@ fn shader(text: &str, max_alpha: f32, antialiased: bool) -> String {
         ("ALPHA_MAX", max_alpha.into()),
         ("DILATION", DILATION),
         ("JACOBIAN_MARGIN", JACOBIAN_MARGIN),
+        ("LAMP_NEAREST", LAMP_NEAREST),
+        ("LAMP_FARTHEST", LAMP_FARTHEST),
     ];
     let floats = constants.map(|(name, value)| format!("const float {name} = {value:?};"));
     let constants = [floats.join("\n"), format!("const bool ANTIALIASED = {antialiased};")];
@@ -211,6 +219,7 @@ mod tests {
             fingerprint: None,
             near: 0.2,
             up: DVec3::NEG_Y,
+            lamp: None,
         };
         let html = page.html().unwrap();
         let mut of_fisheye = page.clone();
@@ -226,6 +235,8 @@ mod tests {
         let provenance = Provenance { facts, ..Provenance::default() };
         let compensated = Page { provenance, ..page.clone() }.html().unwrap();
         assert!(compensated.contains("const bool ANTIALIASED = true;"));
+        let lit = Page { lamp: Some(Lamp::AT_CAMERA), ..page.clone() }.html().unwrap();
+        assert!(lit.contains("\"reference_distance\":1.0") && html.contains("\"lamp\":null"));
         assert_eq!(html.matches("<script").count(), html.matches("</script>").count());
         for outside in ["http://", "https://", "src=\"/", "@import"] {
             assert!(!html.contains(outside), "{outside}");

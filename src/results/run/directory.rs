@@ -266,7 +266,7 @@ impl RunDirectory {
         self.save_trained(trainer)
     }
 
-    /// Writes the current model with its networks and exposures.
+    /// Writes the current model with its networks, lamp and exposures.
     ///
     /// # Errors
     /// The disk is full or gone, the device was lost, or a parameter is not finite.
@@ -274,6 +274,10 @@ impl RunDirectory {
         self.save_model(trainer)?;
         if let Some(networks) = trainer.networks() {
             self.save_networks(networks)?;
+        }
+        if let Some(lamp) = trainer.lamp()? {
+            let text = serde_json::json!(lamp);
+            write_whole(&self.path.join(LAMP), format!("{text:#}\n").as_bytes())?;
         }
         match trainer.exposures()? {
             Some(exposures) => self.save_exposures(&exposures),
@@ -325,7 +329,7 @@ impl RunDirectory {
         self.flush_log()?;
         let in_frame = trainer.gaussians_in_frame()?;
         trainer.refuse_not_finite(&in_frame)?;
-        let model = trainer.model_of(&in_frame);
+        let model = trainer.model_of(&in_frame)?;
         let comments = model.facts().comments();
         ply::save_with_comments(&model.shown(), self.path.join("model.ply"), &comments)
     }

@@ -6,12 +6,13 @@ use crate::Error;
 use crate::gpu::Gpu;
 
 /// The files of a run that a new run replaces; nothing else in the directory is touched.
-pub(super) const FILES: [&str; 14] = [
+pub(super) const FILES: [&str; 15] = [
     DONE,
     "metrics.json",
     "model.ply",
     NETWORKS,
     EXPOSURES,
+    LAMP,
     CHECKPOINT,
     CHECKPOINT_BEFORE,
     LOG,
@@ -61,6 +62,9 @@ pub(crate) const HELD_OUT_CURVE: &str = "held_out";
 
 /// Gain and bias of the training views.
 pub(super) const EXPOSURES: &str = "exposures.csv";
+
+/// The lamp that moves with the camera.
+pub(super) const LAMP: &str = "lamp.json";
 
 /// The weights of the networks.
 pub(super) const NETWORKS: &str = "networks.safetensors";

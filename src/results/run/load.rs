@@ -6,12 +6,14 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use super::directory::view_lines;
-use super::files::{EXPOSURES, NETWORKS, PLAN, VIEWS};
+use super::files::{EXPOSURES, LAMP, NETWORKS, PLAN, VIEWS};
 use super::generations;
+use crate::base::input;
 use crate::gpu::Gpu;
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::Dataset;
 use crate::splats::joined::Manifest;
+use crate::splats::lamp::Lamp;
 use crate::splats::scene::{Features, Gaussians, ply};
 use crate::train::{ModelConfig, Networks, TrainConfig};
 use crate::{Error, Result};
@@ -95,6 +97,22 @@ pub fn load_networks(
     let mut networks = Networks::new(gpu, model, features, 0)?;
     networks.load(&run.join(NETWORKS))?;
     Ok(Some(networks))
+}
+
+/// The learned lamp of a run, in units of its dataset's world; `None` if it has none.
+///
+/// # Errors
+/// The file is damaged, or a number of it is out of range.
+pub fn load_lamp(run: &Path) -> Result<Option<Lamp>> {
+    let path = run.join(LAMP);
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let refused = |problem: String| Error::input(&path, format!("is not a lamp: {problem}"));
+    let text = input::text(&path)?;
+    let lamp: Lamp = serde_json::from_str(&text).map_err(|error| refused(error.to_string()))?;
+    lamp.check().map_err(|error| refused(error.to_string()))?;
+    Ok(Some(lamp))
 }
 
 /// The learned exposures of a run's training views relative to its model, by name; empty if none were learned.

@@ -124,6 +124,7 @@ pub fn train_in(
     if config.exposure.learn == OnOff::On {
         eval::add_exposure(&mut metrics, &scored);
     }
+    eval::add_lit(&mut metrics, &scored);
     metrics[ENDED] = serde_json::json!(ended);
     metrics[TRAINED_WITH] = trained_with(gpu);
     if let Some(curve) = held_out_curve(&trainer) {
@@ -428,8 +429,12 @@ impl<'a> TrainLoop<'a> {
             )?,
         };
         let (step, mut is_first) = (trainer.steps_done(), true);
-        let render = |view: &View| trainer.render(&view.camera);
-        let scored =
+        let is_even = score_reference.is_evenly_lit(self.dataset);
+        let render = |view: &View| match is_even {
+            true => trainer.render_in_even_light(&view.camera),
+            false => trainer.render(&view.camera),
+        };
+        let mut scored =
             eval::score_by(&mut score_reference, self.dataset, render, |score, compared| {
                 if self.config.exposure.learn == OnOff::On {
                     score.aligned = Some(compared.aligned()?);
@@ -440,6 +445,9 @@ impl<'a> TrainLoop<'a> {
                 Ok(())
             })?;
         self.score_reference = Some(score_reference);
+        if self.config.model.lamp {
+            eval::score_lit(&mut scored, self.dataset, |view| trainer.render(&view.camera))?;
+        }
         observe(Event::Evaluated { step, scored: &scored });
         self.write_event_scores(step, &scored)?;
         if let Some(scores) = eval::means(&scored).0.filter(|_| self.config.eval_every > 0) {

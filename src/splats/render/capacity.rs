@@ -45,7 +45,8 @@ impl Renderer {
             }
         }
         let before = self.context_count();
-        self.frame.reserve(&self.gpu, before + gaussian_count, before + capacity, pixels, tiles)
+        self.frame.reserve(&self.gpu, before + gaussian_count, before + capacity, pixels, tiles)?;
+        self.reserve_lamp()
     }
 
     /// Grows the memory to `intersections`, and half as many again where the device can bind them; never shrinks.

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::buffers::{RANKS_PER_PARTITION, RenderBuffers, Segments};
+use super::lamp::DeviceLamp;
 use super::limits::{longest_run, segment_length, splats_per_turn};
 use super::{Purpose, RenderSettings, Renderer};
 use crate::Result;
@@ -12,6 +13,7 @@ use crate::kernels::{
     blend_backward, blend_forward, emit, order_counts, project, project_backward,
 };
 use crate::splats::batches::{GradientKind, rest_by_column};
+use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::Shape;
 use crate::splats::sort::RadixSort;
@@ -107,6 +109,10 @@ impl Renderer {
             limits: gpu.uninit("limits", 1)?,
             host_targets: None,
             context: None,
+            lamp: settings
+                .lamp
+                .map(|lamp| DeviceLamp::new(gpu, &settings, tile, &lamp))
+                .transpose()?,
         })
     }
 
@@ -130,6 +136,31 @@ impl Renderer {
         Ok(())
     }
 
+    /// Lights the colours with another lamp, or with none.
+    ///
+    /// # Errors
+    /// The driver refuses a kernel, or the device is out of memory; the renderer is as it was.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn set_lamp(&mut self, lamp: Option<Lamp>) -> Result<()> {
+        let settings = RenderSettings { lamp, ..self.settings };
+        let own = lamp.map(|lamp| DeviceLamp::new(&self.gpu, &settings, self.tile, &lamp));
+        let own = own.transpose()?;
+        if lamp.is_some() != self.settings.lamp.is_some() {
+            self.projections = self.built_with(&settings)?;
+        }
+        (self.settings, self.lamp) = (settings, own);
+        self.reserve_lamp()
+    }
+
+    /// The kernels that read Gaussians, for other settings.
+    fn built_with(&self, settings: &RenderSettings) -> Result<BTreeMap<(u32, bool), Projections>> {
+        let own = |&key: &(u32, bool)| {
+            let (tile, written) = (self.tile.size, (self.gradients, self.frozen_columns));
+            Ok((key, Projections::new(&self.gpu, settings, tile, key, written)?))
+        };
+        self.projections.keys().map(own).collect()
+    }
+
     /// Switches to another SH degree.
     ///
     /// # Errors
@@ -141,11 +172,7 @@ impl Renderer {
         }
         let shape = Shape { sh_degree, ..self.settings.shape };
         let settings = RenderSettings { shape, ..self.settings };
-        let own = |&key: &(u32, bool)| {
-            let (tile, written) = (self.tile.size, (self.gradients, self.frozen_columns));
-            Ok((key, Projections::new(&self.gpu, &settings, tile, key, written)?))
-        };
-        self.projections = self.projections.keys().map(own).collect::<Result<_>>()?;
+        self.projections = self.built_with(&settings)?;
         #[cfg(feature = "io")]
         self.set_context_degree(sh_degree)?;
         self.settings = settings;
@@ -173,7 +200,7 @@ impl Projections {
         let (view_depths, alpha_max) = (u32::from(has_depths), settings.max_alpha);
         let channels = settings.channels() as u32 + view_depths;
         let RenderSettings { raw_colors, antialiased, .. } = *settings;
-        let sh_degree = settings.shape.sh_degree;
+        let (sh_degree, lamp) = (settings.shape.sh_degree, settings.lamp.is_some());
         let half_rest = settings.rest == StorageFormat::Half;
         let rest_by_column = rest_by_column(gpu);
         macro_rules! pipeline {
@@ -186,6 +213,7 @@ impl Projections {
                     sh_degree,
                     raw_colors,
                     antialiased,
+                    lamp,
                     half_rest,
                     rest_by_column,
                     camera_model,

@@ -1,6 +1,7 @@
 //! The settings of a renderer, and the tile that suits a device.
 
 use crate::gpu::{Gpu, Properties, Tile};
+use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{Features, Shape};
 use crate::{Error, Result};
@@ -19,6 +20,8 @@ pub struct RenderSettings {
     /// Opacities are compensated for the dilation, so that a splat smaller than a pixel does not gain light: the 2D
     /// filter of Mip-Splatting. Only for a model that was trained so.
     pub antialiased: bool,
+    /// Lights the colours; in units of the Gaussians. `None`: evenly lit, each Gaussian in its own colour.
+    pub lamp: Option<Lamp>,
     /// The storage format of the SH coefficients above degree 0: 32 bits after
     /// [`Gaussians::upload`](crate::splats::scene::Gaussians::upload) and by default, 16
     /// where the training configuration sets it.
@@ -51,6 +54,7 @@ impl Default for RenderSettings {
             shape: 3.into(),
             raw_colors: false,
             antialiased: false,
+            lamp: None,
             rest: StorageFormat::Single,
             detach_geometry: false,
             purpose: Purpose::Train,

@@ -16,8 +16,25 @@ const RANDOM_POINTS: usize = 2000;
 const MAX_POINTS: usize = 20_000;
 /// The brightness of a point is the mean over a square with this half-width, in pixels.
 const REACH: i64 = 2;
+/// Where more of the values are 0, noise is cut off, and the mean is too bright.
+const MAX_ZEROS: f64 = 0.1;
 /// The fewest shared points for an exposure.
 const MIN_SHARED: usize = 12;
+
+/// A point in a photograph.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Observation {
+    /// The position of the view among the training views.
+    pub(super) view: usize,
+    /// log2 of the linear luminance around it.
+    pub(super) light: f64,
+    /// The distance from the camera, world units.
+    pub(super) distance: f64,
+    /// 1 - cos of the angle between the direction to the point and the camera's axis.
+    pub(super) off_axis: f64,
+    /// Whether too many of the values around it are 0 for its brightness to be that of the point.
+    pub(super) is_clipped: bool,
+}
 
 /// Measurements across the cameras of the training views.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -30,6 +47,8 @@ pub(super) struct Shared {
     pub(super) views_per_point: f64,
     /// log2 exposure of each view at shared points, with mean 0; `None` if it shares too few.
     pub(super) exposures: Vec<Option<f64>>,
+    /// Those of each point that two views see, unless the points are random.
+    pub(super) observations: Vec<Vec<Observation>>,
 }
 
 impl Shared {
@@ -73,15 +92,14 @@ impl Shared {
         let (sum, visible) = visible.fold((0, 0), |(sum, n), count| (sum + count, n + 1));
         // Random points are not points of the dataset.
         let each = if dataset.points.is_empty() { 0 } else { stride };
+        let observations =
+            if dataset.points.is_empty() { vec![] } else { observations(&points, counted, views)? };
         Ok(Self {
             points: counts.into_iter().map(|count| each * count).collect(),
             overlaps: shares.iter().map(|&(sum, count)| sum / count.max(1) as f64).collect(),
             views_per_point: sum as f64 / visible.max(1) as f64,
-            exposures: if dataset.points.is_empty() {
-                vec![None; views.len()]
-            } else {
-                exposures(&brightness(&points, counted, views)?, views.len())
-            },
+            exposures: exposures(&observations, views.len()),
+            observations,
         })
     }
 }
@@ -99,12 +117,12 @@ fn pixel(camera: &Camera, point: &Point) -> Option<DVec2> {
     (pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all()).then_some(pixel)
 }
 
-/// For each point, (view, log2 of the linear luminance around it) if it is neither black nor white.
-fn brightness(
+/// The observations of each point around which a photograph is neither black nor white; of at least two views.
+fn observations(
     points: &[&Point],
     seen: &[Vec<usize>],
     views: &[(usize, &View)],
-) -> Result<Vec<Vec<(usize, f64)>>> {
+) -> Result<Vec<Vec<Observation>>> {
     let mut of_view = vec![vec![]; views.len()];
     for (point, places) in seen.iter().enumerate() {
         places.iter().for_each(|&place| of_view[place].push(point));
@@ -115,42 +133,50 @@ fn brightness(
         let Some(image) = view.loaded()? else { continue };
         for point in shown {
             let at = pixel(&view.camera, points[point]);
-            let light = at.and_then(|at| light_around(&image, at));
-            lights[point].extend(light.map(|light| (place, light.log2())));
+            let Some((light, is_clipped)) = at.and_then(|at| light_around(&image, at)) else {
+                continue;
+            };
+            let in_view = view.camera.view_from_world.transform_point3(points[point].position);
+            let distance = in_view.length();
+            let off_axis = 1.0 - in_view.z / distance;
+            let light = light.log2();
+            lights[point].push(Observation { view: place, light, distance, off_axis, is_clipped });
         }
     }
     lights.retain(|seen| seen.len() >= 2);
     Ok(lights)
 }
 
-/// The mean linear luminance around a pixel.
-fn light_around(image: &Image, at: DVec2) -> Option<f64> {
+/// The mean linear luminance around a pixel, and whether many values there are 0.
+fn light_around(image: &Image, at: DVec2) -> Option<(f64, bool)> {
     let (width, height) = (i64::from(image.width), i64::from(image.height));
     let (x, y) = (at.x as i64, at.y as i64);
     if !(REACH..width - REACH).contains(&x) || !(REACH..height - REACH).contains(&y) {
         return None;
     }
-    let mut sum = 0.0;
+    let (mut sum, mut zeros) = (0.0, 0_usize);
     for (dy, dx) in (-REACH..=REACH).flat_map(|dy| (-REACH..=REACH).map(move |dx| (dy, dx))) {
         let rgb = image.pixel((x + dx) as u32, (y + dy) as u32).map(measurable);
         if rgb.iter().any(|&value| value >= 1.0) {
             return None;
         }
+        zeros += rgb.iter().filter(|&&value| value <= 0.0).count();
         sum += f64::from(luminance(rgb.map(linear_from_srgb)));
     }
-    let mean = sum / ((2 * REACH + 1) as f64).powi(2);
-    (mean > 0.0).then_some(mean)
+    let pixels = ((2 * REACH + 1) as f64).powi(2);
+    let mean = sum / pixels;
+    (mean > 0.0).then_some((mean, zeros as f64 > MAX_ZEROS * 3.0 * pixels))
 }
 
 /// Alternating medians: a point's brightness over its views, a view's exposure over its points. Only the brighter half
 /// of the points counts, judged without the exposures: noise and quantisation distort the logarithm of dim light.
-fn exposures(points: &[Vec<(usize, f64)>], view_count: usize) -> Vec<Option<f64>> {
+fn exposures(points: &[Vec<Observation>], view_count: usize) -> Vec<Option<f64>> {
     const ROUNDS: usize = 20;
     let mut exposures = vec![Some(0.0); view_count];
-    let mut kept: Vec<&Vec<(usize, f64)>> = points.iter().collect();
+    let mut kept: Vec<&Vec<Observation>> = points.iter().collect();
     for round in 0..ROUNDS {
-        let level = |point: &[(usize, f64)]| {
-            let own = point.iter().filter_map(|&(view, light)| Some(light - exposures[view]?));
+        let level = |point: &[Observation]| {
+            let own = point.iter().filter_map(|one| Some(one.light - exposures[one.view]?));
             median(own.collect())
         };
         // Approximate exposures determine which points are bright.
@@ -161,8 +187,8 @@ fn exposures(points: &[Vec<(usize, f64)>], view_count: usize) -> Vec<Option<f64>
         let mut of_view = vec![vec![]; view_count];
         for point in &kept {
             let Some(level) = level(point) else { continue };
-            for &(view, light) in *point {
-                of_view[view].push(light - level);
+            for one in *point {
+                of_view[one.view].push(one.light - level);
             }
         }
         let known = |of: Vec<f64>| if of.len() < MIN_SHARED { None } else { median(of) };
@@ -196,10 +222,14 @@ mod tests {
     #[test]
     fn exposures_are_found_for_any_brightness_of_the_points() {
         let truth = [0.5, -1.0, 0.25, 0.25];
-        let point = |index: usize| -> Vec<(usize, f64)> {
+        let point = |index: usize| -> Vec<Observation> {
             let level = -3.0 - 0.1 * (index % 17) as f64;
             let views = (0..4).filter(|view| view % 3 != index % 3 || index.is_multiple_of(2));
-            views.map(|view| (view, level + truth[view])).collect()
+            let seen = |view: usize| {
+                let light = level + truth[view];
+                Observation { view, light, distance: 1.0, off_axis: 0.0, is_clipped: false }
+            };
+            views.map(seen).collect()
         };
         let points: Vec<_> = (0..200).map(point).collect();
         for (found, truth) in exposures(&points, 4).into_iter().zip(truth) {

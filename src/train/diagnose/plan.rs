@@ -10,8 +10,8 @@ use crate::base::input;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::tone::ToneCurve;
 use crate::splats::scene::{Features, Shape, width};
-use crate::train::TrainConfig;
 use crate::train::layers::{Origin, SettingsLayer};
+use crate::train::{LampConfig, TrainConfig};
 use crate::{Error, Result};
 
 /// Below this brightening, targets are the photographs themselves, as in `--curve auto`.
@@ -58,6 +58,26 @@ pub struct PlannedNumber {
     pub why: String,
 }
 
+/// The decision on a lamp at the camera, with the numbers from which its learning begins and its reason.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlannedLamp {
+    /// Whether the model has it.
+    pub on: bool,
+    /// The power of the distance by which its light falls.
+    #[serde(default)]
+    pub exponent: f64,
+    /// Its fall with u = 1 - cos of the angle off its axis, and with the square of u.
+    #[serde(default)]
+    pub falloff: [f64; 2],
+    /// The share of light that does not move with the camera.
+    #[serde(default)]
+    pub ambient: f64,
+    /// The reason with its figure, as a sentence.
+    #[serde(default)]
+    pub why: String,
+}
+
 /// Identifies the dataset of a plan by the names and loaded sizes of its training views.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -89,7 +109,7 @@ impl PlannedViews {
 }
 
 /// The plan of a capture's model, with its reasons.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Plan {
     /// The names of training views that are left out.
@@ -101,6 +121,9 @@ pub struct Plan {
     pub curve: PlannedPart,
     /// Whether each view's exposure is learned.
     pub exposure: PlannedPart,
+    /// [`Part::Lamp`](crate::train::Part::Lamp).
+    #[serde(default)]
+    pub lamp: PlannedLamp,
     /// [`Part::Denoiser`](crate::train::Part::Denoiser).
     pub denoiser: PlannedPart,
     /// [`Part::Tonemapper`](crate::train::Part::Tonemapper).
@@ -130,6 +153,7 @@ impl Plan {
             dataset: diagnosis.fingerprint.clone(),
             curve,
             exposure: spread.exposure(),
+            lamp: lamp(scene, config),
             denoiser: denoiser(scene),
             tonemapper: tonemapper(scene, spread.is_wide),
             structure: spread.structure(scene),
@@ -150,6 +174,13 @@ impl Plan {
             say("tone.curve", ToneCurve::None.name().into())?;
         }
         say("exposure.learn", if self.exposure.on { "on" } else { "off" }.into())?;
+        say("model.lamp", self.lamp.on.into())?;
+        if self.lamp.on {
+            say("lamp.exponent", self.lamp.exponent.into())?;
+            say("lamp.falloff", self.lamp.falloff[0].into())?;
+            say("lamp.falloff_squared", self.lamp.falloff[1].into())?;
+            say("lamp.ambient", self.lamp.ambient.into())?;
+        }
         say("model.denoiser", self.denoiser.on.into())?;
         say("model.tonemapper", self.tonemapper.on.into())?;
         say("model.structure", self.structure.on.into())?;
@@ -173,6 +204,7 @@ impl Plan {
         let named = [
             (switch("curve", &self.curve), &self.curve.why),
             (switch("exposure", &self.exposure), &self.exposure.why),
+            (("lamp", if self.lamp.on { "on" } else { "off" }.to_owned()), &self.lamp.why),
             (switch("denoiser", &self.denoiser), &self.denoiser.why),
             (switch("tonemapper", &self.tonemapper), &self.tonemapper.why),
             (switch("structure", &self.structure), &self.structure.why),
@@ -253,9 +285,17 @@ struct Spread {
 impl Spread {
     /// A curve that follows each view compensates most of the photographs' spread.
     fn of(scene: &SceneDiagnosis, follows_views: bool, views: usize) -> Self {
-        let SceneDiagnosis { exposure_spread: spread, exposure_share: share, .. } = *scene;
+        let SceneDiagnosis { exposure_share: share, spread_is_measured, .. } = *scene;
+        // With a lamp, all views have one curve, and what it explains is not the exposures'.
+        let beside_lamp = scene.lamp.as_ref().filter(|lamp| lamp.is_found());
+        let spread = beside_lamp.map_or(scene.exposure_spread, |lamp| lamp.exposure_spread);
+        let follows_views = follows_views && beside_lamp.is_none();
         let left = if follows_views { (1.0 - share) * spread } else { spread };
-        let by = if scene.spread_is_measured { "at shared points" } else { "by the views' gains" };
+        let by = match (beside_lamp, spread_is_measured) {
+            (Some(_), _) => "beside the lamp",
+            (None, true) => "at shared points",
+            (None, false) => "by the views' gains",
+        };
         Self {
             is_wide: left >= MIN_SPREAD && views > 2,
             found: format!("exposures spread by {spread:.2} stops {by}, {left:.2} in the targets"),
@@ -271,6 +311,30 @@ impl Spread {
         let why =
             format!("{} (threshold {MIN_SPREAD}); edges do not depend on exposure", self.found);
         PlannedPart { on, why }
+    }
+}
+
+/// Without a lamp, a plan that is edited to have one begins at the configuration's.
+fn lamp(scene: &SceneDiagnosis, config: &TrainConfig) -> PlannedLamp {
+    let LampConfig { exponent, ambient, falloff, falloff_squared, .. } = config.lamp;
+    let falloff = [falloff, falloff_squared];
+    let usual = |why: String| PlannedLamp { on: false, exponent, ambient, falloff, why };
+    match &scene.lamp {
+        None => {
+            let why = scene.lamp_unknown.as_deref().unwrap_or("not measured");
+            usual(format!("a lamp that moves with the camera is not measurable: {why}"))
+        }
+        Some(lamp) if !lamp.is_found() => usual(lamp.why()),
+        Some(lamp) if config.learns_no_colour() => {
+            usual(format!("{}; the colours are frozen", lamp.why()))
+        }
+        Some(lamp) => PlannedLamp {
+            on: true,
+            exponent: lamp.exponent,
+            falloff: lamp.falloff,
+            ambient: lamp.ambient,
+            why: lamp.why(),
+        },
     }
 }
 

@@ -7,6 +7,7 @@ use std::f64::consts::{PI, TAU};
 use glam::{DMat3, DVec2, DVec3};
 
 use super::Scene;
+use super::lamp::{self, CameraLamp};
 use super::shapes::{Noise, Shape, Surface, hidden_by_sphere, nearest, smoothstep};
 use crate::base::random::Stream;
 
@@ -24,6 +25,8 @@ pub(super) struct Room {
     /// Positions on the lamp, the same for every position that it lights, so that all views agree on the shadows.
     lamp: Vec<DVec3>,
     noise: Noise,
+    /// Whether the cameras come close and turn, as those of who carries a lamp.
+    is_walked: bool,
 }
 
 /// The point that the cameras look at.
@@ -38,8 +41,8 @@ const SKY_RADIANCE: DVec3 = DVec3::new(0.12, 0.135, 0.165);
 const GROUND_RADIANCE: DVec3 = DVec3::new(0.07, 0.055, 0.04);
 
 impl Room {
-    /// The room whose textures are drawn from `seed`.
-    pub(super) fn new(seed: u64) -> Self {
+    /// The room whose textures are drawn from `seed`; its cameras are at about one distance, or walk through it.
+    pub(super) fn new(seed: u64, is_walked: bool) -> Self {
         let plane = |normal, offset, albedo| Surface {
             shape: Shape::Plane { normal, offset },
             look: Look { albedo, gloss: 0.0 },
@@ -66,12 +69,11 @@ impl Room {
             block(DVec3::new(0.95, 0.45, 0.42), DVec3::new(0.5, 0.4, 0.42), 0.45, Self::checker),
             block(DVec3::new(0.12, 1.1, 0.62), DVec3::new(0.32, 0.2, 0.62), -0.3, Self::bands),
         ];
-        Self { surfaces, lamp: lamp_places(), noise: Noise(Stream::new(seed, 0)) }
+        Self { surfaces, lamp: lamp_places(), noise: Noise(Stream::new(seed, 0)), is_walked }
     }
 
     /// The lamp's diffuse light (1 if perpendicular and unoccluded) and its highlight at a position.
     fn lamp(&self, position: DVec3, normal: DVec3, direction: DVec3, gloss: f64) -> (f64, f64) {
-        const SHININESS: f64 = 60.0;
         let start = position + 1e-6 * normal;
         let (mut lit, mut highlight) = (0.0, 0.0);
         for place in &self.lamp {
@@ -81,8 +83,7 @@ impl Room {
             if cosine > 0.0 && self.is_clear(start, to_lamp, distance) {
                 lit += cosine;
                 if gloss > 0.0 {
-                    let half = (to_lamp - direction).normalize();
-                    highlight += gloss * normal.dot(half).max(0.0).powf(SHININESS);
+                    highlight += gloss * shine(to_lamp, normal, direction);
                 }
             }
         }
@@ -222,7 +223,12 @@ impl Room {
 }
 
 impl Scene for Room {
-    fn radiance(&self, origin: DVec3, direction: DVec3) -> [DVec3; 2] {
+    fn radiance(
+        &self,
+        origin: DVec3,
+        direction: DVec3,
+        carried: Option<&CameraLamp>,
+    ) -> [DVec3; 2] {
         let Some((surface, hit)) = nearest(self.surfaces.iter(), origin, direction) else {
             return [SKY_RADIANCE; 2];
         };
@@ -231,7 +237,14 @@ impl Scene for Room {
         let up = 0.5 + 0.5 * hit.normal.z;
         let ambient = GROUND_RADIANCE.lerp(SKY_RADIANCE, up) * self.openness(position, hit.normal);
         let (lit, highlight) = self.lamp(position, hit.normal, direction, surface.look.gloss);
-        [albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * highlight; 2]
+        let even = albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * highlight;
+        let Some(carried) = carried else { return [even; 2] };
+        let is_clear = |start, direction, distance| self.is_clear(start, direction, distance);
+        let light = carried.light(position, hit.normal, is_clear).map(|light| {
+            let shine = surface.look.gloss * shine(light.to_lamp, hit.normal, direction);
+            light.radiance * (albedo * light.cosine + shine)
+        });
+        [even, lamp::AMBIENT * even + light.unwrap_or(DVec3::ZERO)]
     }
 
     fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {
@@ -240,19 +253,34 @@ impl Scene for Room {
     }
 
     /// Cameras on a part of a sphere in front of the scene, spread evenly by a low-discrepancy sequence (Roberts' R2),
-    /// so that every 8th is among the others.
+    /// so that every 8th is among the others. Those that walk come close, and look beside the focus.
     fn place(&self, view: usize, _views: usize) -> [DVec3; 2] {
         const AZIMUTH: f64 = 0.75; // radians to either side
         const ELEVATION: (f64, f64) = (0.24, 0.62); // radians
-        const DISTANCE: (f64, f64) = (2.95, 3.45);
+        const BESIDE: DVec3 = DVec3::new(1.3, 0.0, 0.7);
         let fraction = |step: f64| (0.5 + step * view as f64).fract();
+        let between = |(low, high): (f64, f64), step| low + (high - low) * fraction(step);
         let azimuth = AZIMUTH * (2.0 * fraction(0.754_877_666) - 1.0);
-        let elevation = ELEVATION.0 + (ELEVATION.1 - ELEVATION.0) * fraction(0.569_840_291);
-        let distance = DISTANCE.0 + (DISTANCE.1 - DISTANCE.0) * fraction(0.381_966_011);
+        let elevation = between(ELEVATION, 0.569_840_291);
+        let distance = match self.is_walked {
+            true => between((1.8, 4.0), 0.671_043_607),
+            false => between((2.95, 3.45), 0.381_966_011),
+        };
         let (sin, cos) = azimuth.sin_cos();
         let back = DVec3::new(sin * elevation.cos(), -cos * elevation.cos(), elevation.sin());
-        [FOCUS + distance * back, back]
+        let center = FOCUS + distance * back;
+        if !self.is_walked {
+            return [center, back];
+        }
+        let beside = DVec3::new(fraction(0.430_159_709) - 0.5, 0.0, fraction(0.381_966_011) - 0.5);
+        [center, (center - FOCUS - BESIDE * beside).normalize()]
     }
+}
+
+/// The highlight of a surface by a light in a direction, seen along another.
+fn shine(to_light: DVec3, normal: DVec3, direction: DVec3) -> f64 {
+    const SHININESS: f64 = 60.0;
+    normal.dot((to_light - direction).normalize()).max(0.0).powf(SHININESS)
 }
 
 /// A regular grid on the square lamp.

@@ -6,6 +6,7 @@
 use glam::{DMat3, DVec2, DVec3};
 
 use super::Scene;
+use super::lamp::{self, CameraLamp};
 use super::shapes::{Hit, Noise, Shape, Surface, hidden_by_sphere, nearest, smoothstep};
 use crate::base::random::Stream;
 
@@ -161,9 +162,15 @@ impl Street {
 }
 
 impl Scene for Street {
-    fn radiance(&self, origin: DVec3, direction: DVec3) -> [DVec3; 2] {
+    fn radiance(
+        &self,
+        origin: DVec3,
+        direction: DVec3,
+        carried: Option<&CameraLamp>,
+    ) -> [DVec3; 2] {
         let Some((surface, hit)) = self.nearest(origin, direction) else {
-            return [SKY_RADIANCE; 2];
+            let share = carried.map_or(1.0, |_| lamp::AMBIENT);
+            return [SKY_RADIANCE, share * SKY_RADIANCE];
         };
         let position = origin + hit.distance * direction;
         let albedo = (surface.look.albedo)(self, hit.place, &surface.look);
@@ -172,8 +179,17 @@ impl Scene for Street {
         let cosine = hit.normal.dot(SUN);
         let lit = cosine > 0.0 && self.nearest(position + 1e-6 * hit.normal, SUN).is_none();
         let sun = if lit { SUN_RADIANCE * cosine } else { DVec3::ZERO };
-        let radiance = albedo * (ambient + sun);
-        [radiance, radiance * FALL.powf(0.5 - position.x / self.length)]
+        let even = albedo * (ambient + sun);
+        let Some(carried) = carried else {
+            return [even, even * FALL.powf(0.5 - position.x / self.length)];
+        };
+        let is_clear = |start, direction, distance| {
+            let first = self.nearest(start, direction);
+            first.is_none_or(|(_, hit)| hit.distance > distance)
+        };
+        let light = carried.light(position, hit.normal, is_clear);
+        let light = light.map_or(DVec3::ZERO, |light| light.radiance * light.cosine);
+        [even, lamp::AMBIENT * even + albedo * light]
     }
 
     fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {

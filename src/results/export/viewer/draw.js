@@ -223,8 +223,17 @@ function renderer(gl, changed) {
     changed();
   }
 
+  function light({ position, axis, ambient, exponent, falloffs, reference_distance: reference, slope, black, gain }) {
+    const length = Math.hypot(...axis, 1);
+    gl.uniform3fv(uniform('lampPosition'), position);
+    gl.uniform3fv(uniform('lampAxis'), [...axis, 1].map((value) => value / length));
+    gl.uniform2fv(uniform('lampFalloffs'), falloffs);
+    gl.uniform4f(uniform('lampLight'), ambient, exponent, reference, slope);
+    gl.uniform2f(uniform('lampTone'), black, gain);
+  }
+
   // Draws at most a share of the Gaussians, the most important ones. Returns whether all that is asked for is drawn.
-  function draw(camera, width, height, { grey, layer, share, reach }) {
+  function draw(camera, width, height, { grey, layer, share, reach, lamp }) {
     resize(width, height);
     const m = camera.viewFromWorld, fit = placed(camera, width, height), limit = Math.ceil(share * count);
     const key = `${version} ${limit} ${m}`;
@@ -242,6 +251,8 @@ function renderer(gl, changed) {
     gl.uniform2f(uniform('offset'), fit.left, fit.top);
     gl.uniform2f(uniform('scale'), 2 / width, -2 / height);
     gl.uniform1i(uniform('layer'), fine ? layer : 0);
+    gl.uniform1i(uniform('isLit'), lamp ? 1 : 0);
+    if (lamp) light(lamp);
     gl.bindFramebuffer(gl.FRAMEBUFFER, fine ? sums : null);
     gl.viewport(0, 0, width, height);
     if (layer && fine) gl.clearColor(0, 0, 0, 0); else gl.clearColor(grey, grey, grey, 1);

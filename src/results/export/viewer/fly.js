@@ -92,7 +92,8 @@ function start(gl) {
     painted = now;
     // Before grey, what black hides is seen: holes.
     const grey = element('grey').checked ? 0.5 : 0, layer = Number(element('layer').value);
-    const isWhole = draw(camera(), width, height, { grey, layer, share: isMoving ? fraction : 1, reach: reach() });
+    const lamp = element('lamp').checked ? scene.lamp : null;
+    const isWhole = draw(camera(), width, height, { grey, layer, share: isMoving ? fraction : 1, reach: reach(), lamp });
     document.documentElement.dataset.settled = String(isWhole);
     if (isMoving) setTimeout(refresh, STILL_AFTER);
     compare(ratio);
@@ -141,7 +142,7 @@ function start(gl) {
   // As the page opens: the photograph, which is dark, over the left half of the model.
   const reset = () => {
     share = 0.5;
-    element('grey').checked = false;
+    element('grey').checked = element('lamp').checked = false;
     element('layer').value = '0';
     last = asked && views[asked[1]] ? Number(asked[1]) : 0;
     back();
@@ -257,7 +258,7 @@ function start(gl) {
   const keys = {
     w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], e: [0, -1, 0], q: [0, 1, 0],
   };
-  const commands = { g: 'grey', r: 'return', f: 'fullscreen', home: 'reset' };
+  const commands = { g: 'grey', l: 'lamp', r: 'return', f: 'fullscreen', home: 'reset' };
   // Wherever the focus is, but for controls that have keys of their own.
   document.addEventListener('keydown', (event) => {
     if (event.target.closest?.('select, #divider')) return;
@@ -273,7 +274,8 @@ function start(gl) {
   element('views').append(new Option('free', ''), ...views.map(({ name }, k) => new Option(name, String(k))));
   element('views').addEventListener('change', ({ target: { value } }) => choose(value === '' ? null : Number(value)));
   layers.forEach((name, k) => element('layer').add(new Option(name, String(k))));
-  for (const id of ['compare', 'grey', 'layer', 'difference']) element(id).addEventListener('change', refresh);
+  element('lamp').parentElement.hidden = !scene.lamp;
+  for (const id of ['compare', 'grey', 'layer', 'difference', 'lamp']) element(id).addEventListener('change', refresh);
   for (const [id, act] of [['return', back], ['reset', reset], ['fullscreen', fill]]) element(id).addEventListener('click', act);
   const divider = element('divider');
   divider.addEventListener('pointerdown', (event) => divider.setPointerCapture(event.pointerId));

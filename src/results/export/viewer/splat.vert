@@ -12,6 +12,11 @@ uniform vec2 focal, principalPoint, size;  // pixels of the view
 uniform vec2 offset, scale;                // pixels of the view to clip space
 uniform float near;
 uniform uint degree;  // of the harmonics
+uniform bool isLit;   // by a lamp at the camera
+uniform vec3 lampPosition, lampAxis;  // in the view
+uniform vec2 lampFalloffs;
+uniform vec4 lampLight;  // ambient, exponent, reference distance, slope of the tone law
+uniform vec2 lampTone;  // the target of no light; the light on the axis at the reference distance
 
 in vec2 corner;
 in uint id;
@@ -34,7 +39,16 @@ vec3 shaded(int first, vec3 direction) {
     sh_basis(degree, direction, basis);
     vec3 sum = vec3(0.5);
     for (uint k = 0u; k < sh_count(degree); k++) sum += basis[k] * texel(harmonics, first + int(k)).rgb;
-    return max(sum, vec3(0.0));
+    return sum;
+}
+
+// The law of include/lamp.glsl at a point in the view.
+float lampFactor(vec3 point) {
+    vec3 offset = (point - lampPosition) / lampLight.z;
+    float d = clamp(length(offset), LAMP_NEAREST, LAMP_FARTHEST);
+    float away = 1.0 - clamp(dot(offset / d, lampAxis), -1.0, 1.0);
+    float beam = exp(-lampLight.y * log(d) - (lampFalloffs.x + lampFalloffs.y * away) * away);
+    return pow(lampTone.y * (lampLight.x + (1.0 - lampLight.x) * beam), lampLight.w);
 }
 
 void main() {
@@ -65,6 +79,8 @@ void main() {
     fromMean = corner * reach;
     vec2 pixel = focal * mean.xy / mean.z + principalPoint + fromMean;
     depth = mean.z;
-    color = vec4(shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye)), opacity);
+    vec3 rgb = shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye));
+    if (isLit) rgb = lampTone.x + (rgb - lampTone.x) * lampFactor(mean);
+    color = vec4(max(rgb, vec3(0.0)), opacity);
     gl_Position = vec4((pixel + offset) * scale + vec2(-1.0, 1.0), 0.0, 1.0);
 }

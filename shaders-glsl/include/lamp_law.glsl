@@ -1,0 +1,93 @@
+// The functions of the lamp of include/lamp.glsl: the factor on a colour, and its gradients.
+//
+// The kernel declares `lamp`, an array of LAMP_NUMBERS floats, before it includes this file.
+
+struct Lamp {
+    vec3  position;  // in view space, world units
+    vec3  tangents;  // (x, y, 1) along the axis
+    float ambient;
+    float exponent;
+    vec2  falloffs;
+    float reference_distance;
+    float slope;
+    float black;
+    float gain;
+};
+
+// The numbers that factor and gradient of a point have in common.
+struct LampPoint {
+    vec3  axis;
+    vec3  towards;   // r / d
+    float own;       // |r|
+    float distance;  // within its bounds
+    float away;      // u
+    float beam;      // the lamp's light over that on the axis at the reference distance
+    float light;
+};
+
+float softplus(float x) { return max(x, 0.0) + log(1.0 + exp(-abs(x))); }
+
+// From the array `lamp`, which the kernel declares.
+Lamp load_lamp() {
+    Lamp own;
+    own.reference_distance = lamp[LAMP_REFERENCE_DISTANCE];
+    own.slope = lamp[LAMP_SLOPE];
+    own.black = lamp[LAMP_BLACK];
+    own.gain = lamp[LAMP_GAIN];
+    own.position = LAMP_STEP * own.reference_distance * vec3(lamp[0], lamp[1], lamp[2]);
+    own.tangents = vec3(LAMP_STEP * lamp[3], LAMP_STEP * lamp[4], 1.0);
+    own.ambient = LAMP_LEAST_AMBIENT + (1.0 - LAMP_LEAST_AMBIENT) * sigmoid(lamp[LAMP_AMBIENT]);
+    own.exponent = LAMP_LARGEST_EXPONENT * sigmoid(lamp[LAMP_EXPONENT]);
+    own.falloffs = LAMP_FALLOFF_STEP * vec2(softplus(lamp[LAMP_FALLOFFS]), softplus(lamp[LAMP_FALLOFFS + 1]));
+    return own;
+}
+
+LampPoint lamp_at(Lamp own, vec3 point) {
+    LampPoint at;
+    vec3 offset = point - own.position;
+    at.own = length(offset);
+    at.distance = own.reference_distance * clamp(at.own / own.reference_distance, LAMP_NEAREST, LAMP_FARTHEST);
+    at.axis = own.tangents / length(own.tangents);
+    at.towards = offset / at.distance;
+    at.away = 1.0 - clamp(dot(at.towards, at.axis), -1.0, 1.0);
+    float decay = own.exponent * log(at.distance / own.reference_distance);
+    at.beam = exp(-decay - (own.falloffs.x + own.falloffs.y * at.away) * at.away);
+    at.light = own.gain * (own.ambient + (1.0 - own.ambient) * at.beam);
+    return at;
+}
+
+float lamp_factor(Lamp own, LampPoint at) { return exp(own.slope * log(at.light)); }
+
+// d ln light / d ln beam
+float lamp_share(Lamp own, LampPoint at) { return own.gain * (1.0 - own.ambient) * at.beam / at.light; }
+
+// The steepness of the falloff: -d ln beam / du.
+float lamp_turn(Lamp own, LampPoint at) { return own.falloffs.x + 2.0 * own.falloffs.y * at.away; }
+
+// The gradient of ln factor with respect to the point.
+vec3 lamp_point_gradient(Lamp own, LampPoint at) {
+    if (at.own > LAMP_FARTHEST * own.reference_distance) return vec3(0.0);
+    float turn = lamp_turn(own, at);
+    vec3 gradient = turn * at.axis;
+    if (at.own >= LAMP_NEAREST * own.reference_distance)
+        gradient -= (own.exponent + turn * dot(at.towards, at.axis)) * at.towards;
+    return own.slope * lamp_share(own, at) / at.distance * gradient;
+}
+
+// The gradient of ln factor with respect to the learned numbers.
+void lamp_gradient(Lamp own, LampPoint at, out float gradient[LAMP_WIDTH]) {
+    float share = own.slope * lamp_share(own, at), turn = share * lamp_turn(own, at);
+    vec3 d_position = -LAMP_STEP * own.reference_distance * lamp_point_gradient(own, at);
+    vec3 d_axis = at.own > LAMP_FARTHEST * own.reference_distance ? vec3(0.0) : turn * at.towards;
+    vec3 d_tangents = LAMP_STEP * (d_axis - at.axis * dot(at.axis, d_axis)) / length(own.tangents);
+    [[unroll]] for (uint k = 0; k < 3; k++) gradient[k] = d_position[k];
+    [[unroll]] for (uint k = 0; k < 2; k++) gradient[3 + k] = d_tangents[k];
+    float raised = sigmoid(lamp[LAMP_AMBIENT]), bent = sigmoid(lamp[LAMP_EXPONENT]);
+    gradient[LAMP_AMBIENT] =
+        own.slope * own.gain * (1.0 - at.beam) / at.light * (1.0 - LAMP_LEAST_AMBIENT) * raised * (1.0 - raised);
+    gradient[LAMP_EXPONENT] =
+        -share * log(at.distance / own.reference_distance) * LAMP_LARGEST_EXPONENT * bent * (1.0 - bent);
+    gradient[LAMP_FALLOFFS] = -share * at.away * LAMP_FALLOFF_STEP * sigmoid(lamp[LAMP_FALLOFFS]);
+    gradient[LAMP_FALLOFFS + 1] =
+        -share * at.away * at.away * LAMP_FALLOFF_STEP * sigmoid(lamp[LAMP_FALLOFFS + 1]);
+}

@@ -1,0 +1,58 @@
+#version 460
+#extension GL_GOOGLE_include_directive : require
+#include "kernel.glsl"
+#include "gaussian.glsl"
+#include "camera.glsl"
+#include "splat.glsl"
+#include "sh.glsl"
+#include "lamp.glsl"
+
+//! Lamp backward: the sums of the gradients of the lamp's numbers over chunks of Gaussians, after `project_backward`.
+//!
+//! The gradient of ln factor is that of the lit colour times the lit colour above black; `project_backward` has written SH_C0
+//! factor times that of the lit colour, as the gradient of the coefficients of degree 0. It is 0 for a Gaussian that the
+//! view does not show. A subgroup sums `CHUNK` Gaussians in a fixed order: the partition of a sum does not depend on the
+//! device.
+
+layout(local_size_x_id = 100) in;
+layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
+#include "subgroup_sum.glsl"
+layout(constant_id = 15) const uint CHUNK = 1024;
+
+layout(push_constant) uniform Params {
+    uint camera_index;
+    uint gaussian_count;
+    uint first_chunk;  // of those of this dispatch
+};
+
+layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // planes
+layout(binding = 1) readonly  buffer Cameras { Camera cameras[]; };
+layout(binding = 2) readonly  buffer LampNumbers { float lamp[]; };  // (LAMP_NUMBERS)
+layout(binding = 3) readonly  buffer Colors { vec4 colors[]; };  // (gaussian_count, COLOR_VECTORS), lit
+layout(binding = 4) readonly  buffer Gradients { float gradients[]; };  // (columns x gaussian_count)
+layout(binding = 5) writeonly buffer Partials { float partials[]; };  // (chunks, LAMP_WIDTH)
+
+#include "lamp_law.glsl"
+
+void main() {
+    uint chunk = WORKGROUP_INDEX;
+    if (chunk * CHUNK >= gaussian_count) return;
+    uint end = min((chunk + 1) * CHUNK, gaussian_count);
+    Lamp own = load_lamp();
+    float sums[LAMP_WIDTH];
+    [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) sums[n] = 0.0;
+    for (uint i = chunk * CHUNK + gl_SubgroupInvocationID; i < end; i += SUBGROUP_SIZE) {
+        vec3 d_dc = LOAD_VEC3(gradients, DC_COLUMN, gaussian_count, i);
+        if (d_dc == vec3(0.0)) continue;
+        vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
+        LampPoint at = lamp_at(own, cameras[camera_index].view_from_world * vec4(mean, 1.0));
+        float d = dot(d_dc, colors[COLOR_VECTORS * i].rgb - own.black) / (SH_C0 * lamp_factor(own, at));
+        float gradient[LAMP_WIDTH];
+        lamp_gradient(own, at, gradient);
+        [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) sums[n] += d * gradient[n];
+    }
+    [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) {
+        float sum = subgroup_sum(sums[n]);
+        if (subgroupElect()) partials[LAMP_WIDTH * (first_chunk + chunk) + n] = sum;
+    }
+}

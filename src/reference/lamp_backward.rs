@@ -1,0 +1,92 @@
+//! The sums of the gradients of the lamp's numbers over chunks of Gaussians.
+
+use glam::DVec3;
+
+use super::camera::Camera;
+use super::lamp::{Lamp, WIDTH};
+use super::rounding::{Rounded, UNIT, chain, sensitivity, values};
+use super::splat::stored_color;
+use crate::gpu::Reference;
+use crate::kernels::lamp::LAMP_NUMBERS;
+use crate::kernels::lamp_backward::{Constants, Kernel, Params, Slices, Tolerances};
+use crate::kernels::sh::SH_C0;
+use crate::splats::attributes::Attribute;
+
+/// The numbers before the lamp's among the inputs of a Gaussian: its mean, and the gradient of its DC times its colour.
+const OWN: usize = 4;
+
+/// A Gaussian's share of the gradient of the numbers.
+fn share(camera: &Camera, inputs: &[f64]) -> Vec<f64> {
+    let (own, numbers) = inputs.split_at(OWN);
+    let (point, lamp) = (camera.view(DVec3::from_slice(own)), Lamp::of(numbers));
+    let d = own[3] / (SH_C0 * lamp.factor(point));
+    lamp.gradient(point).map(|number| d * number).to_vec()
+}
+
+/// The shares of Gaussian `i`, with their rounding errors; `None` if it has none.
+fn shares(
+    params: &Params,
+    constants: &Constants,
+    slices: &Slices<'_>,
+    i: usize,
+) -> Option<Vec<Rounded>> {
+    const OFF: f64 = 64.0 * UNIT;
+    let vector = |values: &[f32], at: usize| {
+        DVec3::from_array([0, 1, 2].map(|axis| f64::from(values[at + axis])))
+    };
+    let count = params.gaussian_count as usize;
+    let d_dc = vector(slices.gradients, Attribute::Dc.column(0) * count + 3 * i);
+    if d_dc == DVec3::ZERO {
+        return None;
+    }
+    let camera = Camera::from(&slices.cameras[params.camera_index as usize]);
+    let color = vector(slices.colors, stored_color(constants.channels) * i);
+    let mean = vector(slices.parameters, 3 * i);
+    let lamp = Lamp::of(slices.lamp);
+    let above = lamp.above_black(color);
+    let mut inputs = [&mean.to_array()[..], &[d_dc.dot(above)]].concat();
+    let far = mean.length() + camera.center().length();
+    let mut errors = vec![
+        OFF * far,
+        OFF * far,
+        OFF * far,
+        OFF * d_dc.abs().dot(color.abs() + (color - above).abs()),
+    ];
+    for &number in &slices.lamp[..LAMP_NUMBERS as usize] {
+        inputs.push(number.into());
+        errors.push(OFF * (1.0 + f64::from(number.abs())));
+    }
+    let moved = sensitivity(&inputs, &errors, |inputs| share(&camera, inputs));
+    let own = OFF + lamp.factor_error(camera.view(mean));
+    // A number whose terms cancel has the errors of these.
+    let values = share(&camera, &inputs);
+    let largest = values.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
+    let of = |(value, moved): (f64, f64)| Rounded { value, error: moved + own * largest };
+    Some(values.into_iter().zip(moved).map(of).collect())
+}
+
+fn sums(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Rounded> {
+    let (count, chunk) = (params.gaussian_count as usize, constants.chunk as usize);
+    let of_chunk = |first: usize| {
+        let own = first..(first + chunk).min(count);
+        let all: Vec<_> = own.filter_map(|i| shares(params, constants, slices, i)).collect();
+        let sum = move |n| Rounded::sum(chain(chunk), all.iter().map(|own| own[n]));
+        (0..WIDTH).map(sum).collect::<Vec<_>>()
+    };
+    (0..count).step_by(chunk).flat_map(of_chunk).collect()
+}
+
+impl Reference for Kernel {
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
+        let sums = values(sums(params, constants, &slices));
+        let to = &mut slices.partials[WIDTH * params.first_chunk as usize..];
+        to.iter_mut().zip(sums).for_each(|(to, sum)| *to = sum);
+    }
+
+    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+        let mut all = vec![Rounded::default(); WIDTH * params.first_chunk as usize];
+        all.extend(sums(params, constants, &slices));
+        all.resize(slices.partials.len(), Rounded::default());
+        Tolerances { partials: all.into_iter().collect() }
+    }
+}

@@ -1,0 +1,267 @@
+//! A lamp that moves with the camera, on the host; `include/lamp.glsl` has its law.
+
+use glam::DVec3;
+#[cfg(feature = "io")]
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+use crate::kernels::lamp::{
+    LAMP_AMBIENT, LAMP_BLACK, LAMP_EXPONENT, LAMP_FALLOFF_STEP, LAMP_FALLOFFS, LAMP_FARTHEST,
+    LAMP_GAIN, LAMP_LARGEST_EXPONENT, LAMP_LEAST_AMBIENT, LAMP_NEAREST, LAMP_NUMBERS,
+    LAMP_REFERENCE_DISTANCE, LAMP_SLOPE, LAMP_STEP,
+};
+use crate::{Error, Result};
+
+/// The largest magnitude of the number of a share that is 0 or 1, which no number is exactly.
+const FARTHEST_NUMBER: f64 = 12.0;
+
+/// A lamp that moves with the camera, in view space: x points right, y down, z forward.
+///
+/// The light at a point at r from it, with d = |r| and u = 1 - cos of the angle between r and its axis, is
+///
+/// ```text
+/// gain (ambient + (1 - ambient) (reference_distance / d)^exponent exp(-falloffs[0] u - falloffs[1] u^2))
+/// ```
+///
+/// and the colour of a Gaussian is black + (colour - black) light^slope.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Lamp {
+    /// World units.
+    pub position: [f64; 3],
+    /// The axis is the direction of (x, y, 1).
+    pub axis: [f64; 2],
+    /// 0 to 1.
+    pub ambient: f64,
+    /// 0 to 4; 2 is a point without absorption.
+    pub exponent: f64,
+    /// Not negative.
+    pub falloffs: [f64; 2],
+    /// The distance at which the light on the axis is the gain; world units.
+    pub reference_distance: f64,
+    /// The slope of the tone law: d ln(target - black) / d ln linear light.
+    pub slope: f64,
+    /// The target of no light.
+    #[serde(default)]
+    pub black: f64,
+    /// The light on the axis at the reference distance, with that of evenly lit colours as its unit.
+    #[serde(default = "one")]
+    pub gain: f64,
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+impl Lamp {
+    /// A lamp at the camera that shines ahead in all directions alike.
+    pub const AT_CAMERA: Self = Self {
+        position: [0.0; 3],
+        axis: [0.0; 2],
+        ambient: 0.05,
+        exponent: 2.0,
+        falloffs: [0.0; 2],
+        reference_distance: 1.0,
+        slope: 1.0 / 2.2,
+        black: 0.0,
+        gain: 1.0,
+    };
+
+    /// The numbers of the device with which the light is this everywhere.
+    pub(crate) fn even_numbers(&self, light: f64) -> [f32; LAMP_NUMBERS as usize] {
+        /// Sigmoid and softplus of this are 0 next to 1.
+        const NONE: f32 = -80.0;
+        let mut numbers = Self { gain: light, ..*self }.numbers();
+        numbers[LAMP_EXPONENT as usize..LAMP_REFERENCE_DISTANCE as usize].fill(NONE);
+        numbers
+    }
+
+    /// The light at a point in view space.
+    pub fn light(&self, point: DVec3) -> f64 {
+        let offset = point - DVec3::from(self.position);
+        let distance =
+            (offset.length() / self.reference_distance).clamp(LAMP_NEAREST, LAMP_FARTHEST);
+        let towards = offset / (distance * self.reference_distance);
+        let axis = DVec3::new(self.axis[0], self.axis[1], 1.0).normalize();
+        let away = 1.0 - towards.dot(axis).clamp(-1.0, 1.0);
+        let [first, second] = self.falloffs;
+        let beam = distance.powf(-self.exponent) * (-(first + second * away) * away).exp();
+        self.gain * (self.ambient + (1.0 - self.ambient) * beam)
+    }
+
+    /// The factor on the colour of a Gaussian at a point in view space.
+    pub fn factor(&self, point: DVec3) -> f64 {
+        self.light(point).powf(self.slope)
+    }
+
+    /// The colour of a Gaussian without the light at a point in view space.
+    #[cfg(feature = "io")]
+    pub(crate) fn unlit(&self, color: Vec3, point: DVec3) -> Vec3 {
+        let black = self.black as f32;
+        black + (color - black) / self.factor(point) as f32
+    }
+
+    /// The same lamp with this light as the unit; colours then have the factor light^slope above black.
+    #[cfg(feature = "io")]
+    #[must_use]
+    pub(crate) fn with_unit(&self, light: f64) -> Self {
+        Self { gain: self.gain / light, ..*self }
+    }
+
+    /// The same lamp where a world unit is `scale` units.
+    #[must_use]
+    pub fn scaled(&self, scale: f64) -> Self {
+        Self {
+            position: self.position.map(|x| scale * x),
+            reference_distance: scale * self.reference_distance,
+            ..*self
+        }
+    }
+
+    /// Refuses numbers out of range.
+    ///
+    /// # Errors
+    /// [`Error::Usage`], with the number.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn check(&self) -> Result<()> {
+        let Self { position, axis, ambient, exponent, falloffs, .. } = *self;
+        let Self { reference_distance, slope, black, gain, .. } = *self;
+        let is_finite = position.iter().chain(&axis).all(|x| x.abs() < 1e9);
+        for (name, is_valid, rule) in [
+            ("position or axis", is_finite, "finite"),
+            ("ambient", (0.0..1.0).contains(&ambient), "at least 0 and below 1"),
+            ("exponent", (0.0..=LAMP_LARGEST_EXPONENT).contains(&exponent), "0 to 4"),
+            ("falloffs", falloffs.iter().all(|x| (0.0..1e6).contains(x)), "at least 0 and finite"),
+            (
+                "reference_distance",
+                reference_distance.is_normal() && (1e-30..1e30).contains(&reference_distance),
+                "above 0 and finite",
+            ),
+            ("slope", slope > 0.0 && slope <= 8.0, "above 0 and at most 8"),
+            ("black", (-1.0..=1.0).contains(&black), "-1 to 1"),
+            ("gain", (1e-9..1e9).contains(&gain), "above 0 and finite"),
+        ] {
+            if !is_valid {
+                return Err(Error::Usage(format!("the lamp's {name} must be {rule}: {self:?}")));
+            }
+        }
+        Ok(())
+    }
+
+    /// The numbers of the device; ambient, exponent and falloffs at a bound are next to it.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn numbers(&self) -> [f32; LAMP_NUMBERS as usize] {
+        let mut numbers = [0.0; LAMP_NUMBERS as usize];
+        let position = self.position.map(|x| x / (LAMP_STEP * self.reference_distance));
+        numbers[..3].copy_from_slice(&position);
+        numbers[3..5].copy_from_slice(&self.axis.map(|x| x / LAMP_STEP));
+        let ambient = (self.ambient - LAMP_LEAST_AMBIENT) / (1.0 - LAMP_LEAST_AMBIENT);
+        numbers[LAMP_AMBIENT as usize] = logit(ambient);
+        numbers[LAMP_EXPONENT as usize] = logit(self.exponent / LAMP_LARGEST_EXPONENT);
+        for (number, falloff) in numbers[LAMP_FALLOFFS as usize..].iter_mut().zip(self.falloffs) {
+            // The inverse of ln(1 + e^x).
+            let falloff = falloff / LAMP_FALLOFF_STEP;
+            *number = (falloff + (-(-falloff).exp()).ln_1p()).max(-FARTHEST_NUMBER);
+        }
+        numbers[LAMP_REFERENCE_DISTANCE as usize] = self.reference_distance;
+        numbers[LAMP_SLOPE as usize] = self.slope;
+        numbers[LAMP_BLACK as usize] = self.black;
+        numbers[LAMP_GAIN as usize] = self.gain;
+        numbers.map(|number| number as f32)
+    }
+
+    /// The lamp of the device's numbers.
+    pub(crate) fn of_numbers(numbers: &[f32]) -> Self {
+        let at = |n: u32| f64::from(numbers[n as usize]);
+        let reference_distance = at(LAMP_REFERENCE_DISTANCE);
+        let share = sigmoid(at(LAMP_AMBIENT));
+        let softplus = |x: f64| x.max(0.0) + (-x.abs()).exp().ln_1p();
+        Self {
+            position: [0, 1, 2].map(|n| LAMP_STEP * reference_distance * at(n)),
+            axis: [3, 4].map(|n| LAMP_STEP * at(n)),
+            ambient: LAMP_LEAST_AMBIENT + (1.0 - LAMP_LEAST_AMBIENT) * share,
+            exponent: LAMP_LARGEST_EXPONENT * sigmoid(at(LAMP_EXPONENT)),
+            falloffs: [LAMP_FALLOFFS, LAMP_FALLOFFS + 1]
+                .map(|n| LAMP_FALLOFF_STEP * softplus(at(n))),
+            reference_distance,
+            slope: at(LAMP_SLOPE),
+            black: at(LAMP_BLACK),
+            gain: at(LAMP_GAIN),
+        }
+    }
+}
+
+fn sigmoid(x: f64) -> f64 {
+    1.0 / (1.0 + (-x).exp())
+}
+
+/// The inverse of the sigmoid, bounded.
+fn logit(share: f64) -> f64 {
+    (share / (1.0 - share)).max(0.0).ln().clamp(-FARTHEST_NUMBER, FARTHEST_NUMBER)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn lamp() -> Lamp {
+        Lamp {
+            position: [0.1, -0.2, 0.05],
+            axis: [0.1, 0.2],
+            ambient: 0.1,
+            exponent: 1.7,
+            falloffs: [3.0, 0.5],
+            reference_distance: 1.5,
+            ..Lamp::AT_CAMERA
+        }
+    }
+
+    #[test]
+    fn the_light_is_1_on_the_axis_at_the_reference_distance() {
+        let own = lamp();
+        let axis = DVec3::new(0.1, 0.2, 1.0).normalize();
+        let at = |distance: f64| own.light(DVec3::from(own.position) + distance * axis);
+        assert!((at(1.5) - 1.0).abs() < 1e-12);
+        assert!((at(3.0) - (0.1 + 0.9 * 0.5_f64.powf(1.7))).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_light_is_finite_and_positive_at_the_lamp_and_far_away() {
+        let own =
+            Lamp { ambient: LAMP_LEAST_AMBIENT, exponent: 4.0, falloffs: [50.0; 2], ..lamp() };
+        let position = DVec3::from(own.position);
+        for point in [position, position - 1e-30, DVec3::NEG_Z, DVec3::splat(1e25), DVec3::Z * 1e30]
+        {
+            let light = own.light(point);
+            assert!(light >= LAMP_LEAST_AMBIENT && light <= 16_f64.powi(4), "{point}: {light}");
+        }
+    }
+
+    #[test]
+    fn the_numbers_of_the_device_are_those_of_the_lamp() {
+        let own = lamp();
+        let back = Lamp::of_numbers(&own.numbers());
+        for point in [DVec3::Z, DVec3::new(0.5, -0.3, 2.0), DVec3::new(-1.0, 0.3, 0.4)] {
+            assert!((back.light(point) / own.light(point) - 1.0).abs() < 1e-5);
+        }
+        let bounds = Lamp { ambient: 0.0, exponent: 0.0, falloffs: [0.0; 2], ..own };
+        let back = Lamp::of_numbers(&bounds.numbers());
+        back.check().unwrap();
+        assert!(back.exponent < 1e-4 && back.ambient < 2e-4 && back.falloffs[0] < 1e-4);
+    }
+
+    #[test]
+    fn a_number_out_of_range_is_refused_by_its_name() {
+        for (wrong, name) in [
+            (Lamp { exponent: 5.0, ..lamp() }, "exponent"),
+            (Lamp { ambient: 1.0, ..lamp() }, "ambient"),
+            (Lamp { falloffs: [-1.0, 0.0], ..lamp() }, "falloffs"),
+            (Lamp { reference_distance: 0.0, ..lamp() }, "reference_distance"),
+            (Lamp { position: [f64::NAN; 3], ..lamp() }, "position"),
+            (Lamp { slope: f64::INFINITY, ..lamp() }, "slope"),
+        ] {
+            let refused = wrong.check().unwrap_err().to_string();
+            assert!(refused.contains(name), "{refused}");
+        }
+    }
+}

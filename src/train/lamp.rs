@@ -1,0 +1,212 @@
+//! A lamp that moves with the camera: where its learning begins, and its steps.
+
+use std::collections::BTreeMap;
+
+use glam::DVec3;
+
+use super::LampRates;
+use super::scene_light::SceneLight;
+use super::{OnOff, Optimizer, TrainConfig, Trainer};
+use crate::Result;
+use crate::gpu::{Gpu, Recorder, Slice, SliceMut};
+use crate::kernels::lamp::LAMP_WIDTH;
+use crate::photographs::dataset::{Dataset, Point, View};
+use crate::photographs::pseudo_gt::PseudoGt;
+use crate::splats::lamp::Lamp;
+use crate::splats::optimizer::{AdamBuffers, Learnable, Moments};
+use crate::splats::render::{DeviceLamp, Renderer};
+
+/// The most points whose distances are measured.
+const MAX_POINTS: usize = 20_000;
+/// The least falloff that learning begins from: near 0 its gradient is proportional to it.
+const LEAST_FALLOFF: f64 = 0.05;
+/// Of views that tell their exposures from a lamp: distances that differ by a tenth.
+const LEAST_SPREAD: f64 = 0.1;
+/// Fewer views show hardly any surface at two distances.
+const FEWEST_VIEWS: usize = 3;
+
+/// The state of the learning of a lamp's numbers.
+#[derive(Debug)]
+pub(super) struct LampLearning {
+    rates: LampRates,
+    pub(super) moments: Moments,
+    /// Points that training views see, in view space and in units of the frame.
+    points: Vec<DVec3>,
+}
+
+impl LampLearning {
+    /// # Errors
+    /// The device is out of memory.
+    pub(super) fn new(gpu: &Gpu, rates: LampRates, dataset: &Dataset, scale: f64) -> Result<Self> {
+        let points = in_views(dataset).into_values().flatten().map(|point| scale * point);
+        let moments = Moments::zeros(gpu, LAMP_WIDTH as usize)?;
+        Ok(Self { rates, moments, points: points.collect() })
+    }
+
+    /// The median of the light on the points that views see.
+    fn median_light(&self, lamp: &Lamp) -> f64 {
+        median(self.points.iter().map(|point| lamp.light(*point)).collect()).unwrap_or(1.0)
+    }
+}
+
+/// The learned numbers of a lamp.
+struct LearnedLamp<'a> {
+    numbers: SliceMut<'a, f32>,
+    gradients: Slice<'a, f32>,
+    learning: &'a mut LampLearning,
+}
+
+impl Learnable for LearnedLamp<'_> {
+    fn name(&self) -> &'static str {
+        LEARNED
+    }
+
+    fn learning_rate(&self, step: u64) -> f64 {
+        self.learning.rates.at(step)
+    }
+
+    fn buffers(&mut self) -> AdamBuffers<'_> {
+        AdamBuffers {
+            parameters: self.numbers.reborrow(),
+            gradients: self.gradients,
+            moments: self.learning.moments.slice_mut(),
+        }
+    }
+}
+
+/// The prefix of its tensors in a checkpoint.
+pub(super) const LEARNED: &str = "lamp";
+
+impl Optimizer {
+    /// Records a step of the lamp, if one is learned.
+    ///
+    /// # Errors
+    /// A pass exceeds the device's launch limits.
+    pub(super) fn update_lamp(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        renderer: &mut Renderer,
+        (step, factor): (u64, f64),
+    ) -> Result<()> {
+        let Some((learning, (lamp, status))) = self.lamp.as_mut().zip(renderer.lamp_and_status())
+        else {
+            return Ok(());
+        };
+        // The gradients of the first steps, whose colours are not settled, would be Adam's measure of later ones.
+        let Some(step) = step.checked_sub(learning.rates.after).filter(|&step| step > 0) else {
+            return Ok(());
+        };
+        let DeviceLamp { numbers, gradients, .. } = lamp;
+        let mut learned = LearnedLamp {
+            numbers: numbers.slice_mut().range(0..LAMP_WIDTH as usize)?,
+            gradients: gradients.slice(),
+            learning,
+        };
+        self.adam.update(pass, step, factor, &mut learned, status)
+    }
+}
+
+impl Trainer {
+    /// The lamp as learned so far, in units of the dataset's world, for the colours of [`Trainer::model`]; `None`
+    /// without one.
+    ///
+    /// # Errors
+    /// The device was lost.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn lamp(&self) -> Result<Option<Lamp>> {
+        let own = self.renderer.lamp()?.zip(self.even_light()?);
+        Ok(own.map(|(lamp, light)| lamp.with_unit(light).scaled(1.0 / self.frame.scale)))
+    }
+
+    /// The light that evenly lit views have, with that of the colours in training as its unit; `None` without a lamp.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(super) fn even_light(&self) -> Result<Option<f64>> {
+        let own = self.renderer.lamp()?.zip(self.optimizer.lamp.as_ref());
+        Ok(own.map(|(lamp, learning)| learning.median_light(&lamp)))
+    }
+}
+
+/// The lamp of the first step, in the training frame: that of the configuration, at the distances and the tone law of
+/// the dataset.
+///
+/// # Errors
+/// A photograph can no longer be read, or the device is out of memory or lost.
+pub(super) fn start(pseudo_gt: &PseudoGt, dataset: &Dataset, config: &TrainConfig) -> Result<Lamp> {
+    let views = dataset.train_views().count();
+    if views < FEWEST_VIEWS {
+        tracing::warn!(
+            "{views} training views do not tell a lamp from the surfaces that it lights; without the part lamp, all \
+             light is the surfaces'"
+        );
+    }
+    if !config.tone.scene_statistics && config.tone.takes_exposure() {
+        tracing::warn!(
+            "every photograph has a gain of its own, which follows the lamp: set tone.scene_statistics to true"
+        );
+    }
+    let scale = config.frame.unwrap_or_default().scale;
+    let distances: Vec<Vec<f64>> = in_views(dataset)
+        .into_values()
+        .map(|points| points.iter().map(|point| point.length()).collect())
+        .collect();
+    if config.exposure.learn == OnOff::On && spread(&distances) < LEAST_SPREAD {
+        tracing::warn!(
+            "all views are at about the same distance from what they show: exposures of views can take the lamp's \
+             place; --exposure off leaves it the light"
+        );
+    }
+    let all = distances.into_iter().flatten().collect();
+    let reference_distance = median(all).unwrap_or_else(|| config.extent_of(dataset));
+    let (black, slope) = SceneLight::of(&config.tone, dataset)?.encoding(pseudo_gt)?;
+    let lamp = Lamp {
+        ambient: config.lamp.ambient,
+        exponent: config.lamp.exponent,
+        falloffs: [config.lamp.falloff, config.lamp.falloff_squared].map(|x| x.max(LEAST_FALLOFF)),
+        reference_distance,
+        slope,
+        black,
+        ..Lamp::AT_CAMERA
+    };
+    tracing::info!(
+        "a lamp at the camera: reference distance {reference_distance:.3}, slope of the tone law {slope:.3}"
+    );
+    Ok(lamp.scaled(scale))
+}
+
+/// The points in view space of the training cameras that triangulated them, by the index of the view; if the dataset
+/// does not list these, of those that see them.
+fn in_views(dataset: &Dataset) -> BTreeMap<usize, Vec<DVec3>> {
+    let Dataset { views, points, .. } = dataset;
+    let has_tracks = points.iter().any(|point| !point.views.is_empty());
+    let is_seen = |point: &Point, (index, view): (usize, &View)| match has_tracks {
+        true => point.views.binary_search(&(index as u32)).is_ok(),
+        false => view.camera.sees(point.position).is_some(),
+    };
+    let stride = points.len().div_ceil(MAX_POINTS).max(1);
+    let mut in_views = BTreeMap::<usize, Vec<DVec3>>::new();
+    for point in points.iter().step_by(stride) {
+        let training = views.iter().enumerate().filter(|(_, view)| view.is_train());
+        for (index, view) in training.filter(|own| is_seen(point, *own)) {
+            let in_view = view.camera.view_from_world.transform_point3(point.position);
+            in_views.entry(index).or_default().push(in_view);
+        }
+    }
+    in_views
+}
+
+/// The standard deviation of the logarithm of the views' median distances.
+fn spread(distances: &[Vec<f64>]) -> f64 {
+    let own = distances.iter().filter_map(|own| Some(median(own.clone())?.ln()));
+    let own: Vec<f64> = own.collect();
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
+    let middle = mean(&own);
+    mean(&own.iter().map(|value| (value - middle).powi(2)).collect::<Vec<_>>()).sqrt()
+}
+
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.retain(|value| value.is_normal() && *value > 0.0);
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
+}

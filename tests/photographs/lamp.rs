@@ -1,0 +1,146 @@
+//! The synthetic sets whose cameras carry a lamp.
+
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::path::Path;
+
+use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};
+use nightsplat::photographs::dataset::{Dataset, LoadOptions};
+use nightsplat::photographs::image::{Image, linear_from_srgb};
+
+use crate::common::command::{refused, run};
+
+fn set() -> SyntheticOptions {
+    let lamp = Some(16.0);
+    SyntheticOptions { views: 17, width: 80, height: 60, seed: 2, lamp, ..Default::default() }
+}
+
+fn street() -> SyntheticOptions {
+    SyntheticOptions { width: 80, height: 60, ..SyntheticOptions::street(3) }
+}
+
+fn written(options: &SyntheticOptions, capture: &Capture) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    synthetic::write_captured(folder.path(), options, capture).unwrap();
+    folder
+}
+
+fn image(folder: &Path, name: &str) -> Image {
+    Image::load(folder.join(name)).unwrap()
+}
+
+fn green(image: &Image) -> Vec<f64> {
+    let pixels = (0..image.width * image.height).map(|i| (i % image.width, i / image.width));
+    pixels.map(|(x, y)| f64::from(linear_from_srgb(image.pixel(x, y)[1]))).collect()
+}
+
+/// The irradiance of the pixels of a test view in stops below the reference's light, ascending.
+fn stops(folder: &Path, view: &str) -> Vec<f64> {
+    let [lit, even] = ["lit", "high"].map(|of| green(&image(folder, &format!("{of}/{view}.png"))));
+    let pairs = lit.into_iter().zip(even).filter(|&(_, even)| even > 0.02 && even < 1.0);
+    let mut stops: Vec<f64> = pairs.map(|(lit, even)| (lit.max(1e-4) / even).log2()).collect();
+    stops.sort_unstable_by(f64::total_cmp);
+    stops
+}
+
+#[test]
+fn a_view_is_lit_over_about_eight_stops() {
+    let folder = written(&set(), &Capture::clean());
+    let street = written(&SyntheticOptions { lamp: Some(16.0), ..street() }, &Capture::clean());
+    for (folder, views) in [(&folder, ["000", "008", "016"]), (&street, ["000", "008", "016"])] {
+        let spread = views.map(|view| {
+            let stops = stops(folder.path(), view);
+            stops[stops.len() - 1 - stops.len() / 200] - stops[stops.len() / 200]
+        });
+        println!("{spread:?}");
+        let mean = spread.iter().sum::<f64>() / 3.0;
+        assert!((6.5..9.5).contains(&mean), "{spread:?}");
+    }
+}
+
+#[test]
+fn a_lit_test_view_is_what_its_photograph_would_be_without_darkening_and_noise() {
+    let folder = written(&set(), &Capture::clean());
+    for view in ["000", "008", "016"] {
+        let [low, lit] = ["low", "lit"].map(|of| image(folder.path(), &format!("{of}/{view}.png")));
+        assert!(low.data == lit.data, "{view}");
+        let mean = lit.data.iter().sum::<f32>() / lit.data.len() as f32;
+        assert!((0.2..0.6).contains(&mean), "{view}: {mean}");
+        let white = lit.data.iter().filter(|&&value| value >= 1.0).count();
+        assert!(white < lit.data.len() / 50, "{view}: {white} values are white");
+    }
+    assert!(!folder.path().join("lit/001.png").exists());
+    let dark = written(&set(), &Capture::default());
+    for view in ["000", "008"] {
+        let [low, lit] =
+            ["low", "lit"].map(|of| green(&image(dark.path(), &format!("{of}/{view}.png"))));
+        let [low, lit] = [low, lit].map(|light| light.iter().sum::<f64>());
+        assert!((lit / low / synthetic::DARKENING - 1.0).abs() < 0.1, "{view}: {}", lit / low);
+    }
+}
+
+#[test]
+fn the_references_of_a_street_do_not_depend_on_the_lamp() {
+    let [with, without] = [Some(16.0), None]
+        .map(|lamp| written(&SyntheticOptions { lamp, ..street() }, &Capture::default()));
+    for view in ["000", "007"] {
+        let [a, b] = [&with, &without].map(|set| image(set.path(), &format!("high/{view}.png")));
+        assert!(a.data == b.data, "{view}");
+    }
+    assert!(!without.path().join("lit").exists());
+}
+
+#[test]
+fn a_point_is_brighter_from_nearby_and_on_the_axis() {
+    let set = written(&SyntheticOptions { lamp: Some(30.0), ..set() }, &Capture::clean());
+    let dataset = Dataset::load(set.path(), &LoadOptions::default()).unwrap();
+    let images: Vec<Image> = (dataset.views.iter())
+        .map(|view| image(set.path(), &format!("low/{}.png", view.name)))
+        .collect();
+    let (mut as_expected, mut pairs) = (0, 0);
+    for point in &dataset.points {
+        let seen = point.views.iter().filter_map(|&view| {
+            let camera = &dataset.views[view as usize].camera;
+            let pixel = camera.project(point.position)?;
+            let [x, y] = [pixel.x as u32, pixel.y as u32];
+            let image = &images[view as usize];
+            let light = (x < image.width && y < image.height).then(|| image.pixel(x, y)[1])?;
+            let in_view = camera.view_from_world.transform_point3(point.position);
+            Some((light, in_view.length(), in_view.z / in_view.length()))
+        });
+        let seen: Vec<_> = seen.collect();
+        for (a, b) in seen.iter().flat_map(|a| seen.iter().map(move |b| (a, b))) {
+            if a.1 < 0.8 * b.1 && a.2 >= b.2 {
+                pairs += 1;
+                as_expected += u32::from(a.0 > b.0);
+            }
+        }
+    }
+    assert!(pairs > 1000, "{pairs}");
+    assert!(f64::from(as_expected) > 0.9 * f64::from(pairs), "{as_expected} of {pairs}");
+}
+
+#[test]
+fn a_lamp_that_cannot_be_made_is_refused_in_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let set = folder.path().join("set");
+    for degrees in ["4", "81", "NaN", "-3"] {
+        refused(&format!("synth {} --lamp={degrees}", set.display()), 2, &["5 to 80", degrees]);
+        assert!(!set.exists());
+    }
+}
+
+#[test]
+fn the_command_makes_the_same_set_twice() {
+    let folder = tempfile::tempdir().unwrap();
+    let size = "--views 3 --width 24 --height 16";
+    for (name, lamp) in [("a", "--lamp"), ("b", "--lamp=16"), ("c", "--lamp=40 --fisheye")] {
+        run(&format!("synth {} {size} {lamp}", folder.path().join(name).display()), 0);
+    }
+    for file in ["low/001.png", "high/001.png", "lit/000.png", "colmap_sparse/0/points3D.txt"] {
+        let [a, b, c] =
+            ["a", "b", "c"].map(|set| std::fs::read(folder.path().join(set).join(file)));
+        let [a, b, c] = [a.unwrap(), b.unwrap(), c.unwrap()];
+        assert!(a == b && b != c, "{file}");
+    }
+}

@@ -1,0 +1,250 @@
+//! A lamp that moves with the camera is told apart from everything else that makes a point differ between its views.
+
+#![cfg(feature = "cli")]
+#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+
+use std::fs;
+use std::path::Path;
+
+use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};
+use nightsplat::photographs::dataset::{Dataset, LoadOptions};
+use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
+use nightsplat::train::TrainConfig;
+use nightsplat::train::diagnose::{Diagnosis, LampDiagnosis, Plan, SceneDiagnosis};
+
+use crate::common::command::succeed;
+
+/// Of a room.
+fn set(lamp: Option<f64>) -> SyntheticOptions {
+    SyntheticOptions { views: 20, width: 96, height: 72, seed: 4, lamp, ..Default::default() }
+}
+
+/// Exposures that have nothing to do with where the cameras are.
+fn varying() -> Capture {
+    Capture { stops: vec![0.0, -1.0, 0.6, -0.4, 0.3, 0.8, -0.7], ..Capture::default() }
+}
+
+fn written(options: &SyntheticOptions, capture: &Capture) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    synthetic::write_captured(folder.path(), options, capture).unwrap();
+    folder
+}
+
+fn diagnosis(folder: &Path) -> Diagnosis {
+    let options = LoadOptions::default();
+    Diagnosis::of(&Dataset::load(folder, &options).unwrap(), &options).unwrap()
+}
+
+fn scene(folder: &Path) -> SceneDiagnosis {
+    diagnosis(folder).scene
+}
+
+fn lamp_of(options: &SyntheticOptions, capture: &Capture) -> LampDiagnosis {
+    let scene = scene(written(options, capture).path());
+    scene.lamp.unwrap_or_else(|| panic!("{:?}", scene.lamp_unknown))
+}
+
+/// Multiplies the linear light of every pixel of the photographs by a function of the photograph's number and of the
+/// pixel's distance from the middle, 0 to 1 in a corner.
+fn relit(folder: &Path, factor: impl Fn(usize, f64) -> f64) {
+    let mut paths: Vec<_> =
+        fs::read_dir(folder.join("low")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    paths.sort();
+    for (index, path) in paths.iter().enumerate() {
+        let image = Image::load(path).unwrap();
+        let half = [image.width, image.height].map(|side| 0.5 * f64::from(side));
+        let relit = Image::from_fn(image.width, image.height, |x, y| {
+            let off =
+                (f64::from(x) - half[0]).hypot(f64::from(y) - half[1]) / half[0].hypot(half[1]);
+            let light = |value: f32| linear_from_srgb(value) * factor(index, off) as f32;
+            image.pixel(x, y).map(|value| srgb_from_linear(light(value)).clamp(0.0, 1.0))
+        });
+        relit.save_png8(path).unwrap();
+    }
+}
+
+#[test]
+fn a_lamp_alone_is_found_and_has_the_inverse_square_law() {
+    for (seed, degrees) in [(1, 16.0), (2, 30.0)] {
+        let lamp = lamp_of(&SyntheticOptions { seed, ..set(Some(degrees)) }, &Capture::default());
+        println!("{degrees}: {lamp:?}");
+        assert!(lamp.is_found(), "{lamp:?}");
+        assert!((lamp.exponent - 2.0).abs() < 0.5, "{lamp:?}");
+        assert!(lamp.lamp_r_squared > 0.5 && lamp.exposure_spread < 0.2, "{lamp:?}");
+        // Half the light at the angle of half the light.
+        let u = 1.0 - degrees.to_radians().cos();
+        let half = (-lamp.falloff[0] * u - lamp.falloff[1] * u * u).exp();
+        assert!((half - 0.5).abs() < 0.15, "{half} at {degrees} degrees: {lamp:?}");
+        assert!((2.0..4.0).contains(&lamp.d_ref) && lamp.ambient < 0.1, "{lamp:?}");
+    }
+}
+
+#[test]
+fn a_lamp_with_other_exposures_is_found_beside_them() {
+    let lamp = lamp_of(&set(Some(16.0)), &varying());
+    println!("{lamp:?}");
+    assert!(lamp.is_found() && (lamp.exponent - 2.0).abs() < 0.5, "{lamp:?}");
+    assert!(lamp.r_squared > lamp.lamp_r_squared + 0.2, "{lamp:?}");
+    assert!((lamp.exposure_spread - 0.65).abs() < 0.15, "{lamp:?}");
+}
+
+#[test]
+fn exposures_alone_are_no_lamp() {
+    let lamp = lamp_of(&set(None), &varying());
+    println!("{lamp:?}");
+    assert!(!lamp.is_found() && lamp.stops < 0.1, "{lamp:?}");
+    assert!(lamp.exposure_r_squared > 0.8, "{lamp:?}");
+}
+
+#[test]
+fn noise_alone_is_no_lamp() {
+    for (seed, full_well) in [(1, 9000.0), (2, 900.0), (3, 200.0)] {
+        let grainy = Capture { full_well, ..Capture::default() };
+        let scene = scene(written(&SyntheticOptions { seed, ..set(None) }, &grainy).path());
+        println!("{:?} {:?}", scene.lamp, scene.lamp_unknown);
+        let lamp = scene.lamp.filter(|lamp| lamp.is_found() || lamp.stops > 0.1);
+        assert_eq!(lamp, None);
+    }
+}
+
+#[test]
+fn light_that_falls_on_a_place_is_no_lamp() {
+    // The light of this street falls eightfold from one end to the other.
+    let street = SyntheticOptions::street(4);
+    let lamp = lamp_of(&street, &Capture::default());
+    println!("{lamp:?}");
+    assert!(!lamp.is_found() && lamp.stops < 0.1, "{lamp:?}");
+    let lit = lamp_of(&SyntheticOptions { lamp: Some(16.0), ..street }, &Capture::default());
+    println!("{lit:?}");
+    assert!(lit.is_found(), "{lit:?}");
+}
+
+#[test]
+fn a_vignette_is_no_lamp() {
+    let folder = written(&set(None), &Capture::default());
+    relit(folder.path(), |_, off| (-2.0 * off * off).exp2());
+    let lamp = scene(folder.path()).lamp.unwrap();
+    println!("{lamp:?}");
+    assert!(lamp.stops > 0.15, "the vignette is to be seen: {lamp:?}");
+    assert!(!lamp.is_found() && lamp.distance_stops < 0.08, "{lamp:?}");
+}
+
+#[test]
+fn clipped_photographs_few_views_and_one_position_measure_no_lamp() {
+    let unknown = |folder: &Path, why: &str| {
+        let scene = scene(folder);
+        assert_eq!(scene.lamp, None);
+        let told = scene.lamp_unknown.unwrap();
+        assert!(told.contains(why), "{told}");
+    };
+    let folder = written(&set(Some(16.0)), &Capture::default());
+    let path = folder.path().join("transforms_train.json");
+    let whole = fs::read(&path).unwrap();
+    let list = || -> serde_json::Value { serde_json::from_slice(&whole).unwrap() };
+
+    let mut fewer = list();
+    fewer["frames"].as_array_mut().unwrap().truncate(4);
+    fs::write(&path, fewer.to_string()).unwrap();
+    unknown(folder.path(), "in 4 views");
+
+    fs::write(&path, &whole).unwrap();
+    relit(folder.path(), |_, _| 1e4);
+    unknown(folder.path(), "are unclipped");
+
+    let folder = written(&set(Some(16.0)), &Capture::default());
+    let path = folder.path().join("transforms_train.json");
+    let points = Dataset::load(folder.path(), &LoadOptions::default()).unwrap().points;
+    fs::remove_dir_all(folder.path().join("colmap_sparse")).unwrap();
+    unknown(folder.path(), "0 points in 0 views");
+    let mut still = list();
+    let pose = still["frames"][0]["transform_matrix"].clone();
+    for frame in still["frames"].as_array_mut().unwrap() {
+        frame["transform_matrix"] = pose.clone();
+    }
+    fs::write(&path, still.to_string()).unwrap();
+    let lines: String = points
+        .iter()
+        .map(|point| point.position.to_array())
+        .fold(String::new(), |lines, [x, y, z]| lines + &format!("{x} {y} {z}\n"));
+    let header = format!(
+        "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n",
+        points.len()
+    );
+    fs::write(folder.path().join("points3D.ply"), header + &lines).unwrap();
+    unknown(folder.path(), "differ by 0.0 %");
+}
+
+#[test]
+fn the_plan_has_a_lamp_and_exposures_each_where_its_cause_is() {
+    let plan = |lamp, capture: &Capture| {
+        let folder = written(&set(lamp), capture);
+        let found = diagnosis(folder.path());
+        let mut config = TrainConfig::default();
+        config.tone.scene_statistics = true;
+        let plan = Plan::new(&found, &config, 8 << 30);
+        config.freeze = Some("means,quats,scales,opacities,dc".parse().unwrap());
+        let frozen = Plan::new(&found, &config, 8 << 30).lamp;
+        assert!(
+            !frozen.on && frozen.why.contains("colours are frozen") == plan.lamp.on,
+            "{frozen:?}"
+        );
+        (found.scene.lamp.unwrap(), plan)
+    };
+    for (lamp, capture, expected) in [
+        (None, Capture::default(), [false, false]),
+        (None, varying(), [false, true]),
+        (Some(16.0), Capture::default(), [true, false]),
+        (Some(16.0), varying(), [true, true]),
+    ] {
+        let (found, plan) = plan(lamp, &capture);
+        assert_eq!(
+            [plan.lamp.on, plan.exposure.on],
+            expected,
+            "{:?} {:?}",
+            plan.lamp,
+            plan.exposure
+        );
+        assert!(plan.lamp.why.contains("threshold"), "{:?}", plan.lamp);
+        let begins = match lamp {
+            Some(_) => (found.exponent, found.falloff, found.ambient),
+            None => (2.0, [0.0; 2], 0.05),
+        };
+        assert_eq!((plan.lamp.exponent, plan.lamp.falloff, plan.lamp.ambient), begins);
+    }
+}
+
+#[test]
+fn a_run_learns_the_lamp_that_was_found_and_none_where_there_is_none() {
+    for (lamp, learned) in [(Some(16.0), "lamp = true"), (None, "lamp = false")] {
+        let folder = written(&set(lamp), &Capture::default());
+        let out = folder.path().join("run");
+        succeed(&format!("train {} --out {} --steps 2", folder.path().display(), out.display()));
+        let config = fs::read_to_string(out.join("config.toml")).unwrap();
+        assert!(config.contains(learned), "no `{learned}` in {config}");
+        assert_eq!(config.contains("scene_statistics = true"), lamp.is_some(), "{config}");
+        let plan: toml::Value =
+            toml::from_str(&fs::read_to_string(out.join("plan.toml")).unwrap()).unwrap();
+        let exponent = plan["lamp"]["exponent"].as_float().unwrap();
+        assert!((exponent - 2.0).abs() < 0.5 && config.contains(&format!("exponent = {exponent}")));
+    }
+}
+
+#[test]
+fn the_command_reports_the_lamp_as_text_json_and_page() {
+    let folder = written(&set(Some(16.0)), &Capture::default());
+    let (root, page) = (folder.path().display(), folder.path().join("page.html"));
+    let text = succeed(&format!("diagnose {root} --report {}", page.display()));
+    let line = text.lines().find(|line| line.starts_with("lamp ")).unwrap();
+    assert!(text.lines().any(|line| line.starts_with("lamp ") && line.contains(" on ")), "{text}");
+    for part in ["moves with the camera", "exponent", "beyond exposures", "by distance"] {
+        assert!(line.contains(part), "{line}");
+    }
+    assert!(fs::read_to_string(page).unwrap().contains("moves with the camera"));
+    let json: serde_json::Value =
+        serde_json::from_str(&succeed(&format!("diagnose {root} --json"))).unwrap();
+    let lamp = &json["scene"]["lamp"];
+    for key in ["exponent", "ambient", "d_ref", "r_squared", "stops", "exposure_r_squared"] {
+        assert!(lamp[key].is_f64(), "{key} of {lamp}");
+    }
+    assert_eq!(lamp["falloff"].as_array().unwrap().len(), 2);
+}
