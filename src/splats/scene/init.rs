@@ -232,7 +232,9 @@ fn radius(cameras: &[Camera]) -> f64 {
 /// The colour of each point: the mean of the targets of the training views that see it, RGB.
 ///
 /// A point is seen by the training views of its track; without a track, by the training views that it projects into,
-/// of [`MAX_VIEWS`] that cover the scene (`Camera::covering`). A point that none of them sees gets the mean grey of the targets.
+/// of [`MAX_VIEWS`] that cover the scene (`Camera::covering`). A point that none of them sees gets the mean grey of the
+/// targets.
+///
 /// `factor` is that of the light of a view on a colour at a point: the colours are those in even light, by least
 /// squares. `target` returns the target of a view (an index into `views`), or `None`; it is called once per training
 /// view, in order, so it may compute.
