@@ -228,13 +228,23 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub fn model(&self) -> Result<splats::model::Model> {
-        Ok(self.model_of(&self.gaussians_in_frame()?))
+        self.model_of(&self.gaussians_in_frame()?)
     }
 
-    /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world.
-    pub(crate) fn model_of(&self, in_frame: &Gaussians) -> splats::model::Model {
+    /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world. If the model has a
+    /// lamp, their colours are those in its light at the median of the points that the views see.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(crate) fn model_of(&self, in_frame: &Gaussians) -> Result<splats::model::Model> {
         let facts = self.config.facts(&self.frame);
-        splats::model::Model::of(in_frame.to_world(&self.frame), &facts)
+        let mut gaussians = in_frame.to_world(&self.frame);
+        if let Some((lamp, light)) = self.renderer.lamp()?.zip(self.even_light()?) {
+            let shown = if self.config.model.raw_colors { 0.0 } else { 0.5 };
+            let factor = light.powf(lamp.slope) as f32;
+            gaussians.scale_colors(lamp.black as f32 - shown, factor);
+        }
+        Ok(splats::model::Model::of(gaussians, &facts))
     }
 
     /// The Gaussians in [`Trainer::frame`], bit for bit as trained.
@@ -422,14 +432,16 @@ impl Trainer {
         self.render_of_degree(&camera, self.sh_degree_in_use())
     }
 
-    /// [`Trainer::render`] in even light, each Gaussian in its own colour, if the model has a lamp.
+    /// [`Trainer::render`] in even light, as [`Trainer::model`] is, if the model has a lamp.
     ///
     /// # Errors
     /// Those of [`Trainer::render`].
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn render_in_even_light(&mut self, camera: &Camera) -> Result<Rendered> {
-        self.renderer.set_even_light(true);
+        let light = self.even_light()?;
+        self.renderer.set_even_light(light)?;
         let rendered = self.render(camera);
-        self.renderer.set_even_light(false);
+        self.renderer.set_even_light(None)?;
         rendered
     }
 

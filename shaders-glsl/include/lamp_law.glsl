@@ -10,6 +10,8 @@ struct Lamp {
     vec2  falloffs;
     float reference_distance;
     float slope;
+    float black;
+    float gain;
 };
 
 // The numbers that factor and gradient of a point have in common.
@@ -30,11 +32,13 @@ Lamp load_lamp() {
     Lamp own;
     own.reference_distance = lamp[LAMP_REFERENCE_DISTANCE];
     own.slope = lamp[LAMP_SLOPE];
+    own.black = lamp[LAMP_BLACK];
+    own.gain = lamp[LAMP_GAIN];
     own.position = LAMP_STEP * own.reference_distance * vec3(lamp[0], lamp[1], lamp[2]);
     own.tangents = vec3(LAMP_STEP * lamp[3], LAMP_STEP * lamp[4], 1.0);
     own.ambient = LAMP_LEAST_AMBIENT + (1.0 - LAMP_LEAST_AMBIENT) * sigmoid(lamp[LAMP_AMBIENT]);
     own.exponent = LAMP_LARGEST_EXPONENT * sigmoid(lamp[LAMP_EXPONENT]);
-    own.falloffs = vec2(softplus(lamp[LAMP_FALLOFFS]), softplus(lamp[LAMP_FALLOFFS + 1]));
+    own.falloffs = LAMP_FALLOFF_STEP * vec2(softplus(lamp[LAMP_FALLOFFS]), softplus(lamp[LAMP_FALLOFFS + 1]));
     return own;
 }
 
@@ -48,14 +52,14 @@ LampPoint lamp_at(Lamp own, vec3 point) {
     at.away = 1.0 - clamp(dot(at.towards, at.axis), -1.0, 1.0);
     float decay = own.exponent * log(at.distance / own.reference_distance);
     at.beam = exp(-decay - (own.falloffs.x + own.falloffs.y * at.away) * at.away);
-    at.light = own.ambient + (1.0 - own.ambient) * at.beam;
+    at.light = own.gain * (own.ambient + (1.0 - own.ambient) * at.beam);
     return at;
 }
 
 float lamp_factor(Lamp own, LampPoint at) { return exp(own.slope * log(at.light)); }
 
 // d ln light / d ln beam
-float lamp_share(Lamp own, LampPoint at) { return (1.0 - own.ambient) * at.beam / at.light; }
+float lamp_share(Lamp own, LampPoint at) { return own.gain * (1.0 - own.ambient) * at.beam / at.light; }
 
 // The steepness of the falloff: -d ln beam / du.
 float lamp_turn(Lamp own, LampPoint at) { return own.falloffs.x + 2.0 * own.falloffs.y * at.away; }
@@ -80,9 +84,10 @@ void lamp_gradient(Lamp own, LampPoint at, out float gradient[LAMP_WIDTH]) {
     [[unroll]] for (uint k = 0; k < 2; k++) gradient[3 + k] = d_tangents[k];
     float raised = sigmoid(lamp[LAMP_AMBIENT]), bent = sigmoid(lamp[LAMP_EXPONENT]);
     gradient[LAMP_AMBIENT] =
-        own.slope * (1.0 - at.beam) / at.light * (1.0 - LAMP_LEAST_AMBIENT) * raised * (1.0 - raised);
+        own.slope * own.gain * (1.0 - at.beam) / at.light * (1.0 - LAMP_LEAST_AMBIENT) * raised * (1.0 - raised);
     gradient[LAMP_EXPONENT] =
         -share * log(at.distance / own.reference_distance) * LAMP_LARGEST_EXPONENT * bent * (1.0 - bent);
-    gradient[LAMP_FALLOFFS] = -share * at.away * sigmoid(lamp[LAMP_FALLOFFS]);
-    gradient[LAMP_FALLOFFS + 1] = -share * at.away * at.away * sigmoid(lamp[LAMP_FALLOFFS + 1]);
+    gradient[LAMP_FALLOFFS] = -share * at.away * LAMP_FALLOFF_STEP * sigmoid(lamp[LAMP_FALLOFFS]);
+    gradient[LAMP_FALLOFFS + 1] =
+        -share * at.away * at.away * LAMP_FALLOFF_STEP * sigmoid(lamp[LAMP_FALLOFFS + 1]);
 }

@@ -216,7 +216,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         if let Some(lit) = eval::mean_lit(&scored) {
             writeln!(
                 out,
-                "in the light of the lamp, against lit/: PSNR {:.2} dB, SSIM {:.3}",
+                "in the light of the lamp, against lit/, after gain and bias of each channel: PSNR {:.2} dB, SSIM {:.3}",
                 lit.psnr, lit.ssim
             )?;
         }

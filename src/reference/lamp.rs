@@ -5,9 +5,9 @@ use glam::DVec3;
 use super::gaussian::sigmoid;
 use super::rounding::UNIT;
 use crate::kernels::lamp::{
-    LAMP_AMBIENT, LAMP_EXPONENT, LAMP_FALLOFFS, LAMP_FARTHEST, LAMP_LARGEST_EXPONENT,
-    LAMP_LEAST_AMBIENT, LAMP_NEAREST, LAMP_NUMBERS, LAMP_REFERENCE_DISTANCE, LAMP_SLOPE, LAMP_STEP,
-    LAMP_WIDTH,
+    LAMP_AMBIENT, LAMP_BLACK, LAMP_EXPONENT, LAMP_FALLOFF_STEP, LAMP_FALLOFFS, LAMP_FARTHEST,
+    LAMP_GAIN, LAMP_LARGEST_EXPONENT, LAMP_LEAST_AMBIENT, LAMP_NEAREST, LAMP_NUMBERS,
+    LAMP_REFERENCE_DISTANCE, LAMP_SLOPE, LAMP_STEP, LAMP_WIDTH,
 };
 
 /// The learned numbers of the device.
@@ -25,6 +25,8 @@ pub struct Lamp {
     falloffs: [f64; 2],
     reference_distance: f64,
     slope: f64,
+    black: f64,
+    gain: f64,
 }
 
 /// The numbers that factor and gradient of a point have in common.
@@ -50,9 +52,11 @@ impl Lamp {
             tangents: DVec3::new(LAMP_STEP * at(3), LAMP_STEP * at(4), 1.0),
             ambient: LAMP_LEAST_AMBIENT + (1.0 - LAMP_LEAST_AMBIENT) * sigmoid(at(LAMP_AMBIENT)),
             exponent: LAMP_LARGEST_EXPONENT * sigmoid(at(LAMP_EXPONENT)),
-            falloffs: [0, 1].map(|k| softplus(at(LAMP_FALLOFFS + k))),
+            falloffs: [0, 1].map(|k| LAMP_FALLOFF_STEP * softplus(at(LAMP_FALLOFFS + k))),
             reference_distance,
             slope: at(LAMP_SLOPE),
+            black: at(LAMP_BLACK),
+            gain: at(LAMP_GAIN),
             numbers,
         }
     }
@@ -67,13 +71,23 @@ impl Lamp {
         let away = 1.0 - towards.dot(axis).clamp(-1.0, 1.0);
         let [first, second] = self.falloffs;
         let beam = (-self.exponent * bounded.ln() - (first + second * away) * away).exp();
-        let light = self.ambient + (1.0 - self.ambient) * beam;
+        let light = self.gain * (self.ambient + (1.0 - self.ambient) * beam);
         LampPoint { axis, towards, own, distance, away, beam, light }
     }
 
     /// The factor on the colour of a Gaussian at a point in view space.
     pub fn factor(&self, point: DVec3) -> f64 {
         self.at(point).light.powf(self.slope)
+    }
+
+    /// The colour at a point in view space, before it is clamped.
+    pub fn lit(&self, color: DVec3, point: DVec3) -> DVec3 {
+        self.black + (color - self.black) * self.factor(point)
+    }
+
+    /// A lit colour above black, to which the gradient of ln factor is proportional.
+    pub fn above_black(&self, lit: DVec3) -> DVec3 {
+        lit - self.black
     }
 
     /// The relative rounding error of the factor: exponentials and logarithms have errors of a few units in the last
@@ -88,7 +102,7 @@ impl Lamp {
     }
 
     fn share(&self, at: &LampPoint) -> f64 {
-        (1.0 - self.ambient) * at.beam / at.light
+        self.gain * (1.0 - self.ambient) * at.beam / at.light
     }
 
     fn turn(&self, at: &LampPoint) -> f64 {
@@ -138,12 +152,12 @@ impl Lamp {
             d_position.z,
             d_tangents.x,
             d_tangents.y,
-            self.slope * (1.0 - at.beam) / at.light
+            self.slope * self.gain * (1.0 - at.beam) / at.light
                 * (1.0 - LAMP_LEAST_AMBIENT)
                 * of_share(LAMP_AMBIENT),
             -share * decades * LAMP_LARGEST_EXPONENT * of_share(LAMP_EXPONENT),
-            -share * at.away * rising(LAMP_FALLOFFS),
-            -share * at.away * at.away * rising(LAMP_FALLOFFS + 1),
+            -share * at.away * LAMP_FALLOFF_STEP * rising(LAMP_FALLOFFS),
+            -share * at.away * at.away * LAMP_FALLOFF_STEP * rising(LAMP_FALLOFFS + 1),
         ]
     }
 }

@@ -42,15 +42,21 @@ fn shares(
     let camera = Camera::from(&slices.cameras[params.camera_index as usize]);
     let color = vector(slices.colors, stored_color(constants.channels) * i);
     let mean = vector(slices.parameters, 3 * i);
-    let mut inputs = [&mean.to_array()[..], &[d_dc.dot(color)]].concat();
+    let lamp = Lamp::of(slices.lamp);
+    let above = lamp.above_black(color);
+    let mut inputs = [&mean.to_array()[..], &[d_dc.dot(above)]].concat();
     let far = mean.length() + camera.center().length();
-    let mut errors = vec![OFF * far, OFF * far, OFF * far, OFF * d_dc.abs().dot(color.abs())];
+    let mut errors = vec![
+        OFF * far,
+        OFF * far,
+        OFF * far,
+        OFF * d_dc.abs().dot(color.abs() + (color - above).abs()),
+    ];
     for &number in &slices.lamp[..LAMP_NUMBERS as usize] {
         inputs.push(number.into());
         errors.push(OFF * (1.0 + f64::from(number.abs())));
     }
     let moved = sensitivity(&inputs, &errors, |inputs| share(&camera, inputs));
-    let lamp = Lamp::of(slices.lamp);
     let own = OFF + lamp.factor_error(camera.view(mean));
     // A number whose terms cancel has the errors of these.
     let values = share(&camera, &inputs);

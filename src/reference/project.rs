@@ -85,11 +85,12 @@ pub fn project_gaussian(
 
     let basis = sh_basis(sh_degree, (gaussian.mean - camera.center()).normalize());
     let color: DVec3 = gaussian.sh.iter().zip(basis).map(|(&c, b)| b * c).sum();
-    let color = if raw_colors { color } else { (color + 0.5).max(DVec3::ZERO) };
+    let color = if raw_colors { color } else { color + 0.5 };
+    let color = lamp.map_or(color, |lamp| lamp.lit(color, mean_in_view));
     Some(Projection {
         splat: Splat { mean2d, conic, opacity },
         half_extent,
-        color: lamp.map_or(1.0, |lamp| lamp.factor(mean_in_view)) * color,
+        color: if raw_colors { color } else { color.max(DVec3::ZERO) },
         depth,
         conditioning: if antialiased { (xx * yy).sqrt() / normal.length() } else { 0.0 },
     })

@@ -79,7 +79,7 @@ pub fn project_gaussian_backward(
     let mut d_mean_in_view = camera.backward(mean_in_view, d_splat.mean2d, d_rows);
     let mut d_color = d_splat.color;
     if let Some(Lit { lamp, color }) = lit {
-        d_mean_in_view += d_color.dot(color) * lamp.point_gradient(mean_in_view);
+        d_mean_in_view += d_color.dot(lamp.above_black(color)) * lamp.point_gradient(mean_in_view);
         d_color *= lamp.factor(mean_in_view);
     }
 
@@ -230,7 +230,7 @@ impl<'a> ProjectionInputs<'a> {
     fn lamp_error(&self, gaussian: &Gaussian, d_color: DVec3, color: DVec3) -> [f64; 2] {
         let Some(lamp) = &self.lamp else { return [0.0; 2] };
         let point = self.camera.view(gaussian.mean);
-        let d_log_factor = d_color.abs().dot(color.abs());
+        let d_log_factor = d_color.abs().dot(color.abs() + lamp.above_black(DVec3::ZERO).abs());
         [d_log_factor * lamp.point_gradient_error(point), lamp.factor_error(point)]
     }
 

@@ -170,7 +170,8 @@ pub struct ViewScore {
     pub aligned: Option<Scores>,
     /// Scores at the view's own exposure, if it is known.
     pub exposed: Option<Scores>,
-    /// Scores in the light of the lamp, against `lit/NAME.png`, if the model has a lamp and the dataset the image.
+    /// Scores in the light of the lamp, against `lit/NAME.png`, after the least-squares gain and bias of each channel;
+    /// if the model has a lamp and the dataset the image.
     pub lit: Option<Scores>,
     /// The view as a photograph against its own photograph, if requested: PSNR in dB, and by how many stops of linear
     /// light it is brighter.
@@ -302,9 +303,9 @@ impl ModelRenderer {
     /// # Errors
     /// The device is out of memory or lost.
     pub(crate) fn render_as(&mut self, view: &View, in_even_light: bool) -> Result<Rendered> {
-        self.renderer.set_even_light(in_even_light);
+        self.renderer.set_even_light(in_even_light.then_some(1.0))?;
         let rendered = self.render(view);
-        self.renderer.set_even_light(false);
+        self.renderer.set_even_light(None)?;
         rendered
     }
 
@@ -404,8 +405,8 @@ pub(crate) fn score_lit(
         let Some(view) = view.filter(|_| path.is_file()) else { continue };
         let (width, height) = (view.camera.width, view.camera.height);
         let target = quantized(&Image::load(&path)?.resized(width, height));
-        let render = quantized(render(view)?.output());
-        score.lit = Some(Scores::of_counted(&render, &target, view.mask.as_ref())?);
+        let compared = ScoredImages { view, render: quantized(render(view)?.output()), target };
+        score.lit = Some(compared.aligned()?);
     }
     Ok(())
 }
@@ -413,7 +414,8 @@ pub(crate) fn score_lit(
 /// Adds to `metrics.json` the scores in the light of the lamp, if there are any.
 pub(crate) fn add_lit(metrics: &mut Value, scored: &[ViewScore]) {
     if scored.iter().any(|view| view.lit.is_some()) {
-        let what = "in the light of the lamp at the camera, against the dataset's lit/";
+        let what = "in the light of the lamp at the camera, against the dataset's lit/, after the least-squares gain \
+                    and bias of each channel";
         metrics["lit_by_lamp"] = other_scores(what, scored, |view| view.lit);
     }
 }

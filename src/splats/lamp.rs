@@ -1,28 +1,27 @@
 //! A lamp that moves with the camera, on the host; `include/lamp.glsl` has its law.
 
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
 use crate::kernels::lamp::{
-    LAMP_AMBIENT, LAMP_EXPONENT, LAMP_FALLOFFS, LAMP_FARTHEST, LAMP_LARGEST_EXPONENT,
-    LAMP_LEAST_AMBIENT, LAMP_NEAREST, LAMP_NUMBERS, LAMP_REFERENCE_DISTANCE, LAMP_SLOPE, LAMP_STEP,
+    LAMP_AMBIENT, LAMP_BLACK, LAMP_EXPONENT, LAMP_FALLOFF_STEP, LAMP_FALLOFFS, LAMP_FARTHEST,
+    LAMP_GAIN, LAMP_LARGEST_EXPONENT, LAMP_LEAST_AMBIENT, LAMP_NEAREST, LAMP_NUMBERS,
+    LAMP_REFERENCE_DISTANCE, LAMP_SLOPE, LAMP_STEP,
 };
 use crate::{Error, Result};
 
 /// The largest magnitude of the number of a share that is 0 or 1, which no number is exactly.
 const FARTHEST_NUMBER: f64 = 12.0;
-/// The least falloff that can be learned from: its gradient is proportional to itself.
-const LEAST_FALLOFF: f64 = 0.02;
 
 /// A lamp that moves with the camera, in view space: x points right, y down, z forward.
 ///
 /// The light at a point at r from it, with d = |r| and u = 1 - cos of the angle between r and its axis, is
 ///
 /// ```text
-/// ambient + (1 - ambient) (reference_distance / d)^exponent exp(-falloffs[0] u - falloffs[1] u^2)
+/// gain (ambient + (1 - ambient) (reference_distance / d)^exponent exp(-falloffs[0] u - falloffs[1] u^2))
 /// ```
 ///
-/// and the colour of a Gaussian is multiplied by light^slope.
+/// and the colour of a Gaussian is black + (colour - black) light^slope.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Lamp {
@@ -36,10 +35,20 @@ pub struct Lamp {
     pub exponent: f64,
     /// Not negative.
     pub falloffs: [f64; 2],
-    /// The distance at which colours are as they are, on the axis; world units.
+    /// The distance at which the light on the axis is the gain; world units.
     pub reference_distance: f64,
-    /// The slope of the tone law: d ln target / d ln linear light.
+    /// The slope of the tone law: d ln(target - black) / d ln linear light.
     pub slope: f64,
+    /// The target of no light.
+    #[serde(default)]
+    pub black: f64,
+    /// The light on the axis at the reference distance, with that of evenly lit colours as its unit.
+    #[serde(default = "one")]
+    pub gain: f64,
+}
+
+fn one() -> f64 {
+    1.0
 }
 
 impl Lamp {
@@ -52,13 +61,15 @@ impl Lamp {
         falloffs: [0.0; 2],
         reference_distance: 1.0,
         slope: 1.0 / 2.2,
+        black: 0.0,
+        gain: 1.0,
     };
 
-    /// The numbers of the device with which the light is 1 everywhere.
-    pub(crate) fn even_numbers(&self) -> [f32; LAMP_NUMBERS as usize] {
+    /// The numbers of the device with which the light is this everywhere.
+    pub(crate) fn even_numbers(&self, light: f64) -> [f32; LAMP_NUMBERS as usize] {
         /// Sigmoid and softplus of this are 0 next to 1.
         const NONE: f32 = -80.0;
-        let mut numbers = self.numbers();
+        let mut numbers = Self { gain: light, ..*self }.numbers();
         numbers[LAMP_EXPONENT as usize..LAMP_REFERENCE_DISTANCE as usize].fill(NONE);
         numbers
     }
@@ -73,12 +84,24 @@ impl Lamp {
         let away = 1.0 - towards.dot(axis).clamp(-1.0, 1.0);
         let [first, second] = self.falloffs;
         let beam = distance.powf(-self.exponent) * (-(first + second * away) * away).exp();
-        self.ambient + (1.0 - self.ambient) * beam
+        self.gain * (self.ambient + (1.0 - self.ambient) * beam)
     }
 
     /// The factor on the colour of a Gaussian at a point in view space.
     pub fn factor(&self, point: DVec3) -> f64 {
         self.light(point).powf(self.slope)
+    }
+
+    /// The colour of a Gaussian without the light at a point in view space.
+    pub fn unlit(&self, color: Vec3, point: DVec3) -> Vec3 {
+        let black = self.black as f32;
+        black + (color - black) / self.factor(point) as f32
+    }
+
+    /// The same lamp with this light as the unit; colours then have the factor light^slope above black.
+    #[must_use]
+    pub(crate) fn with_unit(&self, light: f64) -> Self {
+        Self { gain: self.gain / light, ..*self }
     }
 
     /// The same lamp where a world unit is `scale` units.
@@ -97,7 +120,8 @@ impl Lamp {
     /// [`Error::Usage`], with the number.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn check(&self) -> Result<()> {
-        let Self { position, axis, ambient, exponent, falloffs, reference_distance, slope } = *self;
+        let Self { position, axis, ambient, exponent, falloffs, .. } = *self;
+        let Self { reference_distance, slope, black, gain, .. } = *self;
         let is_finite = position.iter().chain(&axis).all(|x| x.abs() < 1e9);
         for (name, is_valid, rule) in [
             ("position or axis", is_finite, "finite"),
@@ -110,6 +134,8 @@ impl Lamp {
                 "above 0 and finite",
             ),
             ("slope", slope > 0.0 && slope <= 8.0, "above 0 and at most 8"),
+            ("black", (-1.0..=1.0).contains(&black), "-1 to 1"),
+            ("gain", (1e-9..1e9).contains(&gain), "above 0 and finite"),
         ] {
             if !is_valid {
                 return Err(Error::Usage(format!("the lamp's {name} must be {rule}: {self:?}")));
@@ -129,11 +155,14 @@ impl Lamp {
         numbers[LAMP_AMBIENT as usize] = logit(ambient);
         numbers[LAMP_EXPONENT as usize] = logit(self.exponent / LAMP_LARGEST_EXPONENT);
         for (number, falloff) in numbers[LAMP_FALLOFFS as usize..].iter_mut().zip(self.falloffs) {
-            let falloff = falloff.max(LEAST_FALLOFF);
-            *number = falloff + (-(-falloff).exp()).ln_1p();
+            // The inverse of ln(1 + e^x).
+            let falloff = falloff / LAMP_FALLOFF_STEP;
+            *number = (falloff + (-(-falloff).exp()).ln_1p()).max(-FARTHEST_NUMBER);
         }
         numbers[LAMP_REFERENCE_DISTANCE as usize] = self.reference_distance;
         numbers[LAMP_SLOPE as usize] = self.slope;
+        numbers[LAMP_BLACK as usize] = self.black;
+        numbers[LAMP_GAIN as usize] = self.gain;
         numbers.map(|number| number as f32)
     }
 
@@ -148,9 +177,12 @@ impl Lamp {
             axis: [3, 4].map(|n| LAMP_STEP * at(n)),
             ambient: LAMP_LEAST_AMBIENT + (1.0 - LAMP_LEAST_AMBIENT) * share,
             exponent: LAMP_LARGEST_EXPONENT * sigmoid(at(LAMP_EXPONENT)),
-            falloffs: [LAMP_FALLOFFS, LAMP_FALLOFFS + 1].map(|n| softplus(at(n))),
+            falloffs: [LAMP_FALLOFFS, LAMP_FALLOFFS + 1]
+                .map(|n| LAMP_FALLOFF_STEP * softplus(at(n))),
             reference_distance,
             slope: at(LAMP_SLOPE),
+            black: at(LAMP_BLACK),
+            gain: at(LAMP_GAIN),
         }
     }
 }
@@ -211,7 +243,7 @@ mod tests {
         let bounds = Lamp { ambient: 0.0, exponent: 0.0, falloffs: [0.0; 2], ..own };
         let back = Lamp::of_numbers(&bounds.numbers());
         back.check().unwrap();
-        assert!(back.exponent < 1e-4 && back.ambient < 2e-4 && back.falloffs[0] < 0.021);
+        assert!(back.exponent < 1e-4 && back.ambient < 2e-4 && back.falloffs[0] < 1e-4);
     }
 
     #[test]

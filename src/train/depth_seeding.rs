@@ -125,7 +125,7 @@ impl Trainer {
             if let Some(lamp) = &lamp {
                 for sample in &mut own {
                     let in_view = camera.view_from_world.transform_point3(sample.position);
-                    sample.color /= lamp.factor(in_view) as f32;
+                    sample.color = lamp.unlit(sample.color, in_view);
                 }
             }
             depth_samples.extend(own);

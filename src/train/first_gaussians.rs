@@ -13,9 +13,10 @@ use crate::camera::{Camera, Patch, TrainingFrame};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
 use crate::networks::NetworkVariant;
-use crate::photographs::dataset::{Dataset, Point};
+use crate::photographs::dataset::{Dataset, Point, View};
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
+use crate::splats::lamp::Lamp;
 use crate::splats::scene::{COLOR_CHANNELS, Feature, Gaussians, Shape, init};
 use crate::{Error, Result};
 
@@ -45,7 +46,7 @@ impl Views {
     }
 
     /// One Gaussian for each point of the dataset, and for random points if there are few or none, with their colours
-    /// in the targets of the training views.
+    /// in the targets of the training views, without the light of the lamp, in world units.
     pub(super) fn initial_gaussians(
         &self,
         gpu: &Gpu,
@@ -53,6 +54,7 @@ impl Views {
         dataset: &Dataset,
         config: &TrainConfig,
         exposures: Option<&[Affine]>,
+        lamp: Option<&Lamp>,
     ) -> Result<Gaussians> {
         let frame = config.frame.unwrap_or_default();
         let points = self.points(dataset, config, &frame);
@@ -61,12 +63,24 @@ impl Views {
         let mut places = vec![None; dataset.views.len()];
         self.photographs().for_each(|view| places[view.index] = Some(view.place));
         let mut targets = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Targets);
-        let colors = init::colors_from_views(kept, &dataset.views, |index| {
+        let factor = |view: &View, point: &Point| {
+            let in_view = view.camera.view_from_world.transform_point3(point.position);
+            lamp.map_or(1.0, |lamp| lamp.factor(in_view) as f32)
+        };
+        let mut colors = init::colors_from_views(kept, &dataset.views, factor, |index| {
             let Some(place) = places[index] else { return Ok(None) };
             let target = targets.next(place)?;
             let exposure = exposures.and_then(|exposures| exposures.get(place));
-            Ok(Some(exposure.map_or_else(|| target.clone(), |own| own.inverse().applied(&target))))
+            let mut target =
+                exposure.map_or_else(|| target.clone(), |own| own.inverse().applied(&target));
+            if let Some(lamp) = lamp {
+                target.data.iter_mut().for_each(|value| *value -= lamp.black as f32);
+            }
+            Ok(Some(target))
         })?;
+        if let Some(lamp) = lamp {
+            colors.iter_mut().for_each(|color| *color += lamp.black as f32);
+        }
         let positions: Vec<DVec3> = kept.iter().map(|point| frame.framed(point.position)).collect();
         let seed = Stream::new(config.seed, streams::FEATURES).bits(0);
         let shape = Shape { sh_degree: config.sh_degree, features: config.model.features() };
@@ -76,9 +90,12 @@ impl Views {
             let low = if shape.features.illumination {
                 let mut photographs =
                     ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Photographs);
-                init::colors_from_views(kept, &dataset.views, |index| {
-                    places[index].map(|place| photographs.next(place)).transpose()
-                })?
+                init::colors_from_views(
+                    kept,
+                    &dataset.views,
+                    |_, _| 1.0,
+                    |index| places[index].map(|place| photographs.next(place)).transpose(),
+                )?
             } else {
                 vec![]
             };

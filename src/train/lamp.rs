@@ -2,6 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use glam::DVec3;
+
 use super::LampRates;
 use super::scene_light::SceneLight;
 use super::{OnOff, Optimizer, TrainConfig, Trainer};
@@ -16,6 +18,8 @@ use crate::splats::render::{DeviceLamp, Renderer};
 
 /// The most points whose distances are measured.
 const MAX_POINTS: usize = 20_000;
+/// The least falloff that learning begins from: near 0 its gradient is proportional to it.
+const LEAST_FALLOFF: f64 = 0.05;
 /// Of views that tell their exposures from a lamp: distances that differ by a tenth.
 const LEAST_SPREAD: f64 = 0.1;
 /// Fewer views show hardly any surface at two distances.
@@ -26,13 +30,22 @@ const FEWEST_VIEWS: usize = 3;
 pub(super) struct LampLearning {
     rates: LampRates,
     pub(super) moments: Moments,
+    /// Points that training views see, in view space and in units of the frame.
+    points: Vec<DVec3>,
 }
 
 impl LampLearning {
     /// # Errors
     /// The device is out of memory.
-    pub(super) fn new(gpu: &Gpu, rates: LampRates) -> Result<Self> {
-        Ok(Self { rates, moments: Moments::zeros(gpu, LAMP_WIDTH as usize)? })
+    pub(super) fn new(gpu: &Gpu, rates: LampRates, dataset: &Dataset, scale: f64) -> Result<Self> {
+        let points = in_views(dataset).into_values().flatten().map(|point| scale * point);
+        let moments = Moments::zeros(gpu, LAMP_WIDTH as usize)?;
+        Ok(Self { rates, moments, points: points.collect() })
+    }
+
+    /// The median of the light on the points that views see.
+    fn median_light(&self, lamp: &Lamp) -> f64 {
+        median(self.points.iter().map(|point| lamp.light(*point)).collect()).unwrap_or(1.0)
     }
 }
 
@@ -79,6 +92,10 @@ impl Optimizer {
         else {
             return Ok(());
         };
+        // The gradients of the first steps, whose colours are not settled, would be Adam's measure of later ones.
+        let Some(step) = step.checked_sub(learning.rates.after).filter(|&step| step > 0) else {
+            return Ok(());
+        };
         let DeviceLamp { numbers, gradients, .. } = lamp;
         let mut learned = LearnedLamp {
             numbers: numbers.slice_mut().range(0..LAMP_WIDTH as usize)?,
@@ -90,14 +107,24 @@ impl Optimizer {
 }
 
 impl Trainer {
-    /// The lamp as learned so far, in units of the dataset's world; `None` without one.
+    /// The lamp as learned so far, in units of the dataset's world, for the colours of [`Trainer::model`]; `None`
+    /// without one.
     ///
     /// # Errors
     /// The device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn lamp(&self) -> Result<Option<Lamp>> {
-        let lamp = self.renderer.lamp()?;
-        Ok(lamp.map(|lamp| lamp.scaled(1.0 / self.frame.scale)))
+        let own = self.renderer.lamp()?.zip(self.even_light()?);
+        Ok(own.map(|(lamp, light)| lamp.with_unit(light).scaled(1.0 / self.frame.scale)))
+    }
+
+    /// The light that evenly lit views have, with that of the colours in training as its unit; `None` without a lamp.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(super) fn even_light(&self) -> Result<Option<f64>> {
+        let own = self.renderer.lamp()?.zip(self.optimizer.lamp.as_ref());
+        Ok(own.map(|(lamp, learning)| learning.median_light(&lamp)))
     }
 }
 
@@ -120,22 +147,26 @@ pub(super) fn start(pseudo_gt: &PseudoGt, dataset: &Dataset, config: &TrainConfi
         );
     }
     let scale = config.frame.unwrap_or_default().scale;
-    let distances = distances(dataset);
+    let distances: Vec<Vec<f64>> = in_views(dataset)
+        .into_values()
+        .map(|points| points.iter().map(|point| point.length()).collect())
+        .collect();
     if config.exposure.learn == OnOff::On && spread(&distances) < LEAST_SPREAD {
         tracing::warn!(
             "all views are at about the same distance from what they show: exposures of views can take the lamp's \
              place; --exposure off leaves it the light"
         );
     }
-    let all = distances.into_values().flatten().collect();
+    let all = distances.into_iter().flatten().collect();
     let reference_distance = median(all).unwrap_or_else(|| config.extent_of(dataset));
-    let slope = SceneLight::of(&config.tone, dataset)?.slope(pseudo_gt)?;
+    let (black, slope) = SceneLight::of(&config.tone, dataset)?.encoding(pseudo_gt)?;
     let lamp = Lamp {
         ambient: config.lamp.ambient,
         exponent: config.lamp.exponent,
-        falloffs: [config.lamp.falloff, config.lamp.falloff_squared],
+        falloffs: [config.lamp.falloff, config.lamp.falloff_squared].map(|x| x.max(LEAST_FALLOFF)),
         reference_distance,
         slope,
+        black,
         ..Lamp::AT_CAMERA
     };
     tracing::info!(
@@ -144,9 +175,9 @@ pub(super) fn start(pseudo_gt: &PseudoGt, dataset: &Dataset, config: &TrainConfi
     Ok(lamp.scaled(scale))
 }
 
-/// The distances of points from the training cameras that triangulated them, by the index of the view; if the dataset
-/// does not list these, from those that see them.
-fn distances(dataset: &Dataset) -> BTreeMap<usize, Vec<f64>> {
+/// The points in view space of the training cameras that triangulated them, by the index of the view; if the dataset
+/// does not list these, of those that see them.
+fn in_views(dataset: &Dataset) -> BTreeMap<usize, Vec<DVec3>> {
     let Dataset { views, points, .. } = dataset;
     let has_tracks = points.iter().any(|point| !point.views.is_empty());
     let is_seen = |point: &Point, (index, view): (usize, &View)| match has_tracks {
@@ -154,20 +185,20 @@ fn distances(dataset: &Dataset) -> BTreeMap<usize, Vec<f64>> {
         false => view.camera.sees(point.position).is_some(),
     };
     let stride = points.len().div_ceil(MAX_POINTS).max(1);
-    let mut distances = BTreeMap::<usize, Vec<f64>>::new();
+    let mut in_views = BTreeMap::<usize, Vec<DVec3>>::new();
     for point in points.iter().step_by(stride) {
         let training = views.iter().enumerate().filter(|(_, view)| view.is_train());
         for (index, view) in training.filter(|own| is_seen(point, *own)) {
-            let distance = view.camera.center().distance(point.position);
-            distances.entry(index).or_default().push(distance);
+            let in_view = view.camera.view_from_world.transform_point3(point.position);
+            in_views.entry(index).or_default().push(in_view);
         }
     }
-    distances
+    in_views
 }
 
 /// The standard deviation of the logarithm of the views' median distances.
-fn spread(distances: &BTreeMap<usize, Vec<f64>>) -> f64 {
-    let own = distances.values().filter_map(|own| Some(median(own.clone())?.ln()));
+fn spread(distances: &[Vec<f64>]) -> f64 {
+    let own = distances.iter().filter_map(|own| Some(median(own.clone())?.ln()));
     let own: Vec<f64> = own.collect();
     let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
     let middle = mean(&own);

@@ -4,7 +4,7 @@ use super::measuring::{measured, measured_of, recorded};
 use crate::Result;
 use crate::camera::Camera;
 use crate::photographs::dataset::{Dataset, View};
-use crate::photographs::image::{Image, linear_from_srgb};
+use crate::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
     InverseTone, LuminanceHistogram, MeasuredPhotograph, SceneTone, Statistics, ToneSettings,
@@ -66,28 +66,33 @@ impl SceneLight {
         InverseTone::new(&self.settings, &mapping.parameters)
     }
 
-    /// The slope of the tone law for all photographs together, at the median of their targets: d ln target / d ln light
-    /// of grey, light being linear.
+    /// The target of no light, and the slope of the tone law around the median of the targets, for all photographs
+    /// together: d ln(target - black) / d ln light of grey, light being linear.
     ///
     /// # Errors
     /// The device is out of memory or lost.
-    pub(super) fn slope(&self, pseudo_gt: &PseudoGt) -> Result<f64> {
-        /// The difference of the values of two photographs of grey, in units of either.
-        const STEP: f32 = 0.02;
+    pub(super) fn encoding(&self, pseudo_gt: &PseudoGt) -> Result<(f64, f64)> {
+        /// Of the light between which the slope is taken: a stop below and above.
+        const STOP: f32 = 2.0;
         /// Of a law that is flat there, and of one that is steeper than light.
         const BOUNDS: [f64; 2] = [0.1, 2.0];
         let luminance = &self.together.luminance;
         // A curve does not decrease: the median of its values is the value of the median.
         let median = Some(luminance.quantile(0.5)).filter(|&median| median > 0.0);
         let median = median.unwrap_or_else(|| luminance.mean()) as f32;
-        let values = [median * (1.0 - STEP), median * (1.0 + STEP)];
-        let grey = Image { width: 2, height: 1, data: values.repeat(3) };
+        let light = linear_from_srgb(median);
+        let lights = [light / STOP, light * STOP];
+        let [dim, bright] = lights.map(srgb_from_linear);
+        let grey = Image { width: 3, height: 1, data: [0.0, dim, bright].repeat(3) };
         let mapping = self.settings.tone_mapping(&self.scene, &self.together);
         let target = pseudo_gt.tone_mapped(&grey, &mapping)?.data;
-        let rise = |values: [f32; 2]| f64::from(values[1] / values[0]).ln();
-        let slope = rise([target[0], target[1]]) / rise(values.map(linear_from_srgb));
+        let rise = |[dim, bright]: [f32; 2]| f64::from(bright / dim).ln();
+        let above = [target[1], target[2]].map(|value| value - target[0]);
+        let slope = rise(above) / rise(lights);
         let [least, most] = BOUNDS;
-        Ok(if slope.is_finite() { slope.clamp(least, most) } else { Lamp::AT_CAMERA.slope })
+        let slope =
+            if slope.is_finite() { slope.clamp(least, most) } else { Lamp::AT_CAMERA.slope };
+        Ok((target[0].into(), slope))
     }
 
     /// The inverse for a camera, at the exposure of the photographs around it: all cameras share one unit of light, as

@@ -139,11 +139,22 @@ impl Trainer {
             tracing::info!("{}", scene.reason());
         }
         config.model.log_parts(&sizes);
+        let lamp =
+            config.model.lamp.then(|| lamp::start(&pseudo_gt, dataset, &config)).transpose()?;
         let starts = views.exposures(&pseudo_gt, dataset, &scene, &config)?;
         let gaussians = match &initial.gaussians {
             Some(gaussians) => given(gaussians, &config)?,
             None => {
-                views.initial_gaussians(gpu, &pseudo_gt, dataset, &config, starts.as_deref())?
+                let lamp = lamp.map(|lamp| lamp.scaled(1.0 / frame.scale));
+                let exposures = starts.as_deref();
+                views.initial_gaussians(
+                    gpu,
+                    &pseudo_gt,
+                    dataset,
+                    &config,
+                    exposures,
+                    lamp.as_ref(),
+                )?
             }
         };
         views.warn_of_empty_views(&gaussians);
@@ -156,8 +167,6 @@ impl Trainer {
         if let Some(exposures) = &mut exposures {
             sizes.iter().try_for_each(|&size| exposures.reserve(size))?;
         }
-        let lamp =
-            config.model.lamp.then(|| lamp::start(&pseudo_gt, dataset, &config)).transpose()?;
         dataset.views.iter().filter_map(|view| view.original.as_ref()).for_each(Original::release);
         let (Kernels { mut renderer, mut losses, adam, finite, floor, densifier }, fingerprint) =
             beside.join().unwrap_or_else(|panic| resume_unwind(panic))?;
@@ -186,7 +195,9 @@ impl Trainer {
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MAX_STEPS as usize)?,
         };
-        let learning = lamp.map(|_| LampLearning::new(gpu, config.lamp.rates)).transpose()?;
+        let learning = lamp
+            .map(|_| LampLearning::new(gpu, config.lamp.rates, dataset, frame.scale))
+            .transpose()?;
         let degree = initial.context.as_ref().map_or(0, Gaussians::sh_degree_in_use);
         let degree = degree.max(first_sh_degree(&config));
         let mut trainer = Self {

@@ -171,7 +171,7 @@ impl<'a> Chain<'a> {
                 project_gaussian_backward(&camera, degree, antialiased, &gaussian, own, &d_splat);
             if let Some(Lit { lamp, color }) = lit {
                 let share = lamp.gradient(camera.view(gaussian.mean));
-                let d_log_factor = d_splat.color.dot(color);
+                let d_log_factor = d_splat.color.dot(lamp.above_black(color));
                 (results.lamp.iter_mut().zip(share)).for_each(|(sum, d)| *sum += d_log_factor * d);
             }
             planes.store(&d, i, |at, value| results.gradient[at] = value);

@@ -198,6 +198,14 @@ impl Setup {
         rendered.download()
     }
 
+    /// The render with these numbers of its lamp.
+    pub(crate) fn render_lit(&self, numbers: &[f32]) -> Rendered<'_> {
+        let mut rendered = Rendered::new(self);
+        rendered.renderer.set_lamp_numbers(numbers).unwrap();
+        rendered.forward();
+        rendered.download()
+    }
+
     /// The render and the status, with memory for this number of intersections, sufficient or not.
     pub(crate) fn render_within(&self, capacity: u32) -> (Rendered<'_>, Status) {
         let mut rendered = Rendered::new(self);
@@ -335,6 +343,8 @@ pub(crate) fn lamp() -> Lamp {
         falloffs: [3.0, 0.5],
         reference_distance: 2.0,
         slope: 0.45,
+        black: 0.07,
+        gain: 1.2,
     }
 }
 

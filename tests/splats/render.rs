@@ -14,12 +14,13 @@ use nightsplat::kernels::splat::ALPHA_MIN;
 use nightsplat::kernels::status::{STATUS_NOT_FINITE, STATUS_OVERFLOWED};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::reference::splat::{Splat, splat_columns};
+use nightsplat::splats::lamp::Lamp;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{RenderSettings, Renderer, Status};
 use nightsplat::splats::scene::{Attribute, Features, Gaussians, Shape};
 
 use crate::common::chain::Chain;
-use crate::common::setup::{Rendered, Setup, features, tile_of};
+use crate::common::setup::{Rendered, Setup, features, lamp, tile_of};
 use crate::common::{Random, assert_close, fixture, safetensors, shared};
 
 const SIZE: [u32; 2] = [50, 40];
@@ -132,6 +133,37 @@ fn extreme_gaussians_stay_finite() {
     let Rendered { render, transmittances, .. } = rendered;
     let all = [render, transmittances, gradients.parameters, gradients.grad_norm_sums].concat();
     assert!(all.iter().all(|value| value.is_finite()));
+}
+
+/// In units of a lamp: at it, next to it, far from it, and out of its narrow beam without ambient light.
+#[test]
+fn lit_colors_stay_finite_at_the_lamp_and_far_away() {
+    let mut setup = Setup::new(5, SIZE, 1, 5);
+    let base = plain(&setup, 3.0);
+    let camera = setup.camera();
+    let in_view = camera.view(base.mean);
+    let lamp = Lamp { position: in_view.to_array(), reference_distance: 1e-6, ..lamp() };
+    for (i, offset) in [0.0, 1e-30, 1e-3, 0.1].into_iter().enumerate() {
+        let mean = base.mean + DVec3::new(offset, 0.0, 0.0);
+        setup.set(i, &Gaussian { mean, ..base.clone() });
+    }
+    let far = setup.at_pixel(camera.principal_point, 1e20);
+    setup.set(4, &Gaussian { mean: far, log_scale: DVec3::splat(12.0), ..base });
+    setup.settings.lamp = Some(lamp);
+    let numbers = lamp.numbers();
+    let mut narrow = numbers;
+    // Before their functions: hardly any ambient light, the largest exponent, a beam as narrow as a number allows.
+    (narrow[5], narrow[6], narrow[7], narrow[8]) = (-200.0, 200.0, 1e6, 1e6);
+    (narrow[3], narrow[4]) = (4e3, -4e3);
+    let mut wide = numbers;
+    (wide[5], wide[6], wide[7], wide[8]) = (200.0, -200.0, -200.0, -200.0);
+    for numbers in [numbers, narrow, wide] {
+        let mut rendered = setup.render_lit(&numbers);
+        let gradients = rendered.backward(&vec![1.0; rendered.render.len()]);
+        let of_lamp = gpu().read(rendered.renderer.lamp_gradients().unwrap()).unwrap();
+        let all = [&rendered.render[..], &gradients.parameters, &of_lamp].concat();
+        assert!(all.iter().all(|value| value.is_finite()), "{numbers:?}: {of_lamp:?}");
+    }
 }
 
 #[test]

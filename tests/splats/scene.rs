@@ -296,7 +296,7 @@ mod colors {
     }
 
     fn colors(points: &[Point], views: &[View], targets: &[Image]) -> Vec<Vec3> {
-        init::colors_from_views(points, views, |view| Ok(targets.get(view))).unwrap()
+        init::colors_from_views(points, views, |_, _| 1.0, |view| Ok(targets.get(view))).unwrap()
     }
 
     #[test]
@@ -349,7 +349,7 @@ mod colors {
     fn a_target_that_fails_is_reported() {
         let views = [view(Split::Train, DVec3::ZERO)];
         let failing = |_| Err::<Option<Image>, _>(nightsplat::Error::Usage("no target".into()));
-        assert!(init::colors_from_views(&[], &views, failing).is_err());
+        assert!(init::colors_from_views(&[], &views, |_, _| 1.0, failing).is_err());
     }
 }
 

@@ -11,6 +11,7 @@ mod diagnose;
 mod few_points;
 mod freeze;
 mod holes;
+mod lamp;
 mod lamp_diagnosis;
 mod parts;
 mod patches;

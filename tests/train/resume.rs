@@ -61,7 +61,7 @@ fn a_restored_run_continues_bit_for_bit() {
     let folder = tempfile::tempdir().unwrap();
     make_set(folder.path());
     let gpu = gpu();
-    for parts in [&[][..], &[Part::Denoiser, Part::Tonemapper, Part::Structure]] {
+    for parts in [&[][..], &[Part::Denoiser, Part::Tonemapper, Part::Structure, Part::Lamp]] {
         let config = config(parts);
         let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
         let new = || Trainer::new(&gpu, config.clone(), &dataset).unwrap();

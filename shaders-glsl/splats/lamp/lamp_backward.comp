@@ -9,7 +9,7 @@
 
 //! Lamp backward: the sums of the gradients of the lamp's numbers over chunks of Gaussians, after `project_backward`.
 //!
-//! The gradient of ln factor is that of the lit colour times the lit colour; `project_backward` has written SH_C0
+//! The gradient of ln factor is that of the lit colour times the lit colour above black; `project_backward` has written SH_C0
 //! factor times that of the lit colour, as the gradient of the coefficients of degree 0. It is 0 for a Gaussian that the
 //! view does not show. A subgroup sums `CHUNK` Gaussians in a fixed order: the partition of a sum does not depend on the
 //! device.
@@ -46,7 +46,7 @@ void main() {
         if (d_dc == vec3(0.0)) continue;
         vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
         LampPoint at = lamp_at(own, cameras[camera_index].view_from_world * vec4(mean, 1.0));
-        float d = dot(d_dc, colors[COLOR_VECTORS * i].rgb) / (SH_C0 * lamp_factor(own, at));
+        float d = dot(d_dc, colors[COLOR_VECTORS * i].rgb - own.black) / (SH_C0 * lamp_factor(own, at));
         float gradient[LAMP_WIDTH];
         lamp_gradient(own, at, gradient);
         [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) sums[n] += d * gradient[n];

@@ -14,7 +14,8 @@
 //! definite by construction, and its determinant is |U0 x U1|^2 + 0.3 trace(U U^T) + 0.09, which cannot cancel.
 //! Compensation multiplies the opacity by the square root of det(U U^T) / det(cov2d), so that dilation does not add
 //! light (Yu et al. 2024, Mip-Splatting, section 5.2). Colour is max(SH + 0.5, 0), what every viewer shows, or the
-//! bare SH sum of LITA-GS, times the factor of the lamp (include/lamp.glsl); features are taken as they are. The last channel can be the depth in the view. A culled
+//! bare SH sum of LITA-GS, in the light of the lamp (include/lamp.glsl) before it is clamped; features are taken as
+//! they are. The last channel can be the depth in the view. A culled
 //! Gaussian gets the last depth key and covers no tile.
 
 layout(local_size_x = 64) in;
@@ -67,7 +68,12 @@ vec3 sh_color(uint i, vec3 direction) {
         if (k < sh_count(SH_DEGREE) && k < sh_count(sh_degree)) color += basis[k] * rest_coefficient(i, k);
     }
     if (RAW_COLORS) return color;
-    return max(color + 0.5, vec3(0.0));
+    return color + 0.5;
+}
+
+vec3 shown(vec3 color) {
+    if (RAW_COLORS) return color;
+    return max(color, vec3(0.0));
 }
 
 void main() {
@@ -118,8 +124,9 @@ void main() {
     vec3 rgb = sh_color(i, normalize(offset * finite_scale(length(offset))));
     if (LAMP) {
         Lamp own = load_lamp();
-        rgb *= lamp_factor(own, lamp_at(own, mean_in_view));
+        rgb = own.black + (rgb - own.black) * lamp_factor(own, lamp_at(own, mean_in_view));
     }
+    rgb = shown(rgb);
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
     [[unroll]] for (uint k = 0; k < COLOR_VECTORS; k++) {
         vec4 four = vec4(0);

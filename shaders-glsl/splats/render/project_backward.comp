@@ -194,7 +194,7 @@ void main() {
     if (LAMP) {
         Lamp own = load_lamp();
         LampPoint at = lamp_at(own, mean_in_view);
-        d_mean_in_view += dot(d_color, color) * lamp_point_gradient(own, at);
+        d_mean_in_view += dot(d_color, color - own.black) * lamp_point_gradient(own, at);
         d_color *= lamp_factor(own, at);
     }
     vec3 offset = offset_from_camera(mean, camera.view_from_world);

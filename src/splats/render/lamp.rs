@@ -52,7 +52,7 @@ impl DeviceLamp {
         Ok(Self {
             numbers: gpu.buffer("lamp", &lamp.numbers())?,
             gradients: gpu.zeros("lamp_gradients", if backward.is_some() { WIDTH } else { 0 })?,
-            even: gpu.buffer("even_light", &lamp.even_numbers())?,
+            even: gpu.buffer("even_light", &lamp.even_numbers(1.0))?,
             is_even: false,
             backward,
         })
@@ -112,12 +112,26 @@ impl Renderer {
         self.lamp.as_ref().map(|lamp| &lamp.gradients)
     }
 
-    /// Lights the colours evenly from now on, each Gaussian in its own colour, or by the lamp again.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn set_even_light(&mut self, is_even: bool) {
-        if let Some(lamp) = &mut self.lamp {
-            lamp.is_even = is_even;
-        }
+    /// Replaces the numbers of the lamp on the device, (`LAMP_NUMBERS`).
+    ///
+    /// # Errors
+    /// The device was lost.
+    #[cfg(feature = "testing")]
+    pub fn set_lamp_numbers(&mut self, numbers: &[f32]) -> Result<()> {
+        let Some(lamp) = &mut self.lamp else { return Ok(()) };
+        self.gpu.write(&mut lamp.numbers, numbers)
+    }
+
+    /// Lights the colours evenly by this light from now on, where 1 shows each Gaussian in its own colour; `None`: by
+    /// the lamp again.
+    ///
+    /// # Errors
+    /// The device was lost.
+    pub(crate) fn set_even_light(&mut self, light: Option<f64>) -> Result<()> {
+        let Some(lamp) = &mut self.lamp else { return Ok(()) };
+        lamp.is_even = light.is_some();
+        let Some((light, own)) = light.zip(self.settings.lamp) else { return Ok(()) };
+        self.gpu.write(&mut lamp.even, &own.even_numbers(light))
     }
 
     /// The lamp, and the status words.

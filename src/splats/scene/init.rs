@@ -233,7 +233,8 @@ fn radius(cameras: &[Camera]) -> f64 {
 ///
 /// A point is seen by the training views of its track; without a track, by the training views that it projects into, of
 /// [`MAX_VIEWS`] that cover the scene (`Camera::covering`). A point that none of them sees gets the mean grey of the
-/// targets. `target` returns the target of a view (an index into `views`), or `None`; it is called once per training
+/// targets. `factor` is that of the light of a view on a colour at a point: the colours are those in even light, by
+/// least squares. `target` returns the target of a view (an index into `views`), or `None`; it is called once per training
 /// view, in order, so it may compute.
 ///
 /// The time is proportional to the pixels of the views and the length of all tracks; a point without a track counts as
@@ -244,6 +245,7 @@ fn radius(cameras: &[Camera]) -> f64 {
 pub fn colors_from_views<I: Borrow<Image>>(
     points: &[Point],
     views: &[View],
+    factor: impl Fn(&View, &Point) -> f32 + Sync,
     mut target: impl FnMut(usize) -> Result<Option<I>>,
 ) -> Result<Vec<Vec3>> {
     let candidates = Candidates::of(points, views);
@@ -252,15 +254,16 @@ pub fn colors_from_views<I: Borrow<Image>>(
     for (index, view) in views.iter().enumerate().filter(|(_, view)| view.split == Split::Train) {
         let Some(target) = target(index)? else { continue };
         let target = target.borrow();
-        grey.add(mean_grey(&view.counted(target)));
-        let color = |&point: &u32| {
-            let pixel = shown(view, &points[point as usize])?;
-            Some((point, bilinear(target, pixel)))
+        grey.add(mean_grey(&view.counted(target)), 1.0);
+        let color = |&index: &u32| {
+            let point = &points[index as usize];
+            let pixel = shown(view, point)?;
+            Some((index, bilinear(target, pixel), factor(view, point)))
         };
         let [tracked, untracked] = candidates.of_view(index);
         let own = tracked.par_iter().chain(untracked).filter_map(color);
-        for (point, color) in own.collect::<Vec<_>>() {
-            colors[point as usize].add(color);
+        for (point, color, factor) in own.collect::<Vec<_>>() {
+            colors[point as usize].add(color, factor);
         }
     }
     let grey = grey.value().unwrap_or(Vec3::splat(0.5));
@@ -328,21 +331,21 @@ impl Candidates {
     }
 }
 
-/// A running mean of colours.
+/// A running mean of colours in lights whose factors are known: the sums of factor times colour and of squared factors.
 #[derive(Clone, Copy, Default)]
 struct Mean {
     sum: Vec3,
-    count: u32,
+    weight: f32,
 }
 
 impl Mean {
-    fn add(&mut self, color: Vec3) {
-        self.sum += color;
-        self.count += 1;
+    fn add(&mut self, color: Vec3, factor: f32) {
+        self.sum += factor * color;
+        self.weight += factor * factor;
     }
 
     fn value(self) -> Option<Vec3> {
-        (self.count > 0).then(|| self.sum / self.count as f32)
+        (self.weight > 0.0).then(|| self.sum / self.weight)
     }
 }
 

@@ -31,11 +31,13 @@ settings! {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LampRates {
     /// Adam's rate of the lamp's numbers at the start.
-    initial: f64 = 0.02 => Rule::POSITIVE;
+    initial: f64 = 0.03 => Rule::POSITIVE;
     /// Adam's rate of the lamp's numbers from the end of its exponential decay on.
-    last: f64 = 0.002 => Rule::POSITIVE;
+    last: f64 = 0.003 => Rule::POSITIVE;
     /// The steps of the decay.
     steps: u64 = 1000 => Rule::COUNT, in "steps";
+    /// The steps before the first one that changes the lamp, in which colours settle.
+    after: u64 = 100 => Rule::COUNT, in "steps";
 }
 }
 

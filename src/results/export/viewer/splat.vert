@@ -16,6 +16,7 @@ uniform bool isLit;   // by a lamp at the camera
 uniform vec3 lampPosition, lampAxis;  // in the view
 uniform vec2 lampFalloffs;
 uniform vec4 lampLight;  // ambient, exponent, reference distance, slope of the tone law
+uniform vec2 lampTone;  // the target of no light; the light on the axis at the reference distance
 
 in vec2 corner;
 in uint id;
@@ -38,7 +39,7 @@ vec3 shaded(int first, vec3 direction) {
     sh_basis(degree, direction, basis);
     vec3 sum = vec3(0.5);
     for (uint k = 0u; k < sh_count(degree); k++) sum += basis[k] * texel(harmonics, first + int(k)).rgb;
-    return max(sum, vec3(0.0));
+    return sum;
 }
 
 // The law of include/lamp.glsl at a point in the view.
@@ -47,7 +48,7 @@ float lampFactor(vec3 point) {
     float d = clamp(length(offset), LAMP_NEAREST, LAMP_FARTHEST);
     float away = 1.0 - clamp(dot(offset / d, lampAxis), -1.0, 1.0);
     float beam = exp(-lampLight.y * log(d) - (lampFalloffs.x + lampFalloffs.y * away) * away);
-    return pow(lampLight.x + (1.0 - lampLight.x) * beam, lampLight.w);
+    return pow(lampTone.y * (lampLight.x + (1.0 - lampLight.x) * beam), lampLight.w);
 }
 
 void main() {
@@ -78,7 +79,8 @@ void main() {
     fromMean = corner * reach;
     vec2 pixel = focal * mean.xy / mean.z + principalPoint + fromMean;
     depth = mean.z;
-    color = vec4(shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye)), opacity);
-    if (isLit) color.rgb *= lampFactor(mean);
+    vec3 rgb = shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye));
+    if (isLit) rgb = lampTone.x + (rgb - lampTone.x) * lampFactor(mean);
+    color = vec4(max(rgb, vec3(0.0)), opacity);
     gl_Position = vec4((pixel + offset) * scale + vec2(-1.0, 1.0), 0.0, 1.0);
 }

@@ -1,0 +1,280 @@
+//! A lamp that moves with the camera is told from the surfaces that it lights.
+
+use std::fs;
+use std::path::Path;
+
+use glam::{DAffine3, DMat3, DVec2, DVec3, Vec3};
+use nightsplat::base::random::Stream;
+use nightsplat::camera::{Camera, CameraModel};
+use nightsplat::gpu::testing::gpu;
+use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::{Dataset, Point, Split, View};
+use nightsplat::photographs::image::Image;
+use nightsplat::photographs::metrics::Scores;
+use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::splats::lamp::Lamp;
+use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
+use nightsplat::splats::scene::Gaussians;
+use nightsplat::splats::scene::init::Initialization;
+use nightsplat::train::{Part, TrainConfig, Trainer};
+use serde_json::Value;
+
+use crate::common::command::{refused, run, succeed};
+use crate::common::train::advance;
+
+/// The sides of a gallery along z, and half its length.
+const HALF: DVec3 = DVec3::new(1.0, 0.8, 4.0);
+const SIZE: [u32; 2] = [64, 48];
+const VIEWS: usize = 24;
+
+fn lamp() -> Lamp {
+    Lamp {
+        position: [0.1, -0.1, 0.0],
+        axis: [0.05, 0.0],
+        ambient: 0.01,
+        exponent: 2.0,
+        falloffs: [4.0, 1.0],
+        reference_distance: 1.5,
+        ..Lamp::AT_CAMERA
+    }
+}
+
+/// Positions and colours on the walls of the gallery.
+fn walls() -> (Vec<DVec3>, Vec<Vec3>) {
+    let draws = Stream::new(7, 1);
+    let number = |i: u64, k: u64| draws.uniform(6 * i + k);
+    let place = |i: u64| {
+        let inside = DVec3::new(number(i, 0), number(i, 1), number(i, 2)) * 2.0 - 1.0;
+        let (wall, side) = ((number(i, 3) * 2.4) as usize, 2.0 * (i % 2) as f64 - 1.0);
+        let mut place = inside * HALF;
+        place[wall] = side * HALF[wall];
+        place
+    };
+    let places: Vec<DVec3> = (0..1500).map(place).collect();
+    let tint = |place: &DVec3| {
+        let wave = |at: f64| (0.55 + 0.35 * (3.0 * at).sin()) as f32;
+        Vec3::new(wave(place.x + place.z), wave(place.y - place.z), wave(place.x - place.y))
+    };
+    let colors = places.iter().map(tint).collect();
+    (places, colors)
+}
+
+/// Cameras along the gallery that look along it, one way or the other, and a bit aside.
+fn camera(view: usize) -> Camera {
+    let draws = Stream::new(9, 2);
+    let number = |k: u64| 2.0 * draws.uniform(4 * view as u64 + k) - 1.0;
+    let along = if view.is_multiple_of(2) { 0.0 } else { std::f64::consts::PI };
+    let place = DVec3::new(0.4 * number(0), 0.3 * number(1), 2.8 * number(2));
+    let turn = DMat3::from_rotation_y(along + 0.6 * number(3));
+    let rotation = turn.transpose();
+    Camera {
+        width: SIZE[0],
+        height: SIZE[1],
+        focal: DVec2::splat(44.0),
+        principal_point: DVec2::new(32.0, 24.0),
+        model: CameraModel::Pinhole,
+        view_from_world: DAffine3 { matrix3: rotation, translation: -(rotation * place) },
+    }
+}
+
+/// Photographs of the gallery in the light of the lamp, and the same views in even light.
+fn photographed() -> (Dataset, Vec<Image>) {
+    let (gpu, (places, colors)) = (gpu(), walls());
+    let start = Initialization { opacity: 0.95, scale: 1.0, ..Initialization::default() };
+    let gaussians = Gaussians::from_points(&places, &colors, 0, &start, 1).unwrap();
+    let on_device = gaussians.upload(&gpu).unwrap();
+    let render = |lamp: Option<Lamp>| -> Vec<Image> {
+        let settings = RenderSettings { shape: 0.into(), lamp, near: 0.05, ..Default::default() };
+        let mut renderer = Renderer::new(&gpu, settings).unwrap();
+        let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
+        let image = |view| {
+            let camera = camera(view);
+            renderer.reserve(gaussians.count, [&camera]).unwrap();
+            renderer.render_image(&on_device, &camera, &options).unwrap()
+        };
+        (0..VIEWS).map(image).collect()
+    };
+    let (even, lit) = (render(None), render(Some(lamp())));
+    let view = |(view, image): (usize, Image)| {
+        let split = if view % 6 == 0 { Split::Test } else { Split::Train };
+        View::new(&format!("{view:02}"), split, camera(view), Some(image))
+    };
+    let views: Vec<View> = lit.into_iter().enumerate().map(view).collect();
+    // Those that see a point are near it: the others see a wall before it.
+    let is_near = |view: &View, place: DVec3| view.camera.center().distance(place) < 3.0;
+    let seen = |place: DVec3| {
+        let sees = |(index, view): (usize, &View)| {
+            let is_seen = view.camera.sees(place).is_some() && is_near(view, place);
+            is_seen.then_some(index as u32)
+        };
+        views.iter().enumerate().filter_map(sees).collect()
+    };
+    let points = places.iter().map(|&position| Point { position, views: seen(position) });
+    let points = points.collect();
+    (Dataset { root: "gallery".into(), views, points, skipped: vec![] }, even)
+}
+
+fn config(parts: &[Part]) -> TrainConfig {
+    let mut config = TrainConfig {
+        steps: 700,
+        sh_degree: 1,
+        tone: ToneSettings::new(ToneCurve::None),
+        near: 0.02,
+        ..TrainConfig::bare()
+    };
+    config.model.set_parts(parts);
+    // As a diagnosis would find it, roughly.
+    (config.lamp.exponent, config.lamp.falloff, config.lamp.ambient) = (1.7, 3.0, 0.03);
+    config
+}
+
+/// Mean PSNR of the test views in the light of the photographs, and evenly lit, there with the gain of least squares for
+/// all: the brightness of even light is a matter of definition.
+fn scores(trainer: &mut Trainer, dataset: &Dataset, even: &[Image]) -> [f64; 2] {
+    let (mut sums, mut count) = ([0.0; 2], 0.0);
+    let mut products = [0.0_f32; 2];
+    for (view, even) in dataset.views.iter().zip(even).filter(|(view, _)| view.is_train()) {
+        let own = trainer.render_in_even_light(&view.camera).unwrap().colors;
+        for (own, even) in own.data.iter().zip(&even.data) {
+            products = [products[0] + own * even, products[1] + own * own];
+        }
+    }
+    let gain = products[0] / products[1];
+    for (view, even) in dataset.views.iter().zip(even).filter(|(view, _)| !view.is_train()) {
+        let lit = trainer.render(&view.camera).unwrap().colors;
+        let evenly = trainer.render_in_even_light(&view.camera).unwrap().colors;
+        let psnr = |a: &Image, b: &Image| Scores::of(a, b).unwrap().psnr;
+        sums[0] += psnr(&lit, view.image.as_ref().unwrap());
+        sums[1] +=
+            psnr(&Image { data: evenly.data.iter().map(|x| gain * x).collect(), ..evenly }, even);
+        count += 1.0;
+    }
+    sums.map(|sum| sum / count)
+}
+
+fn trained(parts: &[Part], dataset: &Dataset) -> Trainer {
+    let config = config(parts);
+    let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
+    advance(&mut trainer, config.steps);
+    trainer
+}
+
+#[test]
+fn a_lamp_is_told_from_the_surfaces_that_it_lights() {
+    let (dataset, even) = photographed();
+    let mut without = trained(&[], &dataset);
+    let plain = scores(&mut without, &dataset, &even);
+    let mut with = trained(&[Part::Lamp], &dataset);
+    let [lit, evenly] = scores(&mut with, &dataset, &even);
+    assert!(lit > 24.0 && evenly > 20.0, "lit {lit:.2} dB, evenly lit {evenly:.2} dB");
+    assert!(lit > plain[0] + 2.0, "without a lamp {:.2} dB", plain[0]);
+    assert_eq!(without.lamp().unwrap(), None);
+    // The law along the axis and across it, up to the reference distances of both and the slope of the tone law.
+    let own = with.lamp().unwrap().unwrap();
+    let ratio = |lamp: &Lamp, point: DVec3| lamp.factor(point) / lamp.factor(1.5 * DVec3::Z);
+    for point in [DVec3::Z, 3.0 * DVec3::Z, DVec3::new(0.7, 0.0, 1.2)] {
+        let [own, planted] = [&own, &lamp()].map(|lamp| ratio(lamp, point));
+        assert!((own / planted).ln().abs() < 0.2, "{point}: {own:.3}, planted {planted:.3}");
+    }
+}
+
+#[test]
+fn a_lamp_that_is_not_there_does_not_hurt() {
+    let folder = tempfile::tempdir().unwrap();
+    let options =
+        SyntheticOptions { views: 17, width: 80, height: 60, seed: 4, ..Default::default() };
+    synthetic::write(folder.path(), &options).unwrap();
+    let score = |parts: &[Part]| {
+        let mut config = TrainConfig { steps: 600, ..TrainConfig::bare() };
+        config.tone.scene_statistics = true;
+        config.model.set_parts(parts);
+        let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
+        let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
+        advance(&mut trainer, config.steps);
+        let psnr = |view: &View| {
+            let shown = trainer.render(&view.camera).unwrap().colors;
+            Scores::of(&shown, &view.loaded_reference().unwrap().unwrap()).unwrap().psnr
+        };
+        let scores: Vec<f64> = dataset.test_views().map(psnr).collect();
+        scores.iter().sum::<f64>() / scores.len() as f64
+    };
+    let [plain, lit] = [&[][..], &[Part::Lamp]].map(score);
+    assert!(lit > plain - 0.1, "without {plain:.2} dB, forced {lit:.2} dB");
+}
+
+fn metrics(run: &Path) -> Value {
+    serde_json::from_slice(&fs::read(run.join("metrics.json")).unwrap()).unwrap()
+}
+
+#[test]
+fn a_run_keeps_its_lamp_for_scores_and_for_a_flight_that_carries_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let [set, own] = ["set", "run"].map(|name| folder.path().join(name));
+    let options =
+        SyntheticOptions { views: 9, width: 40, height: 30, seed: 2, ..Default::default() };
+    synthetic::write(&set, &options).unwrap();
+    let [set_name, run_name] = [&set, &own].map(|path| path.display().to_string());
+    succeed(&format!(
+        "train {set_name} --parts lamp --steps 30 --out {run_name} --set lamp.ambient=0"
+    ));
+    let lamp: Value = serde_json::from_slice(&fs::read(own.join("lamp.json")).unwrap()).unwrap();
+    assert!(lamp["reference_distance"].as_f64().unwrap() > 0.1, "{lamp}");
+    let config = fs::read_to_string(own.join("config.toml")).unwrap();
+    let gain = config.lines().find(|line| line.starts_with("scene_statistics")).unwrap();
+    assert!(gain.contains("true") && gain.contains("the part lamp"), "{gain}");
+
+    let eval = |extra: &str| -> Value {
+        serde_json::from_str(&succeed(&format!("eval {run_name} --json{extra}"))).unwrap()
+    };
+    let lit = eval("");
+    let psnr = |metrics: &Value| metrics["mean"]["psnr"].as_f64().unwrap();
+    assert!((psnr(&lit) - psnr(&metrics(&own))).abs() < 1e-3);
+    assert!(lit["lit_by_lamp"].is_null());
+    let [evenly, carried] = ["evenly", "carried"].map(|name| folder.path().join(name));
+    let out = evenly.display();
+    succeed(&format!("render {run_name} --split test --out {out}"));
+    let out = carried.display();
+    succeed(&format!("render {run_name} --split test --lamp --out {out}"));
+    let picture = |folder: &Path| fs::read(folder.join("000.png")).unwrap();
+    assert!(picture(&evenly) != picture(&carried));
+
+    // With its test views in the lamp's light, the references of a set are evenly lit.
+    fs::create_dir(set.join("lit")).unwrap();
+    for name in ["000.png", "008.png"] {
+        fs::copy(carried.join(name), set.join("lit").join(name)).unwrap();
+    }
+    let both = eval("");
+    assert!(both["mean"] != lit["mean"]);
+    let equal = &both["lit_by_lamp"]["mean"]["psnr"];
+    assert!(equal.is_null(), "equal images have no finite PSNR: {both:#}");
+    assert!(both["lit_by_lamp"]["mean"]["ssim"].as_f64().unwrap() > 0.999);
+
+    let without = folder.path().join("without");
+    let out = without.display();
+    succeed(&format!("train {set_name} --parts structure --steps 5 --out {out}"));
+    assert!(!without.join("lamp.json").exists());
+    let pictures = folder.path().join("none");
+    let flight = format!("render {out} --split test --lamp --out {}", pictures.display());
+    refused(&flight, 3, &["has no lamp", "leave out --lamp"]);
+    fs::write(own.join("lamp.json"), "{\"exponent\": 9}").unwrap();
+    refused(&format!("eval {run_name}"), 3, &["lamp.json", "is not a lamp"]);
+}
+
+#[test]
+fn a_lamp_that_cannot_be_told_from_something_else_is_warned_of() {
+    let folder = tempfile::tempdir().unwrap();
+    let options =
+        SyntheticOptions { views: 3, width: 40, height: 30, seed: 2, ..Default::default() };
+    synthetic::write(folder.path(), &options).unwrap();
+    let (set, out) = (folder.path().display(), folder.path().join("run"));
+    let out = out.display();
+    let command = format!(
+        "train {set} --parts lamp --exposure on --steps 2 --set tone.scene_statistics=false --out {out}"
+    );
+    let (_, said) = run(&command, 0);
+    for part in
+        ["2 training views do not tell a lamp", "a gain of its own", "exposures of views can take"]
+    {
+        assert!(said.contains(part), "no `{part}` in {said}");
+    }
+}
