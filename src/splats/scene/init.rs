@@ -411,9 +411,12 @@ mod tests {
         for count in [100, 300] {
             assert_eq!(pairs(count), 10 * 2 + 20 * MAX_VIEWS, "{count} views");
         }
-        let colors = colors_from_views(&points, &views(300), |index| {
-            Ok(Some(Image::from_fn(10, 10, |_, _| [index as f32; 3])))
-        });
+        let colors = colors_from_views(
+            &points,
+            &views(300),
+            |_, _| 1.0,
+            |index| Ok(Some(Image::from_fn(10, 10, |_, _| [index as f32; 3]))),
+        );
         let colors = colors.unwrap();
         assert_eq!(colors[0], Vec3::splat(3.5), "the mean over its track");
         assert!((colors[1].x - 149.5).abs() < 5.0, "the views cover the set: {}", colors[1].x);
