@@ -251,7 +251,7 @@ fn render_error(
     let project = |i| {
         let gaussian = planes.load(&gaussians.parameters, i);
         let RenderSettings { raw_colors, antialiased, .. } = settings;
-        let own = ProjectionSettings { near, sh_degree, raw_colors, antialiased };
+        let own = ProjectionSettings { near, sh_degree, raw_colors, antialiased, lamp: None };
         project_gaussian(&camera, own, &gaussian)
     };
     let mut seen: Vec<_> = (0..count).filter_map(project).collect();

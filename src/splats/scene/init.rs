@@ -232,7 +232,9 @@ fn radius(cameras: &[Camera]) -> f64 {
 /// The colour of each point: the mean of the targets of the training views that see it, RGB.
 ///
 /// A point is seen by the training views of its track; without a track, by the training views that it projects into,
-/// of [`MAX_VIEWS`] that cover the scene (`Camera::covering`). A point that none of them sees gets the mean grey of the targets.
+/// of [`MAX_VIEWS`] that cover the scene (`Camera::covering`). A point that none of them sees gets the mean grey of the
+/// targets.
+///
 /// `factor` is that of the light of a view on a colour at a point: the colours are those in even light, by least
 /// squares. `target` returns the target of a view (an index into `views`), or `None`; it is called once per training
 /// view, in order, so it may compute.
@@ -409,9 +411,12 @@ mod tests {
         for count in [100, 300] {
             assert_eq!(pairs(count), 10 * 2 + 20 * MAX_VIEWS, "{count} views");
         }
-        let colors = colors_from_views(&points, &views(300), |index| {
-            Ok(Some(Image::from_fn(10, 10, |_, _| [index as f32; 3])))
-        });
+        let colors = colors_from_views(
+            &points,
+            &views(300),
+            |_, _| 1.0,
+            |index| Ok(Some(Image::from_fn(10, 10, |_, _| [index as f32; 3]))),
+        );
         let colors = colors.unwrap();
         assert_eq!(colors[0], Vec3::splat(3.5), "the mean over its track");
         assert!((colors[1].x - 149.5).abs() < 5.0, "the views cover the set: {}", colors[1].x);

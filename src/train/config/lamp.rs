@@ -14,8 +14,8 @@ pub struct LampConfig {
     exponent: f64 = 2.0 => Rule::from_to(0.0, LAMP_LARGEST_EXPONENT);
     /// The light that does not move with the camera, as a share of all light on the axis at the reference distance.
     ambient: f64 = 0.05 => Rule::Number(Bound::Included(0.0), Bound::Excluded(1.0));
-    /// The fall of its light away from its axis: by exp(-falloff u - falloff_squared u^2), u being 1 - cos of the
-    /// angle.
+    /// The fall of its light away from its axis, with u = 1 - cos of the angle: by exp(-falloff u), and by the square
+    /// of u as well.
     falloff: f64 = 0.0 => Rule::from_to(0.0, 1000.0);
     /// The part of the fall with the square of u.
     falloff_squared: f64 = 0.0 => Rule::from_to(0.0, 1000.0);

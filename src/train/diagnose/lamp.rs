@@ -31,8 +31,12 @@ const FOLDS: usize = 4;
 /// This fraction of the residuals, the largest ones, does not count: edges, highlights and wrong points.
 const TRIMMED: f64 = 0.05;
 
-/// A lamp that moves with the camera, as the photographs' brightness at shared points shows it. Its light, relative to
-/// that on its axis at `d_ref`, is ambient + (1 - ambient) (d_ref / d)^exponent exp(-falloff[0] u - falloff[1] u^2).
+/// A lamp that moves with the camera, as the photographs' brightness at shared points shows it. Its light at a distance
+/// d, relative to that on its axis at `d_ref`, is
+///
+/// ```text
+/// ambient + (1 - ambient) (d_ref / d)^exponent exp(-falloff[0] u - falloff[1] u^2)
+/// ```
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct LampDiagnosis {
     /// Of the distance; 2 for a small lamp.
@@ -82,7 +86,7 @@ impl LampDiagnosis {
             "distance and angle to the camera explain {:.2} stops or {:.0} % beyond exposures (thresholds {MIN_STOPS}, \
              {:.0} %), distance {:.2} (threshold {MIN_DISTANCE_STOPS}), exponent {:.1} (threshold {MIN_EXPONENT})",
             self.stops,
-            100.0 * self.share(),
+            100.0 * self.share().max(0.0),
             100.0 * MIN_SHARE,
             self.distance_stops,
             self.exponent
