@@ -9,10 +9,10 @@
 
 //! Lamp backward: the sums of the gradients of the lamp's numbers over chunks of Gaussians, after `project_backward`.
 //!
-//! The gradient of ln factor is that of the lit colour times the lit colour above black; `project_backward` has written SH_C0
-//! factor times that of the lit colour, as the gradient of the coefficients of degree 0. It is 0 for a Gaussian that the
-//! view does not show. A subgroup sums `CHUNK` Gaussians in a fixed order: the partition of a sum does not depend on the
-//! device.
+//! The gradient of ln factor is that of the lit colour times the lit colour above black; `project_backward` has
+//! written SH_C0 factor times that of the lit colour, as the gradient of the coefficients of degree 0. It is 0 for a
+//! Gaussian that the view does not show. A subgroup sums `CHUNK` Gaussians in a fixed order: the partition of a sum
+//! does not depend on the device.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;

@@ -18,7 +18,8 @@ layout(binding = 1) writeonly buffer Gradients { float gradients[]; };  // (LAMP
 void main() {
     uint number = WORKGROUP_INDEX;
     float sum = 0.0;
-    for (uint k = gl_SubgroupInvocationID; k < chunk_count; k += SUBGROUP_SIZE) sum += partials[LAMP_WIDTH * k + number];
+    for (uint k = gl_SubgroupInvocationID; k < chunk_count; k += SUBGROUP_SIZE)
+        sum += partials[LAMP_WIDTH * k + number];
     sum = subgroup_sum(sum);
     if (subgroupElect()) gradients[number] = sum;
 }
