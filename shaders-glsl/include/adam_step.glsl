@@ -20,18 +20,20 @@ vec4 clamp_gradient(vec4 gradient) {
     return mix(vec4(0.0), bounded, lessThan(abs(gradient), vec4(3e38)));
 }
 
+// `precise`: values stored in fewer bits must be rounded equally on every device.
+Moments updated(Moments moments, vec4 gradient) {
+    precise vec4 first = BETA1 * moments.first + (1.0 - BETA1) * gradient;
+    precise vec4 second = BETA2 * moments.second + (1.0 - BETA2) * gradient * gradient;
+    return Moments(first, second);
+}
+
 // Zero in place of a subnormal number, which some devices flush by themselves.
 vec4 flushed(vec4 x) {
     uvec4 bits = floatBitsToUint(x);
     return uintBitsToFloat(mix(uvec4(0), bits, notEqual(bits & 0x7f800000u, uvec4(0))));
 }
 
-// `precise`, and flushed: values stored in fewer bits must be rounded equally on every device.
-Moments updated(Moments moments, vec4 gradient) {
-    precise vec4 first = BETA1 * moments.first + (1.0 - BETA1) * gradient;
-    precise vec4 second = BETA2 * moments.second + (1.0 - BETA2) * gradient * gradient;
-    return Moments(flushed(first), flushed(second));
-}
+Moments flushed(Moments moments) { return Moments(flushed(moments.first), flushed(moments.second)); }
 
 // The decrement of a parameter.
 vec4 adam_step(Moments moments, vec4 rate, float second_correction) {

@@ -56,6 +56,7 @@ void main() {
     if (HALF_MOMENTS) moments = from_halves(both_moments[quad]);
     else moments = Moments(first_moments[quad], second_moments[quad]);
     moments = updated(moments, gradient);
+    if (HALF_MOMENTS) moments = flushed(moments);
     vec4 before = parameters[quad];
     vec4 value = before - adam_step(moments, rates_at(i), second_correction);
     // Unsigned: values before the plane wrap beyond its end.

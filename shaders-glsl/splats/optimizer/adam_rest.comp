@@ -62,6 +62,7 @@ void main() {
     }
     if (HALF_MOMENTS) moments = from_halves(both);
     moments = updated(moments, clamp_gradient(gradient));
+    if (HALF_MOMENTS) moments = flushed(moments);
 
     vec4 value = vec4(halves_at(word, true), halves_at(word + next, count > 2));
     uvec4 chance = chance_of(value, moments, step);
