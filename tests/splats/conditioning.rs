@@ -35,6 +35,7 @@ fn opacity_of(count: usize) -> f64 {
 /// `count` layers over a view of one tile, front to back.
 fn layers(count: usize) -> Setup {
     let mut setup = Setup::new(count, [16, 8], 0, 7);
+    setup.settings.tile = Some([16, 8].into());
     let mut random = Random::new(count as u64);
     let opacity = opacity_of(count);
     for i in 0..count {

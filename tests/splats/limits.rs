@@ -302,7 +302,9 @@ fn a_view_has_at_most_the_tiles_that_a_subgroup_of_covering_gaussians_can_proces
     if most == u32::MAX {
         return not_run("lavapipe", "this device has no loop limit");
     }
-    let mut renderer = Renderer::new(&gpu(), Setup::new(1, [32, 32], 0, 1).settings).unwrap();
+    // Of the tile of a CPU.
+    let cpu = gpu_with(|own| own.is_cpu = true);
+    let mut renderer = Renderer::new(&cpu, Setup::new(1, [32, 32], 0, 1).settings).unwrap();
     let view = |size| Setup::new(1, size, 0, 1).camera;
     renderer.reserve(1, [&view([8192, 16])]).unwrap();
     renderer.reserve(1, [&view([3840, 2160])]).unwrap();
@@ -316,7 +318,7 @@ fn a_view_has_at_most_the_tiles_that_a_subgroup_of_covering_gaussians_can_proces
     // The tile grows with the view unless a size is given.
     let tile_for = |tile: Option<Tile>| {
         let settings = RenderSettings { tile, ..RenderSettings::default() };
-        settings.tile_for(&gpu(), [[8192, 4096]].into_iter()).unwrap()
+        settings.tile_for(&cpu, [[8192, 4096]].into_iter()).unwrap()
     };
     let named = Tile::from([16, 8]);
     assert_eq!(tile_for(Some(named)), named);
@@ -397,8 +399,9 @@ fn more_splats_on_a_tile_than_the_device_can_process_are_a_clear_error() {
         return;
     }
     let setup = splats_per_tile(300_000);
-    let gaussians = setup.upload();
-    let mut renderer = Renderer::new(&gpu(), setup.settings).unwrap();
+    let cpu = gpu_with(|own| own.is_cpu = true);
+    let gaussians = setup.gaussians().upload(&cpu).unwrap();
+    let mut renderer = Renderer::new(&cpu, setup.settings).unwrap();
     renderer.reserve(setup.count, [&setup.camera]).unwrap();
     let refused = renderer.render_image(&gaussians, &setup.camera, &setup.options);
     let message = refused.unwrap_err().to_string();
