@@ -17,6 +17,8 @@ const WORKING: f64 = 180.0;
 const INTERSECTION: f64 = 72.0;
 /// Intersections of a Gaussian in a view, with the margin for the largest view.
 const INTERSECTIONS: f64 = 4.0;
+/// Copies of a model on the host while it is saved.
+const COPIES: f64 = 3.0;
 /// The share of the memory that photographs may take.
 const PHOTOGRAPHS: f64 = 0.25;
 /// Bytes of a photograph's pixel: on the device, decoded, and in the buffers of its largest view.
@@ -27,6 +29,8 @@ const PIXEL: f64 = 40.0;
 pub(crate) struct Budget {
     /// Bytes of a Gaussian in training.
     gaussian: f64,
+    /// Bytes of a Gaussian on the host, if that is the memory of the device as well.
+    copies: f64,
     /// Bytes of a Gaussian in the two checkpoints and the model of a run.
     on_disk: f64,
     /// Pixels of the largest view.
@@ -36,7 +40,8 @@ pub(crate) struct Budget {
 }
 
 impl Budget {
-    pub(crate) fn of(config: &TrainConfig, dataset: &Dataset) -> Self {
+    /// `is_shared`: the device's memory is that of the host, as of a software device.
+    pub(crate) fn of(config: &TrainConfig, dataset: &Dataset, is_shared: bool) -> Self {
         let rest = 3.0 * rest_coefficients(config.sh_degree) as f64;
         let floats = BASE_FLOATS + rest;
         let bytes = |format| if format == StorageFormat::Single { 4.0 } else { 2.0 };
@@ -48,10 +53,16 @@ impl Budget {
             .map(|view| f64::from(view.camera.width) * f64::from(view.camera.height));
         Self {
             gaussian: parameters + moments + 4.0 * floats,
+            copies: if is_shared { COPIES * 4.0 * floats } else { 0.0 },
             on_disk: 2.0 * 3.0 * 4.0 * floats + 4.0 * (floats + 3.0),
             pixels: pixels.fold(0.0, f64::max),
             cache: config.cache.map(|CacheSize(bytes)| bytes as f64),
         }
+    }
+
+    /// That of the coarse model, which is trained at half size.
+    pub(crate) fn at_half_size(self) -> Self {
+        Self { pixels: self.pixels / 4.0, ..self }
     }
 
     /// Bytes of training up to this number of Gaussians on this number of views.
@@ -72,10 +83,26 @@ impl Budget {
     }
 
     fn each(&self) -> f64 {
-        HEADROOM * self.gaussian + WORKING + INTERSECTIONS * INTERSECTION
+        HEADROOM * self.gaussian + WORKING + INTERSECTIONS * INTERSECTION + self.copies
     }
 
     fn photographs(&self, most: f64) -> f64 {
         self.cache.unwrap_or(PHOTOGRAPHS * most)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_that_shares_the_memory_of_the_host_has_room_for_the_copies_that_are_saved() {
+        let dataset = Dataset { root: "".into(), views: vec![], points: vec![], skipped: vec![] };
+        let config = TrainConfig::default();
+        let [own, shared] = [false, true].map(|shared| Budget::of(&config, &dataset, shared));
+        let floats = 14.0 + 3.0 * rest_coefficients(config.sh_degree) as f64;
+        let more = shared.memory(1e6, 0.0, 8e9) - own.memory(1e6, 0.0, 8e9);
+        assert!((more - 12e6 * floats).abs() < 1.0, "{more}");
+        assert!(shared.gaussians(8e9) < own.gaussians(8e9));
     }
 }

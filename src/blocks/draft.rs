@@ -63,7 +63,8 @@ impl Draft<'_> {
         gaussians: f64,
     ) -> Row {
         let most = self.request.memory as f64;
-        let fits = self.budget.gaussians(most);
+        let budget = if round == 0 { self.budget.at_half_size() } else { self.budget };
+        let fits = budget.gaussians(most);
         let gaussians = if self.request.blocks.is_some() { gaussians } else { gaussians.min(fits) };
         let key = hash::of(id.as_bytes());
         Row {
@@ -72,8 +73,8 @@ impl Draft<'_> {
             points,
             steps: (steps.round() as u64).max(1),
             gaussians: (gaussians as usize).max(1),
-            memory: self.budget.memory(gaussians, views as f64, most) as u64,
-            disk: self.budget.disk(gaussians) as u64,
+            memory: budget.memory(gaussians, views as f64, most) as u64,
+            disk: budget.disk(gaussians) as u64,
             // Settings are whole numbers of 63 bits.
             seed: Stream::new(self.config.seed, key).bits(0) >> 1,
             id,

@@ -2,6 +2,7 @@
 //! are taken in the order of the plan: neither who trained them nor when enters.
 
 use std::collections::BTreeSet;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
@@ -53,6 +54,7 @@ pub(crate) fn join(
     let devices = devices(folder, &blocks, same_device)?;
     let model = folder.join(model_of(round, last));
     output::create_folder(&model.join(TILES))?;
+    withdraw(&model.join(MANIFEST))?;
     let mut tiles = vec![];
     let (mut cropped, mut origin) = (0, [0.0; 3]);
     for block in &blocks {
@@ -79,6 +81,16 @@ pub(crate) fn join(
         serde_json::to_string_pretty(&manifest).map_err(|error| Error::Usage(error.to_string()))?;
     output::write_whole(&model.join(MANIFEST), (text + "\n").as_bytes())?;
     Ok(Joined { manifest, cropped })
+}
+
+/// Removes the manifest of an earlier join: it states what the tiles are, which are about to be replaced one by one.
+fn withdraw(manifest: &Path) -> Result<()> {
+    match std::fs::remove_file(manifest) {
+        Err(error) if error.kind() != ErrorKind::NotFound => {
+            Err(Error::output(manifest, format!("cannot be replaced: {error}")))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// A block that is done.

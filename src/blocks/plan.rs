@@ -29,6 +29,8 @@ pub(crate) const MAX_ROUNDS: u8 = 3;
 pub(crate) struct Request {
     /// Memory of a worker, bytes.
     pub(crate) memory: u64,
+    /// Whether the device's memory is that of the host.
+    pub(crate) is_shared: bool,
     /// The number of blocks, in place of as many as the memory asks for.
     pub(crate) blocks: Option<usize>,
     /// How often every block trains: from the second time on, its neighbours are those of the round before.

@@ -32,7 +32,7 @@ pub(crate) fn plan(planned: &PlannedRun, request: &Request) -> Result<BlockPlan>
         return Err(Error::input(root, problem));
     }
     let visibility = Visibility::of(dataset);
-    let budget = Budget::of(&config, dataset);
+    let budget = Budget::of(&config, dataset, request.is_shared);
     let parts = parts(dataset, &visibility, &config, &budget, request)?;
     let serving = visibility.serving(&parts);
     let shared = mean_share(&serving, visibility.training.len());

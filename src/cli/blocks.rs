@@ -132,7 +132,12 @@ fn plan(args: &PlanArgs) -> Result<()> {
         Some(CacheSize(bytes)) => bytes,
         None => gpu.properties().memory,
     };
-    let request = Request { memory, blocks: args.blocks.map(usize::from), rounds: args.rounds };
+    let request = Request {
+        memory,
+        is_shared: gpu.properties().is_cpu,
+        blocks: args.blocks.map(usize::from),
+        rounds: args.rounds,
+    };
     let plan = blocks::plan(&planned, &request)?;
     let (summary, json) = (summary(&plan), serde_json::json!(plan.file));
     let steps = plan.steps();

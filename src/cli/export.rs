@@ -133,11 +133,9 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     check_ending(args)?;
     check_levels(args)?;
     check_linear(args)?;
-    if args.to == To::StreamedSog
-        && !is_model(&args.run)
-        && let Some(manifest) = Manifest::of_scene(&args.run)?
-    {
-        return Ok(tiles::write(args, &manifest)?);
+    let joined = if is_model(&args.run) { None } else { Manifest::of_scene(&args.run)? };
+    if let (To::StreamedSog, Some(manifest)) = (args.to, &joined) {
+        return Ok(tiles::write(args, manifest)?);
     }
     let (gaussians, facts, config) = opened(args)?;
     let (gaussians, facts) =
@@ -158,7 +156,9 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     let mut gaussians = up::turned(gaussians, rotation);
     let division = Division { levels: args.levels, chunk: args.chunk };
     if args.level > 0 {
-        gaussians = levels::level(&gaussians, division.cell(), args.level);
+        let whole = || vec![gaussians.count];
+        let tiles = joined.map_or_else(whole, |joined| joined.counts());
+        gaussians = levels::level(&gaussians, &tiles, division.cell(), args.level);
     }
     let provenance = Provenance { rotation, facts, ..provenance(args, &config) };
     let format = match args.to {

@@ -85,6 +85,11 @@ impl Manifest {
         self.tiles.iter().map(|tile| self.folder.join(&tile.file)).collect()
     }
 
+    /// The numbers of Gaussians of the tiles.
+    pub(crate) fn counts(&self) -> Vec<usize> {
+        self.tiles.iter().map(|tile| tile.count).collect()
+    }
+
     /// The whole model.
     ///
     /// # Errors

@@ -135,6 +135,24 @@ fn the_joined_tiles_are_those_of_the_cores_and_are_opened_like_a_run() {
 }
 
 #[test]
+fn a_level_of_the_joined_model_is_those_of_its_tiles() {
+    let city = city();
+    let level = |from: &Path, name: &str| {
+        let to = city.path(name);
+        let options = "--format ply --level 1 --chunk 1000";
+        succeed(&format!("export {} {options} --out {}", from.display(), to.display()));
+        let bytes = fs::read(to).unwrap();
+        let end = b"end_header\n";
+        let header = bytes.windows(end.len()).position(|bytes| bytes == end).unwrap();
+        bytes[header + end.len()..].to_vec()
+    };
+    let folder = city.path("city");
+    let tiles = ["0000", "0001"].map(|tile| folder.join(format!("model/0/{tile}.ply")));
+    let tiles = tiles.map(|tile| level(&tile, "level-of-tile.ply")).concat();
+    assert!(level(&folder, "level.ply") == tiles, "cells across tiles");
+}
+
+#[test]
 fn a_view_has_the_same_gain_in_every_block_and_in_a_run_on_all_views() {
     let city = city();
     let gains = |run: &Path| {
@@ -202,6 +220,67 @@ fn blocks_that_are_missing_unfinished_or_of_another_plan_are_refused_by_name() {
     refuses_to_join(&["plan.toml", "is not a plan"], |city| {
         fs::write(city.join("plan.toml"), "x = [").unwrap();
     });
+}
+
+/// A file that is written under this path meets a full disk. Returns its temporary name.
+#[cfg(target_os = "linux")]
+fn fill_the_disk_for(path: &Path) -> PathBuf {
+    let partial = PathBuf::from(format!("{}.partial", path.display()));
+    std::os::unix::fs::symlink("/dev/full", &partial).unwrap();
+    partial
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_full_disk_stops_a_join_with_one_line_and_leaves_no_manifest_until_there_is_room() {
+    let city = city();
+    let joined = city.copied();
+    let (folder, model) = (joined.path(), joined.path().join("model"));
+    let join = format!("blocks join {}", folder.display());
+    let before = files(folder);
+    // Anew, and in place of an earlier model: from its first to its last file.
+    for is_anew in [true, false] {
+        for file in ["model/0/0000.ply", "model/0/0001.ply", "model/manifest.json"] {
+            if is_anew {
+                fs::remove_dir_all(&model).unwrap();
+                fs::create_dir_all(model.join("0")).unwrap();
+            }
+            let partial = fill_the_disk_for(&folder.join(file));
+            let place = folder.join(file).display().to_string();
+            refused(&join, 1, &[&place, "cannot be written", "check the folder and the disk"]);
+            assert!(!model.join("manifest.json").exists(), "{file}: half a model with a manifest");
+            assert!(partial.symlink_metadata().is_err(), "{file}: half a file");
+            // No command takes it for a model.
+            refused(&format!("eval {}", folder.display()), 3, &[&folder.display().to_string()]);
+            succeed(&join);
+            assert!(files(folder) == before, "{file}: another model once there is room");
+        }
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_full_disk_stops_an_export_of_tiles_with_one_line_and_leaves_no_index_until_there_is_room() {
+    let city = city();
+    let out = city.path("streamed-full");
+    let options = "--format streamed-sog --levels 2 --chunk 1000";
+    let export =
+        format!("export {} {options} --out {}", city.path("city").display(), out.display());
+    succeed(&export);
+    let before = files(&out);
+    // Limits the size of files, as on a full disk.
+    let program = command("").get_program().to_str().unwrap().to_owned();
+    let line = format!("trap '' XFSZ; ulimit -f 4; exec {program} {export}");
+    let output = std::process::Command::new("sh").args(["-c", &line]).output().unwrap();
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{stderr}");
+    let is_told = stderr.contains(&out.display().to_string()) && stderr.contains("the disk");
+    assert!(stderr.lines().count() == 1 && is_told, "{stderr}");
+    assert!(!out.join("lod-meta.json").exists(), "half a model with an index");
+    // As a killed export leaves it.
+    fs::write(out.join("lod-meta.json.partial"), "{").unwrap();
+    succeed(&export);
+    assert!(files(&out) == before, "another model once there is room");
 }
 
 #[test]

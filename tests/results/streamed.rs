@@ -143,7 +143,7 @@ fn the_index_finds_every_gaussian_of_every_level_once_and_chunks_are_our_levels(
         let all = Gaussians::concatenated(&cells.iter().collect::<Vec<_>>());
         assert_eq!(all.origin, models[0].origin);
         for model in &models {
-            let errors = errors(&level(model, division.cell(), k), &all);
+            let errors = errors(&level(model, &[model.count], division.cell(), k), &all);
             let most = [1e-3, 0.1, 0.003, 0.05];
             assert!(errors.iter().zip(most).all(|(error, most)| *error < most), "{k}: {errors:?}");
         }
@@ -216,7 +216,7 @@ fn the_command_writes_levels_and_refuses_options_of_other_formats() {
 
     succeed(&format!("export {root}/a.ply --format ply --level 1 --chunk 160 --out {root}/b.ply"));
     let half = ply::load(folder.path().join("b.ply")).unwrap();
-    assert_eq!(half, level(&model, 40, 1).with_sh_degree(3));
+    assert_eq!(half, level(&model, &[model.count], 40, 1).with_sh_degree(3));
     for (options, part) in [
         ("--format sog --levels 2", "--level"),
         ("--format streamed-sog --level 1", "--levels"),

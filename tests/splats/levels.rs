@@ -146,7 +146,7 @@ fn levels_are_the_same_bytes_on_any_number_of_threads() {
     let all = cloud(700, 6);
     let on = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| level(&all, 100, 2))
+        pool.install(|| level(&all, &[all.count], 100, 2))
     };
     let first = on(1);
     assert_eq!(first.count, 8 * 22);
@@ -202,7 +202,7 @@ fn each_level_looks_like_the_one_before() {
         renderer.render_image(&on_device, &camera, &options).unwrap()
     };
     let full = wall();
-    let images: Vec<Image> = (0..4).map(|k| render(&level(&full, 600, k))).collect();
+    let images: Vec<Image> = (0..4).map(|k| render(&level(&full, &[full.count], 600, k))).collect();
     // Level 0 is the model in another order.
     assert!(psnr(&images[0], &render(&full)).unwrap() > 60.0);
     for (k, least) in [(1, 36.0), (2, 32.0), (3, 28.0)] {

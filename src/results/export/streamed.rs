@@ -153,7 +153,8 @@ fn prepare(folder: &Path) -> Result<()> {
         fs::read_dir(folder).and_then(Iterator::collect::<std::io::Result<_>>).map_err(failed)?;
     let names: Vec<String> =
         entries.iter().map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
-    if let Some(other) = names.iter().find(|name| *name != INDEX && !is_chunk(name)) {
+    let is_index = |name: &str| name.strip_suffix(".partial").unwrap_or(name) == INDEX;
+    if let Some(other) = names.iter().find(|name| !is_index(name) && !is_chunk(name)) {
         let problem =
             format!("holds `{other}`, which is no part of a streamed SOG; choose a new folder");
         return Err(Error::output(folder, problem));
