@@ -22,7 +22,7 @@ list=docs/drivers.csv
     {
         [ ! -e "$list" ] || tail -n +2 "$list" | grep -vF "$driver," || true
         echo "$driver,$(grep -o '[0-9]* \(identical\|within\|failed\)' <<< "$passes" | cut -d ' ' -f 1 | paste -sd ,)"
-    } | sort
+    } | LC_ALL=C sort
 } > "$list.new"
 mv "$list.new" "$list"
 exit "$status"
