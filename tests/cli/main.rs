@@ -376,6 +376,8 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
         "exposure_center",
         "exposure_gradient",
         "first_not_finite",
+        "lamp_backward",
+        "lamp_gradient",
         "largest_magnitude",
         "mask_gradient",
         "mask_render",
