@@ -239,7 +239,7 @@ impl Trainer {
     pub(crate) fn model_of(&self, in_frame: &Gaussians) -> Result<splats::model::Model> {
         let facts = self.config.facts(&self.frame);
         let mut gaussians = in_frame.to_world(&self.frame);
-        if let Some((lamp, light)) = self.renderer.lamp()?.zip(self.even_light()?) {
+        if let Some((lamp, light)) = self.lamp_and_even_light()? {
             let shown = if self.config.model.raw_colors { 0.0 } else { 0.5 };
             let factor = light.powf(lamp.slope) as f32;
             gaussians.scale_colors(lamp.black as f32 - shown, factor);
@@ -438,7 +438,7 @@ impl Trainer {
     /// Those of [`Trainer::render`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn render_in_even_light(&mut self, camera: &Camera) -> Result<Rendered> {
-        let light = self.even_light()?;
+        let light = self.lamp_and_even_light()?.map(|(_, light)| light);
         self.renderer.set_even_light(light)?;
         let rendered = self.render(camera);
         self.renderer.set_even_light(None)?;

@@ -2,7 +2,7 @@
 //! targets.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use serde_json::{Map, Value, json};
 
@@ -22,10 +22,13 @@ use crate::train::{Networks, Rendered, TestTargets, TrainConfig};
 use crate::{Error, Result};
 
 mod layers;
+mod lit;
 mod transmittance;
 
 use layers::Normals;
 pub use layers::RenderLayer;
+use lit::lit_folder;
+pub(crate) use lit::{add_lit, mean_lit, score_lit};
 pub use transmittance::{
     MAX_RESIDUAL_TRANSMITTANCE, ResidualTransmittance, hole_warning, warn_of_holes,
 };
@@ -150,11 +153,6 @@ impl ScoreReference {
         self.made.extend(kept.map(|target| (view.name.clone(), target.clone())));
         Ok(target)
     }
-}
-
-/// The test views in the light of the lamp at the camera, bright and without noise, if a dataset has these.
-fn lit_folder(dataset: &Dataset) -> PathBuf {
-    dataset.root.join("lit")
 }
 
 /// The scores of a test view.
@@ -387,42 +385,6 @@ pub fn score_by(
         scored.push(score);
     }
     Ok(scored)
-}
-
-/// Adds the scores in the light of the lamp; `render` renders a view so.
-///
-/// # Errors
-/// Those of `render`, or an image of `lit/` cannot be read.
-pub(crate) fn score_lit(
-    scored: &mut [ViewScore],
-    dataset: &Dataset,
-    mut render: impl FnMut(&View) -> Result<Rendered>,
-) -> Result<()> {
-    let folder = lit_folder(dataset);
-    for score in scored {
-        let path = folder.join(format!("{}.png", score.name));
-        let view = dataset.test_views().find(|view| view.name == score.name);
-        let Some(view) = view.filter(|_| path.is_file()) else { continue };
-        let (width, height) = (view.camera.width, view.camera.height);
-        let target = quantized(&Image::load(&path)?.resized(width, height));
-        let compared = ScoredImages { view, render: quantized(render(view)?.output()), target };
-        score.lit = Some(compared.aligned()?);
-    }
-    Ok(())
-}
-
-/// Adds to `metrics.json` the scores in the light of the lamp, if there are any.
-pub(crate) fn add_lit(metrics: &mut Value, scored: &[ViewScore]) {
-    if scored.iter().any(|view| view.lit.is_some()) {
-        let what = "in the light of the lamp at the camera, against the dataset's lit/, after the least-squares gain \
-                    and bias of each channel";
-        metrics["lit_by_lamp"] = other_scores(what, scored, |view| view.lit);
-    }
-}
-
-/// The mean scores in the light of the lamp, if there are any.
-pub(crate) fn mean_lit(scored: &[ViewScore]) -> Option<Scores> {
-    Scores::mean(&scored.iter().filter_map(|view| view.lit).collect::<Vec<_>>())
 }
 
 /// `metrics.json`: means, views, and the resources of the run; unknown values are null. [`add_lpips`] adds LPIPS.

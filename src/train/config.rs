@@ -400,8 +400,12 @@ impl TrainConfig {
     /// steps.
     pub(super) fn scored_every(&self) -> u64 {
         const FROZEN: u64 = 50;
-        let is_frozen = self.freeze.as_ref().is_some_and(Freeze::has_geometry);
-        if is_frozen { self.stop.every.min(FROZEN) } else { self.stop.every }
+        if self.freezes_geometry() { self.stop.every.min(FROZEN) } else { self.stop.every }
+    }
+
+    /// Whether the shape or the place of the Gaussians is frozen.
+    pub(super) fn freezes_geometry(&self) -> bool {
+        self.freeze.as_ref().is_some_and(Freeze::has_geometry)
     }
 
     /// The columns of the Gaussians' attributes, from the first, that no pass updates.

@@ -5,7 +5,7 @@ use glam::UVec2;
 use super::memory::MARGIN;
 use super::rendered::Rendered;
 use super::target_views::TargetViews;
-use super::{Freeze, TrainConfig, Trainer, streams};
+use super::{TrainConfig, Trainer, streams};
 use crate::Result;
 use crate::base::random::Stream;
 use crate::camera::Camera;
@@ -34,8 +34,10 @@ impl Trainer {
     pub(super) fn densifies_at(&self, step: u64) -> bool {
         let schedule = &self.config.schedule;
         let is_in_time = step + schedule.densify_interval <= self.config.steps;
-        let is_frozen = self.config.freeze.as_ref().is_some_and(Freeze::has_geometry);
-        schedule.densifies_at(step) && is_in_time && step <= self.cooldown_begin() && !is_frozen
+        schedule.densifies_at(step)
+            && is_in_time
+            && step <= self.cooldown_begin()
+            && !self.config.freezes_geometry()
     }
 
     /// Density control after the last step, whose view had this many intersections.

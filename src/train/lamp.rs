@@ -114,17 +114,18 @@ impl Trainer {
     /// The device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn lamp(&self) -> Result<Option<Lamp>> {
-        let own = self.renderer.lamp()?.zip(self.even_light()?);
+        let own = self.lamp_and_even_light()?;
         Ok(own.map(|(lamp, light)| lamp.with_unit(light).scaled(1.0 / self.frame.scale)))
     }
 
-    /// The light that evenly lit views have, with that of the colours in training as its unit; `None` without a lamp.
+    /// The lamp as learned so far, in the training frame, and the light that evenly lit views have, with that of the
+    /// colours in training as its unit; `None` without a lamp.
     ///
     /// # Errors
     /// The device was lost.
-    pub(super) fn even_light(&self) -> Result<Option<f64>> {
+    pub(super) fn lamp_and_even_light(&self) -> Result<Option<(Lamp, f64)>> {
         let own = self.renderer.lamp()?.zip(self.optimizer.lamp.as_ref());
-        Ok(own.map(|(lamp, learning)| learning.median_light(&lamp)))
+        Ok(own.map(|(lamp, learning)| (lamp, learning.median_light(&lamp))))
     }
 }
 
