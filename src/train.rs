@@ -228,23 +228,12 @@ impl Trainer {
     /// # Errors
     /// The device was lost.
     pub fn model(&self) -> Result<splats::model::Model> {
-        self.model_of(&self.gaussians_in_frame()?)
+        Ok(self.model_of(&self.gaussians_in_frame()?))
     }
 
-    /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world. If the model has
-    /// a lamp, their colours are those in its light at the median of the points that the views see.
-    ///
-    /// # Errors
-    /// The device was lost.
-    pub(crate) fn model_of(&self, in_frame: &Gaussians) -> Result<splats::model::Model> {
-        let facts = self.config.facts(&self.frame);
-        let mut gaussians = in_frame.to_world(&self.frame);
-        if let Some((lamp, light)) = self.lamp_and_even_light()? {
-            let shown = if self.config.model.raw_colors { 0.0 } else { 0.5 };
-            let factor = light.powf(lamp.slope) as f32;
-            gaussians.scale_colors(lamp.black as f32 - shown, factor);
-        }
-        Ok(splats::model::Model::of(gaussians, &facts))
+    /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world.
+    pub(crate) fn model_of(&self, in_frame: &Gaussians) -> splats::model::Model {
+        splats::model::Model::of(in_frame.to_world(&self.frame), &self.config.facts(&self.frame))
     }
 
     /// The Gaussians in [`Trainer::frame`], bit for bit as trained.
@@ -438,10 +427,9 @@ impl Trainer {
     /// Those of [`Trainer::render`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn render_in_even_light(&mut self, camera: &Camera) -> Result<Rendered> {
-        let light = self.lamp_and_even_light()?.map(|(_, light)| light);
-        self.renderer.set_even_light(light)?;
+        self.renderer.set_even_light(true);
         let rendered = self.render(camera);
-        self.renderer.set_even_light(None)?;
+        self.renderer.set_even_light(false);
         rendered
     }
 

@@ -2,14 +2,15 @@
 //
 // For a point in view space at r from the lamp, d = |r|, and u = 1 - cos(angle between r and the lamp's axis):
 //
-//   light = gain (ambient + (1 - ambient) (reference_distance / d)^exponent exp(-falloffs.x u - falloffs.y u^2))
-//   lit colour = black + (colour - black) light^slope
+//   light = ambient + (1 - ambient) (reference_distance / d)^exponent exp(-falloffs.x u - falloffs.y u^2)
+//   lit colour = black + tone(light^slope tone^-1(colour - black))
 //
-// In training the gain is 1, and so is the light on the axis at the reference distance, whatever the learned numbers:
-// brightness cannot move between the lamp and the colours, which are those at the reference light. Ambient light and
-// that of the lamp add in linear light, so the sum is taken there; colours are encoded by the tone law, t = f(linear
-// light), with black = f(0). A factor k of linear light multiplies t - black by k^slope to first order in ln k, with
-// slope = d ln(f - black) / d ln light, and exactly where f - black is a power.
+// The light on the axis at the reference distance is 1, whatever the learned numbers: brightness cannot move between
+// the lamp and the colours, which are those in a light of 1. Ambient light and that of the lamp add in linear light, so
+// the sum is taken there. Colours are encoded by the tone law, which saturates: black + tone(x), with x in proportion
+// to linear light to the power of slope, and
+//
+//   tone(x) = reach (1 - exp(-x / reach)), a line below 0 and beyond LAMP_KNEE reach; x for a reach of 0.
 //
 // Bounds: distances count from LAMP_NEAREST to LAMP_FARTHEST, u is at most 2, opposite to the axis, and the ambient
 // light is at least LAMP_LEAST_AMBIENT: all is finite, and the light is above 0.
@@ -19,11 +20,11 @@ const uint LAMP_WIDTH = 9;
 const uint LAMP_AMBIENT = 5;
 const uint LAMP_EXPONENT = 6;
 const uint LAMP_FALLOFFS = 7;
-// Then those of the set: the reference distance in world units, and the slope of the tone law.
+// Then those of the set: the reference distance in world units, and the tone law.
 const uint LAMP_REFERENCE_DISTANCE = 9;
 const uint LAMP_SLOPE = 10;
 const uint LAMP_BLACK = 11;
-const uint LAMP_GAIN = 12;
+const uint LAMP_REACH = 12;
 const uint LAMP_NUMBERS = 13;
 // Position in reference distances, and tangents of the axis, per unit of their numbers: they learn more slowly.
 const float LAMP_STEP = 0.25;
@@ -34,3 +35,6 @@ const float LAMP_NEAREST = 0.0625;
 const float LAMP_FARTHEST = 65536.0;
 const float LAMP_LEAST_AMBIENT = 1e-4;
 const float LAMP_LARGEST_EXPONENT = 4.0;
+// Where the tone law becomes a line, and the share of its reach that is left there: exp(-LAMP_KNEE).
+const float LAMP_KNEE = 2.7725887;
+const float LAMP_LEFT = 0.0625;

@@ -11,7 +11,7 @@ struct Lamp {
     float reference_distance;
     float slope;
     float black;
-    float gain;
+    float reach;
 };
 
 // The numbers that factor and gradient of a point have in common.
@@ -33,7 +33,7 @@ Lamp load_lamp() {
     own.reference_distance = lamp[LAMP_REFERENCE_DISTANCE];
     own.slope = lamp[LAMP_SLOPE];
     own.black = lamp[LAMP_BLACK];
-    own.gain = lamp[LAMP_GAIN];
+    own.reach = lamp[LAMP_REACH];
     own.position = LAMP_STEP * own.reference_distance * vec3(lamp[0], lamp[1], lamp[2]);
     own.tangents = vec3(LAMP_STEP * lamp[3], LAMP_STEP * lamp[4], 1.0);
     own.ambient = LAMP_LEAST_AMBIENT + (1.0 - LAMP_LEAST_AMBIENT) * sigmoid(lamp[LAMP_AMBIENT]);
@@ -52,14 +52,40 @@ LampPoint lamp_at(Lamp own, vec3 point) {
     at.away = 1.0 - clamp(dot(at.towards, at.axis), -1.0, 1.0);
     float decay = own.exponent * log(at.distance / own.reference_distance);
     at.beam = exp(-decay - (own.falloffs.x + own.falloffs.y * at.away) * at.away);
-    at.light = own.gain * (own.ambient + (1.0 - own.ambient) * at.beam);
+    at.light = own.ambient + (1.0 - own.ambient) * at.beam;
     return at;
 }
 
 float lamp_factor(Lamp own, LampPoint at) { return exp(own.slope * log(at.light)); }
 
+float lamp_tone(Lamp own, float x) {
+    float bent = x / own.reach;
+    if (own.reach == 0.0 || bent < 0.0) return x;
+    float line = 1.0 - LAMP_LEFT + LAMP_LEFT * (bent - LAMP_KNEE);
+    return own.reach * (bent < LAMP_KNEE ? 1.0 - exp(-bent) : line);
+}
+
+float lamp_tone_inverse(Lamp own, float above) {
+    float share = above / own.reach;
+    if (own.reach == 0.0 || share < 0.0) return above;
+    float line = LAMP_KNEE + (share - (1.0 - LAMP_LEFT)) / LAMP_LEFT;
+    return own.reach * (share < 1.0 - LAMP_LEFT ? -log(1.0 - share) : line);
+}
+
+// d tone / dx
+float lamp_tone_slope(Lamp own, float x) {
+    return own.reach == 0.0 || x < 0.0 ? 1.0 : exp(-min(x / own.reach, LAMP_KNEE));
+}
+
+// A colour in the light with this factor.
+vec3 lamp_lit(Lamp own, float factor, vec3 color) {
+    for (uint c = 0; c < 3; c++)
+        color[c] = own.black + lamp_tone(own, factor * lamp_tone_inverse(own, color[c] - own.black));
+    return color;
+}
+
 // d ln light / d ln beam
-float lamp_share(Lamp own, LampPoint at) { return own.gain * (1.0 - own.ambient) * at.beam / at.light; }
+float lamp_share(Lamp own, LampPoint at) { return (1.0 - own.ambient) * at.beam / at.light; }
 
 // The steepness of the falloff: -d ln beam / du.
 float lamp_turn(Lamp own, LampPoint at) { return own.falloffs.x + 2.0 * own.falloffs.y * at.away; }
@@ -84,7 +110,7 @@ void lamp_gradient(Lamp own, LampPoint at, out float gradient[LAMP_WIDTH]) {
     [[unroll]] for (uint k = 0; k < 2; k++) gradient[3 + k] = d_tangents[k];
     float raised = sigmoid(lamp[LAMP_AMBIENT]), bent = sigmoid(lamp[LAMP_EXPONENT]);
     gradient[LAMP_AMBIENT] =
-        own.slope * own.gain * (1.0 - at.beam) / at.light * (1.0 - LAMP_LEAST_AMBIENT) * raised * (1.0 - raised);
+        own.slope * (1.0 - at.beam) / at.light * (1.0 - LAMP_LEAST_AMBIENT) * raised * (1.0 - raised);
     gradient[LAMP_EXPONENT] =
         -share * log(at.distance / own.reference_distance) * LAMP_LARGEST_EXPONENT * bent * (1.0 - bent);
     gradient[LAMP_FALLOFFS] = -share * at.away * LAMP_FALLOFF_STEP * sigmoid(lamp[LAMP_FALLOFFS]);

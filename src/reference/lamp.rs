@@ -6,8 +6,8 @@ use super::gaussian::sigmoid;
 use super::rounding::UNIT;
 use crate::kernels::lamp::{
     LAMP_AMBIENT, LAMP_BLACK, LAMP_EXPONENT, LAMP_FALLOFF_STEP, LAMP_FALLOFFS, LAMP_FARTHEST,
-    LAMP_GAIN, LAMP_LARGEST_EXPONENT, LAMP_LEAST_AMBIENT, LAMP_NEAREST, LAMP_NUMBERS,
-    LAMP_REFERENCE_DISTANCE, LAMP_SLOPE, LAMP_STEP, LAMP_WIDTH,
+    LAMP_KNEE, LAMP_LARGEST_EXPONENT, LAMP_LEAST_AMBIENT, LAMP_LEFT, LAMP_NEAREST, LAMP_NUMBERS,
+    LAMP_REACH, LAMP_REFERENCE_DISTANCE, LAMP_SLOPE, LAMP_STEP, LAMP_WIDTH,
 };
 
 /// The learned numbers of the device.
@@ -26,7 +26,7 @@ pub struct Lamp {
     reference_distance: f64,
     slope: f64,
     black: f64,
-    gain: f64,
+    reach: f64,
 }
 
 /// The numbers that factor and gradient of a point have in common.
@@ -56,7 +56,7 @@ impl Lamp {
             reference_distance,
             slope: at(LAMP_SLOPE),
             black: at(LAMP_BLACK),
-            gain: at(LAMP_GAIN),
+            reach: at(LAMP_REACH),
             numbers,
         }
     }
@@ -71,23 +71,60 @@ impl Lamp {
         let away = 1.0 - towards.dot(axis).clamp(-1.0, 1.0);
         let [first, second] = self.falloffs;
         let beam = (-self.exponent * bounded.ln() - (first + second * away) * away).exp();
-        let light = self.gain * (self.ambient + (1.0 - self.ambient) * beam);
+        let light = self.ambient + (1.0 - self.ambient) * beam;
         LampPoint { axis, towards, own, distance, away, beam, light }
     }
 
-    /// The factor on the colour of a Gaussian at a point in view space.
+    /// The factor on what the tone law shows at a point in view space.
     pub fn factor(&self, point: DVec3) -> f64 {
         self.at(point).light.powf(self.slope)
     }
 
     /// The colour at a point in view space, before it is clamped.
     pub fn lit(&self, color: DVec3, point: DVec3) -> DVec3 {
-        self.black + (color - self.black) * self.factor(point)
+        let factor = self.factor(point);
+        color.map(|value| self.black + self.tone(factor * self.tone_inverse(value - self.black)))
     }
 
-    /// A lit colour above black, to which the gradient of ln factor is proportional.
-    pub fn above_black(&self, lit: DVec3) -> DVec3 {
-        lit - self.black
+    fn tone(&self, x: f64) -> f64 {
+        let bent = x / self.reach;
+        if self.reach == 0.0 || bent < 0.0 {
+            return x;
+        }
+        let line = 1.0 - LAMP_LEFT + LAMP_LEFT * (bent - LAMP_KNEE);
+        self.reach * if bent < LAMP_KNEE { -(-bent).exp_m1() } else { line }
+    }
+
+    fn tone_inverse(&self, above: f64) -> f64 {
+        let share = above / self.reach;
+        if self.reach == 0.0 || share < 0.0 {
+            return above;
+        }
+        let line = LAMP_KNEE + (share - (1.0 - LAMP_LEFT)) / LAMP_LEFT;
+        self.reach * if share < 1.0 - LAMP_LEFT { -(-share).ln_1p() } else { line }
+    }
+
+    fn tone_slope(&self, x: f64) -> f64 {
+        if self.reach == 0.0 || x < 0.0 { 1.0 } else { (-(x / self.reach).min(LAMP_KNEE)).exp() }
+    }
+
+    /// From the gradient of a lit colour to those of the colour without the lamp and of ln factor.
+    pub fn lit_backward(&self, lit: DVec3, d_lit: DVec3, point: DVec3) -> (DVec3, f64) {
+        let factor = self.factor(point);
+        let x = lit.map(|value| self.tone_inverse(value - self.black));
+        let d_x = d_lit * x.map(|x| self.tone_slope(x));
+        (factor * d_x / (x / factor).map(|x| self.tone_slope(x)), d_x.dot(x))
+    }
+
+    /// The gradient of ln factor, from that of the colour without the lamp.
+    pub fn log_factor_gradient(&self, lit: DVec3, d_color: DVec3, point: DVec3) -> f64 {
+        let x = lit.map(|value| self.tone_inverse(value - self.black)) / self.factor(point);
+        d_color.dot(x * x.map(|x| self.tone_slope(x)))
+    }
+
+    /// A bound of the relative change of a lit colour, and of its gradient, over that of the colour.
+    pub(super) fn steepness(&self) -> f64 {
+        if self.reach == 0.0 { 1.0 } else { 1.0 / LAMP_LEFT }
     }
 
     /// The relative rounding error of the factor: exponentials and logarithms have errors of a few units in the last
@@ -102,7 +139,7 @@ impl Lamp {
     }
 
     fn share(&self, at: &LampPoint) -> f64 {
-        self.gain * (1.0 - self.ambient) * at.beam / at.light
+        (1.0 - self.ambient) * at.beam / at.light
     }
 
     fn turn(&self, at: &LampPoint) -> f64 {
@@ -152,7 +189,7 @@ impl Lamp {
             d_position.z,
             d_tangents.x,
             d_tangents.y,
-            self.slope * self.gain * (1.0 - at.beam) / at.light
+            self.slope * (1.0 - at.beam) / at.light
                 * (1.0 - LAMP_LEAST_AMBIENT)
                 * of_share(LAMP_AMBIENT),
             -share * decades * LAMP_LARGEST_EXPONENT * of_share(LAMP_EXPONENT),

@@ -12,14 +12,15 @@ use crate::kernels::lamp_backward::{Constants, Kernel, Params, Slices, Tolerance
 use crate::kernels::sh::SH_C0;
 use crate::splats::attributes::Attribute;
 
-/// The numbers before the lamp's among the inputs of a Gaussian: its mean, and the gradient of its DC times its colour.
-const OWN: usize = 4;
+/// The numbers before the lamp's among the inputs of a Gaussian: its mean, its lit colour, and the gradient of its DC.
+const OWN: usize = 9;
 
 /// A Gaussian's share of the gradient of the numbers.
 fn share(camera: &Camera, inputs: &[f64]) -> Vec<f64> {
     let (own, numbers) = inputs.split_at(OWN);
     let (point, lamp) = (camera.view(DVec3::from_slice(own)), Lamp::of(numbers));
-    let d = own[3] / (SH_C0 * lamp.factor(point));
+    let [lit, d_dc] = [3, 6].map(|at| DVec3::from_slice(&own[at..]));
+    let d = lamp.log_factor_gradient(lit, d_dc / SH_C0, point);
     lamp.gradient(point).map(|number| d * number).to_vec()
 }
 
@@ -43,15 +44,10 @@ fn shares(
     let color = vector(slices.colors, stored_color(constants.channels) * i);
     let mean = vector(slices.parameters, 3 * i);
     let lamp = Lamp::of(slices.lamp);
-    let above = lamp.above_black(color);
-    let mut inputs = [&mean.to_array()[..], &[d_dc.dot(above)]].concat();
-    let far = mean.length() + camera.center().length();
-    let mut errors = vec![
-        OFF * far,
-        OFF * far,
-        OFF * far,
-        OFF * d_dc.abs().dot(color.abs() + (color - above).abs()),
-    ];
+    let mut inputs = [mean, color, d_dc].map(|own| own.to_array()).concat();
+    let far = DVec3::splat(mean.length() + camera.center().length());
+    let mut errors =
+        [far, DVec3::ONE + color.abs(), d_dc.abs()].map(|own| (OFF * own).to_array()).concat();
     for &number in &slices.lamp[..LAMP_NUMBERS as usize] {
         inputs.push(number.into());
         errors.push(OFF * (1.0 + f64::from(number.abs())));

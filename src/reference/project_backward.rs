@@ -79,8 +79,9 @@ pub fn project_gaussian_backward(
     let mut d_mean_in_view = camera.backward(mean_in_view, d_splat.mean2d, d_rows);
     let mut d_color = d_splat.color;
     if let Some(Lit { lamp, color }) = lit {
-        d_mean_in_view += d_color.dot(lamp.above_black(color)) * lamp.point_gradient(mean_in_view);
-        d_color *= lamp.factor(mean_in_view);
+        let d_log_factor;
+        (d_color, d_log_factor) = lamp.lit_backward(color, d_color, mean_in_view);
+        d_mean_in_view += d_log_factor * lamp.point_gradient(mean_in_view);
     }
 
     let (d_mean_sh, d_sh) =
@@ -209,7 +210,7 @@ impl<'a> ProjectionInputs<'a> {
         if self.constants.color_gradients {
             let rest = &mut gradient.sh[1..];
             rest.fill(DVec3::ZERO);
-            let d_color = self.factor(gaussian) * d_splat.color;
+            let d_color = self.d_color(gaussian, d_splat.color, color);
             rest.first_mut().into_iter().for_each(|first| *first = d_color);
         }
         gradient
@@ -221,17 +222,20 @@ impl<'a> ProjectionInputs<'a> {
         DVec3::from_array([0, 1, 2].map(|c| f64::from(color[c])))
     }
 
-    /// The factor of the lamp on a colour; 1 without one.
-    fn factor(&self, gaussian: &Gaussian) -> f64 {
-        self.lamp.map_or(1.0, |lamp| lamp.factor(self.camera.view(gaussian.mean)))
+    /// The gradient of a colour without the lamp, from that of the lit one.
+    fn d_color(&self, gaussian: &Gaussian, d_lit: DVec3, lit: DVec3) -> DVec3 {
+        let point = self.camera.view(gaussian.mean);
+        self.lamp.map_or(d_lit, |lamp| lamp.lit_backward(lit, d_lit, point).0)
     }
 
     /// The rounding errors of what the lamp adds to the gradient of the mean, and of its factor, relative.
     fn lamp_error(&self, gaussian: &Gaussian, d_color: DVec3, color: DVec3) -> [f64; 2] {
         let Some(lamp) = &self.lamp else { return [0.0; 2] };
         let point = self.camera.view(gaussian.mean);
-        let d_log_factor = d_color.abs().dot(color.abs() + lamp.above_black(DVec3::ZERO).abs());
-        [d_log_factor * lamp.point_gradient_error(point), lamp.factor_error(point)]
+        let (_, d_log_factor) = lamp.lit_backward(color, d_color.abs(), point);
+        let rounded = lamp.steepness() * d_color.abs().dot(DVec3::ONE + color.abs());
+        let error = (d_log_factor.abs() + rounded) * lamp.point_gradient_error(point);
+        [error, lamp.steepness() * lamp.factor_error(point)]
     }
 
     /// Columns of gradients that are written; those of the colour are the first ones of their plane.
@@ -325,7 +329,7 @@ impl Reference for Kernel {
             let gaussian = planes.load(&parameters, i);
             let color = scene.color(colors, i);
             let gradient = scene.backward(&gaussian, (&splat, color), &d_splat);
-            let d_color = scene.factor(&gaussian) * d_splat.color;
+            let d_color = scene.d_color(&gaussian, d_splat.color, color);
             let mut is_finite = (8.0 * d_color.as_vec3()).is_finite();
             scene.planes.store(&gradient, i, |at, value| {
                 let value = value as f32;
@@ -395,7 +399,8 @@ impl Reference for Kernel {
             // A basis is a polynomial of magnitude 3 and degree 3, which may vanish.
             let [by_lamp, factor] = scene.lamp_error(&gaussian, d_splat.color, color);
             moved.mean += by_lamp;
-            let basis = (64.0 * UNIT + factor) * scene.factor(&gaussian) * d_splat.color.abs();
+            let d_color = scene.d_color(&gaussian, d_splat.color, color);
+            let basis = (64.0 * UNIT + factor) * d_color.abs();
             moved.sh.iter_mut().for_each(|bound| *bound += basis);
             moved.quat += scene.quat_error(&gaussian, &splat, &d_splat);
             scene.planes.store(&moved, i, |at, bound| gradients[at] += bound);

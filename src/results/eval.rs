@@ -301,9 +301,9 @@ impl ModelRenderer {
     /// # Errors
     /// The device is out of memory or lost.
     pub(crate) fn render_as(&mut self, view: &View, in_even_light: bool) -> Result<Rendered> {
-        self.renderer.set_even_light(in_even_light.then_some(1.0))?;
+        self.renderer.set_even_light(in_even_light);
         let rendered = self.render(view);
-        self.renderer.set_even_light(None)?;
+        self.renderer.set_even_light(false);
         rendered
     }
 

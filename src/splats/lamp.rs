@@ -7,9 +7,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::kernels::lamp::{
     LAMP_AMBIENT, LAMP_BLACK, LAMP_EXPONENT, LAMP_FALLOFF_STEP, LAMP_FALLOFFS, LAMP_FARTHEST,
-    LAMP_GAIN, LAMP_LARGEST_EXPONENT, LAMP_LEAST_AMBIENT, LAMP_NEAREST, LAMP_NUMBERS,
+    LAMP_LARGEST_EXPONENT, LAMP_LEAST_AMBIENT, LAMP_NEAREST, LAMP_NUMBERS, LAMP_REACH,
     LAMP_REFERENCE_DISTANCE, LAMP_SLOPE, LAMP_STEP,
 };
+#[cfg(feature = "io")]
+use crate::kernels::lamp::{LAMP_KNEE, LAMP_LEFT};
 use crate::{Error, Result};
 
 /// The largest magnitude of the number of a share that is 0 or 1, which no number is exactly.
@@ -20,10 +22,11 @@ const FARTHEST_NUMBER: f64 = 12.0;
 /// The light at a point at r from it, with d = |r| and u = 1 - cos of the angle between r and its axis, is
 ///
 /// ```text
-/// gain (ambient + (1 - ambient) (reference_distance / d)^exponent exp(-falloffs[0] u - falloffs[1] u^2))
+/// ambient + (1 - ambient) (reference_distance / d)^exponent exp(-falloffs[0] u - falloffs[1] u^2)
 /// ```
 ///
-/// and the colour of a Gaussian is black + (colour - black) light^slope.
+/// and the colour of a Gaussian is black + tone(light^slope tone^-1(colour - black)), with the saturating tone law
+/// tone(x) = reach (1 - exp(-x / reach)), a line below 0 and near its reach; x for a reach of 0.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Lamp {
@@ -37,20 +40,16 @@ pub struct Lamp {
     pub exponent: f64,
     /// Not negative.
     pub falloffs: [f64; 2],
-    /// The distance at which the light on the axis is the gain; world units.
+    /// The distance at which the light on the axis is 1, that of evenly lit colours; world units.
     pub reference_distance: f64,
-    /// The slope of the tone law: d ln(target - black) / d ln linear light.
+    /// The slope of the tone law near black: d ln(target - black) / d ln linear light.
     pub slope: f64,
     /// The target of no light.
     #[serde(default)]
     pub black: f64,
-    /// The light on the axis at the reference distance, with that of evenly lit colours as its unit.
-    #[serde(default = "one")]
-    pub gain: f64,
-}
-
-fn one() -> f64 {
-    1.0
+    /// The target above black to which the tone law saturates; 0: it does not.
+    #[serde(default)]
+    pub reach: f64,
 }
 
 impl Lamp {
@@ -64,14 +63,14 @@ impl Lamp {
         reference_distance: 1.0,
         slope: 1.0 / 2.2,
         black: 0.0,
-        gain: 1.0,
+        reach: 0.0,
     };
 
-    /// The numbers of the device with which the light is this everywhere.
-    pub(crate) fn even_numbers(&self, light: f64) -> [f32; LAMP_NUMBERS as usize] {
+    /// The numbers of the device with which the light is 1 everywhere.
+    pub(crate) fn even_numbers(&self) -> [f32; LAMP_NUMBERS as usize] {
         /// Sigmoid and softplus of this are 0 next to 1.
         const NONE: f32 = -80.0;
-        let mut numbers = Self { gain: light, ..*self }.numbers();
+        let mut numbers = self.numbers();
         numbers[LAMP_EXPONENT as usize..LAMP_REFERENCE_DISTANCE as usize].fill(NONE);
         numbers
     }
@@ -86,10 +85,10 @@ impl Lamp {
         let away = 1.0 - towards.dot(axis).clamp(-1.0, 1.0);
         let [first, second] = self.falloffs;
         let beam = distance.powf(-self.exponent) * (-(first + second * away) * away).exp();
-        self.gain * (self.ambient + (1.0 - self.ambient) * beam)
+        self.ambient + (1.0 - self.ambient) * beam
     }
 
-    /// The factor on the colour of a Gaussian at a point in view space.
+    /// The factor on what the tone law shows at a point in view space.
     pub fn factor(&self, point: DVec3) -> f64 {
         self.light(point).powf(self.slope)
     }
@@ -97,15 +96,49 @@ impl Lamp {
     /// The colour of a Gaussian without the light at a point in view space.
     #[cfg(feature = "io")]
     pub(crate) fn unlit(&self, color: Vec3, point: DVec3) -> Vec3 {
-        let black = self.black as f32;
-        black + (color - black) / self.factor(point) as f32
+        let factor = self.factor(point);
+        let own = color.to_array().map(|value| self.tone(self.tone_inverse(value.into()) / factor));
+        Vec3::from_array(own.map(|value| value as f32))
     }
 
-    /// The same lamp with this light as the unit; colours then have the factor light^slope above black.
+    /// The value that the tone law shows as `x`, in proportion to light^slope.
+    #[cfg(feature = "io")]
+    pub(crate) fn tone(&self, x: f64) -> f64 {
+        let bent = x / self.reach;
+        if self.reach == 0.0 || bent < 0.0 {
+            return self.black + x;
+        }
+        let line = 1.0 - LAMP_LEFT + LAMP_LEFT * (bent - LAMP_KNEE);
+        self.black + self.reach * if bent < LAMP_KNEE { -(-bent).exp_m1() } else { line }
+    }
+
+    /// The inverse of [`Lamp::tone`].
+    #[cfg(feature = "io")]
+    pub(crate) fn tone_inverse(&self, value: f64) -> f64 {
+        let above = value - self.black;
+        let share = above / self.reach;
+        if self.reach == 0.0 || share < 0.0 {
+            return above;
+        }
+        let line = LAMP_KNEE + (share - (1.0 - LAMP_LEFT)) / LAMP_LEFT;
+        self.reach * if share < 1.0 - LAMP_LEFT { -(-share).ln_1p() } else { line }
+    }
+
+    /// The same lamp with this light as the unit, and the distance where it is on the axis as the reference distance;
+    /// unchanged if that is farther off than a factor of four, or nowhere.
     #[cfg(feature = "io")]
     #[must_use]
-    pub(crate) fn with_unit(&self, light: f64) -> Self {
-        Self { gain: self.gain / light, ..*self }
+    pub(crate) fn in_units_of(&self, light: f64) -> Self {
+        let ambient = self.ambient / light;
+        let farther = ((1.0 - self.ambient) / (light - self.ambient)).powf(1.0 / self.exponent);
+        if ambient < 1.0 && (0.25..=4.0).contains(&farther) {
+            return Self {
+                ambient,
+                reference_distance: farther * self.reference_distance,
+                ..*self
+            };
+        }
+        *self
     }
 
     /// The same lamp where a world unit is `scale` units.
@@ -125,7 +158,7 @@ impl Lamp {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn check(&self) -> Result<()> {
         let Self { position, axis, ambient, exponent, falloffs, .. } = *self;
-        let Self { reference_distance, slope, black, gain, .. } = *self;
+        let Self { reference_distance, slope, black, reach, .. } = *self;
         let is_finite = position.iter().chain(&axis).all(|x| x.abs() < 1e9);
         for (name, is_valid, rule) in [
             ("position or axis", is_finite, "finite"),
@@ -139,7 +172,7 @@ impl Lamp {
             ),
             ("slope", slope > 0.0 && slope <= 8.0, "above 0 and at most 8"),
             ("black", (-1.0..=1.0).contains(&black), "-1 to 1"),
-            ("gain", (1e-9..1e9).contains(&gain), "above 0 and finite"),
+            ("reach", reach == 0.0 || (1e-3..=1e3).contains(&reach), "0, or 0.001 to 1000"),
         ] {
             if !is_valid {
                 return Err(Error::Usage(format!("the lamp's {name} must be {rule}: {self:?}")));
@@ -166,7 +199,7 @@ impl Lamp {
         numbers[LAMP_REFERENCE_DISTANCE as usize] = self.reference_distance;
         numbers[LAMP_SLOPE as usize] = self.slope;
         numbers[LAMP_BLACK as usize] = self.black;
-        numbers[LAMP_GAIN as usize] = self.gain;
+        numbers[LAMP_REACH as usize] = self.reach;
         numbers.map(|number| number as f32)
     }
 
@@ -186,7 +219,7 @@ impl Lamp {
             reference_distance,
             slope: at(LAMP_SLOPE),
             black: at(LAMP_BLACK),
-            gain: at(LAMP_GAIN),
+            reach: at(LAMP_REACH),
         }
     }
 }
@@ -251,6 +284,33 @@ mod tests {
     }
 
     #[test]
+    #[cfg(feature = "io")]
+    fn another_unit_of_light_changes_no_ratio() {
+        let other = lamp().in_units_of(0.6);
+        for point in [DVec3::Z, DVec3::new(0.5, -0.3, 2.0), DVec3::new(-1.0, 0.3, 0.4)] {
+            assert!((0.6 * other.light(point) / lamp().light(point) - 1.0).abs() < 1e-12);
+        }
+        for light in [0.05, 1e-9] {
+            assert_eq!(lamp().in_units_of(light), lamp(), "the ambient light is 0.1");
+        }
+    }
+
+    #[test]
+    #[cfg(feature = "io")]
+    fn the_tone_law_has_an_inverse_on_both_sides_of_black_and_of_its_knee() {
+        for reach in [0.0, 0.5, 0.9] {
+            let own = Lamp { black: 0.07, reach, ..lamp() };
+            for value in [-0.3, 0.07, 0.08, 0.4, 0.53, 0.95, 1.5] {
+                let back = own.tone(own.tone_inverse(value));
+                assert!((back - value).abs() < 1e-6, "reach {reach}: {value} became {back}");
+            }
+        }
+        let power = Lamp { reach: 0.0, ..lamp() };
+        let nearly = Lamp { reach: 1e3, ..lamp() };
+        assert!((power.tone(0.5) - nearly.tone(0.5)).abs() < 2e-4);
+    }
+
+    #[test]
     fn a_number_out_of_range_is_refused_by_its_name() {
         for (wrong, name) in [
             (Lamp { exponent: 5.0, ..lamp() }, "exponent"),
@@ -258,6 +318,7 @@ mod tests {
             (Lamp { falloffs: [-1.0, 0.0], ..lamp() }, "falloffs"),
             (Lamp { reference_distance: 0.0, ..lamp() }, "reference_distance"),
             (Lamp { position: [f64::NAN; 3], ..lamp() }, "position"),
+            (Lamp { reach: -1.0, ..lamp() }, "reach"),
             (Lamp { slope: f64::INFINITY, ..lamp() }, "slope"),
         ] {
             let refused = wrong.check().unwrap_err().to_string();

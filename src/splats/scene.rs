@@ -192,15 +192,6 @@ impl Gaussians {
         rotated
     }
 
-    /// Multiplies the differences of colours to `fixed`, from every direction.
-    #[cfg(feature = "io")]
-    pub(crate) fn scale_colors(&mut self, fixed: f32, factor: f32) {
-        for dc in self.dc_mut() {
-            *dc = fixed / SH_C0 + factor * (*dc - fixed / SH_C0);
-        }
-        self.rest_mut().iter_mut().for_each(|rest| *rest *= factor);
-    }
-
     /// Adds a constant to the colour from every direction.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn shift_colors(&mut self, by: f32) {

@@ -74,12 +74,14 @@ impl Views {
             let mut target =
                 exposure.map_or_else(|| target.clone(), |own| own.inverse().applied(&target));
             if let Some(lamp) = lamp {
-                target.data.iter_mut().for_each(|value| *value -= lamp.black as f32);
+                let shown = |value: f32| lamp.tone_inverse(value.into()) as f32;
+                target.data.iter_mut().for_each(|value| *value = shown(*value));
             }
             Ok(Some(target))
         })?;
         if let Some(lamp) = lamp {
-            colors.iter_mut().for_each(|color| *color += lamp.black as f32);
+            let toned = |color: Vec3| color.to_array().map(|x| lamp.tone(x.into()) as f32);
+            colors.iter_mut().for_each(|color| *color = toned(*color).into());
         }
         let positions: Vec<DVec3> = kept.iter().map(|point| frame.framed(point.position)).collect();
         let seed = Stream::new(config.seed, streams::FEATURES).bits(0);

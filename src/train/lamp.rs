@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use glam::DVec3;
 
 use super::LampRates;
-use super::scene_light::SceneLight;
+use super::scene_light::{Encoding, SceneLight};
 use super::{OnOff, Optimizer, TrainConfig, Trainer};
 use crate::Result;
 use crate::gpu::{Gpu, Recorder, Slice, SliceMut};
@@ -30,22 +30,13 @@ const FEWEST_VIEWS: usize = 3;
 pub(super) struct LampLearning {
     rates: LampRates,
     pub(super) moments: Moments,
-    /// Points that training views see, in view space and in units of the frame.
-    points: Vec<DVec3>,
 }
 
 impl LampLearning {
     /// # Errors
     /// The device is out of memory.
-    pub(super) fn new(gpu: &Gpu, rates: LampRates, dataset: &Dataset, scale: f64) -> Result<Self> {
-        let points = in_views(dataset).into_values().flatten().map(|point| scale * point);
-        let moments = Moments::zeros(gpu, LAMP_WIDTH as usize)?;
-        Ok(Self { rates, moments, points: points.collect() })
-    }
-
-    /// The median of the light on the points that views see.
-    fn median_light(&self, lamp: &Lamp) -> f64 {
-        median(self.points.iter().map(|point| lamp.light(*point)).collect()).unwrap_or(1.0)
+    pub(super) fn new(gpu: &Gpu, rates: LampRates) -> Result<Self> {
+        Ok(Self { rates, moments: Moments::zeros(gpu, LAMP_WIDTH as usize)? })
     }
 }
 
@@ -107,30 +98,18 @@ impl Optimizer {
 }
 
 impl Trainer {
-    /// The lamp as learned so far, in units of the dataset's world, for the colours of [`Trainer::model`]; `None`
-    /// without one.
+    /// The lamp as learned so far, in units of the dataset's world; `None` without one.
     ///
     /// # Errors
     /// The device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn lamp(&self) -> Result<Option<Lamp>> {
-        let own = self.lamp_and_even_light()?;
-        Ok(own.map(|(lamp, light)| lamp.with_unit(light).scaled(1.0 / self.frame.scale)))
-    }
-
-    /// The lamp as learned so far, in the training frame, and the light that evenly lit views have, with that of the
-    /// colours in training as its unit; `None` without a lamp.
-    ///
-    /// # Errors
-    /// The device was lost.
-    pub(super) fn lamp_and_even_light(&self) -> Result<Option<(Lamp, f64)>> {
-        let own = self.renderer.lamp()?.zip(self.optimizer.lamp.as_ref());
-        Ok(own.map(|(lamp, learning)| (lamp, learning.median_light(&lamp))))
+        Ok(self.renderer.lamp()?.map(|lamp| lamp.scaled(1.0 / self.frame.scale)))
     }
 }
 
-/// The lamp of the first step, in the training frame: that of the configuration, at the distances and the tone law of
-/// the dataset.
+/// The lamp of the first step, in the training frame: that of the configuration at the median distance of what the
+/// views show, with the tone law of the dataset. The unit of light is that on the median of the points.
 ///
 /// # Errors
 /// A photograph can no longer be read, or the device is out of memory or lost.
@@ -148,10 +127,9 @@ pub(super) fn start(pseudo_gt: &PseudoGt, dataset: &Dataset, config: &TrainConfi
         );
     }
     let scale = config.frame.unwrap_or_default().scale;
-    let distances: Vec<Vec<f64>> = in_views(dataset)
-        .into_values()
-        .map(|points| points.iter().map(|point| point.length()).collect())
-        .collect();
+    let points = in_views(dataset);
+    let own = points.values().map(|points| points.iter().map(|point| point.length()).collect());
+    let distances: Vec<Vec<f64>> = own.collect();
     if config.exposure.learn == OnOff::On && spread(&distances) < LEAST_SPREAD {
         tracing::warn!(
             "all views are at about the same distance from what they show: exposures of views can take the lamp's \
@@ -160,7 +138,8 @@ pub(super) fn start(pseudo_gt: &PseudoGt, dataset: &Dataset, config: &TrainConfi
     }
     let all = distances.into_iter().flatten().collect();
     let reference_distance = median(all).unwrap_or_else(|| config.extent_of(dataset));
-    let (black, slope) = SceneLight::of(&config.tone, dataset)?.encoding(pseudo_gt)?;
+    let Encoding { black, slope, reach } =
+        SceneLight::of(&config.tone, dataset)?.encoding(pseudo_gt)?;
     let lamp = Lamp {
         ambient: config.lamp.ambient,
         exponent: config.lamp.exponent,
@@ -168,10 +147,15 @@ pub(super) fn start(pseudo_gt: &PseudoGt, dataset: &Dataset, config: &TrainConfi
         reference_distance,
         slope,
         black,
+        reach,
         ..Lamp::AT_CAMERA
     };
+    let lights = points.values().flatten().map(|point| lamp.light(*point)).collect();
+    let lamp = median(lights).map_or(lamp, |light| lamp.in_units_of(light));
+    let reference_distance = lamp.reference_distance;
     tracing::info!(
-        "a lamp at the camera: reference distance {reference_distance:.3}, slope of the tone law {slope:.3}"
+        "a lamp at the camera: reference distance {reference_distance:.3}, slope of the tone law {slope:.3}, which \
+         saturates at {reach:.3}"
     );
     Ok(lamp.scaled(scale))
 }

@@ -195,9 +195,7 @@ impl Trainer {
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MAX_STEPS as usize)?,
         };
-        let learning = lamp
-            .map(|_| LampLearning::new(gpu, config.lamp.rates, dataset, frame.scale))
-            .transpose()?;
+        let learning = lamp.map(|_| LampLearning::new(gpu, config.lamp.rates)).transpose()?;
         let degree = initial.context.as_ref().map_or(0, Gaussians::sh_degree_in_use);
         let degree = degree.max(first_sh_degree(&config));
         let mut trainer = Self {

@@ -170,8 +170,9 @@ impl<'a> Chain<'a> {
             let d =
                 project_gaussian_backward(&camera, degree, antialiased, &gaussian, own, &d_splat);
             if let Some(Lit { lamp, color }) = lit {
-                let share = lamp.gradient(camera.view(gaussian.mean));
-                let d_log_factor = d_splat.color.dot(lamp.above_black(color));
+                let point = camera.view(gaussian.mean);
+                let share = lamp.gradient(point);
+                let (_, d_log_factor) = lamp.lit_backward(color, d_splat.color, point);
                 (results.lamp.iter_mut().zip(share)).for_each(|(sum, d)| *sum += d_log_factor * d);
             }
             planes.store(&d, i, |at, value| results.gradient[at] = value);

@@ -346,7 +346,7 @@ pub(crate) fn lamp() -> Lamp {
         reference_distance: 2.0,
         slope: 0.45,
         black: 0.07,
-        gain: 1.2,
+        reach: 0.6,
     }
 }
 

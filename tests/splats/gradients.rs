@@ -94,16 +94,18 @@ fn the_gradient_of_compensated_opacities_agrees_with_central_differences() {
 /// Every attribute with a lamp, which also acts on means, and the numbers of the lamp.
 #[test]
 fn the_gradient_of_lit_colors_and_of_their_lamp_agrees_with_central_differences() {
-    for (model, channels) in [(CameraModel::Pinhole, 3), (fisheye(), 11)] {
+    for (model, channels, reach) in
+        [(CameraModel::Pinhole, 3, 0.6), (fisheye(), 11, 0.6), (CameraModel::Pinhole, 3, 0.0)]
+    {
         let shape = Shape { sh_degree: 1, features: features(channels) };
         let mut setup = Setup::seen_by(model, 7, SIZE, shape, 23);
-        setup.settings.lamp = Some(lamp());
+        setup.settings.lamp = Some(Lamp { reach, ..lamp() });
         setup.settings.raw_colors = channels > 3;
         check(&setup, &format!("lit, {model:?}"));
         let mut chain = Chain::new(&setup);
         let (parameters, background) = (chain.parameters(), chain.background());
         let actual = chain.run(&parameters).lamp;
-        let numbers = lamp().numbers().map(f64::from);
+        let numbers = Lamp { reach, ..lamp() }.numbers().map(f64::from);
         let step = 1e-5;
         for (number, actual) in actual.into_iter().enumerate() {
             let mut loss = |by: f64| {

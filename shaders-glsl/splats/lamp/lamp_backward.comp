@@ -9,10 +9,10 @@
 
 //! Lamp backward: the sums of the gradients of the lamp's numbers over chunks of Gaussians, after `project_backward`.
 //!
-//! The gradient of ln factor is that of the lit colour times the lit colour above black; `project_backward` has
-//! written SH_C0 factor times that of the lit colour, as the gradient of the coefficients of degree 0. It is 0 for a
-//! Gaussian that the view does not show. A subgroup sums `CHUNK` Gaussians in a fixed order: the partition of a sum
-//! does not depend on the device.
+//! Without the lamp a colour is black + tone(x), and lit it is black + tone(factor x): the gradient of ln factor is
+//! that of the unlit colour times x d tone / dx. `project_backward` has written SH_C0 times that of the unlit colour,
+//! as the gradient of the coefficients of degree 0. It is 0 for a Gaussian that the view does not show. A subgroup sums
+//! `CHUNK` Gaussians in a fixed order: the partition of a sum does not depend on the device.
 
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
@@ -46,7 +46,11 @@ void main() {
         if (d_dc == vec3(0.0)) continue;
         vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
         LampPoint at = lamp_at(own, cameras[camera_index].view_from_world * vec4(mean, 1.0));
-        float d = dot(d_dc, colors[COLOR_VECTORS * i].rgb - own.black) / (SH_C0 * lamp_factor(own, at));
+        float factor = lamp_factor(own, at), d = 0.0;
+        for (uint c = 0; c < 3; c++) {
+            float x = lamp_tone_inverse(own, colors[COLOR_VECTORS * i][c] - own.black) / factor;
+            d += d_dc[c] / SH_C0 * x * lamp_tone_slope(own, x);
+        }
         float gradient[LAMP_WIDTH];
         lamp_gradient(own, at, gradient);
         [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) sums[n] += d * gradient[n];

@@ -124,7 +124,7 @@ void main() {
     vec3 rgb = sh_color(i, normalize(offset * finite_scale(length(offset))));
     if (LAMP) {
         Lamp own = load_lamp();
-        rgb = own.black + (rgb - own.black) * lamp_factor(own, lamp_at(own, mean_in_view));
+        rgb = lamp_lit(own, lamp_factor(own, lamp_at(own, mean_in_view)), rgb);
     }
     rgb = shown(rgb);
     uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;

@@ -194,8 +194,13 @@ void main() {
     if (LAMP) {
         Lamp own = load_lamp();
         LampPoint at = lamp_at(own, mean_in_view);
-        d_mean_in_view += dot(d_color, color - own.black) * lamp_point_gradient(own, at);
-        d_color *= lamp_factor(own, at);
+        float factor = lamp_factor(own, at), d_log_factor = 0.0;
+        for (uint c = 0; c < 3; c++) {
+            float x = lamp_tone_inverse(own, color[c] - own.black), d_x = d_color[c] * lamp_tone_slope(own, x);
+            d_log_factor += d_x * x;
+            d_color[c] = d_x * factor / lamp_tone_slope(own, x / factor);
+        }
+        d_mean_in_view += d_log_factor * lamp_point_gradient(own, at);
     }
     vec3 offset = offset_from_camera(mean, camera.view_from_world);
     vec3 d_mean = world_from_view * d_mean_in_view + sh_backward(i, offset, d_color);

@@ -11,7 +11,7 @@ use serde_json::json;
 use super::{GENERATOR, Provenance, gzip};
 use crate::camera::{Camera, CameraModel};
 use crate::kernels::camera_pinhole::JACOBIAN_MARGIN;
-use crate::kernels::lamp::{LAMP_FARTHEST, LAMP_NEAREST};
+use crate::kernels::lamp::{LAMP_FARTHEST, LAMP_KNEE, LAMP_LEFT, LAMP_NEAREST};
 use crate::kernels::splat::{ALPHA_MIN, DILATION};
 use crate::photographs::image::Image;
 use crate::results::report::{base64, escape, jpeg};
@@ -141,6 +141,8 @@ fn shader(text: &str, max_alpha: f32, antialiased: bool) -> String {
         ("JACOBIAN_MARGIN", JACOBIAN_MARGIN),
         ("LAMP_NEAREST", LAMP_NEAREST),
         ("LAMP_FARTHEST", LAMP_FARTHEST),
+        ("LAMP_KNEE", LAMP_KNEE),
+        ("LAMP_LEFT", LAMP_LEFT),
     ];
     let floats = constants.map(|(name, value)| format!("const float {name} = {value:?};"));
     let constants = [floats.join("\n"), format!("const bool ANTIALIASED = {antialiased};")];

@@ -329,7 +329,7 @@ impl RunDirectory {
         self.flush_log()?;
         let in_frame = trainer.gaussians_in_frame()?;
         trainer.refuse_not_finite(&in_frame)?;
-        let model = trainer.model_of(&in_frame)?;
+        let model = trainer.model_of(&in_frame);
         let comments = model.facts().comments();
         ply::save_with_comments(&model.shown(), self.path.join("model.ply"), &comments)
     }

@@ -52,7 +52,7 @@ impl DeviceLamp {
         Ok(Self {
             numbers: gpu.buffer("lamp", &lamp.numbers())?,
             gradients: gpu.zeros("lamp_gradients", if backward.is_some() { WIDTH } else { 0 })?,
-            even: gpu.buffer("even_light", &lamp.even_numbers(1.0))?,
+            even: gpu.buffer("even_light", &lamp.even_numbers())?,
             is_even: false,
             backward,
         })
@@ -122,16 +122,9 @@ impl Renderer {
         self.gpu.write(&mut lamp.numbers, numbers)
     }
 
-    /// Lights the colours evenly by this light from now on, where 1 shows each Gaussian in its own colour; `None`: by
-    /// the lamp again.
-    ///
-    /// # Errors
-    /// The device was lost.
-    pub(crate) fn set_even_light(&mut self, light: Option<f64>) -> Result<()> {
-        let Some(lamp) = &mut self.lamp else { return Ok(()) };
-        lamp.is_even = light.is_some();
-        let Some((light, own)) = light.zip(self.settings.lamp) else { return Ok(()) };
-        self.gpu.write(&mut lamp.even, &own.even_numbers(light))
+    /// Shows each Gaussian in its own colour from now on, or by the lamp again.
+    pub(crate) fn set_even_light(&mut self, is_even: bool) {
+        self.lamp.iter_mut().for_each(|lamp| lamp.is_even = is_even);
     }
 
     /// The lamp, and the status words.

@@ -19,8 +19,12 @@ const REACH: f64 = 2.5;
 /// The lamp's light on a surface that faces it at the reach.
 const COLOUR: DVec3 = DVec3::new(0.96, 0.98, 1.0);
 
-/// The fraction of the references' light that is there without the lamp.
+/// The fraction of the scene's own light that is there beside the lamp.
 pub(super) const AMBIENT: f64 = 0.004;
+
+/// The light of the references: the mean of the room's own, and the same on every surface, from all sides. Shading and
+/// shadows of a light that no photograph shows could not be known.
+pub(super) const EVEN: f64 = 0.58;
 
 /// The lamp of a camera, in the world.
 pub(super) struct CameraLamp {

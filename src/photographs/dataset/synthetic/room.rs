@@ -237,14 +237,14 @@ impl Scene for Room {
         let up = 0.5 + 0.5 * hit.normal.z;
         let ambient = GROUND_RADIANCE.lerp(SKY_RADIANCE, up) * self.openness(position, hit.normal);
         let (lit, highlight) = self.lamp(position, hit.normal, direction, surface.look.gloss);
-        let even = albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * highlight;
-        let Some(carried) = carried else { return [even; 2] };
+        let own = albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * highlight;
+        let Some(carried) = carried else { return [own; 2] };
         let is_clear = |start, direction, distance| self.is_clear(start, direction, distance);
         let light = carried.light(position, hit.normal, is_clear).map(|light| {
             let shine = surface.look.gloss * shine(light.to_lamp, hit.normal, direction);
             light.radiance * (albedo * light.cosine + shine)
         });
-        [even, lamp::AMBIENT * even + light.unwrap_or(DVec3::ZERO)]
+        [lamp::EVEN * albedo, lamp::AMBIENT * own + light.unwrap_or(DVec3::ZERO)]
     }
 
     fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {

@@ -179,9 +179,9 @@ impl Scene for Street {
         let cosine = hit.normal.dot(SUN);
         let lit = cosine > 0.0 && self.nearest(position + 1e-6 * hit.normal, SUN).is_none();
         let sun = if lit { SUN_RADIANCE * cosine } else { DVec3::ZERO };
-        let even = albedo * (ambient + sun);
+        let own = albedo * (ambient + sun);
         let Some(carried) = carried else {
-            return [even, even * FALL.powf(0.5 - position.x / self.length)];
+            return [own, own * FALL.powf(0.5 - position.x / self.length)];
         };
         let is_clear = |start, direction, distance| {
             let first = self.nearest(start, direction);
@@ -189,7 +189,7 @@ impl Scene for Street {
         };
         let light = carried.light(position, hit.normal, is_clear);
         let light = light.map_or(DVec3::ZERO, |light| light.radiance * light.cosine);
-        [even, lamp::AMBIENT * even + albedo * light]
+        [lamp::EVEN * albedo, lamp::AMBIENT * own + albedo * light]
     }
 
     fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {

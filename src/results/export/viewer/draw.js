@@ -223,13 +223,13 @@ function renderer(gl, changed) {
     changed();
   }
 
-  function light({ position, axis, ambient, exponent, falloffs, reference_distance: reference, slope, black, gain }) {
+  function light({ position, axis, ambient, exponent, falloffs, reference_distance: reference, slope, black, reach }) {
     const length = Math.hypot(...axis, 1);
     gl.uniform3fv(uniform('lampPosition'), position);
     gl.uniform3fv(uniform('lampAxis'), [...axis, 1].map((value) => value / length));
     gl.uniform2fv(uniform('lampFalloffs'), falloffs);
     gl.uniform4f(uniform('lampLight'), ambient, exponent, reference, slope);
-    gl.uniform2f(uniform('lampTone'), black, gain);
+    gl.uniform2f(uniform('lampLaw'), black, reach);
   }
 
   // Draws at most a share of the Gaussians, the most important ones. Returns whether all that is asked for is drawn.

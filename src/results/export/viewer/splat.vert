@@ -16,7 +16,7 @@ uniform bool isLit;   // by a lamp at the camera
 uniform vec3 lampPosition, lampAxis;  // in the view
 uniform vec2 lampFalloffs;
 uniform vec4 lampLight;  // ambient, exponent, reference distance, slope of the tone law
-uniform vec2 lampTone;  // the target of no light; the light on the axis at the reference distance
+uniform vec2 lampLaw;  // the target of no light; the reach of the tone law
 
 in vec2 corner;
 in uint id;
@@ -48,7 +48,24 @@ float lampFactor(vec3 point) {
     float d = clamp(length(offset), LAMP_NEAREST, LAMP_FARTHEST);
     float away = 1.0 - clamp(dot(offset / d, lampAxis), -1.0, 1.0);
     float beam = exp(-lampLight.y * log(d) - (lampFalloffs.x + lampFalloffs.y * away) * away);
-    return pow(lampTone.y * (lampLight.x + (1.0 - lampLight.x) * beam), lampLight.w);
+    return pow(lampLight.x + (1.0 - lampLight.x) * beam, lampLight.w);
+}
+
+float lampTone(float x) {
+    float reach = lampLaw.y, bent = x / reach;
+    if (reach == 0.0 || bent < 0.0) return x;
+    return reach * (bent < LAMP_KNEE ? 1.0 - exp(-bent) : 1.0 - LAMP_LEFT + LAMP_LEFT * (bent - LAMP_KNEE));
+}
+
+float lampToneInverse(float above) {
+    float reach = lampLaw.y, part = above / reach;
+    if (reach == 0.0 || part < 0.0) return above;
+    return reach * (part < 1.0 - LAMP_LEFT ? -log(1.0 - part) : LAMP_KNEE + (part - (1.0 - LAMP_LEFT)) / LAMP_LEFT);
+}
+
+vec3 lit(vec3 rgb, float factor) {
+    for (int c = 0; c < 3; c++) rgb[c] = lampLaw.x + lampTone(factor * lampToneInverse(rgb[c] - lampLaw.x));
+    return rgb;
 }
 
 void main() {
@@ -80,7 +97,7 @@ void main() {
     vec2 pixel = focal * mean.xy / mean.z + principalPoint + fromMean;
     depth = mean.z;
     vec3 rgb = shaded(int(sh_count(degree)) * i, normalize(a.xyz - eye));
-    if (isLit) rgb = lampTone.x + (rgb - lampTone.x) * lampFactor(mean);
+    if (isLit) rgb = lit(rgb, lampFactor(mean));
     color = vec4(max(rgb, vec3(0.0)), opacity);
     gl_Position = vec4((pixel + offset) * scale + vec2(-1.0, 1.0), 0.0, 1.0);
 }
