@@ -5,12 +5,13 @@
 
 mod cameras;
 mod clip;
+mod pictures;
 mod reconstruction;
 mod stages;
 mod tone_mapped;
 mod tool;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -18,11 +19,12 @@ pub use self::cameras::describe;
 pub use self::reconstruction::{Mapper, Matcher};
 pub use self::tool::how_to_install;
 
+use self::pictures::{BRIGHT, Pictures, bright_name, is_dark};
 use self::reconstruction::Reconstruction;
 use self::tool::Tool;
 use super::dataset::{Dataset, is_mask};
 use super::image::files::{photographs_in, stem, unread_in};
-use crate::base::output::{check_writable, create_folder, write_whole};
+use crate::base::output::{check_writable, create_folder, is_same_file, write_whole};
 use crate::base::{input, tree};
 use crate::camera::Lens;
 use crate::gpu::{DeviceChoice, Gpu};
@@ -33,6 +35,8 @@ use crate::{Error, Result};
 pub struct PoseOptions {
     /// Folder or archive of photographs of one scene, or a clip.
     pub photos: PathBuf,
+    /// Folder or archive of bright photographs of the same scene, through which the dark ones are posed.
+    pub with: Option<PathBuf>,
     /// Dataset to write; it appears when complete.
     pub out: PathBuf,
     /// Replace a dataset that this module wrote.
@@ -82,6 +86,8 @@ pub struct Posed {
     pub photographs: usize,
     /// Photographs with a camera.
     pub placed: usize,
+    /// Of the bright photographs, those with a camera and all; `None` without any.
+    pub bright: Option<[usize; 2]>,
     /// The calibrated lenses.
     pub lenses: Vec<Lens>,
 }
@@ -104,44 +110,65 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(Progress<'_>)) -> Result<
     let mut out = Unfinished::new(&options.out, options.overwrite)?;
     let colmap = Tool::new(&options.colmap, "colmap", &out.log)
         .found(&format!("by hand: {}", by_hand(&options.photos, &options.out)))?;
+    let follows = is_clip && options.with.is_none();
     let matcher =
-        options.matcher.unwrap_or(if is_clip { Matcher::Sequential } else { Matcher::Exhaustive });
+        options.matcher.unwrap_or(if follows { Matcher::Sequential } else { Matcher::Exhaustive });
+    if options.with.is_some() && matcher == Matcher::Sequential {
+        let problem = "--matcher sequential pairs neighbours by name, and no dark photograph with one of --with; take \
+                       exhaustive";
+        return Err(Error::Usage(problem.to_owned()));
+    }
     let reconstruction = Reconstruction::new(options, colmap, matcher, &out.work)?;
-    let folder = if tree::archive_of(&options.photos).is_some() {
-        Dataset::folder_of(&options.photos)?
-    } else {
-        options.photos.clone()
-    };
-    let mut photographs = if is_clip {
+    let folder = folder_of(&options.photos)?;
+    let bright = options.with.as_deref().map(|with| bright_photographs(with, &folder));
+    let bright = bright.transpose()?.unwrap_or_default();
+    let dark = if is_clip {
         let ffmpeg = Tool::new(&options.ffmpeg, "ffmpeg", &out.log).found("")?;
         clip::frames(&ffmpeg, &options.photos, options.fps, &out.work.join("frames"))?
     } else {
         distinct_photographs(&folder)?
     };
     let gpu = (options.open)(&options.device)?;
-    let tone_mapped = out.work.join("tone-mapped");
-    let gain = tone_mapped::write(&gpu, &mut photographs, &tone_mapped, report)?;
-    let all = photographs.len();
+    let mut pictures = Pictures { dark, bright, copies: out.work.join("tone-mapped") };
+    let gain = tone_mapped::write(&gpu, &mut pictures.dark, &pictures.copies, report)?;
+    let all = pictures.dark.len();
     report(Progress::Line(&format!("{all} photographs brightened (gain {gain:.1})")));
-    let models = reconstruction.models((&tone_mapped, &photographs), report)?;
-    let largest = Dataset::largest_model(&models)?;
-    let (model, placed) =
-        largest.filter(|(_, placed)| placed.len() >= MIN_CAMERAS).ok_or_else(|| {
-            let problem = format!(
-                "COLMAP found no cameras for these {all} photographs: too little overlap or texture; take more \
+    if options.with.is_some() {
+        // By a curve of their own, which leaves those in normal light as they are.
+        let folder = pictures.copies.join(BRIGHT);
+        let gain = tone_mapped::write(&gpu, &mut pictures.bright, &folder, report)?;
+        let count = pictures.bright.len();
+        report(Progress::Line(&format!("{count} bright photographs beside them (gain {gain:.1})")));
+    }
+    let models = reconstruction.models(&pictures, report)?;
+    let largest = Dataset::largest_model(&models, is_dark)?;
+    let has_enough = |(_, names): &(PathBuf, Vec<String>)| {
+        names.len() >= MIN_CAMERAS && names.iter().any(|name| is_dark(name))
+    };
+    let (model, names) = largest.filter(has_enough).ok_or_else(|| {
+        let problem = format!(
+            "COLMAP found no cameras for these {all} photographs: too little overlap or texture; take more \
              photographs, closer together, or expose longer ({} has its output)",
-                out.kept_log().display()
-            );
-            Error::input(&options.photos, problem)
-        })?;
-    out.add_photographs(&photographs, &placed)?;
+            out.kept_log().display()
+        );
+        Error::input(&options.photos, problem)
+    })?;
+    let bright: Vec<String> = names.iter().filter_map(|name| bright_name(name)).collect();
+    let dark: Vec<String> = names.into_iter().filter(|name| is_dark(name)).collect();
+    out.add_photographs("", &pictures.dark, &dark)?;
     out.add_masks(&folder, is_clip)?;
-    let sparse = out.add_model(&model)?;
+    let own_name = |name: &str| is_dark(name).then(|| name.to_owned());
+    let sparse = out.add_model("", &model, options.with.as_ref().map(|_| own_name))?;
+    if !bright.is_empty() {
+        out.add_photographs(BRIGHT, &pictures.bright, &bright)?;
+        out.add_model(BRIGHT, &model, Some(bright_name))?;
+    }
     let lenses = Dataset::lenses(&sparse)?;
     out.finish()?;
-    let placed = placed.len();
+    let placed = dark.len();
     let target = options.out.display();
     report(Progress::Line(&format!("{placed} of {all} photographs have a camera -> {target}")));
+    warn_of_unplaced(&pictures.dark, &dark);
     for lens in &lenses {
         if let Some(problem) = cameras::implausible(lens) {
             tracing::warn!(
@@ -156,7 +183,42 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(Progress<'_>)) -> Result<
             "most photographs have no camera; take more of them, closer together, or expose longer"
         );
     }
-    Ok(Posed { photographs: all, placed, lenses })
+    let bright = options.with.as_ref().map(|_| [bright.len(), pictures.bright.len()]);
+    Ok(Posed { photographs: all, placed, bright, lenses })
+}
+
+/// Names the first photographs without a camera.
+fn warn_of_unplaced(photographs: &[PathBuf], placed: &[String]) {
+    const NAMED: usize = 5;
+    let placed: BTreeSet<&str> = placed.iter().map(|name| stem(name)).collect();
+    let names = photographs.iter().filter_map(|path| path.file_name()?.to_str());
+    let without: Vec<&str> = names.filter(|name| !placed.contains(stem(name))).collect();
+    if !without.is_empty() {
+        let (count, first) = (without.len(), without[..without.len().min(NAMED)].join(", "));
+        let more = if count > NAMED { ", ..." } else { "" };
+        tracing::warn!("{count} photographs have no camera and are left out: {first}{more}");
+    }
+}
+
+/// The folder of photographs, which may be in an archive.
+fn folder_of(photos: &Path) -> Result<PathBuf> {
+    match tree::archive_of(photos) {
+        Some(_) => Dataset::folder_of(photos),
+        None => Ok(photos.to_owned()),
+    }
+}
+
+/// The bright photographs, which are not in the folder of the dark ones.
+///
+/// # Errors
+/// Those of [`distinct_photographs`], or both are in one folder.
+fn bright_photographs(with: &Path, dark: &Path) -> Result<Vec<PathBuf>> {
+    let bright = folder_of(with)?;
+    if is_same_file(&bright, dark) {
+        let problem = "is the folder of the dark photographs itself; --with takes the bright ones";
+        return Err(Error::input(with, problem));
+    }
+    distinct_photographs(&bright)
 }
 
 /// The commands to run COLMAP by hand.
@@ -253,13 +315,18 @@ impl Unfinished {
         Ok(Self { target: target.to_owned(), replaces, folder, work, log, is_finished: false })
     }
 
-    /// Adds those of `photographs` that are placed, by their names without extension.
-    fn add_photographs(&self, photographs: &[PathBuf], placed: &[String]) -> Result<()> {
+    /// Adds those of `photographs` that are placed, by their names without extension, to the dataset `below` this one.
+    fn add_photographs(
+        &self,
+        below: &str,
+        photographs: &[PathBuf],
+        placed: &[String],
+    ) -> Result<()> {
         let by_name: BTreeMap<&str, &PathBuf> = photographs
             .iter()
             .filter_map(|path| Some((stem(path.file_name()?.to_str()?), path)))
             .collect();
-        let images = self.folder.join("images");
+        let images = self.folder.join(below).join("images");
         create_folder(&images)?;
         let placed = placed.iter().filter_map(|name| by_name.get(stem(name)));
         placed.into_iter().try_for_each(|path| link_or_copy(path, &images))
@@ -281,12 +348,25 @@ impl Unfinished {
         files.iter().filter(|file| is_mask(file)).try_for_each(|mask| link_or_copy(mask, &images))
     }
 
-    /// Adds the files of a COLMAP model; returns their folder.
-    fn add_model(&self, model: &Path) -> Result<PathBuf> {
-        let sparse = self.folder.join("sparse/0");
+    /// Adds the files of a COLMAP model to the dataset `below` this one; where names are given anew, with the images
+    /// that have one. Returns their folder.
+    fn add_model(
+        &self,
+        below: &str,
+        model: &Path,
+        renamed: Option<impl Fn(&str) -> Option<String>>,
+    ) -> Result<PathBuf> {
+        let sparse = self.folder.join(below).join("sparse/0");
         create_folder(&sparse)?;
-        for file in ["cameras.bin", "images.bin", "points3D.bin"] {
+        for file in ["cameras.bin", "points3D.bin"] {
             link_or_copy(&model.join(file), &sparse)?;
+        }
+        match renamed {
+            None => link_or_copy(&model.join("images.bin"), &sparse)?,
+            Some(renamed) => {
+                let images = Dataset::images_renamed(model, renamed)?;
+                write_whole(&sparse.join("images.bin"), &images)?;
+            }
         }
         Ok(sparse)
     }
