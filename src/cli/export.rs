@@ -268,7 +268,9 @@ fn check_law(args: &ExportArgs) -> crate::Result<()> {
         }
         _ if is_model(&args.run) => {
             let run = args.run.display();
-            format!("--law states the tone curve of a run, and {run} is a model file; pass the run directory")
+            format!(
+                "--law states the tone curve of a run, and {run} is a model file; pass the run directory"
+            )
         }
         To::Ply | To::Spz | To::Sog => return Ok(()),
     };

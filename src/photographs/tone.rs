@@ -67,11 +67,11 @@ pub(crate) use self::profile::profiled;
 #[cfg(feature = "fit")]
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
-pub use self::scene_law::SceneLaw;
 #[cfg(feature = "io")]
 pub(crate) use self::recorded::ToneLaw;
 #[cfg(feature = "io")]
 pub use self::recorded::ToneMapping;
+pub use self::scene_law::SceneLaw;
 #[cfg(feature = "io")]
 pub(crate) use self::settings::OF_CURVE;
 #[cfg(feature = "io")]

@@ -392,7 +392,7 @@ fn a_model_that_states_its_law_is_drawn_as_its_dark_photographs_or_in_their_line
     assert_eq!(info.law_stops, law.stops());
     let inverse = InverseTone::of_law(&law);
     let planes = own_planes(&own);
-    let mut drawn = |number, exposure, format: ImageFormat| {
+    let drawn = |number, exposure, format: ImageFormat| {
         let picture = session.host.picture(format, SIZE).unwrap();
         let (camera, commands) = (c_camera(), session.host.begin());
         let color = NspImage { format: vulkan(format), ..image(&picture) };
@@ -418,7 +418,8 @@ fn a_model_that_states_its_law_is_drawn_as_its_dark_photographs_or_in_their_line
         for (c, x) in inverse.of(target).rgb.into_iter().enumerate() {
             let byte = (255.0 * (x * alpha).clamp(0.0, 1.0)).round();
             assert!((f64::from(bytes[c]) - byte).abs() <= 1.0, "{at}: {bytes:?} {byte}");
-            let light = f64::from(law.stops().exp2()) * f64::from(linear_from_srgb(x as f32)) * alpha;
+            let light =
+                f64::from(law.stops().exp2()) * f64::from(linear_from_srgb(x as f32)) * alpha;
             let half = f16::from_bits(halves[c] as u16).to_f64();
             assert!((half - light).abs() <= 2e-3 * light + 1e-6, "{at}: {half} {light}");
             bright += u32::from(light > 0.2);

@@ -3,9 +3,9 @@
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 
+use super::pictures::{Pictures, is_dark};
 use super::stages::Stage;
 use super::tool::Tool;
-use super::pictures::{Pictures, is_dark};
 use super::{PoseOptions, Progress, cameras};
 use crate::base::output::create_folder;
 use crate::photographs::dataset::Dataset;

@@ -99,9 +99,7 @@ impl InverseTone {
                 let own = (1.0 - share) * t.one_minus_exp() + share * t * factor;
                 self.offset + (1.0 - self.offset) * own
             }
-            ToneCurve::Table => {
-                self.table.as_ref().map_or(t, |table| table.value(t, channel))
-            }
+            ToneCurve::Table => self.table.as_ref().map_or(t, |table| table.value(t, channel)),
             // A pixel's gain is that of its luminance, up to 1e-6 of it.
             ToneCurve::LumPreserve => self.gain * x,
             ToneCurve::PerChannel => x / self.constants[channel],

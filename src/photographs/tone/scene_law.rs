@@ -64,7 +64,8 @@ impl fmt::Display for SceneLaw {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let ToneParameters { white, offset, gain, weight, constants } = &self.parameters;
         write!(f, "{} {} {white} {offset} {gain} {weight}", self.curve.name(), self.stops)?;
-        let used = constants.iter().rposition(|constant| *constant != 0.0).map_or(0, |last| last + 1);
+        let used =
+            constants.iter().rposition(|constant| *constant != 0.0).map_or(0, |last| last + 1);
         constants[..used].iter().try_for_each(|constant| write!(f, " {constant}"))
     }
 }
@@ -75,9 +76,15 @@ mod tests {
 
     #[test]
     fn a_law_is_read_back_to_the_bit_and_anything_else_is_refused() {
-        let mut parameters =
-            ToneParameters { white: 0.1, offset: 1e-7, gain: 1.0, weight: 0.3, ..Default::default() };
-        for (curve, constants) in [(ToneCurve::Auto, 1), (ToneCurve::Ap3, 0), (ToneCurve::Hable, 6)] {
+        let mut parameters = ToneParameters {
+            white: 0.1,
+            offset: 1e-7,
+            gain: 1.0,
+            weight: 0.3,
+            ..Default::default()
+        };
+        for (curve, constants) in [(ToneCurve::Auto, 1), (ToneCurve::Ap3, 0), (ToneCurve::Hable, 6)]
+        {
             parameters.constants[..constants].fill(1.0 / 3.0);
             let law = SceneLaw { curve, parameters, stops: 4.123_456_7 };
             assert_eq!(SceneLaw::parse(&law.to_string()), Some(law));
@@ -110,7 +117,8 @@ mod tests {
             ..Default::default()
         };
         let settings = ToneSettings { table: Some(table), ..ToneSettings::new(ToneCurve::Table) };
-        let parameters = ToneParameters { white: 1.0, gain: 1.0, weight: 1.0, ..Default::default() };
+        let parameters =
+            ToneParameters { white: 1.0, gain: 1.0, weight: 1.0, ..Default::default() };
         let refused = SceneLaw::of(&settings, &parameters).unwrap_err().to_string();
         assert!(refused.contains("a table of values") && refused.contains("--law"), "{refused}");
     }

@@ -158,7 +158,8 @@ impl Renderer {
             own.reserve(&self.gpu, pixels, target)?;
             if let (Some(law), None) = (law, &own.photograph) {
                 let tone_curve = law.curve.constant();
-                own.photograph = Some(self.gpu.pipeline(&photograph_light::Constants { tone_curve })?);
+                own.photograph =
+                    Some(self.gpu.pipeline(&photograph_light::Constants { tone_curve })?);
             }
         }
         self.grow_as_drawn();

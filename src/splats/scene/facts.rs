@@ -138,7 +138,8 @@ fn number(key: &str, text: &str, rule: &str, holds: impl Fn(f32) -> bool) -> Res
 
 /// A curve and its numbers.
 fn law(text: &str) -> Result<SceneLaw, String> {
-    let refused = || format!("states the law `{}`, which is no curve with its numbers", text.trim());
+    let refused =
+        || format!("states the law `{}`, which is no curve with its numbers", text.trim());
     SceneLaw::parse(text).ok_or_else(refused)
 }
 

@@ -22,7 +22,8 @@ pub(crate) fn law() -> SceneLaw {
 
 /// Black, the black level, no number, beyond white, clipped, and everything between in all three channels.
 fn targets() -> Vec<[f32; 3]> {
-    let edges = [0.0, -0.5, 0.02, 0.075, 0.0751, 0.0755, 0.5, 0.97, 0.99, 0.998, 1.0, 1.7, f32::NAN];
+    let edges =
+        [0.0, -0.5, 0.02, 0.075, 0.0751, 0.0755, 0.5, 0.97, 0.99, 0.998, 1.0, 1.7, f32::NAN];
     let greys = edges.iter().map(|&edge| [edge; 3]);
     let mixed = edges.iter().map(|&edge| [edge, 0.3, 0.9]);
     let mut random = Random::new(9);
@@ -78,8 +79,13 @@ fn the_light_of_every_curve_that_rises_agrees_with_the_hosts_inverse() {
     let targets = targets();
     let rising = FAMILIES.iter().filter(|family| family.monotone);
     for family in rising {
-        let mut parameters =
-            ToneParameters { white: 0.12, offset: 0.02, gain: 0.9, weight: 1.0, ..Default::default() };
+        let mut parameters = ToneParameters {
+            white: 0.12,
+            offset: 0.02,
+            gain: 0.9,
+            weight: 1.0,
+            ..Default::default()
+        };
         for (own, given) in parameters.constants.iter_mut().zip(family.defaults()) {
             *own = given as f32;
         }
