@@ -97,6 +97,10 @@ vec3 automatic(vec3 value) {
     for (uint channel = 0; channel < 3; ++channel) t[channel] = solved(value[channel], 1.0, 0.0).x;
     float y = dot(WEIGHTS, t);
     float share = (1.0 - tone.offset) * tone.constants[0] * (tone.weight < 1.0 ? tone.weight : 1.0);
+    // Below its solution, Y is less than the luminance of its own result.
+    float low = 0.0;
+    float most = LARGEST / tone.white;
+    float high = most;
     for (uint trial = 0; trial < TRIALS && share > 0.0; ++trial) {
         vec2 factor = factor_at(y);
         float rise = 0.0;
@@ -107,9 +111,12 @@ vec3 automatic(vec3 value) {
         }
         float error = dot(WEIGHTS, t) - y;
         if (abs(error) <= PRECISION * y) break;
-        // The luminance of the result rises by less than y itself; where that is lost to rounding, it is followed.
-        float next = rise < 0.9999 ? y + error / (1.0 - rise) : y + error;
-        y = next > 0.0 ? next : y + error;
+        if (error > 0.0) low = y;
+        else high = y;
+        // Beyond the bounds, Newton's method is replaced by bisection; without an upper one, by the result's luminance.
+        float next = y + error / (1.0 - rise);
+        bool is_between = next > low && next < high;
+        y = is_between ? next : high < most ? 0.5 * (low + high) : y + error;
     }
     return min(t * tone.white, vec3(LARGEST));
 }
