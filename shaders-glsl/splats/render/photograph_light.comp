@@ -6,8 +6,8 @@
 //! Photograph light: a render in the values of its targets to those of the photographs, in place; one thread per pixel.
 //!
 //! Colours are weighted by alpha, so the colour before that is c / alpha. A curve that maps each value by itself is
-//! inverted by bisection. `auto` also depends on the luminance Y of the pixel, by s(Y) / Y: for a given Y a channel is a
-//! concave curve, whose inverse Newton's method finds from the left; Newton's method also finds the Y that its own
+//! inverted by bisection. `auto` also depends on the luminance Y of the pixel, by s(Y) / Y: for a given Y, a channel is
+//! a concave curve, whose inverse Newton's method finds from the left; bracketed, it also finds the Y that its own
 //! result has. Values within half a code of 8 bits of the largest that a curve gives become those of that limit. The
 //! host's inverse is `src/photographs/tone/inverse.rs`.
 

@@ -132,9 +132,9 @@ impl<'a> Reconstruction<'a> {
     }
 
     /// The folder of the models, each a folder; it is empty if nothing could be reconstructed. If more than a tenth of
-    /// the dark photographs have no camera, all are matched again, guided: without it, the result of a small set depends on
-    /// chance; always matching guided would double the time of a large one. If most still have none, the choice of the
-    /// initial pair is relaxed.
+    /// the dark photographs have no camera, all are matched again, guided: without it, the result of a small set
+    /// depends on chance; always matching guided would double the time of a large one. If most still have none, the
+    /// choice of the initial pair is relaxed.
     ///
     /// # Errors
     /// [`Error::Input`] if a program fails.

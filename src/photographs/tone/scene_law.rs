@@ -22,7 +22,8 @@ impl SceneLaw {
     /// The law of a scene with these parameters.
     ///
     /// # Errors
-    /// [`Error::Usage`] for a camera profile, which has no inverse, and for a table, which has too many numbers to state.
+    /// [`Error::Usage`] for a camera profile, which has no inverse, and for a table, which has too many numbers to
+    /// state.
     #[cfg(feature = "io")]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn of(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {
@@ -34,8 +35,8 @@ impl SceneLaw {
         Ok(Self { curve: settings.curve, parameters: *parameters, stops })
     }
 
-    /// By how many stops the linear light of the photographs has to be raised for the brightness of the model's colours:
-    /// for a grey that reflects 18 %.
+    /// By how many stops the linear light of the photographs has to be raised for the brightness of the model's
+    /// colours: for a grey that reflects 18 %.
     pub fn stops(&self) -> f32 {
         self.stops
     }
