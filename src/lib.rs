@@ -202,6 +202,7 @@ pub use gpu::{CheckReport, CheckedPass, Difference, Tolerance};
 // Cameras, Gaussians, and the renderer.
 pub use camera::{Camera, CameraModel, CameraPath, KannalaBrandt};
 pub use photographs::image::Image;
+pub use photographs::tone::SceneLaw;
 pub use splats::lamp::Lamp;
 pub use splats::model::Model;
 pub use splats::packed_sh::StorageFormat;

@@ -25,7 +25,6 @@ pub mod pose;
 pub mod pseudo_gt;
 #[cfg(feature = "io")]
 pub mod structure;
-#[cfg(feature = "io")]
 pub mod tone;
 #[cfg(feature = "io")]
 pub mod white_balance;

@@ -68,6 +68,7 @@ pub mod pack_pixels;
 mod pack_weights;
 mod packed;
 pub mod parameter_terms;
+mod photograph_light;
 mod product;
 mod product_backward;
 pub mod project;

@@ -45,8 +45,9 @@ pub struct NspModelInfo {
     pub max_alpha: f32,
     /// 1: colours are the raw SH sum.
     pub raw_colors: u32,
-    /// Unused.
-    pub reserved: u32,
+    /// The stops by which the photographs' linear light is raised to the brightness of the model's colours: their power
+    /// of two is the exposure for that with `NSP_RENDER_PHOTOGRAPH`. NaN: the model states no law.
+    pub law_stops: f32,
     /// The world position of the model's own origin.
     pub origin: [f64; 3],
 }
@@ -214,7 +215,7 @@ pub unsafe extern "C" fn nsp_model_info(
             near_plane: model.near,
             max_alpha: model.max_alpha,
             raw_colors: model.raw_colors.into(),
-            reserved: 0,
+            law_stops: model.law.map_or(f32::NAN, |law| law.stops()),
             origin: model.gaussians.origin.to_array(),
         };
         // SAFETY: as the caller promises.

@@ -38,6 +38,10 @@
 // `depth_out` is the mean of what is seen; otherwise the depth at which half of it is.
 #define NSP_DEPTH_EXPECTED 16
 
+// Colours are those of the dark photographs, by the law that the model states: their linear light where the image is
+// linear, else their values. `background` stays.
+#define NSP_RENDER_PHOTOGRAPH 32
+
 // A device and what belongs to it. Any thread may use it.
 typedef struct NspDevice NspDevice;
 
@@ -148,8 +152,9 @@ typedef struct NspModelInfo {
     float max_alpha;
     // 1: colours are the raw SH sum.
     uint32_t raw_colors;
-    // Unused.
-    uint32_t reserved;
+    // The stops by which the photographs' linear light is raised to the brightness of the model's colours: their power
+    // of two is the exposure for that with `NSP_RENDER_PHOTOGRAPH`. NaN: the model states no law.
+    float law_stops;
     // The world position of the model's own origin.
     double origin[3];
 } NspModelInfo;
@@ -361,7 +366,7 @@ NspResult nsp_model_info(const struct NspModel *model, struct NspModelInfo *info
 // Destroys a model; frames that show it may be in flight.
 void nsp_model_destroy(struct NspModel *model);
 
-// Makes a renderer for models with the SH degree, near plane and colours of `model`.
+// Makes a renderer for models with the SH degree, near plane, colours and law of `model`.
 NspResult nsp_renderer_create(struct NspDevice *device, const struct NspModel *model, struct NspRenderer **renderer);
 
 // Takes memory for views of this size, and for this many intersections, ahead of the first recording.

@@ -86,8 +86,13 @@ pub const NSP_DEPTH_LINEAR: u32 = 8;
 /// `depth_out` is the mean of what is seen; otherwise the depth at which half of it is.
 pub const NSP_DEPTH_EXPECTED: u32 = 16;
 
+/// Colours are those of the dark photographs, by the law that the model states: their linear light where the image is
+/// linear, else their values. `background` stays.
+pub const NSP_RENDER_PHOTOGRAPH: u32 = 32;
+
 const FLAGS: u32 = NSP_RENDER_OVER
     | NSP_RENDER_DISPLAY_FLOAT
+    | NSP_RENDER_PHOTOGRAPH
     | NSP_DEPTH_REVERSED
     | NSP_DEPTH_LINEAR
     | NSP_DEPTH_EXPECTED;
@@ -160,7 +165,7 @@ unsafe impl Sized0 for NspStatus {
     const FIRST_SIZE: usize = size_of::<Self>();
 }
 
-/// Makes a renderer for models with the SH degree, near plane and colours of `model`.
+/// Makes a renderer for models with the SH degree, near plane, colours and law of `model`.
 ///
 /// # Safety
 /// `device` and `model` are NULL or valid; `renderer` is NULL or valid.
@@ -284,6 +289,7 @@ unsafe fn record(own: &mut Shown, loaded: &Loaded, render: &NspRender) -> Result
         scene: scene.as_ref().map(|image| SceneDepth { image, convention }),
         is_over: has(NSP_RENDER_OVER),
         is_display_referred: has(NSP_RENDER_DISPLAY_FLOAT),
+        is_photograph: has(NSP_RENDER_PHOTOGRAPH),
         exposure: if render.exposure == 0.0 { 1.0 } else { render.exposure },
         budget: render.budget,
     };

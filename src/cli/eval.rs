@@ -15,7 +15,7 @@ use crate::photographs::metrics::psnr_of_counted;
 use crate::results::eval::{self, ScoreReference, ScoredImages};
 use crate::results::evaluation::{EvalPage, score_table};
 use crate::results::finished_run::{FinishedRun, is_model};
-use crate::results::linear_light::{photograph_of, stops_between};
+use crate::results::linear_light::{photograph_of, slope_at, stops_between};
 use crate::results::run;
 use crate::train::{OnOff, SceneLight, known_stops};
 
@@ -47,8 +47,8 @@ pub struct EvalArgs {
     /// Add the scores after the least-squares gain and bias of each channel of each view, which use the reference
     #[arg(long)]
     pub align: bool,
-    /// Add the scores of the renders as dark photographs, against the photographs of the test views: PSNR, and by how
-    /// many stops the render is brighter
+    /// Add the scores of the renders as dark photographs, against the photographs of the test views: PSNR, by how many
+    /// stops the render is brighter, and by how much the tone law, which multiplies differences, raises that PSNR
     #[arg(long)]
     pub photographs: bool,
     /// Add LPIPS, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)
@@ -87,17 +87,19 @@ impl From<LpipsRange> for Range {
     }
 }
 
-/// PSNR of a render as a photograph against the photograph of its view, and the stops by which it is brighter; `None`
-/// if the view has none.
+/// PSNR of a render as a photograph against the photograph of its view, the stops by which it is brighter, and the
+/// slope of the tone law; `None` if the view has no photograph.
 fn as_photograph(
     light: &SceneLight,
     compared: &ScoredImages<'_>,
-) -> crate::Result<Option<[f64; 2]>> {
+) -> crate::Result<Option<[f64; 3]>> {
     let Some(photograph) = compared.view.loaded()? else { return Ok(None) };
-    let (own, _) = photograph_of(&compared.render, &light.of_view(compared.view)?);
+    let inverse = light.of_view(compared.view)?;
+    let (own, _) = photograph_of(&compared.render, &inverse);
     let mask = compared.view.mask.as_ref();
     let psnr = psnr_of_counted(&own, &photograph, mask)?;
-    Ok(Some([psnr, stops_between(&own, &photograph)]))
+    let slope = slope_at(&compared.render, &inverse);
+    Ok(Some([psnr, stops_between(&own, &photograph), slope]))
 }
 
 /// Scores the run and prints the scores.
@@ -218,6 +220,13 @@ pub fn run(args: &EvalArgs) -> Result<()> {
                 out,
                 "in the lamp's light, against lit/, after gain and bias of each channel: PSNR {:.2} dB, SSIM {:.3}",
                 lit.psnr, lit.ssim
+            )?;
+        }
+        if let Some([.., slope]) = eval::mean_photograph(&scored) {
+            writeln!(
+                out,
+                "the tone law multiplies differences of the photographs by {slope:.2}: {:.2} dB of PSNR, dark",
+                20.0 * slope.log10()
             )?;
         }
         if let Some(label) = eval::label(&scored) {

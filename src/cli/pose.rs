@@ -23,6 +23,10 @@ use crate::photographs::pose::{Mapper, Matcher, PoseOptions, Posed, Progress, de
 pub struct PoseArgs {
     /// Folder of photographs of one scene, or a clip (.mp4, .mov, .mkv)
     pub photos: PathBuf,
+    /// Bright photographs of the same scene, from any views: the dark ones are posed through them. Their own dataset is
+    /// `bright` in that of the dark ones
+    #[arg(long, value_name = "DIR")]
+    pub with: Option<PathBuf>,
     /// Dataset to write; it appears when complete
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -63,6 +67,7 @@ pub struct PoseArgs {
 
 const EXAMPLE: &str = "Example:
   nightsplat pose photos --out scene
+  nightsplat pose night --with day --out scene
   nightsplat train scene --out run";
 
 /// Maximum number of lenses that are listed.
@@ -75,7 +80,7 @@ const MAX_LISTED: usize = 3;
 pub fn run(args: &PoseArgs) -> Result<()> {
     let begin = Instant::now();
     let bar: RefCell<Option<ProgressBar>> = RefCell::default();
-    let Posed { photographs, placed, lenses } =
+    let Posed { photographs, placed, bright, lenses } =
         estimate(&args.options(), &|progress| match progress {
             Progress::Line(line) => {
                 // A closed standard error is no reason to stop.
@@ -90,9 +95,11 @@ pub fn run(args: &PoseArgs) -> Result<()> {
                 }
             }
         })?;
+    let bright = bright.map(|[placed, all]| format!(" and {placed} of {all} bright ones"));
     let wrote = format!(
-        "{}: {placed} of {photographs} photographs with their cameras, {} calibrated ({})",
+        "{}: {placed} of {photographs} photographs{} with their cameras, {} calibrated ({})",
         args.out.display(),
+        bright.unwrap_or_default(),
         if lenses.len() == 1 { "one".to_owned() } else { lenses.len().to_string() },
         lenses.iter().take(MAX_LISTED).map(describe).collect::<Vec<_>>().join("; ")
     );
@@ -104,6 +111,7 @@ impl PoseArgs {
         let args = self.clone();
         PoseOptions {
             photos: args.photos,
+            with: args.with,
             out: args.out,
             overwrite: args.overwrite,
             colmap: args.colmap,

@@ -361,16 +361,32 @@ impl Dataset {
         Layout::of(root).is_ok_and(|layout| layout.has_listing())
     }
 
-    /// Of the models that COLMAP wrote into the subfolders of `folder`, the one with the most registered photographs,
-    /// with their names.
+    /// Of the models that COLMAP wrote into the subfolders of `folder`, the one with the most registered photographs of
+    /// which `counts` is true, with the names of all its photographs.
     ///
     /// # Errors
     /// [`Error::Input`] if a model is damaged.
-    pub(crate) fn largest_model(folder: &Path) -> Result<Option<(PathBuf, Vec<String>)>> {
+    pub(crate) fn largest_model(
+        folder: &Path,
+        counts: impl Fn(&str) -> bool,
+    ) -> Result<Option<(PathBuf, Vec<String>)>> {
         let models = colmap::models_in(folder, &["cameras", "images", "points3D"]);
-        let Some((model, _)) = colmap::largest(&models, |_| true)? else { return Ok(None) };
+        let Some((model, _)) = colmap::largest(&models, counts)? else { return Ok(None) };
         let names = colmap::read_images(model)?.into_iter().map(|image| image.name);
         Ok(Some((model.to_owned(), names.collect())))
+    }
+
+    /// The file of the images of a binary COLMAP model, with those that `renamed` gives a name, under that name. Points
+    /// that only others see stay.
+    ///
+    /// # Errors
+    /// [`Error::Input`] if the model is damaged.
+    #[cfg(feature = "cli")]
+    pub(crate) fn images_renamed(
+        model: &Path,
+        renamed: impl Fn(&str) -> Option<String>,
+    ) -> Result<Vec<u8>> {
+        colmap::images_renamed(model, renamed)
     }
 
     /// The calibrated lenses of a COLMAP model.

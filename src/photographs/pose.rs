@@ -5,25 +5,28 @@
 
 mod cameras;
 mod clip;
+mod pictures;
 mod reconstruction;
 mod stages;
 mod tone_mapped;
 mod tool;
+mod unfinished;
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 pub use self::cameras::describe;
 pub use self::reconstruction::{Mapper, Matcher};
 pub use self::tool::how_to_install;
 
+use self::pictures::{BRIGHT, Pictures, bright_name, is_dark};
 use self::reconstruction::Reconstruction;
 use self::tool::Tool;
+use self::unfinished::Unfinished;
 use super::dataset::{Dataset, is_mask};
 use super::image::files::{photographs_in, stem, unread_in};
-use crate::base::output::{check_writable, create_folder, write_whole};
-use crate::base::{input, tree};
+use crate::base::output::{check_writable, is_same_file};
+use crate::base::tree;
 use crate::camera::Lens;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::{Error, Result};
@@ -33,6 +36,8 @@ use crate::{Error, Result};
 pub struct PoseOptions {
     /// Folder or archive of photographs of one scene, or a clip.
     pub photos: PathBuf,
+    /// Folder or archive of bright photographs of the same scene, through which the dark ones are posed.
+    pub with: Option<PathBuf>,
     /// Dataset to write; it appears when complete.
     pub out: PathBuf,
     /// Replace a dataset that this module wrote.
@@ -82,6 +87,8 @@ pub struct Posed {
     pub photographs: usize,
     /// Photographs with a camera.
     pub placed: usize,
+    /// Of the bright photographs, those with a camera and all; `None` without any.
+    pub bright: Option<[usize; 2]>,
     /// The calibrated lenses.
     pub lenses: Vec<Lens>,
 }
@@ -104,45 +111,89 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(Progress<'_>)) -> Result<
     let mut out = Unfinished::new(&options.out, options.overwrite)?;
     let colmap = Tool::new(&options.colmap, "colmap", &out.log)
         .found(&format!("by hand: {}", by_hand(&options.photos, &options.out)))?;
-    let matcher =
-        options.matcher.unwrap_or(if is_clip { Matcher::Sequential } else { Matcher::Exhaustive });
+    let matcher = matcher(options, is_clip)?;
     let reconstruction = Reconstruction::new(options, colmap, matcher, &out.work)?;
-    let folder = if tree::archive_of(&options.photos).is_some() {
-        Dataset::folder_of(&options.photos)?
-    } else {
-        options.photos.clone()
-    };
-    let mut photographs = if is_clip {
+    let folder = folder_of(&options.photos)?;
+    let bright = options.with.as_deref().map(|with| bright_photographs(with, &folder));
+    let bright = bright.transpose()?.unwrap_or_default();
+    let dark = if is_clip {
         let ffmpeg = Tool::new(&options.ffmpeg, "ffmpeg", &out.log).found("")?;
         clip::frames(&ffmpeg, &options.photos, options.fps, &out.work.join("frames"))?
     } else {
         distinct_photographs(&folder)?
     };
     let gpu = (options.open)(&options.device)?;
-    let tone_mapped = out.work.join("tone-mapped");
-    let gain = tone_mapped::write(&gpu, &mut photographs, &tone_mapped, report)?;
-    let all = photographs.len();
-    report(Progress::Line(&format!("{all} photographs brightened (gain {gain:.1})")));
-    let models = reconstruction.models((&tone_mapped, &photographs), report)?;
-    let largest = Dataset::largest_model(&models)?;
-    let (model, placed) =
-        largest.filter(|(_, placed)| placed.len() >= MIN_CAMERAS).ok_or_else(|| {
-            let problem = format!(
-                "COLMAP found no cameras for these {all} photographs: too little overlap or texture; take more \
+    let mut pictures = Pictures { dark, bright, copies: out.work.join("tone-mapped") };
+    brighten(&gpu, &mut pictures, report)?;
+    let all = pictures.dark.len();
+    let models = reconstruction.models(&pictures, report)?;
+    let largest = Dataset::largest_model(&models, is_dark)?;
+    let has_enough = |(_, names): &(PathBuf, Vec<String>)| {
+        names.len() >= MIN_CAMERAS && names.iter().any(|name| is_dark(name))
+    };
+    let (model, names) = largest.filter(has_enough).ok_or_else(|| {
+        let problem = format!(
+            "COLMAP found no cameras for these {all} photographs: too little overlap or texture; take more \
              photographs, closer together, or expose longer ({} has its output)",
-                out.kept_log().display()
-            );
-            Error::input(&options.photos, problem)
-        })?;
-    out.add_photographs(&photographs, &placed)?;
+            out.kept_log().display()
+        );
+        Error::input(&options.photos, problem)
+    })?;
+    let bright: Vec<String> = names.iter().filter_map(|name| bright_name(name)).collect();
+    let dark: Vec<String> = names.into_iter().filter(|name| is_dark(name)).collect();
+    out.add_photographs("", &pictures.dark, &dark)?;
     out.add_masks(&folder, is_clip)?;
-    let sparse = out.add_model(&model)?;
+    let own_name = |name: &str| is_dark(name).then(|| name.to_owned());
+    let sparse = out.add_model("", &model, options.with.as_ref().map(|_| own_name))?;
+    if !bright.is_empty() {
+        out.add_photographs(BRIGHT, &pictures.bright, &bright)?;
+        out.add_model(BRIGHT, &model, Some(bright_name))?;
+    }
     let lenses = Dataset::lenses(&sparse)?;
     out.finish()?;
-    let placed = placed.len();
+    let placed = dark.len();
     let target = options.out.display();
     report(Progress::Line(&format!("{placed} of {all} photographs have a camera -> {target}")));
-    for lens in &lenses {
+    warn_of(&lenses, &pictures.dark, &dark);
+    let bright = options.with.as_ref().map(|_| [bright.len(), pictures.bright.len()]);
+    Ok(Posed { photographs: all, placed, bright, lenses })
+}
+
+/// The pairs that are matched.
+///
+/// # Errors
+/// [`Error::Usage`] if dark and bright photographs would not be matched with each other.
+fn matcher(options: &PoseOptions, is_clip: bool) -> Result<Matcher> {
+    let follows = is_clip && options.with.is_none();
+    let default = if follows { Matcher::Sequential } else { Matcher::Exhaustive };
+    let matcher = options.matcher.unwrap_or(default);
+    if options.with.is_some() && matcher == Matcher::Sequential {
+        let problem = "--matcher sequential pairs neighbours by name, and no dark photograph with one of --with; take \
+                       exhaustive";
+        return Err(Error::Usage(problem.to_owned()));
+    }
+    Ok(matcher)
+}
+
+/// Writes the tone-mapped copies. Bright photographs have a curve of their own, which leaves those in normal light as
+/// they are.
+fn brighten(gpu: &Gpu, pictures: &mut Pictures, report: &dyn Fn(Progress<'_>)) -> Result<()> {
+    let Pictures { dark, bright, copies } = pictures;
+    let gain = tone_mapped::write(gpu, dark, copies, report)?;
+    let count = dark.len();
+    report(Progress::Line(&format!("{count} photographs brightened (gain {gain:.1})")));
+    if !bright.is_empty() {
+        let gain = tone_mapped::write(gpu, bright, &copies.join(BRIGHT), report)?;
+        let count = bright.len();
+        report(Progress::Line(&format!("{count} bright photographs beside them (gain {gain:.1})")));
+    }
+    Ok(())
+}
+
+/// Warns of implausible lenses, and of photographs without a camera, of which it names the first.
+fn warn_of(lenses: &[Lens], photographs: &[PathBuf], placed: &[String]) {
+    const NAMED: usize = 5;
+    for lens in lenses {
         if let Some(problem) = cameras::implausible(lens) {
             tracing::warn!(
                 "the calibration of {} is implausible: {problem}; photographs of several lenses may \
@@ -151,12 +202,40 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(Progress<'_>)) -> Result<
             );
         }
     }
-    if 2 * placed < all {
+    let names = photographs.iter().filter_map(|path| path.file_name()?.to_str());
+    let is_placed = |name: &&str| placed.iter().any(|own| stem(own) == stem(name));
+    let without: Vec<&str> = names.filter(|name| !is_placed(name)).collect();
+    if !without.is_empty() {
+        let (count, first) = (without.len(), without[..without.len().min(NAMED)].join(", "));
+        let more = if count > NAMED { ", ..." } else { "" };
+        tracing::warn!("{count} photographs have no camera and are left out: {first}{more}");
+    }
+    if 2 * placed.len() < photographs.len() {
         tracing::warn!(
             "most photographs have no camera; take more of them, closer together, or expose longer"
         );
     }
-    Ok(Posed { photographs: all, placed, lenses })
+}
+
+/// The folder of photographs, which may be in an archive.
+fn folder_of(photos: &Path) -> Result<PathBuf> {
+    match tree::archive_of(photos) {
+        Some(_) => Dataset::folder_of(photos),
+        None => Ok(photos.to_owned()),
+    }
+}
+
+/// The bright photographs, which are not in the folder of the dark ones.
+///
+/// # Errors
+/// Those of [`distinct_photographs`], or both are in one folder.
+fn bright_photographs(with: &Path, dark: &Path) -> Result<Vec<PathBuf>> {
+    let bright = folder_of(with)?;
+    if is_same_file(&bright, dark) {
+        let problem = "is the folder of the dark photographs itself; --with takes the bright ones";
+        return Err(Error::input(with, problem));
+    }
+    distinct_photographs(&bright)
 }
 
 /// The commands to run COLMAP by hand.
@@ -196,134 +275,4 @@ fn distinct_photographs(folder: &Path) -> Result<Vec<PathBuf>> {
         }
     }
     Ok(paths)
-}
-
-/// Creates a hard link in `folder`, or a copy if the file system has no links.
-fn link_or_copy(from: &Path, folder: &Path) -> Result<()> {
-    let to = folder.join(from.file_name().unwrap_or_default());
-    if tree::archive_of(from).is_some() {
-        return write_whole(&to, &input::bytes(from)?);
-    }
-    let from = from.canonicalize().unwrap_or_else(|_| from.to_owned());
-    if fs::hard_link(&from, &to).is_ok() {
-        return Ok(());
-    }
-    fs::copy(&from, &to)
-        .map(drop)
-        .map_err(|error| Error::output(&to, format!("cannot be written: {error}")))
-}
-
-/// A dataset under a temporary name, removed unless it is finished.
-struct Unfinished {
-    target: PathBuf,
-    replaces: bool,
-    /// The folder that becomes the dataset.
-    folder: PathBuf,
-    /// Working folder of COLMAP.
-    work: PathBuf,
-    /// Output of the programs.
-    log: PathBuf,
-    is_finished: bool,
-}
-
-impl Unfinished {
-    fn new(target: &Path, overwrite: bool) -> Result<Self> {
-        let mut folder = target.as_os_str().to_owned();
-        folder.push(".partial");
-        let folder = PathBuf::from(folder);
-        let has_files =
-            |folder: &Path| fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_some());
-        let is_ours = target.join(LOG).is_file();
-        if target.is_file() || (has_files(target) && !(overwrite && is_ours)) {
-            let remedy = if is_ours {
-                "pass --overwrite, or choose another folder"
-            } else {
-                "choose another folder"
-            };
-            return Err(Error::output(target, format!("exists already; {remedy}")));
-        }
-        if folder.exists() {
-            let problem = "belongs to an interrupted or running `nightsplat pose`; remove it";
-            return Err(Error::output(folder, problem));
-        }
-        let work = folder.join("work");
-        create_folder(&work)?;
-        let log = folder.join(LOG);
-        let replaces = has_files(target);
-        Ok(Self { target: target.to_owned(), replaces, folder, work, log, is_finished: false })
-    }
-
-    /// Adds those of `photographs` that are placed, by their names without extension.
-    fn add_photographs(&self, photographs: &[PathBuf], placed: &[String]) -> Result<()> {
-        let by_name: BTreeMap<&str, &PathBuf> = photographs
-            .iter()
-            .filter_map(|path| Some((stem(path.file_name()?.to_str()?), path)))
-            .collect();
-        let images = self.folder.join("images");
-        create_folder(&images)?;
-        let placed = placed.iter().filter_map(|name| by_name.get(stem(name)));
-        placed.into_iter().try_for_each(|path| link_or_copy(path, &images))
-    }
-
-    /// Adds the masks in `masks` of the source folder and, unless it is a clip, those next to the photographs.
-    fn add_masks(&self, source: &Path, is_clip: bool) -> Result<()> {
-        let masks = source.join("masks");
-        if masks.is_dir() {
-            let folder = self.folder.join("masks");
-            create_folder(&folder)?;
-            photographs_in(&masks)?.iter().try_for_each(|mask| link_or_copy(mask, &folder))?;
-        }
-        if is_clip {
-            return Ok(());
-        }
-        let images = self.folder.join("images");
-        let files = photographs_in(source)?;
-        files.iter().filter(|file| is_mask(file)).try_for_each(|mask| link_or_copy(mask, &images))
-    }
-
-    /// Adds the files of a COLMAP model; returns their folder.
-    fn add_model(&self, model: &Path) -> Result<PathBuf> {
-        let sparse = self.folder.join("sparse/0");
-        create_folder(&sparse)?;
-        for file in ["cameras.bin", "images.bin", "points3D.bin"] {
-            link_or_copy(&model.join(file), &sparse)?;
-        }
-        Ok(sparse)
-    }
-
-    /// Where the log of a failed attempt is kept.
-    fn kept_log(&self) -> PathBuf {
-        let mut path = self.target.as_os_str().to_owned();
-        path.push(".");
-        path.push(LOG);
-        path.into()
-    }
-
-    /// Gives the dataset its name.
-    fn finish(&mut self) -> Result<()> {
-        let failed = |error| Error::output(&self.target, format!("cannot be written: {error}"));
-        fs::remove_dir_all(&self.work).map_err(failed)?;
-        if self.replaces {
-            fs::remove_dir_all(&self.target).map_err(failed)?;
-        }
-        // The rename replaces an empty folder.
-        fs::rename(&self.folder, &self.target).map_err(failed)?;
-        self.is_finished = true;
-        // The log of an earlier attempt.
-        let _ = fs::remove_file(self.kept_log());
-        Ok(())
-    }
-}
-
-/// Name of the log in the dataset.
-const LOG: &str = "colmap.log";
-
-impl Drop for Unfinished {
-    fn drop(&mut self) {
-        if !self.is_finished {
-            // The cause is reported elsewhere; errors of the cleanup are not.
-            let _ = fs::rename(&self.log, self.kept_log());
-            let _ = fs::remove_dir_all(&self.folder);
-        }
-    }
 }

@@ -17,44 +17,72 @@
 //! all photographs ([`Exposure`]); the gain of every other curve can, too. [`FAMILIES`] is the table of all curves; a
 //! [`Table`] of values from a file and a camera [`Profile`] are curves, too.
 
+#[cfg(feature = "io")]
 mod exposure;
 mod families;
+#[cfg(feature = "io")]
 mod file;
+#[cfg(feature = "io")]
 mod histogram;
+#[cfg(feature = "io")]
 mod inverse;
+#[cfg(feature = "io")]
 mod law;
+#[cfg(feature = "io")]
 mod mapping;
+#[cfg(feature = "io")]
 mod profile;
 mod real;
+#[cfg(feature = "io")]
 mod recorded;
+mod scene_law;
+#[cfg(feature = "io")]
 mod settings;
+#[cfg(feature = "io")]
 mod statistics;
+#[cfg(feature = "io")]
 mod table;
 
+#[cfg(feature = "io")]
 pub(crate) use self::exposure::all_black;
+#[cfg(feature = "io")]
 pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
 pub use self::families::{Constant, FAMILIES, Family, OffsetMode, ToneCurve, White};
+#[cfg(feature = "io")]
 pub use self::file::CurveChoice;
+#[cfg(feature = "io")]
 pub use self::histogram::LuminanceHistogram;
+#[cfg(feature = "io")]
 pub use self::inverse::{InverseTone, Inverted};
 #[cfg(feature = "fit")]
 pub(crate) use self::law::{CurveInputs, PhotographCurve, law};
+#[cfg(feature = "io")]
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
+#[cfg(feature = "io")]
 pub use self::mapping::{MeasuredPhotograph, SceneTone};
+#[cfg(feature = "io")]
 pub use self::profile::Profile;
 #[cfg(feature = "check")]
 pub(crate) use self::profile::profiled;
 #[cfg(feature = "fit")]
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
+#[cfg(feature = "io")]
 pub(crate) use self::recorded::ToneLaw;
+#[cfg(feature = "io")]
 pub use self::recorded::ToneMapping;
+pub use self::scene_law::SceneLaw;
+#[cfg(feature = "io")]
 pub(crate) use self::settings::OF_CURVE;
+#[cfg(feature = "io")]
 pub use self::settings::{GainChoice, ToneSettings};
+#[cfg(feature = "io")]
 pub use self::statistics::{Statistics, percentile};
+#[cfg(feature = "io")]
 pub(crate) use self::statistics::{luminance, measurable};
 #[cfg(feature = "check")]
 pub(crate) use self::table::interpolate;
+#[cfg(feature = "io")]
 pub use self::table::{Table, TableInput};
 pub use crate::kernels::ToneParameters;
 use crate::{Error, Result};
@@ -98,9 +126,17 @@ impl ToneCurve {
         self as u32
     }
 
+    /// The curve of that number.
+    #[cfg(feature = "check")]
+    pub(crate) fn of_constant(constant: u32) -> Option<Self> {
+        let others = [Self::Table, Self::Auto, Self::Profile];
+        Self::ALL.into_iter().chain(others).find(|curve| curve.constant() == constant)
+    }
+
     /// The curve at t = x / white, in [0, 1], in f64.
     ///
     /// `lum_preserve` and `per_channel` are straight lines here: they depend on more than one value.
+    #[cfg(feature = "io")]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn value(self, t: f64, offset: f64, gain: f64, constants: &[f64]) -> f64 {
         let constants = families::padded(constants);
@@ -108,6 +144,7 @@ impl ToneCurve {
     }
 
     /// The curve at the sRGB-encoded value `x`, in the arithmetic of the kernels.
+    #[cfg(feature = "io")]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn apply(self, x: f32, parameters: &ToneParameters) -> f32 {
         tone_curve(self.constant(), x, parameters)

@@ -171,9 +171,9 @@ pub struct ViewScore {
     /// Scores in the light of the lamp, against `lit/NAME.png`, after the least-squares gain and bias of each channel;
     /// if the model has a lamp and the dataset the image.
     pub lit: Option<Scores>,
-    /// The view as a photograph against its own photograph, if requested: PSNR in dB, and by how many stops of linear
-    /// light it is brighter.
-    pub photograph: Option<[f64; 2]>,
+    /// The view as a photograph against its own photograph, if requested: PSNR in dB, by how many stops of linear light
+    /// it is brighter, and how many times a small difference of photographs is that of their targets.
+    pub photograph: Option<[f64; 3]>,
     /// The background that shows through; `None` if the image is not a render.
     pub residual_transmittance: Option<ResidualTransmittance>,
     /// What the view was scored against.
@@ -502,7 +502,8 @@ fn other_scores(
 
 /// Adds to `metrics.json` the scores of renders in the light of the photographs, against these.
 pub(crate) fn add_photographs(metrics: &mut Value, scored: &[ViewScore]) {
-    let entry = |[psnr, stops]: [f64; 2]| json!({ "psnr": psnr, "stops": stops });
+    let entry =
+        |[psnr, stops, slope]: [f64; 3]| json!({ "psnr": psnr, "stops": stops, "slope": slope });
     let all = || scored.iter().filter_map(|view| Some((&view.name, view.photograph?)));
     let views: Map<String, Value> = all().map(|(name, own)| (name.clone(), entry(own))).collect();
     metrics["as_photographs"] = json!({
@@ -513,10 +514,10 @@ pub(crate) fn add_photographs(metrics: &mut Value, scored: &[ViewScore]) {
 }
 
 /// The mean scores against the photographs, if there are any.
-pub(crate) fn mean_photograph(scored: &[ViewScore]) -> Option<[f64; 2]> {
-    let all: Vec<[f64; 2]> = scored.iter().filter_map(|view| view.photograph).collect();
+pub(crate) fn mean_photograph(scored: &[ViewScore]) -> Option<[f64; 3]> {
+    let all: Vec<[f64; 3]> = scored.iter().filter_map(|view| view.photograph).collect();
     let mean = |at: usize| all.iter().map(|own| own[at]).sum::<f64>() / all.len() as f64;
-    (!all.is_empty()).then(|| [mean(0), mean(1)])
+    (!all.is_empty()).then(|| [0, 1, 2].map(mean))
 }
 
 /// The mean scores, and the mean scores of R_0 if the model has a denoiser.

@@ -62,7 +62,7 @@ pub(crate) fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> Tab
     let row = |name: &str,
                scores: &Scores,
                [r0, aligned, exposed]: [Option<&Scores>; 3],
-               photograph: Option<[f64; 2]>,
+               photograph: Option<[f64; 3]>,
                residual_transmittance: Option<ResidualTransmittance>| {
         let Scores { psnr, psnr_channel_mean, ssim, lpips } = *scores;
         let mut values = vec![Some(psnr), Some(psnr_channel_mean), Some(ssim)];

@@ -23,6 +23,23 @@ pub(crate) fn photograph_of(target: &Image, inverse: &InverseTone) -> (Image, us
     (Image { data, ..*target }, inverted.iter().filter(|pixel| pixel.is_clipped).count())
 }
 
+/// How many times a small difference between photographs is that between their targets, at the values of a target: of
+/// such differences, PSNR is higher by 20 log10 of it in the photographs. The inverse of the root mean square slope of
+/// the inverse, over values that the curve determines.
+pub(crate) fn slope_at(target: &Image, inverse: &InverseTone) -> f64 {
+    /// Half a code of 8 bits.
+    const STEP: f64 = 0.5 / 255.0;
+    let pixels = target.pixel_count();
+    let squares = |pixel: usize| {
+        let value = [0, 1, 2].map(|plane| f64::from(target.data[plane * pixels + pixel]));
+        let [below, above] = [-STEP, STEP].map(|step| inverse.of(value.map(|value| value + step)));
+        let rise = |c: usize| ((above.rgb[c] - below.rgb[c]) / (2.0 * STEP)).powi(2);
+        (!above.is_clipped).then(|| rise(0) + rise(1) + rise(2))
+    };
+    let all: Vec<f64> = (0..pixels).into_par_iter().filter_map(squares).collect();
+    (3.0 * all.len() as f64 / all.iter().sum::<f64>()).sqrt()
+}
+
 /// The Gaussians with colours in the linear light of the photographs, raised by `stops`, and the number of them with a
 /// colour that the curve does not determine.
 ///
@@ -104,6 +121,7 @@ impl Clipped {
 mod tests {
     use super::*;
     use crate::photographs::image::srgb_from_linear;
+    use crate::photographs::metrics::psnr_of_counted;
     use crate::photographs::tone::{MeasuredPhotograph, ToneCurve, ToneSettings};
 
     #[test]
@@ -135,6 +153,30 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn the_psnr_of_photographs_is_that_of_their_targets_divided_by_the_slope() {
+        let settings = ToneSettings::new(ToneCurve::Auto);
+        let dark = Image::from_fn(40, 30, |x, y| [0.01 + 0.004 * x as f32, 0.006 * y as f32, 0.05]);
+        let photograph = MeasuredPhotograph::of(&dark.data);
+        let scene = settings.scene(std::slice::from_ref(&photograph)).unwrap();
+        let mapping = settings.tone_mapping(&scene, &photograph);
+        let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
+        let target = Image::from_fn(40, 30, |x, y| {
+            inverse.target(dark.pixel(x, y).map(f64::from)).map(|value| value as f32)
+        });
+        // A difference of one sign in all channels of a pixel, and of the other in its neighbours.
+        let off = Image::from_fn(40, 30, |x, y| {
+            let sign = if (x + y).is_multiple_of(2) { 1.0 } else { -1.0 };
+            target.pixel(x, y).map(|value| value + 0.002 * sign)
+        });
+        let [own, other] = [&target, &off].map(|image| photograph_of(image, &inverse).0);
+        let psnr = |a: &Image, b: &Image| psnr_of_counted(a, b, None).unwrap();
+        let slope = slope_at(&target, &inverse);
+        let gained = psnr(&other, &own) - psnr(&off, &target);
+        assert!(slope > 4.0, "{slope}");
+        assert!((gained - 20.0 * slope.log10()).abs() < 0.2, "{gained} dB, {slope}");
     }
 
     #[test]

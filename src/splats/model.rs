@@ -9,6 +9,7 @@ use glam::{DAffine3, DQuat};
 use crate::base::input;
 #[cfg(feature = "capi")]
 use crate::camera::deviation_from_rigid;
+use crate::photographs::tone::SceneLaw;
 use crate::splats::render::RenderSettings;
 #[cfg(feature = "capi")]
 use crate::splats::scene::Features;
@@ -31,6 +32,9 @@ pub struct Model {
     pub raw_colors: bool,
     /// Opacities are those of a renderer that compensates them for the dilation.
     pub antialiased: bool,
+    /// The curve from its photographs to its colours, which [`Target::is_photograph`](crate::Target::is_photograph)
+    /// inverts; `None`: not stated.
+    pub law: Option<SceneLaw>,
 }
 
 /// With the near plane, the alpha limit and the colours that a file has which does not state them.
@@ -38,7 +42,7 @@ impl From<Gaussians> for Model {
     fn from(gaussians: Gaussians) -> Self {
         let RenderSettings { near, max_alpha, raw_colors, antialiased, .. } =
             RenderSettings::default();
-        Self { gaussians, near, max_alpha, raw_colors, antialiased }
+        Self { gaussians, near, max_alpha, raw_colors, antialiased, law: None }
     }
 }
 
@@ -51,6 +55,7 @@ impl Model {
             max_alpha: facts.max_alpha.unwrap_or(defaults.max_alpha),
             raw_colors: facts.raw_colors.unwrap_or(defaults.raw_colors),
             antialiased: facts.antialiased,
+            law: facts.law,
             ..defaults
         }
     }
@@ -75,19 +80,21 @@ impl Model {
     /// # Ok::<(), nightsplat::Error>(())
     /// ```
     pub fn render_settings(&self) -> RenderSettings {
-        let Self { gaussians, near, max_alpha, raw_colors, antialiased } = self;
+        let Self { gaussians, near, max_alpha, raw_colors, antialiased, law } = self;
         RenderSettings {
             near: *near,
             max_alpha: *max_alpha,
             raw_colors: *raw_colors,
             antialiased: *antialiased,
+            law: *law,
             shape: gaussians.shape,
             ..RenderSettings::default()
         }
     }
 
     /// One model of several, each turned and moved by a rigid pose, so that all are sorted together. Near plane, alpha
-    /// limit and colours are the first one's; positions are relative to its origin, and to none where they are moved.
+    /// limit and colours are the first one's, and its law where all have it; positions are relative to its origin, and
+    /// to none where they are moved.
     ///
     /// # Errors
     /// [`Error::Usage`] where there is no part, a pose is not rigid, or a part has other colours or another alpha
@@ -127,7 +134,9 @@ impl Model {
             joined.rest_mut()[rest * range.start..rest * range.end].copy_from_slice(moved.rest());
             at = range.end;
         }
-        Ok(Self { gaussians: joined, ..**first })
+        let is_one = parts.iter().all(|(part, _)| part.law == first.law);
+        let law = first.law.filter(|_| is_one);
+        Ok(Self { gaussians: joined, law, ..**first })
     }
 
     /// The Gaussians in the colours that viewers show, as files hold them.
@@ -147,6 +156,7 @@ impl Model {
             raw_colors: Some(self.raw_colors),
             antialiased: self.antialiased,
             linear: None,
+            law: self.law,
             origin: self.gaussians.origin,
         }
     }

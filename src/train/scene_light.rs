@@ -7,7 +7,8 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::{Image, linear_from_srgb};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
-    InverseTone, LuminanceHistogram, MeasuredPhotograph, SceneTone, Statistics, ToneSettings,
+    InverseTone, LuminanceHistogram, MeasuredPhotograph, SceneLaw, SceneTone, Statistics,
+    ToneSettings,
 };
 use crate::splats::lamp::Lamp;
 
@@ -114,6 +115,15 @@ impl SceneLight {
     pub fn of_scene(&self) -> Result<InverseTone> {
         let mapping = self.settings.tone_mapping(&self.scene, &self.together);
         InverseTone::new(&self.settings, &mapping.parameters)
+    }
+
+    /// The curve of the whole scene, whose inverse is [`SceneLight::of_scene`].
+    ///
+    /// # Errors
+    /// The curve has no inverse, or is a table.
+    pub fn law(&self) -> Result<SceneLaw> {
+        let mapping = self.settings.tone_mapping(&self.scene, &self.together);
+        SceneLaw::of(&self.settings, &mapping.parameters)
     }
 
     /// The tone law of grey, fitted to the targets of all photographs together; light is linear.

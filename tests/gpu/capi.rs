@@ -16,6 +16,7 @@ use std::sync::{Mutex, OnceLock};
 use ash::vk;
 use ash::vk::Handle as _;
 use glam::{DAffine3, DQuat, DVec3, Mat4, Vec3};
+use half::f16;
 use nightsplat::base::random::Stream;
 use nightsplat::camera::Camera;
 use nightsplat::capi::camera::{NspCamera, nsp_camera_from_matrices};
@@ -28,11 +29,14 @@ use nightsplat::capi::train::*;
 use nightsplat::gpu::ImageFormat;
 use nightsplat::gpu::testing::{allocations, fail_allocation, gpu, lose_at_submission, not_run};
 use nightsplat::photographs::dataset::synthetic::{SyntheticOptions, write};
+use nightsplat::photographs::image::linear_from_srgb;
+use nightsplat::photographs::tone::InverseTone;
 use nightsplat::splats::model::Model;
 use nightsplat::splats::render::{RenderOptions, Renderer};
 use nightsplat::splats::scene::Gaussians;
 
-use crate::host::{Host, Picture, usual_extensions};
+use crate::host::{Host, Picture, usual_extensions, vulkan};
+use crate::images::photograph::law;
 
 const SIZE: [u32; 2] = [320, 240];
 const PIXELS: usize = 320 * 240;
@@ -91,6 +95,13 @@ fn c_camera() -> NspCamera {
 
 /// The bytes of our own render before black, RGB.
 fn own_render(model: &Model) -> Vec<u8> {
+    let planes = own_planes(model);
+    let byte = |value: f32| (value.clamp(0.0, 1.0) * 255.0).round() as u8;
+    (0..PIXELS).flat_map(|at| [0, 1, 2].map(|c| byte(planes[c * PIXELS + at]))).collect()
+}
+
+/// The planes of our own render before black, and its transmittances.
+fn own_planes(model: &Model) -> Vec<f32> {
     let gpu = gpu();
     let on_device = model.gaussians.upload(&gpu).unwrap();
     let mut renderer = Renderer::new(&gpu, model.render_settings()).unwrap();
@@ -98,9 +109,7 @@ fn own_render(model: &Model) -> Vec<u8> {
     renderer.reserve(on_device.layout.count, [&camera]).unwrap();
     let sh_degree = model.gaussians.shape.sh_degree;
     let options = RenderOptions { sh_degree, background: [0.0; 3] };
-    let image = renderer.render_image(&on_device, &camera, &options).unwrap();
-    let byte = |value: f32| (value.clamp(0.0, 1.0) * 255.0).round() as u8;
-    (0..PIXELS).flat_map(|at| [0, 1, 2].map(|c| byte(image.data[c * PIXELS + at]))).collect()
+    renderer.render_planes(&on_device, &camera, &options).unwrap()
 }
 
 #[track_caller]
@@ -364,6 +373,59 @@ fn a_model_of_arrays_is_that_of_the_file_and_joined_models_are_sorted_together()
         assert!(none.is_null());
         nsp_model_destroy(both);
     }
+    session.end();
+}
+
+#[test]
+fn a_model_that_states_its_law_is_drawn_as_its_dark_photographs_or_in_their_linear_light() {
+    let mut session = Session::new(|_| {});
+    let law = law();
+    let own = Model { law: Some(law), ..gaussians(2).into() };
+    own.save(session.folder.path().join("model.ply")).unwrap();
+    ok(session.load());
+    ok(session.create());
+    // SAFETY: a struct of numbers.
+    let mut info: NspModelInfo = unsafe { std::mem::zeroed() };
+    info.struct_size = size_of::<NspModelInfo>();
+    // SAFETY: the model is valid, the struct is ours.
+    ok(unsafe { nsp_model_info(session.model, &mut info) });
+    assert_eq!(info.law_stops, law.stops());
+    let inverse = InverseTone::of_law(&law);
+    let planes = own_planes(&own);
+    let drawn = |number, exposure, format: ImageFormat| {
+        let picture = session.host.picture(format, SIZE).unwrap();
+        let (camera, commands) = (c_camera(), session.host.begin());
+        let color = NspImage { format: vulkan(format), ..image(&picture) };
+        let flags = NSP_RENDER_PHOTOGRAPH;
+        let render = NspRender { flags, exposure, ..render(commands, number, &camera, &color) };
+        // SAFETY: everything is valid, and the command buffer is recording.
+        ok(unsafe { nsp_record_render(session.renderer, session.model, &render) });
+        session.host.submit_frame(commands, number);
+        session.host.wait_frame(number);
+        let words = if format == ImageFormat::Rgba16Float { 2 * PIXELS } else { PIXELS };
+        let [pixels, _] = session.host.read_first_layer(&picture, words);
+        session.host.free_picture(picture);
+        pixels
+    };
+    let dark = drawn(1, 0.0, ImageFormat::Rgba8Unorm);
+    let linear = drawn(2, law.stops().exp2(), ImageFormat::Rgba16Float);
+    let mut bright = 0;
+    for at in 0..PIXELS {
+        let alpha = 1.0 - f64::from(planes[3 * PIXELS + at]);
+        let target = [0, 1, 2].map(|c| f64::from(planes[c * PIXELS + at]) / alpha.max(1e-9));
+        let bytes = dark[at].to_le_bytes();
+        let halves = [linear[2 * at], linear[2 * at] >> 16, linear[2 * at + 1]];
+        for (c, x) in inverse.of(target).rgb.into_iter().enumerate() {
+            let byte = (255.0 * (x * alpha).clamp(0.0, 1.0)).round();
+            assert!((f64::from(bytes[c]) - byte).abs() <= 1.0, "{at}: {bytes:?} {byte}");
+            let light =
+                f64::from(law.stops().exp2()) * f64::from(linear_from_srgb(x as f32)) * alpha;
+            let half = f16::from_bits(halves[c] as u16).to_f64();
+            assert!((half - light).abs() <= 2e-3 * light + 1e-6, "{at}: {half} {light}");
+            bright += u32::from(light > 0.2);
+        }
+    }
+    assert!(bright > 1000, "{bright} values are bright");
     session.end();
 }
 

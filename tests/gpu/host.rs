@@ -445,7 +445,7 @@ fn aspects(format: ImageFormat) -> vk::ImageAspectFlags {
 }
 
 /// Vulkan's constant of a format.
-fn vulkan(format: ImageFormat) -> vk::Format {
+pub(crate) fn vulkan(format: ImageFormat) -> vk::Format {
     match format {
         ImageFormat::Rgba16Float => vk::Format::R16G16B16A16_SFLOAT,
         ImageFormat::Rgba8Unorm => vk::Format::R8G8B8A8_UNORM,

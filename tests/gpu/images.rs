@@ -4,6 +4,7 @@
 
 mod frames;
 mod kernels;
+pub(crate) mod photograph;
 
 use ash::vk::Handle as _;
 use glam::{DAffine3, DVec2, DVec3, Vec3};
@@ -134,6 +135,16 @@ fn encoded(encoding: u32, c: f32) -> f32 {
 /// What an image should hold, by the reference of the kernel that packs pixels.
 fn expected(camera: &Camera, encoding: u32, swaps: u32, under: Option<&[u32]>) -> Vec<u32> {
     let (render, transmittances) = planes(camera);
+    packed((&render, &transmittances), encoding, swaps, under)
+}
+
+/// Planes and transmittances as an image has them.
+fn packed(
+    (render, transmittances): (&[f32], &[f32]),
+    encoding: u32,
+    swaps: u32,
+    under: Option<&[u32]>,
+) -> Vec<u32> {
     let words = if encoding <= pixels::PIXELS_DISPLAY_HALF { 2 * PIXELS } else { PIXELS };
     let (mut pixels, mut depths) = (vec![0; words], vec![0.0; PIXELS]);
     let params = pack_pixels::Params {
@@ -148,8 +159,8 @@ fn expected(camera: &Camera, encoding: u32, swaps: u32, under: Option<&[u32]>) -
         has_color: 1,
     };
     let slices = pack_pixels::Slices {
-        render: &render,
-        transmittances: &transmittances,
+        render,
+        transmittances,
         under: under.unwrap_or_default(),
         pixels: &mut pixels,
         depths: &mut depths,

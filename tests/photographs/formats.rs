@@ -12,6 +12,8 @@ mod photographs;
 #[cfg(feature = "cli")]
 mod pose;
 #[cfg(all(unix, feature = "cli"))]
+mod pose_bright;
+#[cfg(all(unix, feature = "cli"))]
 mod pose_cameras;
 #[cfg(all(feature = "cli", feature = "raw"))]
 mod raw;

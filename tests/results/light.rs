@@ -1,6 +1,7 @@
 //! Light out of a run: the photographs' light, linear files, another size, exposures that vary.
 
 use nightsplat::photographs::image::Image;
+use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::ply;
 use serde_json::Value;
 
@@ -29,12 +30,16 @@ fn renders_are_written_and_scored_in_the_light_of_the_photographs() {
     // Sixty steps: the light is about right, and so are dark values.
     assert!(dark["psnr"].as_f64().unwrap() > 25.0, "{dark}");
     assert!(dark["stops"].as_f64().unwrap().abs() < 1.0, "{dark}");
+    // A twentieth of the light takes a law that multiplies differences.
+    let slope = dark["slope"].as_f64().unwrap();
+    assert!(slope > 3.0, "{dark}");
     let aligned = scored["aligned_with_reference"]["mean"]["psnr"].as_f64().unwrap();
     assert!(aligned >= scored["mean"]["psnr"].as_f64().unwrap() - 0.01);
     let half = json(&format!("eval {run_at} --downscale 1.5 --json"));
     assert_ne!(half["mean"]["psnr"], scored["mean"]["psnr"]);
     let table = succeed(&format!("eval {run_at} --photographs --align"));
-    for column in ["PSNR, aligned", "PSNR, dark", "stops"] {
+    let raised = format!("by {slope:.2}: {:.2} dB of PSNR, dark", 20.0 * slope.log10());
+    for column in ["PSNR, aligned", "PSNR, dark", "stops", &raised] {
         assert!(table.contains(column), "{table}");
     }
     refused(&format!("eval {run_at} --downscale 0.5"), 2, &["is 0.5", "at least 1"]);
@@ -84,6 +89,33 @@ fn a_model_in_linear_light_states_it_and_has_other_colours() {
     refused(&of_file, 2, &["is a model file", "pass the run directory"]);
     let (_, warned) = run(&format!("export {} --format glb", at("linear.ply")), 0);
     assert!(warned.contains("its colours are linear light, raised by"), "{warned}");
+}
+
+#[test]
+fn an_exported_model_states_the_law_whose_inverse_is_the_linear_light() {
+    let place = Place::new();
+    succeed(&training(&place, "--steps 40"));
+    let at = |name: &str| place.path(name).display().to_string();
+    let export =
+        |options: &str, out: &str| format!("export {} {options} --out {}", at("run"), at(out));
+    succeed(&export("--format ply --linear", "linear.ply"));
+    let header = String::from_utf8_lossy(&place.read("linear.ply")[..2000]).into_owned();
+    let stated = header.lines().find_map(|line| line.strip_prefix("comment nightsplat linear "));
+    let stops: f32 = stated.unwrap().parse().unwrap();
+    for format in ["ply", "spz", "sog"] {
+        let out = format!("law.{format}");
+        succeed(&export(&format!("--format {format} --law"), &out));
+        let law = Model::load(place.path(&out)).unwrap().law.unwrap();
+        assert!((law.stops() - stops).abs() < 1e-4, "{format}: {law:?}, {stops}");
+    }
+    assert_eq!(Model::load(place.path("run")).unwrap().law, None);
+    refused(
+        &export("--format glb --law", "law.glb"),
+        2,
+        &["--law is for engines", "ply, spz or sog"],
+    );
+    let of_file = format!("export {} --law --format spz", at("law.ply"));
+    refused(&of_file, 2, &["is a model file", "pass the run directory"]);
 }
 
 #[test]

@@ -85,6 +85,18 @@ pub(super) fn read_images(folder: &Path) -> Result<Vec<ModelImage>> {
     }
 }
 
+/// The binary file of the images of a model, with those that `renamed` gives a name, under that name.
+///
+/// # Errors
+/// The model is damaged, or is text.
+#[cfg(feature = "cli")]
+pub(super) fn images_renamed(
+    folder: &Path,
+    renamed: impl Fn(&str) -> Option<String>,
+) -> Result<Vec<u8>> {
+    binary::images_renamed(&folder.join("images.bin"), renamed)
+}
+
 /// The points with finite positions, by id; both encodings give the same order.
 pub(super) fn read_points(folder: &Path) -> Result<Vec<ModelPoint>> {
     let points = match required(folder, "points3D")? {

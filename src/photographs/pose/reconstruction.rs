@@ -3,9 +3,10 @@
 use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
 
+use super::pictures::{Pictures, is_dark};
 use super::stages::Stage;
 use super::tool::Tool;
-use super::{PoseOptions, Progress, cameras, tone_mapped};
+use super::{PoseOptions, Progress, cameras};
 use crate::base::output::create_folder;
 use crate::photographs::dataset::Dataset;
 use crate::{Error, Result};
@@ -57,9 +58,10 @@ pub(super) struct Reconstruction<'a> {
     models: PathBuf,
 }
 
-/// The number of photographs in the largest model.
+/// The number of dark photographs in the model with the most of them.
 fn placed_in(models: &Path) -> Result<usize> {
-    Ok(Dataset::largest_model(models)?.map_or(0, |(_, placed)| placed.len()))
+    let largest = Dataset::largest_model(models, is_dark)?;
+    Ok(largest.map_or(0, |(_, placed)| placed.iter().filter(|name| is_dark(name)).count()))
 }
 
 /// Relaxations of the initial pair, for few photographs: a smaller baseline, motion along the viewing direction, and
@@ -130,27 +132,29 @@ impl<'a> Reconstruction<'a> {
     }
 
     /// The folder of the models, each a folder; it is empty if nothing could be reconstructed. If more than a tenth of
-    /// the photographs have no camera, all are matched again, guided: without it, the result of a small set depends on
-    /// chance; always matching guided would double the time of a large one. If most still have none, the choice of the
-    /// initial pair is relaxed.
+    /// the dark photographs have no camera, all are matched again, guided: without it, the result of a small set
+    /// depends on chance; always matching guided would double the time of a large one. If most still have none, the
+    /// choice of the initial pair is relaxed.
     ///
     /// # Errors
     /// [`Error::Input`] if a program fails.
     pub(super) fn models(
         mut self,
-        (tone_mapped, photographs): (&Path, &[PathBuf]),
+        pictures: &Pictures,
         report: &dyn Fn(Progress<'_>),
     ) -> Result<PathBuf> {
-        self.extract((tone_mapped, photographs), report)?;
+        let copies = pictures.copies.as_path();
+        let everything = pictures.dark.len() + pictures.bright.len();
+        self.extract(pictures, report)?;
         // COLMAP matches no pair twice: matching again begins with the features alone.
         let features = self.work.join("guided.db");
         if self.database.is_file() {
             std::fs::copy(&self.database, &features)
                 .map_err(|error| Error::output(&features, format!("cannot be written: {error}")))?;
         }
-        self.match_features(photographs.len(), report)?;
-        self.register(tone_mapped, report)?;
-        let all = photographs.len();
+        self.match_features(everything, report)?;
+        self.register(copies, report)?;
+        let all = pictures.dark.len();
         let mut placed = placed_in(&self.models)?;
         let mut best = self.models.clone();
         if 10 * placed >= 9 * all {
@@ -161,7 +165,7 @@ impl<'a> Reconstruction<'a> {
         self.is_guided = true;
         self.use_folder("guided")?;
         self.database = features;
-        match self.match_features(all, report).and_then(|()| self.register(tone_mapped, report)) {
+        match self.match_features(everything, report).and_then(|()| self.register(copies, report)) {
             // The models of the first attempt are still there.
             Err(error) if placed > 0 => {
                 tracing::warn!("{error}; using the cameras of the first attempt");
@@ -180,7 +184,7 @@ impl<'a> Reconstruction<'a> {
                 report(Progress::Line(&line));
                 self.relaxed = relaxed;
                 self.use_folder(&format!("relaxed{step}"))?;
-                self.register(tone_mapped, report)?;
+                self.register(copies, report)?;
             }
             let found = placed_in(&self.models)?;
             if found > placed {
@@ -197,13 +201,10 @@ impl<'a> Reconstruction<'a> {
     }
 
     /// Extracts the features of each photograph. Those of one group share a camera.
-    fn extract(
-        &self,
-        (tone_mapped, photographs): (&Path, &[PathBuf]),
-        report: &dyn Fn(Progress<'_>),
-    ) -> Result<()> {
+    fn extract(&self, pictures: &Pictures, report: &dyn Fn(Progress<'_>)) -> Result<()> {
         let command = "feature_extractor";
-        let groups = cameras::groups(photographs);
+        let photographs = pictures.all();
+        let groups = cameras::groups(&photographs);
         let (shared, alone): (Vec<_>, Vec<_>) =
             groups.into_iter().partition(|group| group.len() > 1);
         let alone: Vec<&Path> = alone.concat();
@@ -214,7 +215,7 @@ impl<'a> Reconstruction<'a> {
         }
         let use_gpu = self.named(command, ["FeatureExtraction", "SiftExtraction"], "use_gpu");
         for (at, (group, is_one_camera)) in runs.iter().enumerate() {
-            let mut options = self.files(tone_mapped);
+            let mut options = self.files(&pictures.copies);
             options.extend([
                 ("ImageReader.single_camera".to_owned(), (*is_one_camera).into()),
                 ("ImageReader.camera_model".to_owned(), self.options.camera_model.as_str().into()),
@@ -222,7 +223,7 @@ impl<'a> Reconstruction<'a> {
             ]);
             if runs.len() > 1 {
                 let list = self.work.join(format!("camera{at}.txt"));
-                let names = group.iter().map(|path| tone_mapped::name(path)).collect::<Vec<_>>();
+                let names = group.iter().map(|path| pictures.name(path)).collect::<Vec<_>>();
                 std::fs::write(&list, names.join("\n") + "\n")
                     .map_err(|error| Error::output(&list, format!("cannot be written: {error}")))?;
                 options.push(("image_list_path".to_owned(), list.into()));

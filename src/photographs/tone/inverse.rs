@@ -8,7 +8,7 @@
 
 use super::law::{clamped, curve_at};
 use super::real::Real;
-use super::{ToneCurve, ToneParameters, ToneSettings};
+use super::{SceneLaw, Table, ToneCurve, ToneParameters, ToneSettings};
 use crate::photographs::image::{linear_from_srgb, srgb_from_linear};
 use crate::{Error, Result};
 
@@ -23,8 +23,8 @@ const TRIALS: usize = 60;
 /// The inverse of the curve of a photograph.
 #[derive(Clone, Debug)]
 pub struct InverseTone {
-    settings: ToneSettings,
-    curve: u32,
+    curve: ToneCurve,
+    table: Option<Table>,
     white: f64,
     offset: f64,
     gain: f64,
@@ -54,11 +54,26 @@ impl InverseTone {
                            linear light";
             return Err(Error::Usage(problem.to_owned()));
         }
+        Ok(Self::of_curve(settings.curve, settings.table.clone(), parameters))
+    }
+
+    /// The inverse of the law of a scene.
+    #[cfg(any(test, feature = "testing"))]
+    pub fn of_law(law: &SceneLaw) -> Self {
+        Self::of_curve(law.curve, None, &law.parameters)
+    }
+
+    /// The inverse of any curve but a camera profile.
+    pub(crate) fn of_curve(
+        curve: ToneCurve,
+        table: Option<Table>,
+        parameters: &ToneParameters,
+    ) -> Self {
         let ToneParameters { white, offset, gain, weight, constants } = *parameters;
         let [white, offset, gain, weight] = [white, offset, gain, weight].map(f64::from);
         let mut inverse = Self {
-            curve: settings.curve.constant(),
-            settings: settings.clone(),
+            curve,
+            table,
             white,
             offset,
             gain,
@@ -67,30 +82,31 @@ impl InverseTone {
             largest: [1.0; 3],
         };
         // The automatic curve reaches white in every channel, through its own curve or that of the luminance.
-        let highest = |channel| match settings.curve {
+        let highest = |channel| match curve {
             ToneCurve::Auto => 1.0,
             _ => inverse.channel(LARGEST, channel, 0.0).min(1.0),
         };
         inverse.largest = [0, 1, 2].map(|channel| highest(channel) - FLAT);
-        Ok(inverse)
+        inverse
     }
 
     /// The target of one channel. `factor`: s(Y) / Y of the pixel's luminance, if the curve uses it.
     fn channel(&self, x: f64, channel: usize, factor: f64) -> f64 {
         let t = x / self.white;
-        let curved = match self.settings.curve {
+        let curved = match self.curve {
             ToneCurve::Auto => {
                 let share = self.constants[0];
                 let own = (1.0 - share) * t.one_minus_exp() + share * t * factor;
                 self.offset + (1.0 - self.offset) * own
             }
-            ToneCurve::Table => {
-                self.settings.table.as_ref().map_or(t, |table| table.value(t, channel))
-            }
+            ToneCurve::Table => self.table.as_ref().map_or(t, |table| table.value(t, channel)),
             // A pixel's gain is that of its luminance, up to 1e-6 of it.
             ToneCurve::LumPreserve => self.gain * x,
             ToneCurve::PerChannel => x / self.constants[channel],
-            _ => clamped(curve_at(self.curve, t, [self.offset, self.gain], &self.constants)),
+            curve => {
+                let law = [self.offset, self.gain];
+                clamped(curve_at(curve.constant(), t, law, &self.constants))
+            }
         };
         if self.weight < 1.0 { x.min(1.0) + self.weight * (curved - x.min(1.0)) } else { curved }
     }
@@ -126,19 +142,23 @@ impl InverseTone {
         0.5 * (low + high)
     }
 
+    /// A target with at most the largest values that are inverted. Written so that a NaN stays one, and becomes black.
+    pub(crate) fn bounded(&self, target: [f64; 3]) -> [f64; 3] {
+        [0, 1, 2].map(|channel| {
+            let (value, largest) = (target[channel], self.largest[channel]);
+            if value > largest { largest } else { value }
+        })
+    }
+
     /// The colour of a photograph whose target is this one.
     pub fn of(&self, target: [f64; 3]) -> Inverted {
         let is_clipped = (0..3).any(|channel| target[channel] > self.largest[channel]);
-        // Written so that a NaN stays one, and becomes black.
-        let bounded = [0, 1, 2].map(|channel| {
-            let (value, largest) = (target[channel], self.largest[channel]);
-            if value > largest { largest } else { value }
-        });
+        let bounded = self.bounded(target);
         let solved =
             |factor: f64| [0, 1, 2].map(|channel| self.solved(bounded[channel], channel, factor));
         // The factor is 1 for black, where the result is the darkest.
         let mut rgb = solved(1.0);
-        if self.settings.curve != ToneCurve::Auto || self.constants[0] == 0.0 {
+        if self.curve != ToneCurve::Auto || self.constants[0] == 0.0 {
             return Inverted { rgb, is_clipped };
         }
         // Secants of Y - luminance(rgb(Y)), which is negative below the solution.

@@ -407,6 +407,7 @@ fn of_rotation([a, b, c, largest]: [u8; 4]) -> [f32; 4] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::photographs::tone::SceneLaw;
     use crate::results::export::tests::drawn;
 
     #[test]
@@ -420,6 +421,7 @@ mod tests {
                 raw_colors: Some(true),
                 antialiased: true,
                 linear: None,
+                law: SceneLaw::parse("auto 4.25 0.0125 0.075 1 1 0.333"),
                 origin: model.origin,
             };
             let provenance = Provenance { facts, ..Provenance::default() };

@@ -301,6 +301,7 @@ fn smallest_three([w, x, y, z]: [f32; 4]) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::photographs::tone::SceneLaw;
     use crate::results::export::tests::drawn;
 
     fn encode_alone(model: &Gaussians, version: Version) -> Vec<u8> {
@@ -382,6 +383,7 @@ mod tests {
             raw_colors: Some(true),
             antialiased: true,
             linear: None,
+            law: SceneLaw::parse("auto 4.25 0.0125 0.075 1 1 0.333"),
             origin: model.origin,
         };
         let provenance = Provenance { facts, ..Provenance::default() };

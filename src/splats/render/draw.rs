@@ -9,7 +9,7 @@ use crate::Result;
 use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu, HostImage, ImageState, Pipeline, Recorder, Ring, Threads};
 use crate::kernels::status::STATUS_WORDS;
-use crate::kernels::{depth_limits, pack_pixels};
+use crate::kernels::{depth_limits, pack_pixels, photograph_light};
 use crate::splats::scene::{GaussianSlice, Layout};
 
 /// How the newest draw that is done went.
@@ -37,6 +37,8 @@ impl Drawn {
 pub(super) struct HostTargets {
     pack: Pipeline<pack_pixels::Kernel>,
     limits: Pipeline<depth_limits::Kernel>,
+    /// Built by the first draw of photographs.
+    photograph: Option<Pipeline<photograph_light::Kernel>>,
     pixels: Buffer<u32>,
     under: Buffer<u32>,
     depths: Buffer<f32>,
@@ -51,6 +53,7 @@ impl HostTargets {
         Ok(Self {
             pack: gpu.pipeline(&pack_pixels::Constants {})?,
             limits: gpu.pipeline(&depth_limits::Constants {})?,
+            photograph: None,
             pixels: gpu.uninit("pixels", 0)?,
             under: gpu.uninit("pixels under", 0)?,
             depths: gpu.uninit("depths", 0)?,
@@ -131,7 +134,8 @@ impl Renderer {
         cameras: &[Camera],
         target: &Target<'_>,
     ) -> Result<()> {
-        target.check(cameras)?;
+        let law = self.settings.law.filter(|_| target.is_photograph);
+        target.check(cameras, law.as_ref())?;
         self.check_layout(layout)?;
         let pixels = |camera: &Camera| Patch::from(camera).pixel_count();
         let pixels = cameras.iter().map(pixels).max().unwrap_or_default();
@@ -152,6 +156,11 @@ impl Renderer {
         }
         if let Some(own) = &mut self.host_targets {
             own.reserve(&self.gpu, pixels, target)?;
+            if let (Some(law), None) = (law, &own.photograph) {
+                let tone_curve = law.curve.constant();
+                own.photograph =
+                    Some(self.gpu.pipeline(&photograph_light::Constants { tone_curve })?);
+            }
         }
         self.grow_as_drawn();
         self.reserve_sorts()
@@ -225,6 +234,9 @@ impl Renderer {
         // The background is mixed in as the image counts colours.
         let before_black = RenderOptions { background: [0.0; 3], ..*options };
         self.record_forward(pass, gaussians, camera, &before_black, depths, Some(capacity))?;
+        if target.is_photograph && color.is_some() {
+            self.record_photograph(pass, pixel_count)?;
+        }
         let plane = if target.depth.is_some() { self.settings.channels() as u32 } else { 0 };
         let Self { frame, host_targets, .. } = self;
         let Some(own) = host_targets else { return Ok(()) };
@@ -266,6 +278,22 @@ impl Renderer {
             pass.give_image(&own.depths, &image, size);
         }
         Ok(())
+    }
+
+    /// Records the inversion of the tone law in the render.
+    fn record_photograph(&mut self, pass: &mut Recorder<'_>, pixel_count: u32) -> Result<()> {
+        let Self { settings, frame, host_targets, .. } = self;
+        let kernel = host_targets.as_ref().and_then(|own| own.photograph.as_ref());
+        let (Some(law), Some(kernel)) = (&settings.law, kernel) else { return Ok(()) };
+        pass.dispatch(
+            kernel,
+            &photograph_light::Params { pixel_count, tone: law.parameters },
+            photograph_light::Buffers {
+                transmittances: frame.transmittances.slice(),
+                render: frame.render.slice_mut(),
+            },
+            Threads::Exactly([pixel_count, 1, 1]),
+        )
     }
 
     /// Records the depths beyond which nothing is seen.

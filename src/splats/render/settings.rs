@@ -1,6 +1,7 @@
 //! The settings of a renderer, and the tile that suits a device.
 
 use crate::gpu::{Gpu, Properties, Tile};
+use crate::photographs::tone::SceneLaw;
 use crate::splats::lamp::Lamp;
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::scene::{Features, Shape};
@@ -22,6 +23,8 @@ pub struct RenderSettings {
     pub antialiased: bool,
     /// Lights the colours; in units of the Gaussians. `None`: evenly lit, each Gaussian in its own colour.
     pub lamp: Option<Lamp>,
+    /// What [`Target::is_photograph`](crate::Target::is_photograph) inverts.
+    pub law: Option<SceneLaw>,
     /// The storage format of the SH coefficients above degree 0: 32 bits after
     /// [`Gaussians::upload`](crate::splats::scene::Gaussians::upload) and by default, 16
     /// where the training configuration sets it.
@@ -55,6 +58,7 @@ impl Default for RenderSettings {
             raw_colors: false,
             antialiased: false,
             lamp: None,
+            law: None,
             rest: StorageFormat::Single,
             detach_geometry: false,
             purpose: Purpose::Train,

@@ -10,6 +10,7 @@ use crate::kernels::pixels::{
     DEPTH_16, DEPTH_24, DEPTH_FLOAT, PIXELS_DISPLAY_HALF, PIXELS_LINEAR_HALF, PIXELS_SRGB,
     PIXELS_UNORM,
 };
+use crate::photographs::tone::SceneLaw;
 use crate::{Error, Result};
 
 /// The images of a draw. Camera `i` is drawn into layer `layer + i` of each.
@@ -31,6 +32,9 @@ pub struct Target<'a> {
     pub is_over: bool,
     /// A float image gets display-referred values, as they were trained.
     pub is_display_referred: bool,
+    /// Colours are those of the dark photographs, by [`RenderSettings::law`](crate::RenderSettings::law): their linear
+    /// light where the image is linear, else their values. The background is the host's, and stays.
+    pub is_photograph: bool,
     /// The factor on linear light.
     pub exposure: f32,
     /// The most intersections; 0: as memory allows. The farthest are left out first.
@@ -46,6 +50,7 @@ impl Default for Target<'_> {
             scene: None,
             is_over: false,
             is_display_referred: false,
+            is_photograph: false,
             exposure: 1.0,
             budget: 0,
         }
@@ -119,7 +124,7 @@ impl Target<'_> {
 
     /// # Errors
     /// [`Error::Usage`] names the member and the remedy.
-    pub(super) fn check(&self, cameras: &[Camera]) -> Result<()> {
+    pub(super) fn check(&self, cameras: &[Camera], law: Option<&SceneLaw>) -> Result<()> {
         if cameras.is_empty() {
             return refused("no camera: pass at least one".to_owned());
         }
@@ -132,6 +137,12 @@ impl Target<'_> {
         if !(self.exposure.is_finite() && self.exposure >= 0.0) {
             let exposure = self.exposure;
             return refused(format!("exposure is {exposure}; it is a factor of 0 or more"));
+        }
+        if self.is_photograph && law.is_none() {
+            return refused(
+                "the model states no tone law, and its photographs are unknown; export it from its run with --law"
+                    .to_owned(),
+            );
         }
         check_image("color", self.color, COLOR_FORMATS, cameras)?;
         check_image("depth", self.depth, &[ImageFormat::R32Float], cameras)?;

@@ -6,6 +6,8 @@ use std::str::FromStr;
 use glam::DVec3;
 use serde_json::{Map, Value};
 
+use crate::photographs::tone::SceneLaw;
+
 /// Facts that a file states about its model, each with a key and a value, such as `near 0.1`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Facts {
@@ -19,6 +21,8 @@ pub struct Facts {
     pub antialiased: bool,
     /// Colours are linear light, the photographs' raised by this many stops; `None`: as displayed.
     pub linear: Option<f32>,
+    /// The curve from the photographs to the displayed colours.
+    pub law: Option<SceneLaw>,
     /// The world position that positions are relative to.
     pub origin: DVec3,
 }
@@ -29,7 +33,7 @@ impl Facts {
 
     /// Keys and values; without the origin if it is the world's, and of antialiasing only where it is on.
     fn entries(&self) -> Vec<(&'static str, String)> {
-        let Self { near, max_alpha, raw_colors, antialiased, linear, origin } = self;
+        let Self { near, max_alpha, raw_colors, antialiased, linear, law, origin } = self;
         let DVec3 { x, y, z } = origin;
         let entry = |key, value: Option<&dyn Display>| Some((key, value?.to_string()));
         let entries = [
@@ -38,6 +42,7 @@ impl Facts {
             entry("raw_colors", raw_colors.as_ref().map(|value| value as _)),
             antialiased.then(|| ("antialiased", antialiased.to_string())),
             entry("linear", linear.as_ref().map(|value| value as _)),
+            entry("law", law.as_ref().map(|value| value as _)),
             (self.origin != DVec3::ZERO).then(|| ("origin", format!("{x} {y} {z}"))),
         ];
         entries.into_iter().flatten().collect()
@@ -57,7 +62,8 @@ impl Facts {
     /// As an object of JSON.
     pub(crate) fn json(&self) -> Value {
         let value = |text: &str| {
-            let mut words = text.split(' ').map(|word| word.parse().unwrap_or_default());
+            let word = |word: &str| word.parse().unwrap_or_else(|_| Value::from(word));
+            let mut words = text.split(' ').map(word);
             match words.clone().count() {
                 1 => words.next().unwrap_or_default(),
                 _ => words.collect(),
@@ -73,8 +79,9 @@ impl Facts {
     /// As [`Facts::set`].
     pub(crate) fn of_json(json: &Value) -> Result<Self, String> {
         let mut facts = Self::default();
+        let word = |word: &Value| word.as_str().map_or_else(|| word.to_string(), str::to_owned);
         for (key, value) in json.as_object().into_iter().flatten() {
-            let words = value.as_array().map(|words| words.iter().map(Value::to_string));
+            let words = value.as_array().map(|words| words.iter().map(word));
             let text = words.map(|words| words.collect::<Vec<_>>().join(" "));
             facts.set(key, &text.unwrap_or_else(|| value.to_string()))?;
         }
@@ -97,6 +104,7 @@ impl Facts {
             }
             "antialiased" => self.antialiased = flag(key, value)?,
             "linear" => self.linear = Some(number(key, value, "of stops", |_| true)?),
+            "law" => self.law = Some(law(value)?),
             "origin" => self.origin = origin(value)?,
             _ => {}
         }
@@ -126,6 +134,13 @@ fn number(key: &str, text: &str, rule: &str, holds: impl Fn(f32) -> bool) -> Res
     number.filter(|number| number.is_finite() && holds(*number)).ok_or_else(|| {
         format!("states {key} `{}`, which is not a finite number {rule}", text.trim())
     })
+}
+
+/// A curve and its numbers.
+fn law(text: &str) -> Result<SceneLaw, String> {
+    let refused =
+        || format!("states the law `{}`, which is no curve with its numbers", text.trim());
+    SceneLaw::parse(text).ok_or_else(refused)
 }
 
 /// Three finite numbers.

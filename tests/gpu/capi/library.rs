@@ -204,7 +204,7 @@ fn every_member_is_where_c_has_it() {
             device_memory, frames,
         }
         NspCamera { width, height, focal, principal_point, view_from_world }
-        NspModelInfo { struct_size, count, sh_degree, near_plane, max_alpha, raw_colors, reserved, origin }
+        NspModelInfo { struct_size, count, sh_degree, near_plane, max_alpha, raw_colors, law_stops, origin }
         NspImageState { layout, family, stages, access }
         NspImage { image, format, extent, layer, before, after }
         NspRender {

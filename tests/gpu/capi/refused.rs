@@ -112,6 +112,11 @@ fn every_bad_render_is_refused_by_code_and_name_and_nothing_is_recorded() {
     refuse(&|own| own.cameras = null(), NSP_ERROR_USAGE, &["::cameras"]);
     refuse(&|own| own.camera_count = 0, NSP_ERROR_USAGE, &["::cameras"]);
     refuse(&|own| own.flags = 1 << 20, NSP_ERROR_USAGE, &["::flags", "0x100000"]);
+    refuse(
+        &|own| own.flags = NSP_RENDER_PHOTOGRAPH,
+        NSP_ERROR_USAGE,
+        &["states no tone law", "--law"],
+    );
     refuse(&|own| own.color = null(), NSP_ERROR_USAGE, &["no target"]);
     refuse(&|own| own.exposure = f32::INFINITY, NSP_ERROR_USAGE, &["exposure"]);
     let with = |change: &dyn Fn(&mut NspImage), code, words: &[&str]| {

@@ -298,7 +298,7 @@ fn problems_before_the_start_are_reported_in_a_line() {
 
 /// Whether an external program is installed; prints a line if not.
 #[track_caller]
-fn is_installed(program: &str) -> bool {
+pub(super) fn is_installed(program: &str) -> bool {
     let is_there = Command::new(program).arg("-h").stdin(Stdio::null()).output().is_ok();
     if !is_there {
         not_run(program, "it is not installed");

@@ -1,9 +1,13 @@
 //! Camera RAW: a minimal file, its linear light, and training on it.
 
 use std::fs;
+use std::path::Path;
 
+use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
+use nightsplat::photographs::pseudo_gt::PseudoGt;
+use nightsplat::photographs::tone::{InverseTone, MeasuredPhotograph, ToneSettings};
 
 use crate::common::command::succeed;
 
@@ -131,7 +135,7 @@ fn a_damaged_raw_is_named() {
 }
 
 /// The score after a few steps of training on a dataset.
-fn trained(set: &std::path::Path) -> f64 {
+fn trained(set: &Path) -> f64 {
     let out = set.with_extension("run");
     let options = "--steps 60 --sh-degree 0 --model plain --curve auto --progress none";
     succeed(&format!("train {} --out {} {options}", set.display(), out.display()));
@@ -140,17 +144,11 @@ fn trained(set: &std::path::Path) -> f64 {
     metrics["mean"]["psnr"].as_f64().unwrap()
 }
 
-#[test]
-fn photographs_in_raw_train_as_the_same_light_in_another_format() {
-    let folder = tempfile::tempdir().unwrap();
-    let [encoded, raw] = ["encoded", "raw"].map(|name| folder.path().join(name));
-    let options =
-        SyntheticOptions { views: 9, width: 48, height: 36, ..SyntheticOptions::default() };
-    for set in [&encoded, &raw] {
-        synthetic::write(set, &options).unwrap();
-    }
+/// Writes a synthetic set whose photographs are RAW, and returns their number.
+fn raw_set(set: &Path, options: &SyntheticOptions) -> usize {
+    synthetic::write(set, options).unwrap();
     let mut count = 0;
-    for entry in fs::read_dir(raw.join("low")).unwrap() {
+    for entry in fs::read_dir(set.join("low")).unwrap() {
         let path = entry.unwrap().path();
         let image = Image::load(&path).unwrap();
         let light = |x: u16, y: u16| image.pixel(x.into(), y.into()).map(linear_from_srgb);
@@ -160,7 +158,98 @@ fn photographs_in_raw_train_as_the_same_light_in_another_format() {
         fs::remove_file(&path).unwrap();
         count += 1;
     }
-    assert!(count >= 8);
+    count
+}
+
+#[test]
+fn photographs_in_raw_train_as_the_same_light_in_another_format() {
+    let folder = tempfile::tempdir().unwrap();
+    let [encoded, raw] = ["encoded", "raw"].map(|name| folder.path().join(name));
+    let options =
+        SyntheticOptions { views: 9, width: 48, height: 36, ..SyntheticOptions::default() };
+    synthetic::write(&encoded, &options).unwrap();
+    assert!(raw_set(&raw, &options) >= 8);
     let (encoded, raw) = (trained(&encoded), trained(&raw));
     assert!((encoded - raw).abs() < 0.1, "{encoded} dB of PNG, {raw} dB of RAW");
+}
+
+/// Sensor, target, inverse, EXR: what `render --as linear` writes of a model that fits its targets.
+#[test]
+fn light_on_the_sensor_comes_back_in_an_exr_through_target_and_inverse() {
+    let folder = tempfile::tempdir().unwrap();
+    let [raw, exr] = ["a.dng", "a.exr"].map(|name| folder.path().join(name));
+    // Seven stops, in colours.
+    let light = |x: u16, y: u16| {
+        let own = 0.25 / f32::from(1_u16 << (x / 4));
+        [own, 0.7 * own, if y < 4 { 0.4 * own } else { own }]
+    };
+    fs::write(&raw, dng(28, 8, |x, y| counted(light(x, y)))).unwrap();
+    let photograph = Image::load(&raw).unwrap();
+    let settings = ToneSettings::default();
+    let measured = MeasuredPhotograph::of(&photograph.data);
+    let scene = settings.scene(std::slice::from_ref(&measured)).unwrap();
+    let mapping = settings.tone_mapping(&scene, &measured);
+    let pseudo_gt = PseudoGt::new(&gpu(), &settings).unwrap();
+    let target = pseudo_gt.tone_mapped(&photograph, &mapping).unwrap();
+    assert!(target.pixel(9, 2)[0] > 3.0 * photograph.pixel(9, 2)[0], "the target is brighter");
+    let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
+    let back = Image::from_fn(28, 8, |x, y| {
+        let found = inverse.of(target.pixel(x, y).map(f64::from));
+        assert!(!found.is_clipped, "{x} {y}");
+        found.rgb.map(|x| x as f32)
+    });
+    back.save_exr(&exr).unwrap();
+    let read = Image::load(&exr).unwrap();
+    let mut most = 0.0_f32;
+    for (x, y) in (0..28).flat_map(|x| (0..8).map(move |y| (x, y))) {
+        let planted = light(x, y);
+        let found = read.pixel(x.into(), y.into()).map(linear_from_srgb);
+        for (found, planted) in found.into_iter().zip(planted) {
+            // A code of the sensor, and 1e-4 of the light.
+            let code = 1.0 / f32::from(WHITE - BLACK) / NEUTRAL[0];
+            most = most.max(((found - planted).abs() - code).max(0.0) / planted);
+        }
+    }
+    println!("light comes back to {most:e}, beyond a code of the sensor");
+    assert!(most < 2e-3, "{most:e}");
+}
+
+/// The light of a trained model in `render --as linear`, against that on the sensor, in bins of a stop.
+#[test]
+fn a_raw_set_stays_linear_to_the_exr_of_its_renders() {
+    let folder = tempfile::tempdir().unwrap();
+    let [set, run, out] = ["set", "run", "out"].map(|name| folder.path().join(name));
+    let options =
+        SyntheticOptions { views: 12, width: 64, height: 48, ..SyntheticOptions::default() };
+    let photographs = raw_set(&set, &options);
+    let [set, run] = [&set, &run].map(|path| path.display());
+    succeed(&format!("train {set} --out {run} --steps 500 --plan none --progress none"));
+    let split =
+        format!("render {run} --split train --as linear --format exr --out {}", out.display());
+    succeed(&split);
+    // Sums of the light of sensor and render by the sensor's light, a stop a bin.
+    let mut bins = std::collections::BTreeMap::<i32, [f64; 3]>::new();
+    let mut seen = 0;
+    for entry in fs::read_dir(&out).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_stem().unwrap().to_string_lossy().into_owned();
+        let sensor = Image::load(folder.path().join(format!("set/low/{name}.dng"))).unwrap();
+        let render = Image::load(&path).unwrap();
+        seen += 1;
+        for (sensor, render) in sensor.data.iter().zip(&render.data) {
+            let [sensor, render] = [sensor, render].map(|&x| f64::from(linear_from_srgb(x)));
+            let sums = bins.entry(sensor.max(1e-9).log2().floor() as i32).or_default();
+            *sums = [sums[0] + sensor, sums[1] + render, sums[2] + 1.0];
+        }
+    }
+    assert!(seen >= photographs - 3, "{seen} of {photographs}");
+    let total: f64 = bins.values().map(|sums| sums[2]).sum();
+    let stops: Vec<(i32, f64)> = bins
+        .iter()
+        .filter(|(_, sums)| sums[2] > 0.05 * total)
+        .map(|(bin, sums)| (*bin, (sums[1] / sums[0]).log2()))
+        .collect();
+    println!("by stops of the sensor's light, stops of the render above it: {stops:.3?}");
+    assert!(stops.len() >= 4, "{stops:?}");
+    assert!(stops.iter().all(|(_, off)| off.abs() < 0.15), "{stops:?}");
 }

@@ -42,6 +42,30 @@ pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
     })
 }
 
+/// The file of images with those that `renamed` gives a name, under that name.
+///
+/// # Errors
+/// Those of [`images`].
+#[cfg(feature = "cli")]
+pub(super) fn images_renamed(
+    path: &Path,
+    renamed: impl Fn(&str) -> Option<String>,
+) -> Result<Vec<u8>> {
+    let bytes = bytes(path)?;
+    let mut reader = Reader::new(path, "image", &bytes);
+    let kept: Vec<Option<Vec<u8>>> = reader.records(|reader| {
+        // Id, pose and camera.
+        let head = reader.take(4 + 7 * 8 + 4)?;
+        let name = reader.name()?;
+        let (rest, count) = (reader.rest, reader.u64()?);
+        reader.skip(count, 24)?;
+        let keypoints = &rest[..rest.len() - reader.rest.len()];
+        Ok(renamed(&name).map(|name| [head, name.as_bytes(), &[0], keypoints].concat()))
+    })?;
+    let kept: Vec<Vec<u8>> = kept.into_iter().flatten().collect();
+    Ok([&(kept.len() as u64).to_le_bytes()[..], &kept.concat()].concat())
+}
+
 pub(super) fn points(path: &Path) -> Result<BTreeMap<u64, ModelPoint>> {
     let bytes = bytes(path)?;
     let mut reader = Reader::new(path, "point", &bytes);

@@ -1,0 +1,40 @@
+//! The photographs of a reconstruction, and their names in it.
+
+use std::path::{Path, PathBuf};
+
+use super::tone_mapped;
+
+/// The folder of the bright photographs, in the reconstruction and in the dataset.
+pub(super) const BRIGHT: &str = "bright";
+
+/// Dark photographs, and bright ones of the same scene through which they are posed.
+pub(super) struct Pictures {
+    pub(super) dark: Vec<PathBuf>,
+    pub(super) bright: Vec<PathBuf>,
+    /// The folder of their tone-mapped copies.
+    pub(super) copies: PathBuf,
+}
+
+impl Pictures {
+    /// All photographs, the dark ones first.
+    pub(super) fn all(&self) -> Vec<PathBuf> {
+        [self.dark.as_slice(), self.bright.as_slice()].concat()
+    }
+
+    /// The name of a photograph's copy, relative to the folder of all.
+    pub(super) fn name(&self, photograph: &Path) -> String {
+        let name = tone_mapped::name(photograph);
+        let is_bright = self.bright.iter().any(|own| own == photograph);
+        if is_bright { format!("{BRIGHT}/{name}") } else { name }
+    }
+}
+
+/// The name of a bright photograph without its folder; `None` of a dark one.
+pub(super) fn bright_name(name: &str) -> Option<String> {
+    name.strip_prefix(BRIGHT)?.strip_prefix('/').map(str::to_owned)
+}
+
+/// Whether a name is that of a dark photograph.
+pub(super) fn is_dark(name: &str) -> bool {
+    bright_name(name).is_none()
+}

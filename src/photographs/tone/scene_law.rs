@@ -1,0 +1,126 @@
+//! The tone law of a whole scene as one curve, as a model file states it.
+
+use std::fmt;
+use std::str::FromStr;
+
+#[cfg(feature = "io")]
+use super::{InverseTone, ToneSettings};
+use super::{ToneCurve, ToneParameters};
+#[cfg(feature = "io")]
+use crate::{Error, Result};
+
+/// The curve from the values of a scene's photographs to the colours of its model, at the exposure of all photographs
+/// together. A model file states it where it was exported with `--law`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SceneLaw {
+    pub(crate) curve: ToneCurve,
+    pub(crate) parameters: ToneParameters,
+    pub(crate) stops: f32,
+}
+
+impl SceneLaw {
+    /// The law of a scene with these parameters.
+    ///
+    /// # Errors
+    /// [`Error::Usage`] for a camera profile, which has no inverse, and for a table, which has too many numbers to
+    /// state.
+    #[cfg(feature = "io")]
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn of(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {
+        let stops = InverseTone::new(settings, parameters)?.stops_to_target() as f32;
+        if settings.curve == ToneCurve::Table {
+            let problem = "a table of values is too long for a model to state; train with a named curve for --law";
+            return Err(Error::Usage(problem.to_owned()));
+        }
+        Ok(Self { curve: settings.curve, parameters: *parameters, stops })
+    }
+
+    /// By how many stops the linear light of the photographs has to be raised for the brightness of the model's
+    /// colours: for a grey that reflects 18 %.
+    pub fn stops(&self) -> f32 {
+        self.stops
+    }
+
+    /// What [`fmt::Display`] writes; `None` if it is not that.
+    pub(crate) fn parse(text: &str) -> Option<Self> {
+        let mut words = text.split_whitespace();
+        let curve = ToneCurve::from_str(words.next()?).ok()?;
+        if matches!(curve, ToneCurve::Table | ToneCurve::Profile) {
+            return None;
+        }
+        let mut number = || words.next()?.parse::<f32>().ok().filter(|number| number.is_finite());
+        let (stops, white) = (number()?, number().filter(|white| *white > 0.0)?);
+        let [offset, gain, weight] = [number()?, number()?, number()?];
+        let mut parameters = ToneParameters { white, offset, gain, weight, ..Default::default() };
+        let mut constants = parameters.constants.iter_mut();
+        for word in words {
+            *constants.next()? = word.parse().ok().filter(|number: &f32| number.is_finite())?;
+        }
+        Some(Self { curve, parameters, stops })
+    }
+}
+
+/// The name of the curve, stops, white, offset, gain, weight, and the constants that are not zero at the end.
+impl fmt::Display for SceneLaw {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let ToneParameters { white, offset, gain, weight, constants } = &self.parameters;
+        write!(f, "{} {} {white} {offset} {gain} {weight}", self.curve.name(), self.stops)?;
+        let used =
+            constants.iter().rposition(|constant| *constant != 0.0).map_or(0, |last| last + 1);
+        constants[..used].iter().try_for_each(|constant| write!(f, " {constant}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_law_is_read_back_to_the_bit_and_anything_else_is_refused() {
+        let mut parameters = ToneParameters {
+            white: 0.1,
+            offset: 1e-7,
+            gain: 1.0,
+            weight: 0.3,
+            ..Default::default()
+        };
+        for (curve, constants) in [(ToneCurve::Auto, 1), (ToneCurve::Ap3, 0), (ToneCurve::Hable, 6)]
+        {
+            parameters.constants[..constants].fill(1.0 / 3.0);
+            let law = SceneLaw { curve, parameters, stops: 4.123_456_7 };
+            assert_eq!(SceneLaw::parse(&law.to_string()), Some(law));
+            parameters.constants = Default::default();
+        }
+        let good = "auto 4 0.1 0.075 1 1 0.3";
+        assert!(SceneLaw::parse(good).is_some());
+        let bad = [
+            "",
+            "auto",
+            "bright 4 0.1 0.075 1 1",
+            "table 4 0.1 0.075 1 1",
+            "profile 4 0.1 0.075 1 1",
+            "auto 4 0 0.075 1 1",
+            "auto 4 NaN 0.075 1 1",
+            "auto 4 0.1 0.075 1",
+            "auto 4 0.1 0.075 1 1 x",
+            "auto 4 0.1 0.075 1 1 1 1 1 1 1 1 1 1 1",
+        ];
+        for text in bad {
+            assert_eq!(SceneLaw::parse(text), None, "{text}");
+        }
+    }
+
+    #[test]
+    fn a_table_is_too_long_to_state() {
+        let table = crate::photographs::tone::Table {
+            x: vec![0.0, 1.0],
+            y: vec![vec![0.0, 1.0]],
+            ..Default::default()
+        };
+        let settings = ToneSettings { table: Some(table), ..ToneSettings::new(ToneCurve::Table) };
+        let parameters =
+            ToneParameters { white: 1.0, gain: 1.0, weight: 1.0, ..Default::default() };
+        let refused = SceneLaw::of(&settings, &parameters).unwrap_err().to_string();
+        assert!(refused.contains("a table of values") && refused.contains("--law"), "{refused}");
+    }
+}
