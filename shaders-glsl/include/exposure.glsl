@@ -6,3 +6,8 @@
 const uint EXPOSURE_WIDTH = 6;
 // Gain and bias have similar effects on a render: the bias, at a fraction of the gain's rate, fits the remainder.
 const float BIAS_SCALE = 0.25;
+// Targets this close to that of white, half a code of 8 bits, are clipped.
+const float CLIPPED_REACH = 0.5 / 255.0;
+
+// Whether a target is clipped: a photograph bounds what is brighter than its white from below only.
+bool is_clipped(float target, float white) { return abs(target - white) <= CLIPPED_REACH; }

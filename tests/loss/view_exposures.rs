@@ -40,6 +40,13 @@ fn every_kernel_agrees_with_its_reference_at_every_size() {
             let render = noise(1, 4 * pixels, -0.2, 1.3);
             let d_render = noise(2, 4 * pixels, -1e-3, 1e-3);
             let exposures = noise(3, view_count * WIDTH, -0.5, 0.5);
+            // A third of the targets are clipped, some of them a rounding of 8 bits below white.
+            let whites = noise(4, 3 * view_count, 0.6, 1.0);
+            let mut target = noise(5, 3 * pixels, 0.0, 0.6);
+            for (i, target) in target.iter_mut().enumerate().filter(|(i, _)| i % 3 == 0) {
+                let white = whites[3 * view as usize + i / pixels];
+                *target = white - [0.0, 0.4, -0.4, 0.6][i % 4] / 255.0;
+            }
             for inverse in [false, true] {
                 let exposed = vec![7.0f32; 4 * pixels];
                 let exposed = run_kernel!(
@@ -47,11 +54,14 @@ fn every_kernel_agrees_with_its_reference_at_every_size() {
                     expose::Constants { inverse },
                     expose::Params { pixel_count, view },
                     Threads::Exactly([3 * pixel_count, 1, 1]),
-                    [exposures, render],
+                    [exposures, whites, render, target],
                     [exposed]
                 );
                 assert!(exposed[3 * pixels..].iter().all(|&value| value == 7.0));
             }
+            // Half of the values are at their targets.
+            let mut exposed = noise(6, 3 * pixels, 0.0, 1.0);
+            exposed.iter_mut().zip(&target).step_by(2).for_each(|(own, &target)| *own = target);
             let partials = vec![Vec2::NAN; 3 * chunk_count as usize];
             let expected = d_render[3 * pixels..].to_vec();
             let (d_render, partials) = run_kernel!(
@@ -59,7 +69,7 @@ fn every_kernel_agrees_with_its_reference_at_every_size() {
                 expose_backward::Constants::default(),
                 expose_backward::Params { pixel_count, view },
                 Threads::Workgroups([chunk_count, 3, 1]),
-                [exposures, render],
+                [exposures, whites, render, target, exposed],
                 [d_render, partials]
             );
             assert_eq!(d_render[3 * pixels..], expected);
@@ -131,6 +141,9 @@ fn values_that_are_not_finite_become_finite() {
     }
 }
 
+/// The target of white of a view in which nothing is clipped.
+const WHITE: [f32; 3] = [9.0; 3];
+
 /// Three exposures, the middle one under test.
 fn three() -> [Affine; 3] {
     let second = Affine { gain: [0.7, 1.2, 0.9], bias: [0.05, -0.02, 0.01] };
@@ -148,14 +161,18 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     let (pixels, size) = (setup.pixels(), UVec2::new(26, 19));
     let render = crate::common::narrow(&chain.run(&parameters).render);
 
-    let mut exposures = Exposures::new(&gpu, ExposureRates::default(), &three()).unwrap();
+    let start = &three();
+    let mut exposures =
+        Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE; 3]).unwrap();
     exposures.reserve(size).unwrap();
     let own = exposures.affines().unwrap()[1];
     let render_on_device = gpu.buffer("render", &render).unwrap();
+    let target = gpu.zeros("target", render.len()).unwrap();
     let mut d_render = gpu.buffer("d_render", &crate::common::narrow(&weights)).unwrap();
     gpu.run("exposures", |pass| {
-        exposures.expose(pass, 1, size, &render_on_device)?;
-        exposures.backward(pass, 1, size, &render_on_device, &mut d_render)
+        let images = [&render_on_device, &target];
+        exposures.expose(pass, 1, size, images)?;
+        exposures.backward(pass, 1, size, images, &mut d_render)
     })
     .unwrap();
     let d_render = crate::common::widen(&gpu.read(&d_render).unwrap());
@@ -205,6 +222,60 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     }
 }
 
+/// With the loss as sum of w e: where e is above a clipped target, only that is seen.
+#[test]
+fn the_gradient_of_clipped_values_is_its_central_difference() {
+    let (gpu, size, pixels) = (gpu(), UVec2::new(9, 7), 63);
+    let (render, weights) =
+        (noise(1, 3 * pixels, 0.0, 1.2), noise(2, 3 * pixels, -1.0, 1.0));
+    let white = [0.6, 0.8, 1.0];
+    let is_clipped = |i: usize| i % 3 > 0;
+    let target = |i: usize| if is_clipped(i) { white[i / pixels] } else { 0.3 };
+    let target: Vec<f32> = (0..3 * pixels).map(target).collect();
+    let start = &three();
+    let mut exposures =
+        Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE, white, WHITE]).unwrap();
+    exposures.reserve(size).unwrap();
+    let own = exposures.affines().unwrap()[1];
+    let [on_device, target_on_device] =
+        [&render, &target].map(|values| gpu.buffer("image", values).unwrap());
+    let mut d_render = gpu.buffer("d_render", &weights).unwrap();
+    gpu.run("exposures", |pass| {
+        let images = [&on_device, &target_on_device];
+        exposures.expose(pass, 1, size, images)?;
+        exposures.backward(pass, 1, size, images, &mut d_render)
+    })
+    .unwrap();
+    let gradients = gpu.read(exposures.buffers().gradients).unwrap();
+    let d_render = gpu.read(&d_render).unwrap();
+    let exposed = |affine: &Affine, i: usize, c: f64| {
+        let exposed = affine.gain[i / pixels] * c + affine.bias[i / pixels];
+        if is_clipped(i) { exposed.min(target[i].into()) } else { exposed }
+    };
+    let mut bound = 0;
+    for (i, &c) in render.iter().enumerate() {
+        let difference = exposed(&own, i, f64::from(c) + 1e-4) - exposed(&own, i, f64::from(c) - 1e-4);
+        let expected = f64::from(weights[i]) * difference / 2e-4;
+        assert!((f64::from(d_render[i]) - expected).abs() < 1e-5, "{i}: {} {expected}", d_render[i]);
+        bound += usize::from(difference == 0.0);
+    }
+    assert!((20..160).contains(&bound), "{bound} values are bound by their targets");
+    for number in 0..WIDTH {
+        let loss = |by: f64| -> f64 {
+            let mut affine = own;
+            match number {
+                0..3 => affine.gain[number] += by,
+                _ => affine.bias[number - 3] += BIAS_SCALE * by,
+            }
+            let values = render.iter().zip(&weights).enumerate();
+            values.map(|(i, (&c, &w))| f64::from(w) * exposed(&affine, i, c.into())).sum()
+        };
+        let expected = (loss(1e-5) - loss(-1e-5)) / 2e-5;
+        let actual = f64::from(gradients[WIDTH + number]);
+        assert!((actual - expected).abs() < 1e-3 * (1.0 + expected.abs()), "{actual} {expected}");
+    }
+}
+
 #[test]
 fn adam_finds_the_exposures_of_views_that_only_differ_in_exposure() {
     let (gpu, size) = (gpu(), UVec2::new(20, 15));
@@ -212,13 +283,16 @@ fn adam_finds_the_exposures_of_views_that_only_differ_in_exposure() {
     let render = noise(8, 3 * 300, 0.0, 1.0);
     let render_on_device = gpu.buffer("render", &render).unwrap();
     let rates = ExposureRates { initial: 0.02, last: 0.002, steps: 600 };
-    let mut exposures = Exposures::new(&gpu, rates, &[Affine::IDENTITY; 3]).unwrap();
+    let start = [Affine::IDENTITY; 3];
+    let mut exposures = Exposures::new(&gpu, rates, &start, &[WHITE; 3]).unwrap();
+    let dark = gpu.zeros("target", 900).unwrap();
+    let images = [&render_on_device, &dark];
     exposures.reserve(size).unwrap();
     let (adam, status) = (Adam::new(&gpu).unwrap(), gpu.zeros("status", 1).unwrap());
     for step in 1..=900 {
         let view = step as usize % 3;
         // The gradient of half the mean squared difference.
-        gpu.run("expose", |pass| exposures.expose(pass, view, size, &render_on_device)).unwrap();
+        gpu.run("expose", |pass| exposures.expose(pass, view, size, images)).unwrap();
         let exposed = gpu.read(exposures.exposed()).unwrap();
         let target =
             |i: usize| truth[view].gain[i / 300] * f64::from(render[i]) + truth[view].bias[i / 300];
@@ -226,7 +300,7 @@ fn adam_finds_the_exposures_of_views_that_only_differ_in_exposure() {
             (0..900).map(|i| ((f64::from(exposed[i]) - target(i)) / 900.0) as f32).collect();
         let mut d_render = gpu.buffer("d_render", &d).unwrap();
         gpu.run("learn", |pass| {
-            exposures.backward(pass, view, size, &render_on_device, &mut d_render)?;
+            exposures.backward(pass, view, size, images, &mut d_render)?;
             adam.update(pass, step, 1.0, &mut exposures, &status)?;
             exposures.center(pass, &status)
         })
@@ -243,21 +317,25 @@ fn adam_finds_the_exposures_of_views_that_only_differ_in_exposure() {
 #[test]
 fn buffers_and_views_that_do_not_fit_are_refused() {
     let gpu = gpu();
-    let new = |start: &[Affine]| Exposures::new(&gpu, ExposureRates::default(), start);
-    assert!(new(&[]).is_err());
+    let new =
+        |start: &[Affine]| Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE; 3]);
+    assert!(new(&[]).is_err() && new(&[Affine::IDENTITY; 4]).is_err());
     assert!(new(&[Affine { gain: [1.0, 0.0, 1.0], bias: [0.0; 3] }]).is_err());
     assert!(new(&[Affine { gain: [1.0; 3], bias: [f64::NAN, 0.0, 0.0] }]).is_err());
     let mut exposures = new(&three()).unwrap();
     exposures.reserve(UVec2::splat(8)).unwrap();
     let [mut d_render, render] = [(); 2].map(|()| gpu.zeros("render", 3 * 64).unwrap());
     for (view, size) in [(3, [8, 8]), (0, [0, 8]), (0, [9, 8]), (0, [64, 64])] {
-        let exposed = gpu.run("e", |pass| exposures.expose(pass, view, size.into(), &render));
+        let images = [&render, &render];
+        let exposed = gpu.run("e", |pass| exposures.expose(pass, view, size.into(), images));
         let backward = gpu
-            .run("b", |pass| exposures.backward(pass, view, size.into(), &render, &mut d_render));
+            .run("b", |pass| exposures.backward(pass, view, size.into(), images, &mut d_render));
         assert!(exposed.is_err() && backward.is_err(), "{view} {size:?}");
     }
     let short = gpu.zeros("render", 100).unwrap();
-    assert!(gpu.run("e", |pass| exposures.expose(pass, 0, UVec2::splat(8), &short)).is_err());
+    for images in [[&short, &render], [&render, &short]] {
+        assert!(gpu.run("e", |pass| exposures.expose(pass, 0, UVec2::splat(8), images)).is_err());
+    }
 }
 
 /// The factors of the views' light, in groups of four.
@@ -407,6 +485,25 @@ fn a_denoiser_on_crops_sees_the_neutral_exposure_and_a_tonemapper_is_refused() {
     assert!(error.contains("tonemapper") && error.contains("exposure.learn"), "{error}");
 }
 
+/// The stops of linear light that an exposure of encoded values is worth at middle grey.
+#[test]
+fn without_a_table_exposures_start_at_those_of_the_shared_points() {
+    let folder = tempfile::tempdir().unwrap();
+    let (config, dataset) = varied(folder.path());
+    let trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
+    let found: Vec<f64> =
+        trainer.exposures().unwrap().unwrap().iter().map(|(_, own)| own.stops()).collect();
+    let planted: Vec<f64> =
+        (0..found.len()).map(|at| f64::from(FACTORS[at % 4]).log2()).collect();
+    println!("{found:?} {planted:?}");
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+    let (of_found, of_planted) = (mean(&found), mean(&planted));
+    for (found, planted) in found.iter().zip(&planted) {
+        let error = (found - of_found) - (planted - of_planted);
+        assert!(error.abs() < 0.1, "{error} stops");
+    }
+}
+
 #[test]
 fn a_table_sets_the_initial_exposures() {
     let folder = tempfile::tempdir().unwrap();
@@ -418,8 +515,6 @@ fn a_table_sets_the_initial_exposures() {
         let exposures = trainer.exposures().unwrap().unwrap();
         exposures.into_iter().map(|(_, exposure)| exposure).collect::<Vec<Affine>>()
     };
-    assert!(begin(&config).iter().all(|exposure| *exposure == Affine::IDENTITY));
-
     // Stops of the photographs: with one curve, the targets differ accordingly.
     let lines = names.iter().zip(FACTORS.iter().cycle());
     let lines: String = lines.map(|(name, factor)| format!("{name},{}\n", factor.log2())).collect();
