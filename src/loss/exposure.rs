@@ -1,8 +1,9 @@
 //! Learned exposure and colour per view, for photographs of one scene with different exposures.
 //!
 //! A target is compared with e = gain c + bias, an affine of the encoded colours c of the render, for each channel of
-//! each view, clipped at the target where the photograph is clipped. The brightness of the model is fixed: after every step the mean of the gains over the training views is 1
-//! and that of the biases 0, exactly ([`Exposures::center`]), so that a view of mean exposure shows the model itself.
+//! each view, clipped at the target where the photograph is clipped. The brightness of the model
+//! is fixed: after every step the geometric mean of the gains over the training views is 1 and the mean of the biases 0,
+//! exactly ([`Exposures::center`]), so that a view of mean exposure in stops shows the model itself.
 
 mod affine;
 pub mod table;
@@ -282,7 +283,8 @@ impl Exposures {
 
 impl Learnable for Exposures {
     fn name(&self) -> &'static str {
-        "exposures"
+        // Those of earlier versions were differences of gains from 1.
+        "log_exposures"
     }
 
     fn learning_rate(&self, step: u64) -> f64 {
@@ -306,7 +308,7 @@ fn pixels(size: UVec2) -> u32 {
 impl Affine {
     /// Its learned parameters.
     fn parameters(&self) -> Result<[f32; EXPOSURE_WIDTH as usize]> {
-        let [gains, biases] = [self.gain.map(|gain| gain - 1.0), self.bias.map(|b| b / BIAS_SCALE)];
+        let [gains, biases] = [self.gain.map(f64::ln), self.bias.map(|b| b / BIAS_SCALE)];
         let mut parameters = [0.0; EXPOSURE_WIDTH as usize];
         for (to, value) in parameters.iter_mut().zip(gains.into_iter().chain(biases)) {
             *to = value as f32;
@@ -321,6 +323,6 @@ impl Affine {
 
     fn of_parameters(parameters: &[f32]) -> Self {
         let at = |c: usize| f64::from(parameters[c]);
-        Self { gain: [0, 1, 2].map(|c| 1.0 + at(c)), bias: [3, 4, 5].map(|c| BIAS_SCALE * at(c)) }
+        Self { gain: [0, 1, 2].map(|c| at(c).exp()), bias: [3, 4, 5].map(|c| BIAS_SCALE * at(c)) }
     }
 }

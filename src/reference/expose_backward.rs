@@ -25,13 +25,15 @@ fn backward(
         };
         let c = &slices.render[plane.clone()];
         let d: Vec<f32> = plane.map(passed).collect();
-        d_render.extend(d.iter().map(|&d| gain * Rounded::exact(d)));
-        for (c, d) in c.chunks(chunk).zip(d.chunks(chunk)) {
-            let products = c.iter().zip(d).map(|(&c, &d)| Rounded::exact(c) * Rounded::exact(d));
+        let of_render: Vec<Rounded> = d.iter().map(|&d| gain * Rounded::exact(d)).collect();
+        let chunks = c.chunks(chunk).zip(d.chunks(chunk)).zip(of_render.chunks(chunk));
+        for ((c, d), own) in chunks {
+            let products = c.iter().zip(own).map(|(&c, &own)| Rounded::exact(c) * own);
             let of_render = Rounded::sum(chain(chunk), products);
             let alone = Rounded::sum(chain(chunk), d.iter().copied().map(Rounded::exact));
             partials.push([of_render, alone]);
         }
+        d_render.extend(of_render);
     }
     (d_render, partials)
 }

@@ -108,7 +108,8 @@ impl TargetViews {
             let rendered = render(camera)?;
             for (sum, image) in sums.iter_mut().zip([&rendered.colors, rendered.output()]) {
                 let is_aligned = place.is_none() && !affines.is_empty();
-                let aligned = is_aligned.then(|| Affine::least_squares(image, target)).transpose()?;
+                let aligned =
+                    is_aligned.then(|| Affine::least_squares(image, target)).transpose()?;
                 let aligned = aligned.map(|own| own.applied(image));
                 let image = clamped(aligned.as_ref().unwrap_or(image));
                 *sum += psnr_of_counted(&image, target, mask.as_ref())?;

@@ -11,8 +11,8 @@ use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use nightsplat::kernels::{expose, expose_backward, exposure_center, exposure_gradient};
 use nightsplat::loss::exposure::{Affine, ExposureRates, Exposures, table};
-use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::{Dataset, Split, View};
 use nightsplat::photographs::image::{linear_from_srgb, srgb_from_linear};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::results::run::{self, IfExists};
@@ -162,8 +162,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     let render = crate::common::narrow(&chain.run(&parameters).render);
 
     let start = &three();
-    let mut exposures =
-        Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE; 3]).unwrap();
+    let mut exposures = Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE; 3]).unwrap();
     exposures.reserve(size).unwrap();
     let own = exposures.affines().unwrap()[1];
     let render_on_device = gpu.buffer("render", &render).unwrap();
@@ -178,7 +177,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     let d_render = crate::common::widen(&gpu.read(&d_render).unwrap());
     let gradients = gpu.read(exposures.buffers().gradients).unwrap();
 
-    // With respect to the exposure, in whose values L is linear.
+    // With respect to the exposure.
     let loss = |affine: &Affine| -> f64 {
         let exposed = |(i, &c): (usize, &f32)| {
             weights[i] * (affine.gain[i / pixels] * f64::from(c) + affine.bias[i / pixels])
@@ -189,7 +188,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
         let moved = |by: f64| {
             let mut affine = own;
             match number {
-                0..3 => affine.gain[number] += by,
+                0..3 => affine.gain[number] *= by.exp(),
                 _ => affine.bias[number - 3] += BIAS_SCALE * by,
             }
             loss(&affine)
@@ -226,8 +225,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
 #[test]
 fn the_gradient_of_clipped_values_is_its_central_difference() {
     let (gpu, size, pixels) = (gpu(), UVec2::new(9, 7), 63);
-    let (render, weights) =
-        (noise(1, 3 * pixels, 0.0, 1.2), noise(2, 3 * pixels, -1.0, 1.0));
+    let (render, weights) = (noise(1, 3 * pixels, 0.0, 1.2), noise(2, 3 * pixels, -1.0, 1.0));
     let white = [0.6, 0.8, 1.0];
     let is_clipped = |i: usize| i % 3 > 0;
     let target = |i: usize| if is_clipped(i) { white[i / pixels] } else { 0.3 };
@@ -254,9 +252,14 @@ fn the_gradient_of_clipped_values_is_its_central_difference() {
     };
     let mut bound = 0;
     for (i, &c) in render.iter().enumerate() {
-        let difference = exposed(&own, i, f64::from(c) + 1e-4) - exposed(&own, i, f64::from(c) - 1e-4);
+        let difference =
+            exposed(&own, i, f64::from(c) + 1e-4) - exposed(&own, i, f64::from(c) - 1e-4);
         let expected = f64::from(weights[i]) * difference / 2e-4;
-        assert!((f64::from(d_render[i]) - expected).abs() < 1e-5, "{i}: {} {expected}", d_render[i]);
+        assert!(
+            (f64::from(d_render[i]) - expected).abs() < 1e-5,
+            "{i}: {} {expected}",
+            d_render[i]
+        );
         bound += usize::from(difference == 0.0);
     }
     assert!((20..160).contains(&bound), "{bound} values are bound by their targets");
@@ -264,7 +267,7 @@ fn the_gradient_of_clipped_values_is_its_central_difference() {
         let loss = |by: f64| -> f64 {
             let mut affine = own;
             match number {
-                0..3 => affine.gain[number] += by,
+                0..3 => affine.gain[number] *= by.exp(),
                 _ => affine.bias[number - 3] += BIAS_SCALE * by,
             }
             let values = render.iter().zip(&weights).enumerate();
@@ -317,8 +320,7 @@ fn adam_finds_the_exposures_of_views_that_only_differ_in_exposure() {
 #[test]
 fn buffers_and_views_that_do_not_fit_are_refused() {
     let gpu = gpu();
-    let new =
-        |start: &[Affine]| Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE; 3]);
+    let new = |start: &[Affine]| Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE; 3]);
     assert!(new(&[]).is_err() && new(&[Affine::IDENTITY; 4]).is_err());
     assert!(new(&[Affine { gain: [1.0, 0.0, 1.0], bias: [0.0; 3] }]).is_err());
     assert!(new(&[Affine { gain: [1.0; 3], bias: [f64::NAN, 0.0, 0.0] }]).is_err());
@@ -328,8 +330,8 @@ fn buffers_and_views_that_do_not_fit_are_refused() {
     for (view, size) in [(3, [8, 8]), (0, [0, 8]), (0, [9, 8]), (0, [64, 64])] {
         let images = [&render, &render];
         let exposed = gpu.run("e", |pass| exposures.expose(pass, view, size.into(), images));
-        let backward = gpu
-            .run("b", |pass| exposures.backward(pass, view, size.into(), images, &mut d_render));
+        let backward =
+            gpu.run("b", |pass| exposures.backward(pass, view, size.into(), images, &mut d_render));
         assert!(exposed.is_err() && backward.is_err(), "{view} {size:?}");
     }
     let short = gpu.zeros("render", 100).unwrap();
@@ -385,11 +387,13 @@ fn exposures_explain_photographs_that_differ_in_brightness_and_their_mean_is_exa
         let exposures = trainer.exposures().unwrap().unwrap();
         assert_eq!(exposures.len(), dataset.train_views().count());
         for c in 0..3 {
+            // In the quanta of the parameters.
             let sum = |of: fn(&Affine, usize) -> f64| {
-                exposures.iter().map(|(_, exposure)| of(exposure, c)).sum::<f64>()
+                let quanta = |own: &Affine| (of(own, c) * 2f64.powi(21)).round();
+                exposures.iter().map(|(_, own)| quanta(own)).sum::<f64>()
             };
-            assert_eq!(sum(|e, c| e.gain[c] - 1.0), 0.0, "step {step}");
-            assert_eq!(sum(|e, c| e.bias[c]), 0.0, "step {step}");
+            assert_eq!(sum(|e, c| e.gain[c].ln()), 0.0, "step {step}");
+            assert_eq!(sum(|e, c| e.bias[c] / BIAS_SCALE), 0.0, "step {step}");
         }
     }
     let stops = |at: usize| trainer.exposures().unwrap().unwrap()[at].1.stops();
@@ -485,23 +489,47 @@ fn a_denoiser_on_crops_sees_the_neutral_exposure_and_a_tonemapper_is_refused() {
     assert!(error.contains("tonemapper") && error.contains("exposure.learn"), "{error}");
 }
 
-/// The stops of linear light that an exposure of encoded values is worth at middle grey.
 #[test]
 fn without_a_table_exposures_start_at_those_of_the_shared_points() {
     let folder = tempfile::tempdir().unwrap();
-    let (config, dataset) = varied(folder.path());
-    let trainer = Trainer::new(&gpu(), config, &dataset).unwrap();
-    let found: Vec<f64> =
-        trainer.exposures().unwrap().unwrap().iter().map(|(_, own)| own.stops()).collect();
-    let planted: Vec<f64> =
-        (0..found.len()).map(|at| f64::from(FACTORS[at % 4]).log2()).collect();
-    println!("{found:?} {planted:?}");
-    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-    let (of_found, of_planted) = (mean(&found), mean(&planted));
-    for (found, planted) in found.iter().zip(&planted) {
-        let error = (found - of_found) - (planted - of_planted);
-        assert!(error.abs() < 0.1, "{error} stops");
+    let (mut config, dataset) = varied(folder.path());
+    let begin = |config: &TrainConfig| -> Vec<Affine> {
+        let trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
+        trainer.exposures().unwrap().unwrap().into_iter().map(|(_, own)| own).collect()
+    };
+    let found = begin(&config);
+    let planted = folder.path().join("planted.csv");
+    let lines = dataset.train_views().zip(FACTORS.iter().cycle());
+    let line = |(view, factor): (&View, &f32)| format!("{},{}\n", view.name, factor.log2());
+    std::fs::write(&planted, format!("name,ev\n{}", lines.map(line).collect::<String>())).unwrap();
+    config.exposure.start = Some(planted);
+    for (found, planted) in found.iter().zip(begin(&config)) {
+        let error = found.stops() - planted.stops();
+        assert!(error.abs() < 0.1, "{error} stops: {found} is not {planted}");
     }
+    assert!(found[3].stops() - found[2].stops() > 0.5, "{} {}", found[3], found[2]);
+}
+
+/// The brightness of a held-out view says nothing about the model.
+#[test]
+fn a_held_out_view_scores_alike_at_any_exposure() {
+    let folder = tempfile::tempdir().unwrap();
+    let (mut config, mut dataset) = varied(folder.path());
+    let held_out = dataset.views.iter().position(View::is_train).unwrap();
+    dataset.views[held_out].split = Split::HeldOut;
+    let mut scores = vec![];
+    for gain in [1.0, 0.5] {
+        for x in &mut dataset.views[held_out].image.as_mut().unwrap().data {
+            *x *= gain;
+        }
+        config.tone = ToneSettings::new(ToneCurve::None);
+        let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
+        advance(&mut trainer, 20);
+        scores.push(trainer.held_out_psnr().unwrap().unwrap());
+    }
+    // Against a target of half the contrast, an error is half as large: 6.02 dB.
+    let gap = scores[1] - scores[0];
+    assert!((gap - 6.02).abs() < 0.3, "{scores:?}");
 }
 
 #[test]

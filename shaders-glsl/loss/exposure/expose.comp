@@ -29,7 +29,7 @@ void main() {
     if (i >= 3 * pixel_count) return;
     uint channel = i / pixel_count;
     uint at = view * EXPOSURE_WIDTH + channel;
-    float gain = 1.0 + exposures[at];
+    float gain = exp(exposures[at]);
     float bias = BIAS_SCALE * exposures[at + 3];
     if (INVERSE) {
         exposed[i] = (render[i] - bias) / gain;
