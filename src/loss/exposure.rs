@@ -1,9 +1,9 @@
 //! Learned exposure and colour per view, for photographs of one scene with different exposures.
 //!
 //! A target is compared with e = gain c + bias, an affine of the encoded colours c of the render, for each channel of
-//! each view, clipped at the target where the photograph is clipped. The brightness of the model
-//! is fixed: after every step the geometric mean of the gains over the training views is 1 and the mean of the biases 0,
-//! exactly ([`Exposures::center`]), so that a view of mean exposure in stops shows the model itself.
+//! each view, clipped at the target where the photograph is clipped. The brightness of the model is fixed: after every
+//! step the geometric mean of the gains over the training views is 1 and the mean of the biases 0, exactly
+//! ([`Exposures::center`]), so that a view of mean exposure in stops shows the model itself.
 
 mod affine;
 pub mod table;
@@ -126,8 +126,8 @@ impl Exposures {
         Ok(())
     }
 
-    /// Records `view`'s exposure of a render, (3 or more, H, W), to [`Exposures::exposed`]; where the target, (3, H, W),
-    /// is clipped, at most the target.
+    /// Records `view`'s exposure of a render, (3 or more, H, W), to [`Exposures::exposed`]; at most the target, (3, H,
+    /// W), where that is clipped.
     ///
     /// # Errors
     /// There is no such view, it is larger than those reserved for, or the render or the target is smaller.

@@ -3,8 +3,8 @@
 #include "kernel.glsl"
 #include "exposure.glsl"
 
-//! The gradient of `expose`: of the render, in place of that of the exposed image, and the sums of gain d c and of d per
-//! chunk, for the gradient of the exposure. A value that `expose` has clipped at its target has the gradient 0.
+//! The gradient of `expose`: of the render, in place of that of the exposed image, and the sums of gain d c and of d
+//! per chunk, for the gradient of the exposure. A value that `expose` has clipped at its target has the gradient 0.
 //!
 //! A subgroup processes `CHUNK` values of one channel, in a fixed order: the partition of a sum does not depend on the
 //! device. Reference: `src/reference/expose_backward.rs`.
