@@ -94,7 +94,9 @@ impl Views {
             Some(path) => self.starts_of_table(&path, dataset)?,
             None => self.initial_exposures(dataset, &config.load_options())?,
         };
-        let starts = if starts.is_empty() { self.starts_of_points(dataset)? } else { starts };
+        // At points, exposures and the light of a lamp are not told apart.
+        let measures = starts.is_empty() && !config.model.lamp;
+        let starts = if measures { self.starts_of_points(dataset)? } else { starts };
         let stops = starts.values().filter_map(|start| match start {
             InitialExposures::Stops(stops) => Some(*stops),
             InitialExposures::Affine(_) => None,
