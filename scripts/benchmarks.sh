@@ -16,7 +16,7 @@
 # SIZE          options of `bench`; REPEATS (7) and TUNE_REPEATS (3): of step and tiles
 # GROWTH        arguments of examples/growth.rs; PROFILE (release): cargo's profile of growth and build
 # VIEWS, POINTS of loading (2000, 100000); STEPS (1500): of fisheye
-# SCALE (1): of antialiasing, light, recolour and varying, a factor on the downscale; BRIGHT: the set of varying
+# SCALE (1): of antialiasing, light, recolour and varying, a factor on the downscale; BRIGHT: the sets of varying
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -70,6 +70,8 @@ run, columns = sys.argv[1], sys.argv[2:]
 found = json.load(open(f"{run}/metrics.json")) | json.load(open(f"{run}/eval.json"))
 spent, mean = found["spent"], found["mean"]
 residual = found["residual_transmittance"]["mean"]
+# The PSNR of another kind of scores, in a file of its own.
+other = lambda file, kind: f"{json.load(open(f'{run}/{file}.json'))[kind]['mean']['psnr']:.2f}"
 cells = {
     "psnr": lambda: f"{mean['psnr']:.2f}",
     "channel_mean": lambda: f"{mean['psnr_channel_mean']:.2f}",
@@ -79,6 +81,8 @@ cells = {
     "steps": lambda: str(found["steps"]),
     "gaussians": lambda: str(found["gaussians"]),
     "device": lambda: f"{spent['device_bytes'] / 2**20:.0f}",
+    "aligned": lambda: other("aligned", "aligned_with_reference"),
+    "own": lambda: other("own", "at_own_exposure"),
     "residual": lambda: f"{residual['mean']:.4f}",
     "residual99": lambda: f"{residual['q99']:.3f}",
     "host": lambda: f"{spent['host_bytes'] / 2**20:.0f}",
@@ -374,25 +378,45 @@ section_recolour() {
     done
 }
 
-# Exposures that vary: the curves of the paper's third benchmark on a set of our own, against its clean photographs.
+# Exposures that vary: the curves of the paper's third benchmark on sets of our own, against their clean photographs;
+# the last column is at the test views' own exposure, which is that of the clean photographs.
 section_varying() {
-    local bright=${BRIGHT:?set BRIGHT to a dataset in normal light}
+    : "${BRIGHT:?set BRIGHT to datasets in normal light}"
     stamp "nightsplat vary BRIGHT --seed S --stops 2 --gamma 0.8,1.25; nightsplat train SET OPTIONS"
-    echo "| seed | curve | exposures learned | PSNR, dB | SSIM | LPIPS | processor, s |"
-    echo "|---:|---|---|---:|---:|---:|---:|"
-    for seed in ${SEEDS//,/ }; do
-        local set=$RUNS/varying-set-$seed
-        [ -d "$set" ] || tool vary "$bright" --out "$set" --seed "$seed" --gamma 0.8,1.25 \
-            --downscale "${SCALE:-1}" > /dev/null
-        for curve in "linear --theta 0.49" "ase --gain 0" "ap3 --gain 0" auto; do
-            for learned in off on; do
-                local run=varying-$seed-${curve%% *}-$learned words
-                read -r -a words <<< "$curve"
-                train "$run" "$set" --seed "$seed" --curve "${words[@]}" --exposure "$learned"
-                echo "| $seed | $curve | $learned | $(figures "$run" psnr ssim lpips processor) |"
+    echo "| set | seed | options | PSNR, dB | aligned | SSIM | LPIPS | processor, s | PSNR at own exposure |"
+    echo "|---|---:|---|---:|---:|---:|---:|---:|---:|"
+    local bright seed curve name run set own words
+    for bright in $BRIGHT; do
+        for seed in ${SEEDS//,/ }; do
+            set=$RUNS/varying-$(basename "$bright")-$seed
+            [ -d "$set" ] || tool vary "$bright" --out "$set" --seed "$seed" --gamma 0.8,1.25 \
+                --downscale "${SCALE:-1}" > /dev/null
+            for own in "" "linear --theta 0.49" "ase --gain 0" "ap3 --gain 0" auto; do
+                for learned in off on; do
+                    read -r -a words <<< "${own:+--curve $own --exposure $learned}"
+                    [ -n "$own" ] || [ "$learned" = on ] || continue
+                    curve=${own%% *}
+                    name=varying-$(basename "$bright")-$seed-${curve:-default}-$learned
+                    train "$name" "$set" --seed "$seed" "${words[@]}"
+                    run=$RUNS/$name
+                    tool eval "$run" --align --json > "$run/aligned.json"
+                    # After the training, which would begin with it.
+                    own_exposures "$set" > "$set/exposures.csv"
+                    tool eval "$run" --json > "$run/own.json"
+                    rm "$set/exposures.csv"
+                    echo "| $(basename "$bright") | $seed | ${words[*]:-none} | $(figures "$name" psnr aligned ssim \
+                        lpips processor own) |"
+                done
             done
         done
     done
+}
+
+# exposures.csv of a varied set: the stops of the training views; test views are clean.
+own_exposures() {
+    awk -F, 'NR == FNR { sub(/[.]png$/, ""); test[$1] = 1; next }
+        FNR == 1 { print "name,ev"; next }
+        { print $1 "," (test[$1] ? 0 : $2) }' "$1/test.txt" "$1/varied.csv"
 }
 
 sections=(step tiles quality presets curves targets parts background profile memory growth loading build fisheye)

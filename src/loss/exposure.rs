@@ -1,8 +1,9 @@
 //! Learned exposure and colour per view, for photographs of one scene with different exposures.
 //!
 //! A target is compared with e = gain c + bias, an affine of the encoded colours c of the render, for each channel of
-//! each view. The brightness of the model is fixed: after every step the mean of the gains over the training views is 1
-//! and that of the biases 0, exactly ([`Exposures::center`]), so that a view of mean exposure shows the model itself.
+//! each view, clipped at the target where the photograph is clipped. The brightness of the model is fixed: after every
+//! step the geometric mean of the gains over the training views is 1 and the mean of the biases 0, exactly
+//! ([`Exposures::center`]), so that a view of mean exposure in stops shows the model itself.
 
 mod affine;
 pub mod table;
@@ -55,6 +56,8 @@ pub struct Exposures {
     center: Pipeline<exposure_center::Kernel>,
     /// (views, `EXPOSURE_WIDTH`), in the layout of include/exposure.glsl.
     parameters: Buffer<f32>,
+    /// (views, 3): the target of white.
+    whites: Buffer<f32>,
     gradients: Buffer<f32>,
     moments: Moments,
     /// (3, H, W) of the largest view.
@@ -64,16 +67,22 @@ pub struct Exposures {
 }
 
 impl Exposures {
-    /// Exposures with these initial values, centred; [`Exposures::reserve`] allocates for views.
+    /// Exposures with these initial values, centred, of views in whose targets white has these values;
+    /// [`Exposures::reserve`] allocates for views.
     ///
     /// # Errors
-    /// There is no view, a gain is not above 0, or the device is out of memory.
-    pub fn new(gpu: &Gpu, rates: ExposureRates, start: &[Affine]) -> Result<Self> {
+    /// There is no view, one has no white, a gain is not above 0, or the device is out of memory.
+    pub fn new(
+        gpu: &Gpu,
+        rates: ExposureRates,
+        start: &[Affine],
+        whites: &[[f32; 3]],
+    ) -> Result<Self> {
         let mut parameters = vec![];
         for affine in Affine::about_their_mean(start) {
             parameters.extend(affine.parameters()?);
         }
-        if parameters.is_empty() {
+        if parameters.is_empty() || whites.len() < start.len() {
             return Err(Error::Usage(
                 "there is no view whose exposure could be learned".to_owned(),
             ));
@@ -92,6 +101,7 @@ impl Exposures {
             gradients: gpu.zeros("exposure_gradients", parameters.len())?,
             moments: Moments::zeros(gpu, parameters.len())?,
             parameters: gpu.buffer("exposures", &parameters)?,
+            whites: gpu.buffer("whites", whites.as_flattened())?,
             exposed: gpu.uninit("exposed", 0)?,
             partials: gpu.uninit("exposure_partials", 0)?,
         };
@@ -116,18 +126,20 @@ impl Exposures {
         Ok(())
     }
 
-    /// Records `view`'s exposure of a render, (3 or more, H, W), to [`Exposures::exposed`].
+    /// Records `view`'s exposure of a render, (3 or more, H, W), to [`Exposures::exposed`]; at most the target, (3, H,
+    /// W), where that is clipped.
     ///
     /// # Errors
-    /// There is no such view, it is larger than those reserved for, or the render is smaller.
+    /// There is no such view, it is larger than those reserved for, or the render or the target is smaller.
     pub fn expose(
         &mut self,
         pass: &mut Recorder<'_>,
         view: usize,
         size: UVec2,
-        render: &Buffer<f32>,
+        [render, target]: [&Buffer<f32>; 2],
     ) -> Result<()> {
-        self.dispatch(pass, false, view, size, render)
+        self.check(view, size, target)?;
+        self.dispatch(pass, false, view, size, [render, target])
     }
 
     /// Records the target of `view`, (3, H, W), with its exposure removed, to [`Exposures::exposed`].
@@ -141,7 +153,7 @@ impl Exposures {
         size: UVec2,
         target: &Buffer<f32>,
     ) -> Result<()> {
-        self.dispatch(pass, true, view, size, target)
+        self.dispatch(pass, true, view, size, [target, target])
     }
 
     fn dispatch(
@@ -150,7 +162,7 @@ impl Exposures {
         inverse: bool,
         view: usize,
         size: UVec2,
-        render: &Buffer<f32>,
+        [render, target]: [&Buffer<f32>; 2],
     ) -> Result<()> {
         self.check(view, size, render)?;
         pass.dispatch(
@@ -158,7 +170,9 @@ impl Exposures {
             &expose::Params { pixel_count: pixels(size), view: view as u32 },
             expose::Buffers {
                 exposures: self.parameters.slice(),
+                whites: self.whites.slice(),
                 render: render.slice(),
+                target: target.slice(),
                 exposed: self.exposed.slice_mut(),
             },
             Threads::Exactly([COLOR_CHANNELS as u32 * pixels(size), 1, 1]),
@@ -170,7 +184,8 @@ impl Exposures {
         &self.exposed
     }
 
-    /// Records the gradient of the exposures, and replaces dL/d exposed in the colours of `d_render` by dL/d render.
+    /// Records the gradient of the exposures after [`Exposures::expose`] of the same render and target, and replaces
+    /// dL/d exposed in the colours of `d_render` by dL/d render.
     ///
     /// # Errors
     /// Those of [`Exposures::expose`].
@@ -179,18 +194,22 @@ impl Exposures {
         pass: &mut Recorder<'_>,
         view: usize,
         size: UVec2,
-        render: &Buffer<f32>,
+        [render, target]: [&Buffer<f32>; 2],
         d_render: &mut Buffer<f32>,
     ) -> Result<()> {
-        self.check(view, size, render)?;
-        self.check(view, size, d_render)?;
+        for planes in [render, target, &*d_render] {
+            self.check(view, size, planes)?;
+        }
         let (pixel_count, view, chunk_count) = (pixels(size), view as u32, self.chunks(size));
         pass.dispatch(
             &self.backward,
             &expose_backward::Params { pixel_count, view },
             expose_backward::Buffers {
                 exposures: self.parameters.slice(),
+                whites: self.whites.slice(),
                 render: render.slice(),
+                target: target.slice(),
+                exposed: self.exposed.slice(),
                 d_render: d_render.slice_mut(),
                 partials: self.partials.slice_mut(),
             },
@@ -264,7 +283,8 @@ impl Exposures {
 
 impl Learnable for Exposures {
     fn name(&self) -> &'static str {
-        "exposures"
+        // Those of earlier versions were differences of gains from 1.
+        "log_exposures"
     }
 
     fn learning_rate(&self, step: u64) -> f64 {
@@ -288,7 +308,7 @@ fn pixels(size: UVec2) -> u32 {
 impl Affine {
     /// Its learned parameters.
     fn parameters(&self) -> Result<[f32; EXPOSURE_WIDTH as usize]> {
-        let [gains, biases] = [self.gain.map(|gain| gain - 1.0), self.bias.map(|b| b / BIAS_SCALE)];
+        let [gains, biases] = [self.gain.map(f64::ln), self.bias.map(|b| b / BIAS_SCALE)];
         let mut parameters = [0.0; EXPOSURE_WIDTH as usize];
         for (to, value) in parameters.iter_mut().zip(gains.into_iter().chain(biases)) {
             *to = value as f32;
@@ -303,6 +323,6 @@ impl Affine {
 
     fn of_parameters(parameters: &[f32]) -> Self {
         let at = |c: usize| f64::from(parameters[c]);
-        Self { gain: [0, 1, 2].map(|c| 1.0 + at(c)), bias: [3, 4, 5].map(|c| BIAS_SCALE * at(c)) }
+        Self { gain: [0, 1, 2].map(|c| at(c).exp()), bias: [3, 4, 5].map(|c| BIAS_SCALE * at(c)) }
     }
 }

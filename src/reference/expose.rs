@@ -3,13 +3,18 @@
 use super::rounding::{Rounded, values};
 use crate::gpu::Reference;
 use crate::kernels::expose::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
+use crate::kernels::exposure::{BIAS_SCALE, CLIPPED_REACH, EXPOSURE_WIDTH};
 use crate::photographs::tone::Real;
 
 /// Gain and bias of a channel of a view, in any number type.
 pub fn gain_and_bias<T: Real>(exposures: &[T], view: usize, channel: usize) -> [T; 2] {
     let at = view * EXPOSURE_WIDTH as usize + channel;
-    [T::of(1.0) + exposures[at], T::of(BIAS_SCALE) * exposures[at + 3]]
+    [exposures[at].exp(), T::of(BIAS_SCALE) * exposures[at + 3]]
+}
+
+/// Whether a target is clipped at that of white.
+pub(super) fn is_clipped(target: f32, white: f32) -> bool {
+    (target - white).abs() <= CLIPPED_REACH as f32
 }
 
 /// Every value written.
@@ -21,9 +26,18 @@ fn exposed<'a>(
     let (pixels, view) = (params.pixel_count as usize, params.view as usize);
     let exposures: Vec<Rounded> = slices.exposures.iter().copied().map(Rounded::exact).collect();
     slices.render[..3 * pixels].iter().enumerate().map(move |(i, &value)| {
-        let [gain, bias] = gain_and_bias(&exposures, view, i / pixels);
+        let channel = i / pixels;
+        let [gain, bias] = gain_and_bias(&exposures, view, channel);
         let value = Rounded::exact(value);
-        if inverse { (value - bias) / gain } else { gain * value + bias }
+        if inverse {
+            return (value - bias) / gain;
+        }
+        let exposed = gain * value + bias;
+        let target = slices.target[i];
+        match is_clipped(target, slices.whites[3 * view + channel]) {
+            true => exposed.at_most(Rounded::exact(target)),
+            false => exposed,
+        }
     })
 }
 

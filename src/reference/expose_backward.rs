@@ -1,6 +1,6 @@
 use glam::Vec2;
 
-use super::expose::gain_and_bias;
+use super::expose::{gain_and_bias, is_clipped};
 use super::rounding::{Rounded, chain, values};
 use crate::gpu::Reference;
 use crate::kernels::expose_backward::{Constants, Kernel, Params, Slices, Tolerances};
@@ -17,14 +17,23 @@ fn backward(
     for channel in 0..3 {
         let [gain, _] = gain_and_bias(&exposures, params.view as usize, channel);
         let plane = channel * pixels..(channel + 1) * pixels;
-        let (c, d) = (&slices.render[plane.clone()], &slices.d_render[plane]);
-        d_render.extend(d.iter().map(|&d| gain * Rounded::exact(d)));
-        for (c, d) in c.chunks(chunk).zip(d.chunks(chunk)) {
-            let products = c.iter().zip(d).map(|(&c, &d)| Rounded::exact(c) * Rounded::exact(d));
+        let white = slices.whites[3 * params.view as usize + channel];
+        let passed = |i: usize| {
+            let target = slices.target[i];
+            let is_bound = slices.exposed[i] >= target && is_clipped(target, white);
+            if is_bound { 0.0 } else { slices.d_render[i] }
+        };
+        let c = &slices.render[plane.clone()];
+        let d: Vec<f32> = plane.map(passed).collect();
+        let of_render: Vec<Rounded> = d.iter().map(|&d| gain * Rounded::exact(d)).collect();
+        let chunks = c.chunks(chunk).zip(d.chunks(chunk)).zip(of_render.chunks(chunk));
+        for ((c, d), own) in chunks {
+            let products = c.iter().zip(own).map(|(&c, &own)| Rounded::exact(c) * own);
             let of_render = Rounded::sum(chain(chunk), products);
             let alone = Rounded::sum(chain(chunk), d.iter().copied().map(Rounded::exact));
             partials.push([of_render, alone]);
         }
+        d_render.extend(of_render);
     }
     (d_render, partials)
 }

@@ -467,7 +467,7 @@ pub fn add_lpips(metrics: &mut Value, scored: &[ViewScore], measure: Measure) {
 /// a least-squares affine correction of each channel to the reference image, as other work reports them; these use the
 /// reference and are not comparable with other scores here.
 pub fn add_exposure(metrics: &mut Value, scored: &[ViewScore]) {
-    metrics["exposure"] = json!("neutral: the mean of the training views'");
+    metrics["exposure"] = json!("neutral: the mean of the training views' in stops");
     add_aligned(metrics, scored);
 }
 

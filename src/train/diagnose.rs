@@ -30,6 +30,7 @@ use crate::photographs::tone::{Exposure, LuminanceHistogram, is_black};
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 use geometry::Shared;
+pub(super) use geometry::exposures_at_points;
 pub use lamp::LampDiagnosis;
 pub use noise::Noise;
 use photograph::PhotographStatistics;

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use super::diagnose::exposures_at_points;
 use super::views::Views;
 use super::{OnOff, TrainConfig, Trainer};
 use crate::loss::exposure::{Affine, table};
@@ -74,7 +75,8 @@ enum InitialExposures {
 impl Views {
     /// The exposures of the training views with their initial values; `None` if they are not learned.
     ///
-    /// Initial values come from a table, or from the photographs' EXIF; otherwise they are the identity.
+    /// Initial values come from a table, else from the photographs' EXIF, else from points that several views show; a
+    /// view without one starts at the identity.
     ///
     /// # Errors
     /// The table cannot be read or names an unknown view; the device is out of memory or lost.
@@ -92,6 +94,9 @@ impl Views {
             Some(path) => self.starts_of_table(&path, dataset)?,
             None => self.initial_exposures(dataset, &config.load_options())?,
         };
+        // At points, exposures and the light of a lamp are not told apart.
+        let measures = starts.is_empty() && !config.model.lamp;
+        let starts = if measures { self.starts_of_points(dataset)? } else { starts };
         let stops = starts.values().filter_map(|start| match start {
             InitialExposures::Stops(stops) => Some(*stops),
             InitialExposures::Affine(_) => None,
@@ -138,6 +143,17 @@ impl Views {
             tracing::warn!("{place} lacks {names}: their exposures start at the identity");
         }
         Ok(starts)
+    }
+
+    fn starts_of_points(&self, dataset: &Dataset) -> Result<BTreeMap<String, InitialExposures>> {
+        let known = exposures_at_points(dataset)?;
+        let own: BTreeMap<String, InitialExposures> = self
+            .names()
+            .filter_map(|name| Some((name.to_owned(), InitialExposures::Stops(*known.get(name)?))))
+            .collect();
+        let (found, all) = (own.len(), self.names().count());
+        tracing::info!("initial exposures of {found} of {all} photographs from shared points");
+        Ok(own)
     }
 
     fn initial_exposures(

@@ -162,7 +162,10 @@ impl Trainer {
             views.warn_of_another_world(&gaussians, path);
         }
         let masks = Masks::new(gpu, dataset, &views)?;
-        let exposures = starts.map(|starts| Exposures::new(gpu, config.exposure.rates, &starts));
+        let exposures = starts.map(|starts| {
+            let whites = views.whites(gpu, &pseudo_gt)?;
+            Exposures::new(gpu, config.exposure.rates, &starts, &whites)
+        });
         let mut exposures = exposures.transpose()?;
         if let Some(exposures) = &mut exposures {
             sizes.iter().try_for_each(|&size| exposures.reserve(size))?;

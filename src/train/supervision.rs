@@ -73,7 +73,7 @@ impl Supervision {
             &TermInputs { step, view: number, size, features, render, colors: render, target };
         let exposed = match &mut self.exposures {
             Some(exposures) => {
-                exposures.expose(pass, view.place, size, render)?;
+                exposures.expose(pass, view.place, size, [render, target])?;
                 exposures.exposed()
             }
             None => render,
@@ -82,7 +82,7 @@ impl Supervision {
         losses.record(pass, &TermInputs { colors, ..*inputs }, d_render, log)?;
         masks.hide(pass, number, (size, channels), d_render)?;
         if let Some(exposures) = &mut self.exposures {
-            exposures.backward(pass, view.place, size, render, d_render)?;
+            exposures.backward(pass, view.place, size, [render, target], d_render)?;
         }
         let Some(networks) = &mut self.networks else { return Ok(()) };
         let low = views.record_photograph(pass, pseudo_gt, view, &mut self.photograph)?;

@@ -90,7 +90,8 @@ impl TargetViews {
     }
 
     /// The mean PSNR, dB, of colours and output of `render` for each camera; `None` without views. `affines` are the
-    /// exposures of the training photographs.
+    /// exposures of the training photographs; where these are learned, a view of unknown exposure is compared after the
+    /// least-squares gain and bias of each channel, since its brightness says nothing about the model.
     ///
     /// # Errors
     /// Those of `render`.
@@ -106,7 +107,12 @@ impl TargetViews {
             let target = neutral.as_ref().unwrap_or(target);
             let rendered = render(camera)?;
             for (sum, image) in sums.iter_mut().zip([&rendered.colors, rendered.output()]) {
-                *sum += psnr_of_counted(&clamped(image), target, mask.as_ref())?;
+                let is_aligned = place.is_none() && !affines.is_empty();
+                let aligned =
+                    is_aligned.then(|| Affine::least_squares(image, target)).transpose()?;
+                let aligned = aligned.map(|own| own.applied(image));
+                let image = clamped(aligned.as_ref().unwrap_or(image));
+                *sum += psnr_of_counted(&image, target, mask.as_ref())?;
             }
         }
         Ok((!self.0.is_empty()).then(|| sums.map(|sum| sum / self.0.len() as f64)))
@@ -214,7 +220,10 @@ impl Trainer {
     /// The mean PSNR, dB, of R_0 and of the output (R_K if the model has a denoiser); `None` if no view is held out.
     fn psnr_of_held_out(&mut self, sh_degree: u32) -> Result<Option<[f64; 2]>> {
         let views = std::mem::take(&mut self.convergence.held_out);
-        let scores = views.mean_psnr(&[], |camera| self.render_of_degree(camera, sh_degree));
+        let affines = self.affines();
+        let scores = affines.and_then(|affines| {
+            views.mean_psnr(&affines, |camera| self.render_of_degree(camera, sh_degree))
+        });
         self.convergence.held_out = views;
         scores
     }

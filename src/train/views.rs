@@ -277,6 +277,35 @@ impl Views {
         Ok(Arc::new(target))
     }
 
+    /// The target of white of each photograph.
+    ///
+    /// # Errors
+    /// The device is out of memory or lost.
+    pub(super) fn whites(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Vec<[f32; 3]>> {
+        /// Photographs of one submission.
+        const AT_ONCE: usize = 256;
+        let white = gpu.buffer("white", &[1.0; COLOR_CHANNELS])?;
+        let places: Vec<usize> = (0..self.curves.len()).collect();
+        let mut whites = vec![];
+        for places in places.chunks(AT_ONCE) {
+            let target = |_| gpu.uninit("white_target", COLOR_CHANNELS);
+            let mut targets = places.iter().map(target).collect::<Result<Vec<_>>>()?;
+            let mut downloads = vec![];
+            gpu.run("pseudo-GT", |pass| {
+                for (&place, target) in places.iter().zip(&mut targets) {
+                    pseudo_gt.map(pass, &white, &self.curves, place as u32, target)?;
+                    downloads.push(pass.download(&*target)?);
+                }
+                Ok(())
+            })?;
+            for download in downloads {
+                let values = download.wait()?;
+                whites.push(std::array::from_fn(|channel| values[channel]));
+            }
+        }
+        Ok(whites)
+    }
+
     /// The view of a step at a level: every epoch takes each view once, in its own order; the view after one that is
     /// left out is taken twice.
     pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> ViewId {

@@ -13,6 +13,7 @@ mod log;
 mod parameters;
 mod structure;
 
+mod exposed_training;
 mod masks;
 mod view_exposures;
 

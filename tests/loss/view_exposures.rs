@@ -1,28 +1,19 @@
-//! Exposures: kernels against their references, gradients against central differences, the mean that stays the
-//! identity, and trainings on photographs of different exposure.
+//! Exposures: kernels against their references, gradients against central differences, and the mean that stays the
+//! identity.
 
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
-use std::path::Path;
 
 use glam::{UVec2, Vec2};
 use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use nightsplat::kernels::{expose, expose_backward, exposure_center, exposure_gradient};
-use nightsplat::loss::exposure::{Affine, ExposureRates, Exposures, table};
-use nightsplat::photographs::dataset::Dataset;
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
-use nightsplat::photographs::image::{linear_from_srgb, srgb_from_linear};
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat::results::run::{self, IfExists};
+use nightsplat::loss::exposure::{Affine, ExposureRates, Exposures};
 use nightsplat::splats::optimizer::{Adam, Learnable};
-use nightsplat::train::{OnOff, Part, TrainConfig, Trainer};
 
 use crate::common::Random;
 use crate::common::chain::Chain;
 use crate::common::setup::Setup;
-use crate::common::train::advance;
 
 const WIDTH: usize = EXPOSURE_WIDTH as usize;
 
@@ -40,6 +31,13 @@ fn every_kernel_agrees_with_its_reference_at_every_size() {
             let render = noise(1, 4 * pixels, -0.2, 1.3);
             let d_render = noise(2, 4 * pixels, -1e-3, 1e-3);
             let exposures = noise(3, view_count * WIDTH, -0.5, 0.5);
+            // A third of the targets are clipped, some of them a rounding of 8 bits below white.
+            let whites = noise(4, 3 * view_count, 0.6, 1.0);
+            let mut target = noise(5, 3 * pixels, 0.0, 0.6);
+            for (i, target) in target.iter_mut().enumerate().filter(|(i, _)| i % 3 == 0) {
+                let white = whites[3 * view as usize + i / pixels];
+                *target = white - [0.0, 0.4, -0.4, 0.6][i % 4] / 255.0;
+            }
             for inverse in [false, true] {
                 let exposed = vec![7.0f32; 4 * pixels];
                 let exposed = run_kernel!(
@@ -47,11 +45,14 @@ fn every_kernel_agrees_with_its_reference_at_every_size() {
                     expose::Constants { inverse },
                     expose::Params { pixel_count, view },
                     Threads::Exactly([3 * pixel_count, 1, 1]),
-                    [exposures, render],
+                    [exposures, whites, render, target],
                     [exposed]
                 );
                 assert!(exposed[3 * pixels..].iter().all(|&value| value == 7.0));
             }
+            // Half of the values are at their targets.
+            let mut exposed = noise(6, 3 * pixels, 0.0, 1.0);
+            exposed.iter_mut().zip(&target).step_by(2).for_each(|(own, &target)| *own = target);
             let partials = vec![Vec2::NAN; 3 * chunk_count as usize];
             let expected = d_render[3 * pixels..].to_vec();
             let (d_render, partials) = run_kernel!(
@@ -59,7 +60,7 @@ fn every_kernel_agrees_with_its_reference_at_every_size() {
                 expose_backward::Constants::default(),
                 expose_backward::Params { pixel_count, view },
                 Threads::Workgroups([chunk_count, 3, 1]),
-                [exposures, render],
+                [exposures, whites, render, target, exposed],
                 [d_render, partials]
             );
             assert_eq!(d_render[3 * pixels..], expected);
@@ -131,6 +132,9 @@ fn values_that_are_not_finite_become_finite() {
     }
 }
 
+/// The target of white of a view in which nothing is clipped.
+const WHITE: [f32; 3] = [9.0; 3];
+
 /// Three exposures, the middle one under test.
 fn three() -> [Affine; 3] {
     let second = Affine { gain: [0.7, 1.2, 0.9], bias: [0.05, -0.02, 0.01] };
@@ -148,20 +152,23 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     let (pixels, size) = (setup.pixels(), UVec2::new(26, 19));
     let render = crate::common::narrow(&chain.run(&parameters).render);
 
-    let mut exposures = Exposures::new(&gpu, ExposureRates::default(), &three()).unwrap();
+    let start = &three();
+    let mut exposures = Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE; 3]).unwrap();
     exposures.reserve(size).unwrap();
     let own = exposures.affines().unwrap()[1];
     let render_on_device = gpu.buffer("render", &render).unwrap();
+    let target = gpu.zeros("target", render.len()).unwrap();
     let mut d_render = gpu.buffer("d_render", &crate::common::narrow(&weights)).unwrap();
     gpu.run("exposures", |pass| {
-        exposures.expose(pass, 1, size, &render_on_device)?;
-        exposures.backward(pass, 1, size, &render_on_device, &mut d_render)
+        let images = [&render_on_device, &target];
+        exposures.expose(pass, 1, size, images)?;
+        exposures.backward(pass, 1, size, images, &mut d_render)
     })
     .unwrap();
     let d_render = crate::common::widen(&gpu.read(&d_render).unwrap());
     let gradients = gpu.read(exposures.buffers().gradients).unwrap();
 
-    // With respect to the exposure, in whose values L is linear.
+    // With respect to the exposure.
     let loss = |affine: &Affine| -> f64 {
         let exposed = |(i, &c): (usize, &f32)| {
             weights[i] * (affine.gain[i / pixels] * f64::from(c) + affine.bias[i / pixels])
@@ -172,7 +179,7 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
         let moved = |by: f64| {
             let mut affine = own;
             match number {
-                0..3 => affine.gain[number] += by,
+                0..3 => affine.gain[number] *= by.exp(),
                 _ => affine.bias[number - 3] += BIAS_SCALE * by,
             }
             loss(&affine)
@@ -205,6 +212,64 @@ fn the_gradient_through_exposure_and_renderer_is_its_central_difference() {
     }
 }
 
+/// With the loss as sum of w e: where e is above a clipped target, only that is seen.
+#[test]
+fn the_gradient_of_clipped_values_is_its_central_difference() {
+    let (gpu, size, pixels) = (gpu(), UVec2::new(9, 7), 63);
+    let (render, weights) = (noise(1, 3 * pixels, 0.0, 1.2), noise(2, 3 * pixels, -1.0, 1.0));
+    let white = [0.6, 0.8, 1.0];
+    let is_clipped = |i: usize| i % 3 > 0;
+    let target = |i: usize| if is_clipped(i) { white[i / pixels] } else { 0.3 };
+    let target: Vec<f32> = (0..3 * pixels).map(target).collect();
+    let start = &three();
+    let mut exposures =
+        Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE, white, WHITE]).unwrap();
+    exposures.reserve(size).unwrap();
+    let own = exposures.affines().unwrap()[1];
+    let [on_device, target_on_device] =
+        [&render, &target].map(|values| gpu.buffer("image", values).unwrap());
+    let mut d_render = gpu.buffer("d_render", &weights).unwrap();
+    gpu.run("exposures", |pass| {
+        let images = [&on_device, &target_on_device];
+        exposures.expose(pass, 1, size, images)?;
+        exposures.backward(pass, 1, size, images, &mut d_render)
+    })
+    .unwrap();
+    let gradients = gpu.read(exposures.buffers().gradients).unwrap();
+    let d_render = gpu.read(&d_render).unwrap();
+    let exposed = |affine: &Affine, i: usize, c: f64| {
+        let exposed = affine.gain[i / pixels] * c + affine.bias[i / pixels];
+        if is_clipped(i) { exposed.min(target[i].into()) } else { exposed }
+    };
+    let mut bound = 0;
+    for (i, &c) in render.iter().enumerate() {
+        let difference =
+            exposed(&own, i, f64::from(c) + 1e-4) - exposed(&own, i, f64::from(c) - 1e-4);
+        let expected = f64::from(weights[i]) * difference / 2e-4;
+        assert!(
+            (f64::from(d_render[i]) - expected).abs() < 1e-5,
+            "{i}: {} {expected}",
+            d_render[i]
+        );
+        bound += usize::from(difference == 0.0);
+    }
+    assert!((20..160).contains(&bound), "{bound} values are bound by their targets");
+    for number in 0..WIDTH {
+        let loss = |by: f64| -> f64 {
+            let mut affine = own;
+            match number {
+                0..3 => affine.gain[number] *= by.exp(),
+                _ => affine.bias[number - 3] += BIAS_SCALE * by,
+            }
+            let values = render.iter().zip(&weights).enumerate();
+            values.map(|(i, (&c, &w))| f64::from(w) * exposed(&affine, i, c.into())).sum()
+        };
+        let expected = (loss(1e-5) - loss(-1e-5)) / 2e-5;
+        let actual = f64::from(gradients[WIDTH + number]);
+        assert!((actual - expected).abs() < 1e-3 * (1.0 + expected.abs()), "{actual} {expected}");
+    }
+}
+
 #[test]
 fn adam_finds_the_exposures_of_views_that_only_differ_in_exposure() {
     let (gpu, size) = (gpu(), UVec2::new(20, 15));
@@ -212,13 +277,16 @@ fn adam_finds_the_exposures_of_views_that_only_differ_in_exposure() {
     let render = noise(8, 3 * 300, 0.0, 1.0);
     let render_on_device = gpu.buffer("render", &render).unwrap();
     let rates = ExposureRates { initial: 0.02, last: 0.002, steps: 600 };
-    let mut exposures = Exposures::new(&gpu, rates, &[Affine::IDENTITY; 3]).unwrap();
+    let start = [Affine::IDENTITY; 3];
+    let mut exposures = Exposures::new(&gpu, rates, &start, &[WHITE; 3]).unwrap();
+    let dark = gpu.zeros("target", 900).unwrap();
+    let images = [&render_on_device, &dark];
     exposures.reserve(size).unwrap();
     let (adam, status) = (Adam::new(&gpu).unwrap(), gpu.zeros("status", 1).unwrap());
     for step in 1..=900 {
         let view = step as usize % 3;
         // The gradient of half the mean squared difference.
-        gpu.run("expose", |pass| exposures.expose(pass, view, size, &render_on_device)).unwrap();
+        gpu.run("expose", |pass| exposures.expose(pass, view, size, images)).unwrap();
         let exposed = gpu.read(exposures.exposed()).unwrap();
         let target =
             |i: usize| truth[view].gain[i / 300] * f64::from(render[i]) + truth[view].bias[i / 300];
@@ -226,7 +294,7 @@ fn adam_finds_the_exposures_of_views_that_only_differ_in_exposure() {
             (0..900).map(|i| ((f64::from(exposed[i]) - target(i)) / 900.0) as f32).collect();
         let mut d_render = gpu.buffer("d_render", &d).unwrap();
         gpu.run("learn", |pass| {
-            exposures.backward(pass, view, size, &render_on_device, &mut d_render)?;
+            exposures.backward(pass, view, size, images, &mut d_render)?;
             adam.update(pass, step, 1.0, &mut exposures, &status)?;
             exposures.center(pass, &status)
         })
@@ -243,208 +311,22 @@ fn adam_finds_the_exposures_of_views_that_only_differ_in_exposure() {
 #[test]
 fn buffers_and_views_that_do_not_fit_are_refused() {
     let gpu = gpu();
-    let new = |start: &[Affine]| Exposures::new(&gpu, ExposureRates::default(), start);
-    assert!(new(&[]).is_err());
+    let new = |start: &[Affine]| Exposures::new(&gpu, ExposureRates::default(), start, &[WHITE; 3]);
+    assert!(new(&[]).is_err() && new(&[Affine::IDENTITY; 4]).is_err());
     assert!(new(&[Affine { gain: [1.0, 0.0, 1.0], bias: [0.0; 3] }]).is_err());
     assert!(new(&[Affine { gain: [1.0; 3], bias: [f64::NAN, 0.0, 0.0] }]).is_err());
     let mut exposures = new(&three()).unwrap();
     exposures.reserve(UVec2::splat(8)).unwrap();
     let [mut d_render, render] = [(); 2].map(|()| gpu.zeros("render", 3 * 64).unwrap());
     for (view, size) in [(3, [8, 8]), (0, [0, 8]), (0, [9, 8]), (0, [64, 64])] {
-        let exposed = gpu.run("e", |pass| exposures.expose(pass, view, size.into(), &render));
-        let backward = gpu
-            .run("b", |pass| exposures.backward(pass, view, size.into(), &render, &mut d_render));
+        let images = [&render, &render];
+        let exposed = gpu.run("e", |pass| exposures.expose(pass, view, size.into(), images));
+        let backward =
+            gpu.run("b", |pass| exposures.backward(pass, view, size.into(), images, &mut d_render));
         assert!(exposed.is_err() && backward.is_err(), "{view} {size:?}");
     }
     let short = gpu.zeros("render", 100).unwrap();
-    assert!(gpu.run("e", |pass| exposures.expose(pass, 0, UVec2::splat(8), &short)).is_err());
-}
-
-/// The factors of the views' light, in groups of four.
-const FACTORS: [f32; 4] = [1.0, 0.5, 0.25, 2.0];
-
-/// Synthetic views, each darkened or brightened, under one curve.
-fn varied(folder: &Path) -> (TrainConfig, Dataset) {
-    let options = SyntheticOptions {
-        views: 14,
-        width: 40,
-        height: 30,
-        seed: 3,
-        ..SyntheticOptions::default()
-    };
-    synthetic::write(folder, &options).unwrap();
-    let mut tone = ToneSettings::new(ToneCurve::Ase);
-    tone.scene_statistics = true;
-    let mut config = TrainConfig { steps: 300, sh_degree: 0, tone, ..TrainConfig::bare() };
-    config.schedule.densify_before = 0;
-    config.schedule.resolution_steps = [0, 40];
-    config.exposure.learn = OnOff::On;
-    let mut dataset = Dataset::load(folder, &config.load_options()).unwrap();
-    for (at, view) in dataset.views.iter_mut().filter(|view| view.is_train()).enumerate() {
-        let image = view.image.as_mut().unwrap();
-        for x in &mut image.data {
-            *x = srgb_from_linear(FACTORS[at % 4] * linear_from_srgb(*x));
-        }
+    for images in [[&short, &render], [&render, &short]] {
+        assert!(gpu.run("e", |pass| exposures.expose(pass, 0, UVec2::splat(8), images)).is_err());
     }
-    (config, dataset)
-}
-
-fn l1_of_last_steps(config: &TrainConfig, dataset: &Dataset) -> f64 {
-    let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
-    let reports = advance(&mut trainer, config.steps);
-    let last = &reports[reports.len() - 24..];
-    last.iter().map(|report| report.term(nightsplat::loss::Term::L1)).sum::<f64>() / 24.0
-}
-
-#[test]
-fn exposures_explain_photographs_that_differ_in_brightness_and_their_mean_is_exact_after_every_step()
- {
-    let folder = tempfile::tempdir().unwrap();
-    let (config, dataset) = varied(folder.path());
-    let mut trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
-    for step in [1, 2, 3, 50, 300] {
-        advance(&mut trainer, step);
-        let exposures = trainer.exposures().unwrap().unwrap();
-        assert_eq!(exposures.len(), dataset.train_views().count());
-        for c in 0..3 {
-            let sum = |of: fn(&Affine, usize) -> f64| {
-                exposures.iter().map(|(_, exposure)| of(exposure, c)).sum::<f64>()
-            };
-            assert_eq!(sum(|e, c| e.gain[c] - 1.0), 0.0, "step {step}");
-            assert_eq!(sum(|e, c| e.bias[c]), 0.0, "step {step}");
-        }
-    }
-    let stops = |at: usize| trainer.exposures().unwrap().unwrap()[at].1.stops();
-    let (quarter, half, one, two) = (stops(2), stops(1), stops(0), stops(3));
-    assert!(quarter < half && half < one && one < two, "{quarter} {half} {one} {two}");
-    let with = l1_of_last_steps(&config, &dataset);
-    let mut config = config;
-    config.exposure.learn = OnOff::Off;
-    let without = l1_of_last_steps(&config, &dataset);
-    assert!(with < 0.6 * without, "L1 is {with} with exposures and {without} without");
-}
-
-#[test]
-fn exposures_that_are_off_leave_no_kernel_and_no_file() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut config, dataset) = varied(&folder.path().join("set"));
-    config.steps = 2;
-    let out = folder.path().join("run");
-    for learn in [OnOff::On, OnOff::Off] {
-        config.exposure.learn = learn;
-        let gpu = gpu();
-        let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
-        let (reports, checked) = trainer.check_step();
-        reports.unwrap();
-        checked.agree().unwrap();
-        let own = checked.passes.iter().filter(|pass| pass.kernel.starts_with("expos")).count();
-        assert_eq!(own, if learn == OnOff::On { 4 } else { 0 });
-        run::train(&gpu, &config, &dataset, &out, IfExists::Replace, |_| {}).unwrap();
-        let exposures = run::load_exposures(&out).unwrap();
-        let metrics = std::fs::read_to_string(out.join("metrics.json")).unwrap();
-        let metrics: serde_json::Value = serde_json::from_str(&metrics).unwrap();
-        if learn == OnOff::On {
-            let learned = trainer.exposures().unwrap().unwrap();
-            assert_eq!(exposures.len(), learned.len());
-            assert!(metrics["exposure"].as_str().unwrap().starts_with("neutral"));
-            let aligned = metrics["aligned_with_reference"]["mean"]["psnr"].as_f64().unwrap();
-            assert!(aligned >= metrics["mean"]["psnr"].as_f64().unwrap() - 0.01);
-        } else {
-            assert!(exposures.is_empty() && !out.join("exposures.csv").exists());
-            assert_eq!(
-                (&metrics["exposure"], &metrics["aligned_with_reference"]),
-                (&().into(), &().into())
-            );
-        }
-    }
-}
-
-#[test]
-fn a_run_with_exposures_is_resumed_bit_for_bit() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut config, dataset) = varied(folder.path());
-    config.steps = 30;
-    let gpu = gpu();
-    let new = || Trainer::new(&gpu, config.clone(), &dataset).unwrap();
-    let state = |trainer: &mut Trainer, name: &str| {
-        let path = folder.path().join(name);
-        trainer.save_checkpoint(&path).unwrap();
-        std::fs::read(path).unwrap()
-    };
-    let mut whole = new();
-    advance(&mut whole, 30);
-    let mut interrupted = new();
-    advance(&mut interrupted, 17);
-    state(&mut interrupted, "checkpoint");
-    let mut resumed = new();
-    resumed.restore(&folder.path().join("checkpoint")).unwrap();
-    advance(&mut resumed, 30);
-    assert!(state(&mut whole, "whole") == state(&mut resumed, "resumed"));
-    assert_eq!(whole.exposures().unwrap(), resumed.exposures().unwrap());
-    let mut off = config.clone();
-    off.exposure.learn = OnOff::Off;
-    let mut off = Trainer::new(&gpu, off, &dataset).unwrap();
-    let error = off.restore(&folder.path().join("checkpoint")).unwrap_err().to_string();
-    assert!(error.contains("exposure.learn"), "{error}");
-}
-
-#[test]
-fn a_denoiser_on_crops_sees_the_neutral_exposure_and_a_tonemapper_is_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut config, dataset) = varied(folder.path());
-    config.model.set_parts(&[Part::Denoiser, Part::Structure]);
-    config.model.network.channels = 4;
-    config.model.network.stages = 2;
-    config.model.network.repeats = 2;
-    config.model.denoiser_crop = 16;
-    let gpu = gpu();
-    let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
-    let (reports, checked) = trainer.check_step();
-    reports.unwrap();
-    checked.agree().unwrap();
-    config.model.set_parts(&Part::ALL);
-    let error = Trainer::new(&gpu, config, &dataset).unwrap_err().to_string();
-    assert!(error.contains("tonemapper") && error.contains("exposure.learn"), "{error}");
-}
-
-#[test]
-fn a_table_sets_the_initial_exposures() {
-    let folder = tempfile::tempdir().unwrap();
-    let (mut config, dataset) = varied(folder.path());
-    let names: Vec<&str> = dataset.train_views().map(|view| view.name.as_str()).collect();
-    let path = folder.path().join("known.csv");
-    let begin = |config: &TrainConfig| {
-        let trainer = Trainer::new(&gpu(), config.clone(), &dataset).unwrap();
-        let exposures = trainer.exposures().unwrap().unwrap();
-        exposures.into_iter().map(|(_, exposure)| exposure).collect::<Vec<Affine>>()
-    };
-    assert!(begin(&config).iter().all(|exposure| *exposure == Affine::IDENTITY));
-
-    // Stops of the photographs: with one curve, the targets differ accordingly.
-    let lines = names.iter().zip(FACTORS.iter().cycle());
-    let lines: String = lines.map(|(name, factor)| format!("{name},{}\n", factor.log2())).collect();
-    std::fs::write(&path, format!("name,ev\n{lines}")).unwrap();
-    config.exposure.start = Some(path.clone());
-    let of_stops = begin(&config);
-    assert!(of_stops[2].stops() < of_stops[1].stops() && of_stops[1].stops() < of_stops[0].stops());
-    // Next to the photographs, it is found.
-    std::fs::copy(&path, folder.path().join("exposures.csv")).unwrap();
-    config.exposure.start = None;
-    assert_eq!(begin(&config), of_stops);
-
-    // The exposures of a finished run are initial values.
-    let exposures: Vec<(String, Affine)> =
-        names.iter().map(|&name| name.to_owned()).zip(of_stops.iter().copied()).collect();
-    table::save(&path, &exposures).unwrap();
-    config.exposure.start = Some(path.clone());
-    for (again, first) in begin(&config).iter().zip(&of_stops) {
-        let gap = |c: usize| {
-            (again.gain[c] - first.gain[c]).abs() + (again.bias[c] - first.bias[c]).abs()
-        };
-        assert!((0..3).all(|c| gap(c) < 4e-6), "{again} is not {first}");
-    }
-
-    std::fs::write(&path, "name,ev\nnoone,1\nelsewhere,2\n").unwrap();
-    let error = Trainer::new(&gpu(), config, &dataset).unwrap_err().to_string();
-    assert!(error.contains("noone, elsewhere") && error.contains("known.csv"), "{error}");
 }

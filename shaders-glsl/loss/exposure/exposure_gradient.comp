@@ -3,8 +3,8 @@
 #include "kernel.glsl"
 #include "exposure.glsl"
 
-//! The gradient of all exposures from the partial sums of one view: dL/dp = sum d c and dL/dq = BIAS_SCALE sum d of
-//! that view, 0 of the others.
+//! The gradient of all exposures from the partial sums of one view: dL/dp = sum gain d c and dL/dq = BIAS_SCALE sum d
+//! of that view, 0 of the others.
 //!
 //! One subgroup, in a fixed order. Reference: `src/reference/exposure_gradient.rs`.
 

@@ -65,13 +65,16 @@ impl Affine {
         Image { data: image.data.iter().enumerate().map(value).collect(), ..*image }
     }
 
-    /// The exposures relative to their mean: the mean of the result is the identity.
+    /// The exposures relative to their mean: in the result, the geometric mean of the gains is 1, and the mean of the
+    /// biases 0.
     pub fn about_their_mean(exposures: &[Self]) -> Vec<Self> {
         let mean = |of: &dyn Fn(&Self) -> f64| {
             exposures.iter().map(of).sum::<f64>() / exposures.len().max(1) as f64
         };
-        let gain = [0, 1, 2].map(|c| mean(&|exposure| exposure.gain[c]));
-        let bias = [0, 1, 2].map(|c| mean(&|exposure| exposure.bias[c]));
+        let gain = [0, 1, 2].map(|c| mean(&|exposure| exposure.gain[c].ln()).exp());
+        let bias = [0, 1, 2].map(|c| {
+            gain[c] * mean(&|exposure| exposure.bias[c]) / mean(&|exposure| exposure.gain[c])
+        });
         let about = |own: &Self| {
             let relative = [0, 1, 2].map(|c| own.gain[c] / gain[c]);
             Self { gain: relative, bias: [0, 1, 2].map(|c| own.bias[c] - relative[c] * bias[c]) }

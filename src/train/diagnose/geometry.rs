@@ -1,5 +1,7 @@
 //! Measurements across cameras: points, overlap, and relative exposures.
 
+use std::collections::BTreeMap;
+
 use glam::DVec2;
 use rayon::prelude::*;
 
@@ -168,36 +170,70 @@ fn light_around(image: &Image, at: DVec2) -> Option<(f64, bool)> {
     (mean > 0.0).then_some((mean, zeros as f64 > MAX_ZEROS * 3.0 * pixels))
 }
 
+/// log2 exposure of each training view at shared points, with mean 0, by name; without views that share too few.
+///
+/// # Errors
+/// A photograph can no longer be read.
+pub(in crate::train) fn exposures_at_points(dataset: &Dataset) -> Result<BTreeMap<String, f64>> {
+    let views: Vec<(usize, &View)> =
+        dataset.views.iter().enumerate().filter(|(_, view)| view.is_for_training()).collect();
+    let shared = Shared::of(dataset, &views)?;
+    let named = views.iter().zip(shared.exposures);
+    Ok(named.filter_map(|((_, view), own)| Some((view.name.clone(), own?))).collect())
+}
+
 /// Alternating medians: a point's brightness over its views, a view's exposure over its points. Only the brighter half
-/// of the points counts, judged without the exposures: noise and quantisation distort the logarithm of dim light.
+/// of the points counts, judged without the exposures: noise and quantisation distort the logarithm of dim light. A
+/// view that clips those takes the others.
 fn exposures(points: &[Vec<Observation>], view_count: usize) -> Vec<Option<f64>> {
     const ROUNDS: usize = 20;
     let mut exposures = vec![Some(0.0); view_count];
     let mut kept: Vec<&Vec<Observation>> = points.iter().collect();
     for round in 0..ROUNDS {
-        let level = |point: &[Observation]| {
-            let own = point.iter().filter_map(|one| Some(one.light - exposures[one.view]?));
-            median(own.collect())
-        };
         // Approximate exposures determine which points are bright.
         if round == ROUNDS / 2 {
-            let typical = median(points.iter().filter_map(|point| level(point)).collect());
-            kept.retain(|point| level(point) >= typical);
+            let levels = points.iter().filter_map(|point| level(&exposures, point));
+            let typical = median(levels.collect());
+            kept.retain(|point| level(&exposures, point) >= typical);
         }
         let mut of_view = vec![vec![]; view_count];
         for point in &kept {
-            let Some(level) = level(point) else { continue };
+            let Some(level) = level(&exposures, point) else { continue };
             for one in *point {
                 of_view[one.view].push(one.light - level);
             }
         }
-        let known = |of: Vec<f64>| if of.len() < MIN_SHARED { None } else { median(of) };
-        exposures = of_view.into_iter().map(known).collect();
-        let known: Vec<f64> = exposures.iter().copied().flatten().collect();
-        let mean = known.iter().sum::<f64>() / known.len().max(1) as f64;
-        exposures.iter_mut().flatten().for_each(|exposure| *exposure -= mean);
+        exposures = of_view.into_iter().map(exposure).collect();
+        center(&mut exposures);
     }
+    let mut of_clipped = vec![vec![]; view_count];
+    for point in points {
+        let Some(level) = level(&exposures, point) else { continue };
+        for one in point.iter().filter(|one| exposures[one.view].is_none()) {
+            of_clipped[one.view].push(one.light - level);
+        }
+    }
+    for (known, of) in exposures.iter_mut().zip(of_clipped) {
+        *known = known.or_else(|| exposure(of));
+    }
+    center(&mut exposures);
     exposures
+}
+
+/// The brightness of a point at these exposures.
+fn level(exposures: &[Option<f64>], point: &[Observation]) -> Option<f64> {
+    median(point.iter().filter_map(|one| Some(one.light - exposures[one.view]?)).collect())
+}
+
+/// The exposure of a view from those at its points; `None` if there are too few.
+fn exposure(at_points: Vec<f64>) -> Option<f64> {
+    if at_points.len() < MIN_SHARED { None } else { median(at_points) }
+}
+
+fn center(exposures: &mut [Option<f64>]) {
+    let known: Vec<f64> = exposures.iter().copied().flatten().collect();
+    let mean = known.iter().sum::<f64>() / known.len().max(1) as f64;
+    exposures.iter_mut().flatten().for_each(|exposure| *exposure -= mean);
 }
 
 pub(super) fn median(mut values: Vec<f64>) -> Option<f64> {
@@ -236,5 +272,22 @@ mod tests {
             assert!((found.unwrap() - truth).abs() < 1e-6);
         }
         assert_eq!(exposures(&points[..3], 4), [None; 4]);
+    }
+
+    #[test]
+    fn a_view_that_clips_every_bright_point_is_measured_at_the_dim_ones() {
+        let truth = [-0.5, -0.75, -0.75, 2.0];
+        let point = |index: usize| -> Vec<Observation> {
+            let level = -4.0 + 0.02 * index as f64;
+            let seen = |view: usize| {
+                let light = level + truth[view];
+                Observation { view, light, distance: 1.0, off_axis: 0.0, is_clipped: false }
+            };
+            (0..4).map(seen).filter(|one| one.view < 3 || index < 80).collect()
+        };
+        let points: Vec<_> = (0..200).map(point).collect();
+        for (found, truth) in exposures(&points, 4).into_iter().zip(truth) {
+            assert!((found.unwrap() - truth).abs() < 1e-6);
+        }
     }
 }
