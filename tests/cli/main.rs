@@ -386,6 +386,7 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
         "pack_pixels",
         "pack_weights",
         "parameter_terms",
+        "photograph_light",
         "self_test",
         "smoothing_floor",
     ];

@@ -180,7 +180,7 @@ fn light_on_the_sensor_comes_back_in_an_exr_through_target_and_inverse() {
     let [raw, exr] = ["a.dng", "a.exr"].map(|name| folder.path().join(name));
     // Seven stops, in colours.
     let light = |x: u16, y: u16| {
-        let own = 0.25 / f32::from(1_u16 << (x / 4));
+        let own = 0.03 / f32::from(1_u16 << (x / 4));
         [own, 0.7 * own, if y < 4 { 0.4 * own } else { own }]
     };
     fs::write(&raw, dng(28, 8, |x, y| counted(light(x, y)))).unwrap();
@@ -191,7 +191,7 @@ fn light_on_the_sensor_comes_back_in_an_exr_through_target_and_inverse() {
     let mapping = settings.tone_mapping(&scene, &measured);
     let pseudo_gt = PseudoGt::new(&gpu(), &settings).unwrap();
     let target = pseudo_gt.tone_mapped(&photograph, &mapping).unwrap();
-    assert!(target.pixel(9, 2)[0] > 3.0 * photograph.pixel(9, 2)[0], "the target is brighter");
+    assert!(target.pixel(9, 2)[0] > 2.0 * photograph.pixel(9, 2)[0], "the target is brighter");
     let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
     let back = Image::from_fn(28, 8, |x, y| {
         let found = inverse.of(target.pixel(x, y).map(f64::from));
@@ -205,7 +205,7 @@ fn light_on_the_sensor_comes_back_in_an_exr_through_target_and_inverse() {
         let planted = light(x, y);
         let found = read.pixel(x.into(), y.into()).map(linear_from_srgb);
         for (found, planted) in found.into_iter().zip(planted) {
-            // A code of the sensor, and 1e-4 of the light.
+            // A code of the sensor in red, the weakest, beyond which 2e-3 of the light may differ.
             let code = 1.0 / f32::from(WHITE - BLACK) / NEUTRAL[0];
             most = most.max(((found - planted).abs() - code).max(0.0) / planted);
         }
