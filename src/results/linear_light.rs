@@ -175,7 +175,7 @@ mod tests {
         let psnr = |a: &Image, b: &Image| psnr_of_counted(a, b, None).unwrap();
         let slope = slope_at(&target, &inverse);
         let gained = psnr(&other, &own) - psnr(&off, &target);
-        assert!(slope > 4.0, "{slope}");
+        assert!(slope > 2.0, "{slope}");
         assert!((gained - 20.0 * slope.log10()).abs() < 0.2, "{gained} dB, {slope}");
     }
 
