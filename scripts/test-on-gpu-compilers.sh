@@ -64,6 +64,7 @@ compile() {
     run "$1" "$nightsplat" bench --unchecked --repeats 1 --gaussians 1000 || return
     local train=(train "$work/set" --out "$work/run" --overwrite --plan none --steps 2 --sh-degree 3)
     run "$1" "$nightsplat" "${train[@]}" --model plain --exposure on --set loss.opacity_weight=0.01 || return
+    run "$1" "$nightsplat" "${train[@]}" --model plain --parts lamp || return
     case $1 in
         navi31 | gfx1201) run "$1" "$nightsplat" "${train[@]}" --model lita --denoiser-precision half ;;
     esac
