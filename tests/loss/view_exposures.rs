@@ -218,7 +218,7 @@ fn the_gradient_of_clipped_values_is_its_central_difference() {
     let (gpu, size, pixels) = (gpu(), UVec2::new(9, 7), 63);
     let (render, weights) = (noise(1, 3 * pixels, 0.0, 1.2), noise(2, 3 * pixels, -1.0, 1.0));
     let white = [0.6, 0.8, 1.0];
-    let is_clipped = |i: usize| i % 3 > 0;
+    let is_clipped = |i: usize| !i.is_multiple_of(3);
     let target = |i: usize| if is_clipped(i) { white[i / pixels] } else { 0.3 };
     let target: Vec<f32> = (0..3 * pixels).map(target).collect();
     let start = &three();
