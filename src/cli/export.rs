@@ -52,8 +52,7 @@ pub struct ExportArgs {
     /// stops that the file states. For ply and glb, whose numbers are floats
     #[arg(long)]
     pub linear: bool,
-    /// State the tone law of the photographs in the file, by which an engine draws their light (docs/embedding.md). For
-    /// ply, spz and sog
+    /// State the photographs' tone law in the file, for engines that draw their light. For ply, spz and sog
     #[arg(long, conflicts_with = "linear")]
     pub law: bool,
     /// Version of SPZ; more programs read 3
@@ -68,7 +67,7 @@ pub struct ExportArgs {
     /// For streamed-sog: the most Gaussians of a chunk; levels of detail are made in cells of a quarter of it
     #[arg(long, value_name = "N", default_value_t = Division::default().chunk)]
     pub chunk: usize,
-    /// For html: number of views to start from, with their photographs
+    /// For html: number of views to start from, with photographs
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub views: usize,
     /// For html, --linear and --law: dataset, if it moved since training [default: the run's]
@@ -80,7 +79,7 @@ pub struct ExportArgs {
 }
 
 const EXAMPLES: &str = "Examples:
-  nightsplat export run --format html             run/model.html: a viewer, with photographs to compare
+  nightsplat export run --format html             run/model.html: a viewer with photographs
   nightsplat export run --format spz --out a.spz  a tenth of the size, eight bits per number
   nightsplat export run --format glb              glTF with KHR_gaussian_splatting, at full precision
   nightsplat export run --format streamed-sog     run/model.streamed-sog: levels of detail, for large scenes";
