@@ -75,7 +75,7 @@ impl Lamp {
         LampPoint { axis, towards, own, distance, away, beam, light }
     }
 
-    /// The factor on what the tone law shows at a point in view space.
+    /// light^slope at a point in view space: the factor on the argument of the tone law.
     pub fn factor(&self, point: DVec3) -> f64 {
         self.at(point).light.powf(self.slope)
     }

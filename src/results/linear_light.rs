@@ -155,17 +155,23 @@ mod tests {
         }
     }
 
-    #[test]
-    fn the_psnr_of_photographs_is_that_of_their_targets_divided_by_the_slope() {
+    /// The automatic curve's target of a dark photograph, and the inverse.
+    fn target_of(dark: &Image) -> (InverseTone, Image) {
         let settings = ToneSettings::new(ToneCurve::Auto);
-        let dark = Image::from_fn(40, 30, |x, y| [0.01 + 0.004 * x as f32, 0.006 * y as f32, 0.05]);
         let photograph = MeasuredPhotograph::of(&dark.data);
         let scene = settings.scene(std::slice::from_ref(&photograph)).unwrap();
         let mapping = settings.tone_mapping(&scene, &photograph);
         let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
-        let target = Image::from_fn(40, 30, |x, y| {
+        let target = Image::from_fn(dark.width, dark.height, |x, y| {
             inverse.target(dark.pixel(x, y).map(f64::from)).map(|value| value as f32)
         });
+        (inverse, target)
+    }
+
+    #[test]
+    fn the_psnr_of_photographs_is_that_of_their_targets_divided_by_the_slope() {
+        let dark = Image::from_fn(40, 30, |x, y| [0.01 + 0.004 * x as f32, 0.006 * y as f32, 0.05]);
+        let (inverse, target) = target_of(&dark);
         // A difference of one sign in all channels of a pixel, and of the other in its neighbours.
         let off = Image::from_fn(40, 30, |x, y| {
             let sign = if (x + y).is_multiple_of(2) { 1.0 } else { -1.0 };
@@ -181,15 +187,8 @@ mod tests {
 
     #[test]
     fn a_target_becomes_its_photograph_and_clipped_pixels_are_counted() {
-        let settings = ToneSettings::new(ToneCurve::Auto);
         let dark = Image::from_fn(16, 9, |x, y| [0.01 + 0.01 * x as f32, 0.02 * y as f32, 0.05]);
-        let photograph = MeasuredPhotograph::of(&dark.data);
-        let scene = settings.scene(std::slice::from_ref(&photograph)).unwrap();
-        let mapping = settings.tone_mapping(&scene, &photograph);
-        let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
-        let mut target = Image::from_fn(16, 9, |x, y| {
-            inverse.target(dark.pixel(x, y).map(f64::from)).map(|value| value as f32)
-        });
+        let (inverse, mut target) = target_of(&dark);
         let mut clipped = Clipped::default();
         let back = clipped.add(photograph_of(&target, &inverse));
         assert_eq!(clipped.clipped, 0);

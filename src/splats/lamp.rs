@@ -88,7 +88,7 @@ impl Lamp {
         self.ambient + (1.0 - self.ambient) * beam
     }
 
-    /// The factor on what the tone law shows at a point in view space.
+    /// light^slope at a point in view space: the factor on the argument of the tone law.
     pub fn factor(&self, point: DVec3) -> f64 {
         self.light(point).powf(self.slope)
     }
@@ -101,7 +101,7 @@ impl Lamp {
         Vec3::from_array(own.map(|value| value as f32))
     }
 
-    /// The value that the tone law shows as `x`, in proportion to light^slope.
+    /// The colour of the tone law's argument `x`, which is in proportion to light^slope.
     #[cfg(feature = "io")]
     pub(crate) fn tone(&self, x: f64) -> f64 {
         let bent = x / self.reach;
@@ -112,7 +112,7 @@ impl Lamp {
         self.black + self.reach * if bent < LAMP_KNEE { -(-bent).exp_m1() } else { line }
     }
 
-    /// The inverse of [`Lamp::tone`].
+    /// The argument of the tone law for a colour: the inverse of [`Lamp::tone`].
     #[cfg(feature = "io")]
     pub(crate) fn tone_inverse(&self, value: f64) -> f64 {
         let above = value - self.black;

@@ -42,12 +42,9 @@ impl Encoding {
         let all = [0.0].into_iter().chain(reaches).map(fit);
         let best =
             all.filter(|(residual, _)| residual.is_finite()).min_by(|a, b| a.0.total_cmp(&b.0));
-        let mut own = best
-            .map_or(Self { black, slope: Lamp::AT_CAMERA.slope, reach: 0.0 }, |(_, encoding)| {
-                encoding
-            });
-        own.slope = own.slope.clamp(SLOPES[0], SLOPES[1]);
-        own
+        let usual = Self { black, slope: Lamp::AT_CAMERA.slope, reach: 0.0 };
+        let own = best.map_or(usual, |(_, own)| own);
+        Self { slope: own.slope.clamp(SLOPES[0], SLOPES[1]), ..own }
     }
 }
 
