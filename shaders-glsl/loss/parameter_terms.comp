@@ -5,7 +5,7 @@
 
 //! The gradients of w_o mean sigmoid(o) + w_s mean exp(s) + w_a mean max(max s - min s - ln r, 0) with respect to the
 //! raw opacities o and the logarithms s of the standard deviations, added to the existing ones, and partial sums of the
-//! three terms.
+//! three terms. A frozen attribute has no gradient.
 //!
 //! A thread processes `GAUSSIANS_PER_THREAD` Gaussians, one subgroup apart. A weight of 0 leaves the gradients
 //! unchanged. Reference: `src/reference/parameter_terms.rs`.
@@ -23,10 +23,12 @@ layout(push_constant) uniform Params {
 };
 
 layout(binding = 0) readonly  buffer Parameters      { float parameters[]; };        // planes of the batch
-layout(binding = 1)           buffer Gradients       { float gradients[]; };         // planes of the batch
+layout(binding = 1)           buffer Gradients       { float gradients[]; };         // its trained planes
 layout(binding = 2) writeonly buffer OpacityPartials { float opacity_partials[]; };  // one per workgroup
 layout(binding = 3) writeonly buffer ScalePartials   { float scale_partials[]; };    // one per workgroup
 layout(binding = 4) writeonly buffer RatioPartials   { float ratio_partials[]; };    // one per workgroup
+
+#include "trained.glsl"
 
 void main() {
     uint first = WORKGROUP_INDEX * SUBGROUP_SIZE * GAUSSIANS_PER_THREAD;
@@ -39,23 +41,27 @@ void main() {
         uint at = RAW_OPACITIES_COLUMN * gaussian_count + i;
         float opacity = sigmoid(parameters[at]);
         opacities += opacity;
-        if (opacity_scale > 0.0) gradients[at] += opacity_scale * opacity * (1.0 - opacity);
+        if (opacity_scale > 0.0 && is_trained(RAW_OPACITIES_COLUMN)) {
+            gradients[trained_place(at)] += opacity_scale * opacity * (1.0 - opacity);
+        }
         uint first_axis = LOG_SCALES_COLUMN * gaussian_count + 3 * i;
         uint longest = 0, shortest = 0;
         for (uint axis = 0; axis < 3; ++axis) {
             at = first_axis + axis;
             float scale = exp(parameters[at]);
             scales += scale;
-            if (log_scale_scale > 0.0) gradients[at] += log_scale_scale * scale;
+            if (log_scale_scale > 0.0 && is_trained(LOG_SCALES_COLUMN)) {
+                gradients[trained_place(at)] += log_scale_scale * scale;
+            }
             if (parameters[at] > parameters[first_axis + longest]) longest = axis;
             if (parameters[at] < parameters[first_axis + shortest]) shortest = axis;
         }
         float excess = parameters[first_axis + longest] - parameters[first_axis + shortest] - log_ratio;
         if (excess > 0.0) {
             ratios += excess;
-            if (ratio_scale > 0.0) {
-                gradients[first_axis + longest] += ratio_scale;
-                gradients[first_axis + shortest] -= ratio_scale;
+            if (ratio_scale > 0.0 && is_trained(LOG_SCALES_COLUMN)) {
+                gradients[trained_place(first_axis + longest)] += ratio_scale;
+                gradients[trained_place(first_axis + shortest)] -= ratio_scale;
             }
         }
     }

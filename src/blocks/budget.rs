@@ -46,13 +46,14 @@ impl Budget {
         let floats = BASE_FLOATS + rest;
         let bytes = |format| if format == StorageFormat::Single { 4.0 } else { 2.0 };
         let parameters = 4.0 * BASE_FLOATS + bytes(config.precision.rest) * rest;
-        let moments = 2.0 * bytes(config.precision.moments) * floats;
+        let trained = floats - f64::from(config.frozen_columns());
+        let moments = 2.0 * bytes(config.precision.moments) * trained;
         let pixels = dataset
             .views
             .iter()
             .map(|view| f64::from(view.camera.width) * f64::from(view.camera.height));
         Self {
-            gaussian: parameters + moments + 4.0 * floats,
+            gaussian: parameters + moments + 4.0 * trained,
             copies: if is_shared { COPIES * 4.0 * floats } else { 0.0 },
             on_disk: 2.0 * 3.0 * 4.0 * floats + 4.0 * (floats + 3.0),
             pixels: pixels.fold(0.0, f64::max),

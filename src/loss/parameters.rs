@@ -67,7 +67,7 @@ impl ParameterWeights {
 /// The inputs of the terms in a step.
 #[derive(Clone, Copy, Debug)]
 pub struct ParameterInputs<'a> {
-    /// The layout of the planes of the Gaussians.
+    /// The layout of the planes of gradients.
     pub batches: &'a Batches,
     /// Words per Gaussian in `parameters`.
     pub words: usize,
@@ -92,12 +92,12 @@ pub struct ParameterTerms {
 }
 
 impl ParameterTerms {
-    /// `None` if no weight is above 0.
+    /// `None` if no weight is above 0. The first `frozen_columns` columns are not trained.
     ///
     /// # Errors
     /// The device refuses the pipeline.
-    pub fn new(gpu: &Gpu, weights: ParameterWeights) -> Result<Option<Self>> {
-        let constants = parameter_terms::Constants::default();
+    pub fn new(gpu: &Gpu, weights: ParameterWeights, frozen_columns: u32) -> Result<Option<Self>> {
+        let constants = parameter_terms::Constants { frozen_columns, ..Default::default() };
         let new = || {
             Ok(Self {
                 gpu: gpu.clone(),

@@ -6,6 +6,7 @@ use crate::kernels::adam_step::{BETA1, BETA2, EPSILON, GRADIENT_BOUND};
 use crate::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
 use crate::photographs::tone::Real;
 use crate::splats::attributes::{Attribute, planes};
+use crate::splats::batches::frozen_floats;
 
 /// The parameter and both moments after a step at `rate`. A compiler folds 1 - beta in double precision.
 pub(super) fn stepped<T: Real>(
@@ -68,17 +69,18 @@ pub(super) fn bounded<T: Real>(plane: usize, [p, m, v]: [T; 3]) -> [T; 3] {
     [bounded, m, v]
 }
 
-/// Parameter `i`, its gradient and both moments.
+/// Parameter `i`, and at `own` its gradient and both moments.
 fn before(
     constants: &Constants,
-    i: usize,
+    [i, own]: [usize; 2],
     parameters: &[f32],
     gradients: &[f32],
     [first, second]: [&[f32]; 2],
     both: &[u32],
 ) -> [f32; 4] {
-    let [m, v] = if constants.half_moments { from_halves(both[i]) } else { [first[i], second[i]] };
-    [parameters[i], gradients[i], m, v]
+    let [m, v] =
+        if constants.half_moments { from_halves(both[own]) } else { [first[own], second[own]] };
+    [parameters[i], gradients[own], m, v]
 }
 
 impl Reference for Kernel {
@@ -90,16 +92,17 @@ impl Reference for Kernel {
         }
         let gaussian_count = params.gaussian_count as usize;
         let frozen = constants.frozen_columns as usize * gaussian_count;
+        let left_out = frozen_floats(constants.frozen_columns, gaussian_count);
         for i in frozen..params.column_count as usize * gaussian_count {
-            let moments = [&*first_moments, &*second_moments];
-            let before = before(constants, i, parameters, gradients, moments, both_moments);
+            let (own, moments) = (i - left_out, [&*first_moments, &*second_moments]);
+            let before = before(constants, [i, own], parameters, gradients, moments, both_moments);
             let [parameter, first, second] = updated(params, i / gaussian_count, before);
             parameters[i] = parameter;
             if constants.half_moments {
                 let (moments, chance) = moments_after(params.step, before);
-                both_moments[i] = in_halves(moments, chance);
+                both_moments[own] = in_halves(moments, chance);
             } else {
-                (first_moments[i], second_moments[i]) = (first, second);
+                (first_moments[own], second_moments[own]) = (first, second);
             }
         }
     }
@@ -110,17 +113,20 @@ impl Reference for Kernel {
             slices;
         let count = if status[0] == 0 { params.column_count * params.gaussian_count } else { 0 };
         let frozen = (constants.frozen_columns * params.gaussian_count) as usize;
+        let left_out = frozen_floats(constants.frozen_columns, params.gaussian_count as usize);
         let bounds = |which: usize| {
             let of = |i: usize| {
                 if i < frozen {
                     return 0.0;
                 }
-                let moments = [&*first_moments, &*second_moments];
-                let before = before(constants, i, parameters, gradients, moments, both_moments);
+                let (own, moments) = (i - left_out, [&*first_moments, &*second_moments]);
+                let before =
+                    before(constants, [i, own], parameters, gradients, moments, both_moments);
                 let column = i / params.gaussian_count as usize;
                 2.0 * updated::<Rounded>(params, column, before)[which].error
             };
-            Tolerance::Each((0..count as usize).map(of).collect())
+            let first = if which == 0 { 0 } else { left_out };
+            Tolerance::Each((first..count as usize).map(of).collect())
         };
         let parameters = bounds(0);
         if constants.half_moments {

@@ -8,10 +8,13 @@ use super::sh::sh_basis;
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::adam_gaussian::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::splats::attributes::{Attribute, planes};
+use crate::splats::batches::frozen_floats;
 
 /// The number with this place in the planes, of plane `plane`, and its gradient.
 struct Update {
     at: usize,
+    /// Among the planes that are trained.
+    own: usize,
     plane: usize,
     gradient: f32,
     /// Of the gradient.
@@ -28,6 +31,7 @@ fn updates(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<U
     let count = params.gaussian_count as usize;
     let own = Planes { count, feature_count: feature_count as usize, sh_degree, rest_by_column };
     let camera = Camera::from(&cameras[params.camera_index as usize]);
+    let left_out = frozen_floats(frozen_columns, count);
     let of_gaussian = |i: usize| {
         let places: Vec<usize> = own.places(i).collect();
         let planes = planes(own.feature_count, places.len());
@@ -40,17 +44,19 @@ fn updates(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<U
         let update = |column: usize| {
             let plane = planes.iter().rposition(|(first, width)| *width > 0 && column >= *first);
             let (at, plane) = (places[column], plane.unwrap_or_default());
+            let own = at - left_out;
             if column < before_rest {
-                return Update { at, plane, gradient: gradients[at], error: 0.0 };
+                return Update { at, own, plane, gradient: gradients[own], error: 0.0 };
             }
             let (coefficient, channel) = ((column - before_rest) / 3 + 1, column % 3);
             let channel = (channel + 3 - before_rest % 3) % 3;
-            let d_color = f64::from(gradients[places[before_rest + channel]]);
+            let d_color = f64::from(gradients[places[before_rest + channel] - left_out]);
             let error = 256.0 * UNIT * d_color.abs() * (1.0 + far);
             // Beyond the degree in use, the basis is zero.
             let is_used = coefficient < (params.sh_degree as usize + 1).pow(2);
             Update {
                 at,
+                own,
                 plane,
                 gradient: (basis[coefficient] * d_color) as f32,
                 error: if is_used { error } else { 0.0 },
@@ -64,26 +70,26 @@ fn updates(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<U
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        for Update { at, plane, gradient, .. } in updates(params, constants, &slices) {
+        for Update { at, own, plane, gradient, .. } in updates(params, constants, &slices) {
             let before = [
                 slices.parameters[at],
                 gradient,
-                slices.first_moments[at],
-                slices.second_moments[at],
+                slices.first_moments[own],
+                slices.second_moments[own],
             ];
             let rates = [params.rates[plane], params.second_correction];
             let [p, m, v] = bounded(plane, stepped::<f64>(rates, before));
             slices.parameters[at] = p as f32;
-            (slices.first_moments[at], slices.second_moments[at]) = (m as f32, v as f32);
+            (slices.first_moments[own], slices.second_moments[own]) = (m as f32, v as f32);
         }
     }
 
     /// Those of `adam`, and the change by an error of the gradient.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let mut bounds = [(); 3].map(|()| vec![0.0; slices.parameters.len()]);
-        for Update { at, plane, gradient, error } in updates(params, constants, &slices) {
-            let [p, m, v] = [&*slices.parameters, &*slices.first_moments, &*slices.second_moments]
-                .map(|numbers| numbers[at]);
+        for Update { at, own, plane, gradient, error } in updates(params, constants, &slices) {
+            let [p, m, v] =
+                [slices.parameters[at], slices.first_moments[own], slices.second_moments[own]];
             let rates = [params.rates[plane], params.second_correction];
             let rounded = bounded(plane, stepped::<Rounded>(rates, [p, gradient, m, v]));
             let of = |gradient: f32| stepped::<f64>(rates, [p, gradient, m, v]);
@@ -91,7 +97,7 @@ impl Reference for Kernel {
             let moved = [-error, error].map(|by| of((f64::from(gradient) + by) as f32));
             for which in 0..3 {
                 let change = |moved: [f64; 3]| (moved[which] - expected[which]).abs();
-                bounds[which][at] =
+                bounds[which][[at, own, own][which]] =
                     2.0 * rounded[which].error + moved.map(change).into_iter().fold(0.0, f64::max);
             }
         }

@@ -3,6 +3,7 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::adam_rest::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::half::{LARGEST_HALF, SMALLEST_HALF};
 use crate::splats::attributes::word_of;
+use crate::splats::batches::frozen_floats;
 use crate::splats::packed_sh::value;
 
 /// Rounds to a multiple of the half's unit, up or down depending on `chance`; returns the bits of a half.
@@ -24,11 +25,12 @@ impl Reference for Kernel {
             return;
         }
         let (count, own) = (params.gaussian_count as usize, params.coefficient_count as usize);
+        let left_out = frozen_floats(constants.frozen_columns, count);
         let rest = |width, i, k| {
             word_of((params.first_column as usize, width), constants.rest_by_column, count, i, k)
         };
         for (i, k) in (0..count).flat_map(|i| (0..own).map(move |k| (i, k))) {
-            let (at, word) = (rest(own, i, k), rest(own.div_ceil(2), i, k / 2));
+            let (at, word) = (rest(own, i, k) - left_out, rest(own.div_ceil(2), i, k / 2));
             let [m, v] = match constants.half_moments {
                 true => from_halves(both_moments[at]),
                 false => [first_moments[at], second_moments[at]],

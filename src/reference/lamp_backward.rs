@@ -11,6 +11,7 @@ use crate::kernels::lamp::LAMP_NUMBERS;
 use crate::kernels::lamp_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::sh::SH_C0;
 use crate::splats::attributes::Attribute;
+use crate::splats::batches::frozen_floats;
 
 /// The numbers before the lamp's among the inputs of a Gaussian: its mean, its lit colour, and the gradient of its DC.
 const OWN: usize = 9;
@@ -36,7 +37,8 @@ fn shares(
         DVec3::from_array([0, 1, 2].map(|axis| f64::from(values[at + axis])))
     };
     let count = params.gaussian_count as usize;
-    let d_dc = vector(slices.gradients, Attribute::Dc.column(0) * count + 3 * i);
+    let dc = Attribute::Dc.column(0) * count - frozen_floats(constants.frozen_columns, count);
+    let d_dc = vector(slices.gradients, dc + 3 * i);
     if d_dc == DVec3::ZERO {
         return None;
     }

@@ -7,6 +7,7 @@ use crate::gpu::{Reference, Tolerance};
 use crate::kernels::parameter_terms::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::photographs::tone::Real;
 use crate::splats::attributes::Attribute;
+use crate::splats::batches::frozen_floats;
 
 /// A value that a term sums, and its derivative with respect to the parameter, in any number type.
 fn opacity<T: Real>(raw: T) -> [T; 2] {
@@ -80,16 +81,19 @@ struct Outcome {
     gradients: Vec<Rounded>,
 }
 
-fn outcome(params: &Params, slices: &Slices<'_>) -> Outcome {
+fn outcome(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Outcome {
     let count = params.gaussian_count as usize;
+    let frozen = constants.frozen_columns as usize * count;
+    let left_out = frozen_floats(constants.frozen_columns, count);
     let parameter = |at: usize| Rounded::exact(slices.parameters[at]);
     let mut gradients: Vec<Rounded> =
         slices.gradients.iter().map(|&gradient| Rounded::exact(gradient)).collect();
     let mut of = |range: Range<usize>, term: fn(Rounded) -> [Rounded; 2], weight: f32| {
         let value = |at: usize| {
             let [value, derivative] = term(parameter(at));
-            if weight > 0.0 {
-                gradients[at] = gradients[at] + Rounded::exact(weight) * derivative;
+            if weight > 0.0 && at >= frozen {
+                let own = at - left_out;
+                gradients[own] = gradients[own] + Rounded::exact(weight) * derivative;
             }
             value
         };
@@ -106,8 +110,9 @@ fn outcome(params: &Params, slices: &Slices<'_>) -> Outcome {
         let is_over = slices.parameters[longest] - slices.parameters[shortest] - params.log_ratio;
         if is_over > 0.0 {
             ratios.push(excess);
-            if params.ratio_scale > 0.0 {
+            if params.ratio_scale > 0.0 && first >= frozen {
                 let weight = Rounded::exact(params.ratio_scale);
+                let [longest, shortest] = [longest, shortest].map(|at| at - left_out);
                 gradients[longest] = gradients[longest] + weight;
                 gradients[shortest] = gradients[shortest] - weight;
             }
@@ -118,8 +123,8 @@ fn outcome(params: &Params, slices: &Slices<'_>) -> Outcome {
 
 impl Reference for Kernel {
     /// The whole sums go into the first partials: the number of partials is chosen by the device.
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let Outcome { opacities, scales, ratios, gradients } = outcome(params, &slices);
+    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
+        let Outcome { opacities, scales, ratios, gradients } = outcome(params, constants, &slices);
         for (own, gradient) in slices.gradients.iter_mut().zip(gradients) {
             *own = gradient.value as f32;
         }
@@ -134,7 +139,7 @@ impl Reference for Kernel {
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let Outcome { opacities, scales, ratios, gradients } = outcome(params, &slices);
+        let Outcome { opacities, scales, ratios, gradients } = outcome(params, constants, &slices);
         // A gradient that no term adds to keeps its bits.
         let bound = |(gradient, &before): (&Rounded, &f32)| {
             if gradient.value == f64::from(before) { 0.0 } else { gradient.bound() }

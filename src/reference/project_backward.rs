@@ -16,6 +16,7 @@ use crate::kernels::shared_intersections::SHARED_INTERSECTIONS;
 use crate::kernels::splat::{DILATION, RECORD_HEAD};
 use crate::kernels::status::STATUS_GRADIENT;
 use crate::splats::attributes::{Attribute, column_count};
+use crate::splats::batches::frozen_floats;
 
 /// The gradients that arrive at one splat.
 #[derive(Clone, Debug)]
@@ -246,6 +247,11 @@ impl<'a> ProjectionInputs<'a> {
         if self.constants.color_gradients { columns.min(rest + 3) } else { columns }
     }
 
+    /// Floats of the planes before those of the gradients.
+    fn left_out(&self) -> usize {
+        frozen_floats(self.constants.frozen_columns, self.planes.count)
+    }
+
     /// The rounding error of a quaternion's gradient, whose terms can cancel, as for a sphere, which has no gradient:
     /// its entries are sums of products with these magnitudes.
     fn quat_error(&self, gaussian: &Gaussian, splat: &Splat, d_splat: &DSplat) -> f64 {
@@ -320,7 +326,8 @@ impl Reference for Kernel {
         let (planes, parameters) = scene.planes.floats(parameters, constants.half_rest);
         let written = scene.written_columns() * scene.planes.count;
         let frozen = constants.frozen_columns as usize * scene.planes.count;
-        gradients[frozen..written].fill(0.0);
+        let left_out = scene.left_out();
+        gradients[frozen - left_out..written - left_out].fill(0.0);
         for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
             let record =
                 summed_record(constants.channels, intersection_ranges[i], gradient_records);
@@ -335,7 +342,7 @@ impl Reference for Kernel {
                 let value = value as f32;
                 is_finite &= value.is_finite() || at < frozen;
                 if (frozen..written).contains(&at) {
-                    gradients[at] = value;
+                    gradients[at - left_out] = value;
                 }
             });
             if !is_finite {
@@ -409,7 +416,7 @@ impl Reference for Kernel {
             grad_norm_sums[i] = bounds[one.float_count()] + 16.0 * UNIT * norm + 2.0 * UNIT * sum;
         }
         Tolerances {
-            gradients: Tolerance::Each(gradients),
+            gradients: Tolerance::Each(gradients.split_off(scene.left_out())),
             grad_norm_sums: Tolerance::Each(grad_norm_sums),
             ..Tolerances::default()
         }

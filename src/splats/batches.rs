@@ -14,6 +14,8 @@ use crate::splats::packed_sh::StorageFormat;
 #[derive(Clone, Copy, Debug)]
 pub struct Batches {
     planes: PlaneCounts,
+    /// Columns, from the first, that the buffer does not have.
+    frozen: u32,
     /// The most Gaussians of a batch.
     size: usize,
     rest_by_column: bool,
@@ -53,6 +55,13 @@ pub struct Batch {
     /// Its number of Gaussians.
     pub count: usize,
     columns: usize,
+    frozen: u32,
+}
+
+/// The floats of a batch, from the first, that its gradients and moments do not have: those of the first `columns`
+/// columns, in whole vectors of four (include/trained.glsl).
+pub(crate) fn frozen_floats(columns: u32, gaussians: usize) -> usize {
+    columns as usize * gaussians / 4 * 4
 }
 
 /// A batch starts at a multiple of this many Gaussians: its binding is then aligned on every device, for any element
@@ -66,12 +75,24 @@ impl Batches {
         // Kernels count floats in 32 bits.
         let floats = floats.min(u64::from(u32::MAX)) as usize;
         let size = (floats / planes.columns.max(1) / ALIGNMENT).max(1) * ALIGNMENT;
-        Self { planes, size, rest_by_column: rest_by_column(gpu) }
+        Self { planes, frozen: 0, size, rest_by_column: rest_by_column(gpu) }
+    }
+
+    /// The layout of the gradients and moments of the same Gaussians if their first `columns` columns are not trained.
+    /// It has no memory for these; they are read as 0.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn without(self, columns: u32) -> Self {
+        Self { frozen: columns, ..self }
     }
 
     /// Floats of a batch that is full.
     pub(crate) fn window(&self) -> usize {
-        self.size * self.planes.columns
+        self.size * (self.planes.columns - self.frozen as usize)
+    }
+
+    /// Floats of all batches. Those of all but the last have a multiple of [`ALIGNMENT`] Gaussians.
+    pub(crate) fn floats(&self) -> usize {
+        self.planes.total() - frozen_floats(self.frozen, self.planes.gaussians)
     }
 
     /// The layout of the same Gaussians with `columns` words each instead of their floats.
@@ -81,9 +102,10 @@ impl Batches {
 
     /// The batches in order; one empty batch if there are no Gaussians.
     pub fn iter(&self) -> impl Iterator<Item = Batch> + use<> {
-        let Self { planes: PlaneCounts { gaussians: count, columns, .. }, size, .. } = *self;
+        let Self { planes: PlaneCounts { gaussians: count, columns, .. }, frozen, size, .. } =
+            *self;
         let begins = (0..count.max(1)).step_by(size);
-        begins.map(move |first| Batch { first, count: size.min(count - first), columns })
+        begins.map(move |first| Batch { first, count: size.min(count - first), columns, frozen })
     }
 
     /// A buffer of planes in batches, from the planes of all Gaussians.
@@ -102,7 +124,7 @@ impl Batches {
     /// # Errors
     /// The device is out of memory.
     pub fn uninit(&self, gpu: &Gpu, name: &str) -> Result<Buffer<f32>> {
-        gpu.uninit_in_windows(name, self.planes.total(), self.window())
+        gpu.uninit_in_windows(name, self.floats(), self.window())
     }
 
     /// A buffer of zeroed planes.
@@ -126,7 +148,7 @@ impl Batches {
         if self.is_plain() {
             return gpu.write(buffer, planes);
         }
-        let mut batched = Vec::with_capacity(self.planes.total());
+        let mut batched = Vec::with_capacity(self.floats());
         for Part { range, columns } in self.parts() {
             let rows = &planes[range];
             (0..columns).for_each(|k| batched.extend(rows.iter().skip(k).step_by(columns)));
@@ -140,11 +162,11 @@ impl Batches {
     /// The device was lost.
     pub fn read<'a>(&self, gpu: &Gpu, buffer: impl Into<Slice<'a, f32>>) -> Result<Vec<f32>> {
         let mut batched = gpu.read(buffer)?;
-        batched.truncate(self.planes.total());
+        batched.truncate(self.floats());
         if self.is_plain() {
             return Ok(batched);
         }
-        let mut planes = vec![0.0; batched.len()];
+        let mut planes = vec![0.0; self.planes.total()];
         let mut rest = batched.as_slice();
         for Part { range, columns } in self.parts() {
             let (own, others) = rest.split_at(range.len());
@@ -174,7 +196,7 @@ impl Batches {
     /// Whether the buffer has the planes as they are.
     fn is_plain(&self) -> bool {
         let is_whole = self.planes.gaussians <= self.size;
-        is_whole && !(self.rest_by_column && self.planes.rest() > 1)
+        is_whole && self.frozen == 0 && !(self.rest_by_column && self.planes.rest() > 1)
     }
 
     /// The parts of a buffer, in order.
@@ -182,12 +204,14 @@ impl Batches {
         let Self { planes: PlaneCounts { gaussians: count, columns, features }, .. } = *self;
         let rest_by_column = self.rest_by_column;
         self.iter().flat_map(move |batch| {
+            let frozen = frozen_floats(batch.frozen, batch.count);
             planes(features, columns).into_iter().enumerate().map(
                 move |(plane, (column, width))| {
-                    let begin = column * count + width * batch.first;
+                    let (begin, own) = (column * count + width * batch.first, width * batch.count);
                     let is_by_column = rest_by_column && plane == Attribute::Rest as usize;
                     let columns = if is_by_column { width.max(1) } else { 1 };
-                    Part { range: begin..begin + width * batch.count, columns }
+                    let left_out = frozen.saturating_sub(column * batch.count).min(own);
+                    Part { range: begin + left_out..begin + own, columns }
                 },
             )
         })
@@ -208,7 +232,7 @@ impl Batch {
     /// # Errors
     /// The buffer is shorter.
     pub fn planes<'a>(&self, planes: impl Into<Slice<'a, f32>>) -> Result<Slice<'a, f32>> {
-        self.rows(planes, self.columns)
+        planes.into().range(self.floats())
     }
 
     /// [`Self::planes`], mutable.
@@ -219,7 +243,13 @@ impl Batch {
         &self,
         planes: impl Into<SliceMut<'a, f32>>,
     ) -> Result<SliceMut<'a, f32>> {
-        self.rows_mut(planes, self.columns)
+        planes.into().range(self.floats())
+    }
+
+    fn floats(&self) -> Range<usize> {
+        let Range { start, end } = self.range(self.columns);
+        let first = start - frozen_floats(self.frozen, self.first);
+        first..first + end - start - frozen_floats(self.frozen, self.count)
     }
 
     /// Its slice of a buffer of `each` elements per Gaussian, Gaussian-major.

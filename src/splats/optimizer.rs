@@ -14,7 +14,7 @@ use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Slice, SliceMut, Threa
 use crate::kernels::sh::MAX_SH_DEGREE;
 use crate::kernels::{self, adam, adam_gaussian, adam_rest};
 use crate::splats::attributes::PlaneCounts;
-use crate::splats::batches::{Batch, rest_by_column};
+use crate::splats::batches::{Batch, frozen_floats, rest_by_column};
 use crate::splats::packed_sh::StorageFormat;
 use crate::{Error, Result};
 
@@ -148,7 +148,8 @@ impl<'a> Moments<SliceMut<'a, f32>> {
     }
 }
 
-/// The planes that a step of [`Adam`] updates; each has at least `column_count * gaussian_count` floats.
+/// The planes that a step of [`Adam`] updates. Parameters have at least `column_count * gaussian_count` floats,
+/// gradients and moments those of the columns that are trained.
 #[derive(Debug)]
 pub struct AdamBuffers<'a> {
     /// The parameters.
@@ -252,7 +253,7 @@ impl Adam {
         self.record_from(0, pass, (step, rates), planes, buffers, status)
     }
 
-    /// [`Adam::record`] without the frozen columns of Gaussians, whose gradients and moments it does not access.
+    /// [`Adam::record`] for Gaussians, whose frozen columns have neither gradients nor moments.
     ///
     /// # Errors
     /// Those of [`Adam::record`].
@@ -279,12 +280,12 @@ impl Adam {
         status: &Buffer<u32>,
     ) -> Result<()> {
         let len = planes.total();
-        check(step, status, [(parameters.as_slice(), len), (gradients, len)], (&moments, len))?;
+        let left = frozen_floats(frozen_columns, planes.gaussians);
+        check(step, status, [(parameters.as_slice(), len), (gradients, len - left)], &moments)?;
         let half_moments = moments.bits() == StorageFormat::Half;
         let constants = adam::Constants { half_moments, frozen_columns };
         let pipelines = if frozen_columns == 0 { &self.floats } else { &self.trained };
         let pipeline = self.pipeline(pipelines, half_moments.into(), &constants)?;
-        let first_quad = frozen_columns * planes.gaussians as u32 / 4;
         let [first_moments, second_moments, both_moments] = moments.bindings()?;
         let (uncorrected, second_correction) = corrections(step);
         pass.dispatch(
@@ -305,7 +306,7 @@ impl Adam {
                 both_moments: both_moments.words(),
                 status: status.slice(),
             },
-            Threads::Exactly([(len as u32).div_ceil(4).saturating_sub(first_quad), 1, 1]),
+            Threads::Exactly([(len - left).div_ceil(4) as u32, 1, 1]),
         )
     }
 
@@ -323,13 +324,14 @@ impl Adam {
         status: &Buffer<u32>,
     ) -> Result<()> {
         let words = planes.gaussians * StorageFormat::Half.words(planes);
-        let buffers = [(parameters.as_slice(), words), (gradients, planes.total())];
-        check(step, status, buffers, (&moments, planes.total()))?;
+        let frozen_columns = self.frozen_columns;
+        let floats = planes.total() - frozen_floats(frozen_columns, planes.gaussians);
+        check(step, status, [(parameters.as_slice(), words), (gradients, floats)], &moments)?;
         let [gaussian_count, first_column, coefficient_count] =
             [planes.gaussians, planes.before_rest(), planes.rest()].map(|n| n as u32);
         let half_moments = moments.bits() == StorageFormat::Half;
         let rest_by_column = rest_by_column(&self.gpu);
-        let constants = adam_rest::Constants { half_moments, rest_by_column };
+        let constants = adam_rest::Constants { half_moments, rest_by_column, frozen_columns };
         let pipeline = self.pipeline(&self.halves, half_moments.into(), &constants)?;
         let [first_moments, second_moments, both_moments] = moments.bindings()?;
         let (uncorrected, second_correction) = corrections(step);
@@ -366,14 +368,14 @@ impl Adam {
         planes: PlaneCounts,
         AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
     ) -> Result<()> {
-        let len = planes.total();
-        check(step, status, [(parameters.as_slice(), len), (gradients, len)], (&moments, len))?;
+        let (len, frozen_columns) = (planes.total(), self.frozen_columns);
+        let floats = len - frozen_floats(frozen_columns, planes.gaussians);
+        check(step, status, [(parameters.as_slice(), len), (gradients, floats)], &moments)?;
         let Moments::Single { first: first_moments, second: second_moments } = moments else {
             return Err(Error::Usage("whole Gaussians have moments of 32 bits".to_owned()));
         };
         let ([sh_degree, used], feature_count) = (sh_degrees, planes.features as u32);
         let rest_by_column = rest_by_column(&self.gpu);
-        let frozen_columns = self.frozen_columns;
         let constants =
             adam_gaussian::Constants { sh_degree, feature_count, rest_by_column, frozen_columns };
         let pipeline = self.pipeline(&self.gaussians, sh_degree as usize, &constants)?;
@@ -414,15 +416,17 @@ impl Adam {
     }
 }
 
-/// A kernel that exceeds a buffer overwrites other data, so lengths are checked before anything is recorded.
+/// A kernel that exceeds a buffer overwrites other data, so lengths are checked before anything is recorded: those of
+/// the parameters and of the gradients, which the moments share.
 fn check(
     step: u64,
     status: &Buffer<u32>,
-    planes: [(Slice<'_, f32>, usize); 2],
-    (moments, len): (&Moments<SliceMut<'_, f32>>, usize),
+    [parameters, gradients]: [(Slice<'_, f32>, usize); 2],
+    moments: &Moments<SliceMut<'_, f32>>,
 ) -> Result<()> {
-    let moments = moments.planes().into_iter().map(|(_, plane)| (plane.as_slice(), len));
-    if let Some((short, needed)) = planes.into_iter().chain(moments).find(|(b, n)| b.len() < *n) {
+    let moments = moments.planes().into_iter().map(|(_, plane)| (plane.as_slice(), gradients.1));
+    let mut planes = [parameters, gradients].into_iter().chain(moments);
+    if let Some((short, needed)) = planes.find(|(plane, needed)| plane.len() < *needed) {
         let (name, has) = (short.name(), short.len());
         let what = format!("buffer `{name}` holds {has} floats, Adam needs {needed}");
         return Err(Error::Usage(what));

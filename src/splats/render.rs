@@ -326,7 +326,7 @@ impl Renderer {
             Threads::Workgroups([tile_count.saturating_add(further_segments), 1, 1]),
         )?;
         let GaussianSlice { layout, parameters } = gaussians;
-        for batch in layout.batches(&self.gpu).iter() {
+        for batch in layout.batches(&self.gpu).without(self.frozen_columns).iter() {
             let (gaussian_count, rendered) = (batch.gaussian_count(), batch.after(first));
             pass.dispatch(
                 project_backward,

@@ -346,11 +346,12 @@ impl Trainer {
 
     /// The state that the next step depends on, except the visit counts, which are integers.
     pub(super) fn state(&mut self) -> Vec<State<'_>> {
+        let trained = self.model.trained_planes(&self.gpu);
         let Model { gaussians, moments, grad_norm_sums, .. } = &mut self.model;
         let layout = gaussians.layout;
-        let batches = layout.batches(&self.gpu);
-        let [of_parameters, of_moments] = [layout.words(), layout.floats().columns]
-            .map(|columns| (vec![columns, layout.count], batches.with_columns(columns)));
+        let of_parameters =
+            (vec![layout.words(), layout.count], layout.parameter_batches(&self.gpu));
+        let of_moments = (vec![layout.floats().columns, layout.count], trained);
         let name = "density.grad_norm_sums".to_owned();
         let shape = vec![layout.count];
         let buffer = grad_norm_sums.slice_mut();

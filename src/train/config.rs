@@ -409,7 +409,7 @@ impl TrainConfig {
     }
 
     /// The columns of the Gaussians' attributes, from the first, that no pass updates.
-    pub(super) fn frozen_columns(&self) -> u32 {
+    pub(crate) fn frozen_columns(&self) -> u32 {
         self.freeze.as_ref().map_or(0, Freeze::leading_columns)
     }
 

@@ -88,8 +88,9 @@ impl Trainer {
             old.count
         );
         let filled = joined(&old, &picked, &self.config.start)?;
-        let in_use = self.model.shape().sh_degree;
-        self.model = Model::upload(&self.gpu, &filled, in_use, &self.config.precision)?;
+        let (in_use, frozen_columns) = (self.model.shape().sh_degree, self.config.frozen_columns());
+        let precision = &self.config.precision;
+        self.model = Model::upload(&self.gpu, &filled, in_use, precision, frozen_columns)?;
         Ok(())
     }
 

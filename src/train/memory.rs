@@ -184,11 +184,12 @@ impl Trainer {
         let layout = Layout { shape, ..self.model.gaussians.layout };
         let columns = [layout.floats().columns, layout.words()];
         let [plane, parameters] = columns.map(|columns| (columns * size_of::<f32>()) as f64);
-        // Gradients and moments are planes.
-        let planes = 1 + self.model.moments.planes().len();
+        // Gradients and moments are planes, without the columns that are not trained.
+        let planes = (1 + self.model.moments.planes().len()) as f64;
+        let frozen = f64::from(self.config.frozen_columns()) * size_of::<f32>() as f64;
         PerGaussian {
             plane,
-            model: parameters + planes as f64 * plane + STATISTICS,
+            model: parameters + planes * (plane - frozen) + STATISTICS,
             working: (self.renderer.bytes_per_gaussian()
                 + self.growth.densifier.bytes_per_gaussian()) as f64,
         }

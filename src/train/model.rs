@@ -5,7 +5,7 @@ use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::loss::{LogSlot, ParameterInputs, ParameterTerms};
 use crate::splats::attributes::{PlaneCounts, planes};
-use crate::splats::batches::GradientKind;
+use crate::splats::batches::{Batches, GradientKind};
 use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, Round};
 use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, GaussianStep, Moments};
 use crate::splats::packed_sh::StorageFormat;
@@ -21,9 +21,15 @@ impl Trainer {
     #[cfg(feature = "testing")]
     pub fn gradients(&self) -> Result<Gaussians> {
         let Model { gaussians, gradients, .. } = &self.model;
-        let parameters = gaussians.layout.batches(&self.gpu).read(&self.gpu, gradients)?;
+        let parameters = self.model.trained_planes(&self.gpu).read(&self.gpu, gradients)?;
         let Layout { count, shape, .. } = gaussians.layout;
         Ok(Gaussians { count, shape, parameters, origin: gaussians.origin })
+    }
+
+    /// The floats of a plane set of gradients or moments.
+    #[cfg(feature = "testing")]
+    pub fn trained_floats(&self) -> usize {
+        self.model.gradients.len()
     }
 }
 
@@ -38,7 +44,8 @@ pub(super) struct Model {
     pub(super) moments: Moments,
     /// The configured SH degree.
     sh_degree: u32,
-    /// Of the same size as the parameters.
+    /// Columns, from the first, that are not trained: there are neither gradients nor moments of them.
+    frozen_columns: u32,
     pub(super) gradients: Buffer<f32>,
     /// One value per Gaussian.
     pub(super) grad_norm_sums: Buffer<f32>,
@@ -55,13 +62,16 @@ impl Model {
         gaussians: &Gaussians,
         in_use: u32,
         precision: &PrecisionConfig,
+        frozen_columns: u32,
     ) -> Result<Self> {
         let sh_degree = gaussians.shape.sh_degree;
         let gaussians = gaussians.with_sh_degree(in_use.max(gaussians.sh_degree_in_use()));
         let gaussians = gaussians.upload_as(gpu, precision.rest)?;
-        let (batches, count) = (gaussians.layout.batches(gpu), gaussians.layout.count);
+        let count = gaussians.layout.count;
+        let batches = gaussians.layout.batches(gpu).without(frozen_columns);
         Ok(Self {
             sh_degree,
+            frozen_columns,
             moments: Moments::of(precision.moments, |name| batches.zeros(gpu, name))?,
             gradients: batches.zeros(gpu, "gradients")?,
             grad_norm_sums: gpu.zeros("grad_norm_sums", count)?,
@@ -91,7 +101,13 @@ impl Model {
     pub(super) fn zeros_like(&self, gpu: &Gpu, count: usize, in_use: u32) -> Result<Self> {
         let (rest, moments) = (self.gaussians.layout.sh_rest, self.moments.bits());
         let precision = PrecisionConfig { rest, moments, ..PrecisionConfig::default() };
-        Self::upload(gpu, &Gaussians::zeros(count, self.whole_shape()), in_use, &precision)
+        let zeros = Gaussians::zeros(count, self.whole_shape());
+        Self::upload(gpu, &zeros, in_use, &precision, self.frozen_columns)
+    }
+
+    /// The batches of gradients and moments.
+    pub(super) fn trained_planes(&self, gpu: &Gpu) -> Batches {
+        self.gaussians.layout.batches(gpu).without(self.frozen_columns)
     }
 
     /// The configured shape of the Gaussians.
@@ -106,14 +122,13 @@ impl Model {
     pub(super) fn set_sh_degree(&mut self, gpu: &Gpu, sh_degree: u32) -> Result<()> {
         let own = self.gaussians.layout;
         let new = Layout { shape: Shape { sh_degree, ..own.shape }, ..own };
-        let (capacity, columns) = (own.capacity, new.floats().columns);
         // Grows one buffer after the other, keeping contents and capacity.
-        let windows = [new.parameter_batches(gpu), new.batches(gpu)].map(|all| all.window());
-        lengthen(gpu, &mut self.gaussians.parameters, capacity * new.words(), windows[0])?;
-        self.planes_mut()
-            .try_for_each(|plane| lengthen(gpu, plane, capacity * columns, windows[1]))?;
+        let all = Layout { count: own.capacity, ..new };
+        lengthen(gpu, &mut self.gaussians.parameters, all.parameter_batches(gpu))?;
+        let trained = all.batches(gpu).without(self.frozen_columns);
+        self.planes_mut().try_for_each(|plane| lengthen(gpu, plane, trained))?;
         let parameters = self.gaussians.read(gpu)?;
-        let batches = own.batches(gpu);
+        let batches = self.trained_planes(gpu);
         let planes = self.planes_mut().map(|plane| batches.read(gpu, &*plane));
         let planes = planes.collect::<Result<Vec<_>>>()?;
 
@@ -123,7 +138,7 @@ impl Model {
             Gaussians { count, shape, parameters, origin }.with_sh_degree(sh_degree).parameters
         };
         self.gaussians.write(gpu, &resized(parameters))?;
-        let batches = new.batches(gpu);
+        let batches = self.trained_planes(gpu);
         let mut pairs = self.planes_mut().zip(planes);
         pairs.try_for_each(|(plane, values)| batches.write(gpu, plane, &resized(values)))
     }
@@ -163,7 +178,7 @@ impl Model {
         let Self { gaussians, moments, .. } = self;
         let layout = gaussians.layout;
         let is_half = layout.sh_rest == StorageFormat::Half;
-        layout.batches(gpu).iter().try_for_each(|batch| {
+        layout.batches(gpu).without(self.frozen_columns).iter().try_for_each(|batch| {
             let planes = PlaneCounts { gaussians: batch.count, ..layout.floats() };
             let mut buffers = AdamBuffers {
                 parameters: batch.rows_mut(&mut gaussians.parameters, layout.words())?,
@@ -194,9 +209,10 @@ impl Model {
         terms: &mut ParameterTerms,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
+        let batches = &self.trained_planes(gpu);
         let Self { gaussians, gradients, .. } = self;
         let inputs = ParameterInputs {
-            batches: &gaussians.layout.batches(gpu),
+            batches,
             words: gaussians.layout.words(),
             parameters: &gaussians.parameters,
         };
@@ -272,8 +288,9 @@ impl Model {
     }
 }
 
-/// Grows a buffer to `len` elements in such windows, keeping its contents.
-fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, len: usize, window: usize) -> Result<()> {
+/// Grows a buffer to these batches, keeping its contents.
+fn lengthen(gpu: &Gpu, buffer: &mut Buffer<f32>, batches: Batches) -> Result<()> {
+    let (len, window) = (batches.floats(), batches.window());
     if buffer.len() < len || !buffer.suits_windows(window) {
         let mut longer = gpu.uninit_in_windows(buffer.name(), len.max(buffer.len()), window)?;
         gpu.write(&mut longer, &gpu.read(&*buffer)?)?;
@@ -288,6 +305,28 @@ mod tests {
     use crate::gpu::testing::gpu;
     use crate::splats::scene::Features;
 
+    #[test]
+    fn another_sh_degree_keeps_the_moments_of_the_columns_that_are_trained() {
+        let gpu = gpu();
+        let given = Gaussians::zeros(7, Shape { sh_degree: 3, features: Features::NONE });
+        let mut model = Model::upload(&gpu, &given, 1, &PrecisionConfig::default(), 11).unwrap();
+        // The last float of a frozen column is in the first vector of four.
+        let (frozen, in_vectors) = (7 * 11, 7 * 11 / 4 * 4);
+        let columns = [14 + 9, 14 + 24];
+        let written: Vec<f32> = (0..7 * columns[0] as u16).map(f32::from).collect();
+        let planes = model.trained_planes(&gpu);
+        planes.write(&gpu, &mut model.gradients, &written).unwrap();
+        assert_eq!(model.gradients.len(), 7 * columns[0] - in_vectors);
+        model.set_sh_degree(&gpu, 2).unwrap();
+        let lens: Vec<_> = model.planes_mut().map(|plane| plane.len()).collect();
+        assert_eq!(lens[0], 7 * columns[1] - in_vectors);
+        assert!(lens.iter().all(|len| *len == lens[0]));
+        let kept = model.trained_planes(&gpu).read(&gpu, &model.gradients).unwrap();
+        assert_eq!(kept[frozen..7 * 14], written[frozen..7 * 14]);
+        assert_eq!(kept[7 * 14..][..9], written[7 * 14..][..9]);
+        assert_eq!(kept[..in_vectors], [0.0; 76]);
+    }
+
     /// Without the capacity, the next round of density control would allocate again.
     #[test]
     fn another_sh_degree_keeps_the_capacity_and_the_contents_of_the_planes() {
@@ -299,7 +338,7 @@ mod tests {
             let mut given = Gaussians::zeros(10, shape);
             // Degree 3 is not in use, so there is no memory for it.
             given.parameters[..140].fill(0.5);
-            let mut model = Model::upload(&gpu, &given, 0, &precision).unwrap();
+            let mut model = Model::upload(&gpu, &given, 0, &precision, 0).unwrap();
             assert_eq!(model.gaussians.parameters.len(), 140);
             model.set_sh_degree(&gpu, 2).unwrap();
             assert_eq!(model.gaussians.parameters.len(), 10 * model.gaussians.layout.words());

@@ -194,13 +194,14 @@ impl Trainer {
             exposures,
             networks,
             losses,
-            parameter_terms: ParameterTerms::new(gpu, config.loss)?,
+            parameter_terms: ParameterTerms::new(gpu, config.loss, config.frozen_columns())?,
             d_render: gpu.uninit("d_render", values)?,
             log: LossLog::new(gpu, MAX_STEPS as usize)?,
         };
         let learning = lamp.map(|_| LampLearning::new(gpu, config.lamp.rates)).transpose()?;
         let degree = initial.context.as_ref().map_or(0, Gaussians::sh_degree_in_use);
         let degree = degree.max(first_sh_degree(&config));
+        let (precision, frozen_columns) = (&config.precision, config.frozen_columns());
         let mut trainer = Self {
             gpu: gpu.clone(),
             fingerprint,
@@ -208,7 +209,7 @@ impl Trainer {
             extent: config.extent_of(dataset) * frame.scale,
             step: 0,
             supervision,
-            model: Model::upload(gpu, &gaussians, degree, &config.precision)?,
+            model: Model::upload(gpu, &gaussians, degree, precision, frozen_columns)?,
             renderer,
             optimizer: Optimizer { adam, finite, floor, lamp: learning, checked: 0 },
             growth: Growth { densifier, probes, has_logged_capacity: false },

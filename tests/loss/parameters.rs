@@ -83,7 +83,7 @@ fn the_means_over_the_gaussians_reach_the_log_and_their_gradients_the_planes() {
         anisotropy_weight: 0.2,
         anisotropy_limit: 2.0,
     };
-    let mut terms = ParameterTerms::new(&gpu, weights).unwrap().unwrap();
+    let mut terms = ParameterTerms::new(&gpu, weights, 0).unwrap().unwrap();
     let (planes, words) = (planes(count), column_count(0, 0));
     let batches = Batches::new(&gpu, PlaneCounts { gaussians: count, columns: words, features: 0 });
     let parameters = batches.upload(&gpu, "parameters", &planes).unwrap();
@@ -109,8 +109,43 @@ fn the_means_over_the_gaussians_reach_the_log_and_their_gradients_the_planes() {
 }
 
 #[test]
+fn frozen_attributes_have_no_gradient() {
+    let (gpu, count, words) = (gpu(), 739, column_count(0, 0));
+    let weights = ParameterWeights {
+        opacity_weight: 0.3,
+        scale_weight: 0.7,
+        anisotropy_weight: 0.2,
+        anisotropy_limit: 2.0,
+    };
+    let whole = Batches::new(&gpu, PlaneCounts { gaussians: count, columns: words, features: 0 });
+    let parameters = whole.upload(&gpu, "parameters", &planes(count)).unwrap();
+    let gradients = |frozen_columns: u32| {
+        let mut terms = ParameterTerms::new(&gpu, weights, frozen_columns).unwrap().unwrap();
+        let batches = &whole.without(frozen_columns);
+        let mut gradients = batches.zeros(&gpu, "gradients").unwrap();
+        let (logged, report) = gpu.checked(|| {
+            log_step(&gpu, |pass, log| {
+                let inputs = ParameterInputs { batches, words, parameters: &parameters };
+                terms.record(pass, inputs, &mut gradients, log)
+            })
+        });
+        report.agree().unwrap();
+        (logged.unwrap().losses, batches.read(&gpu, &gradients).unwrap())
+    };
+    let (losses, all) = gradients(0);
+    // The means are those of all Gaussians, frozen or not.
+    for (attribute, frozen_columns) in [(Attribute::RawOpacities, 10), (Attribute::Dc, 11)] {
+        let (own, trained) = gradients(frozen_columns);
+        assert_eq!(own, losses);
+        let first = attribute.column(0) * count;
+        assert!(trained[..first].iter().all(|own| *own == 0.0));
+        assert!(trained[first..] == all[first..]);
+    }
+}
+
+#[test]
 fn a_term_of_weight_0_is_off() {
-    assert!(ParameterTerms::new(&gpu(), ParameterWeights::default()).unwrap().is_none());
+    assert!(ParameterTerms::new(&gpu(), ParameterWeights::default(), 0).unwrap().is_none());
 }
 
 #[test]

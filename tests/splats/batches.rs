@@ -92,6 +92,32 @@ fn written_and_read_back(gpu: &Gpu) {
     }
 }
 
+#[test]
+fn columns_that_are_not_trained_take_no_memory_and_are_read_as_zeros() {
+    let shape = Shape { sh_degree: 1, features: features(5) };
+    let columns = width(shape);
+    for gpu in [gpu_that_binds(LITTLE), little_gpu()] {
+        for (frozen, count) in [(3, 1), (11, 2), (11, 3), (10, 5), (14, 6), (11, 12_347)] {
+            let all = Layout::new(count, shape, StorageFormat::Single).batches(&gpu);
+            let trained = all.without(frozen);
+            let planes: Vec<f32> = (1..=count * columns).map(|i| i as f32).collect();
+            let buffer = trained.upload(&gpu, "trained", &planes).unwrap();
+            let frozen = frozen as usize * count;
+            assert_eq!(buffer.len(), count * columns - frozen / 4 * 4);
+            let read = trained.read(&gpu, &buffer).unwrap();
+            assert!(read[frozen..] == planes[frozen..]);
+            // Up to three floats share a vector with the first trained one.
+            assert!(read[..frozen.saturating_sub(3)].iter().all(|own| *own == 0.0));
+            let whole = all.upload(&gpu, "whole", &planes).unwrap();
+            for (trained, whole_batch) in trained.iter().zip(all.iter()) {
+                let own = gpu.read(trained.planes(&buffer).unwrap()).unwrap();
+                let expected = gpu.read(whole_batch.planes(&whole).unwrap()).unwrap();
+                assert!(expected.ends_with(&own));
+            }
+        }
+    }
+}
+
 /// Views of a dataset without points.
 fn views() -> Dataset {
     Dataset { points: vec![], ..dataset(8, [40, 30]) }

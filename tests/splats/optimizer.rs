@@ -146,6 +146,54 @@ fn adam_matches_its_reference() {
     }
 }
 
+/// A vector of four can begin in a frozen column.
+#[test]
+fn frozen_columns_have_no_moments_and_keep_their_parameters() {
+    let gpu = gpu();
+    let status = gpu.buffer("status", &[0]).unwrap();
+    for (frozen, gaussian_count) in [(3, 1), (10, 3), (11, 2), (11, 1025), (14, 7)] {
+        let adam = Adam::with_frozen(&gpu, frozen).unwrap();
+        let before = Planes::new(gaussian_count);
+        let begin = (frozen * gaussian_count) as usize;
+        let trained = begin / 4 * 4..;
+        let upload = |name: &str, data: &[f32]| gpu.buffer(name, data).unwrap();
+        let mut parameters = upload("parameters", &before.parameters);
+        let gradients = upload("gradients", &before.gradients[trained.clone()]);
+        let mut moments = Moments::Single {
+            first: upload("first", &before.first[trained.clone()]),
+            second: upload("second", &before.second[trained.clone()]),
+        };
+        let planes = PlaneCounts {
+            gaussians: gaussian_count as usize,
+            columns: COLUMNS as usize,
+            features: FEATURES as usize,
+        };
+        let (done, report) = gpu.checked(|| {
+            gpu.run("adam", |pass| {
+                let buffers = AdamBuffers {
+                    parameters: parameters.slice_mut(),
+                    gradients: gradients.slice(),
+                    moments: moments.slice_mut(),
+                };
+                adam.record_trained(pass, 3, &RATES, planes, buffers, &status)
+            })
+        });
+        done.unwrap();
+        report.agree().unwrap();
+        let mut expected = before.clone();
+        expected.step(&gpu, 3, [gaussian_count, COLUMNS], 0);
+        let Moments::Single { first, second } = &moments else { panic!("{moments:?}") };
+        let [stepped, first, second] = [&parameters, first, second].map(|p| gpu.read(p).unwrap());
+        assert!(stepped[..begin] == before.parameters[..begin]);
+        assert!(stepped[begin..] == expected.parameters[begin..]);
+        let shared = begin % 4;
+        assert!(first[shared..] == expected.first[begin..]);
+        assert!(second[shared..] == expected.second[begin..]);
+        // Those of frozen parameters in the first vector.
+        assert!(first[..shared] == before.first[trained][..shared]);
+    }
+}
+
 #[test]
 fn the_first_step_moves_every_attribute_by_its_own_learning_rate() {
     let gpu = gpu();

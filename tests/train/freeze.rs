@@ -1,7 +1,8 @@
 //! Frozen attributes: other colours on given geometry.
 
+use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::{gpu, gpu_with};
-use nightsplat::photographs::dataset::Split;
+use nightsplat::photographs::dataset::{Dataset, Split};
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{TrainConfig, Trainer};
@@ -46,6 +47,7 @@ fn frozen_geometry_keeps_its_bits_and_colours_learn_on_any_device() {
             let (reports, report) = trainer.check_step();
             reports.unwrap();
             report.agree().unwrap();
+            assert_eq!(trainer.trained_floats(), day.count * 59 - day.count * 11 / 4 * 4);
             let reports = advance(&mut trainer, 40);
             // Of as many steps on each of the five views.
             let loss = |steps: std::ops::Range<usize>| {
@@ -67,6 +69,43 @@ fn frozen_geometry_keeps_its_bits_and_colours_learn_on_any_device() {
             assert!(gradients.means().iter().all(|own| *own == glam::Vec3::ZERO), "not written");
         }
     }
+}
+
+/// More Gaussians than a binding holds, of a number that is odd in each batch.
+#[test]
+fn frozen_geometry_in_batches_gives_the_bits_of_one_batch_and_resumes() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = Dataset { points: vec![], ..dataset(6, [40, 30]) };
+    let mut random = TrainConfig { steps: 2, random_points: 4205, ..TrainConfig::bare() };
+    // Small Gaussians, which intersect few tiles: a binding holds the intersections of all of them.
+    random.start.scale = 0.1;
+    let path = folder.path().join("day.ply");
+    train(&random, &dataset).1.save(&path).unwrap();
+    let (whole, little) = (gpu(), gpu_with(|own| own.max_storage_buffer_range = 1 << 19));
+    let new = |gpu: &Gpu| {
+        let mut config = config(path.clone(), GEOMETRY);
+        config.tile = Some([16, 16].into());
+        Trainer::new(gpu, config, &dataset).unwrap()
+    };
+    let (mut expected, mut batched) = (new(&whole), new(&little));
+    let (done, report) = batched.check_step();
+    done.unwrap();
+    report.agree().unwrap();
+    let passes = report.passes.iter().filter(|pass| pass.kernel == "project_backward");
+    assert!(passes.count() > 1);
+    for trainer in [&mut expected, &mut batched] {
+        advance(trainer, 12);
+    }
+    let checkpoint = folder.path().join("checkpoint.safetensors");
+    batched.save_checkpoint(&checkpoint).unwrap();
+    let mut resumed = new(&whole);
+    resumed.restore(&checkpoint).unwrap();
+    for trainer in [&mut expected, &mut batched, &mut resumed] {
+        advance(trainer, 25);
+    }
+    let expected = expected.gaussians().unwrap();
+    assert!(batched.gaussians().unwrap() == expected);
+    assert!(resumed.gaussians().unwrap() == expected);
 }
 
 fn bytes<T: bytemuck::NoUninit>(values: &[T]) -> Vec<u8> {

@@ -17,7 +17,7 @@
 layout(local_size_x_id = 100) in;
 layout(constant_id = 100) const uint SUBGROUP_SIZE = 8;
 #include "subgroup_sum.glsl"
-layout(constant_id = 15) const uint CHUNK = 1024;
+layout(constant_id = 17) const uint CHUNK = 1024;
 
 layout(push_constant) uniform Params {
     uint camera_index;
@@ -29,10 +29,11 @@ layout(binding = 0) readonly  buffer Parameters { float parameters[]; };  // pla
 layout(binding = 1) readonly  buffer Cameras { Camera cameras[]; };
 layout(binding = 2) readonly  buffer LampNumbers { float lamp[]; };  // (LAMP_NUMBERS)
 layout(binding = 3) readonly  buffer Colors { vec4 colors[]; };  // (gaussian_count, COLOR_VECTORS), lit
-layout(binding = 4) readonly  buffer Gradients { float gradients[]; };  // (columns x gaussian_count)
+layout(binding = 4) readonly  buffer Gradients { float gradients[]; };  // trained planes
 layout(binding = 5) writeonly buffer Partials { float partials[]; };  // (chunks, LAMP_WIDTH)
 
 #include "lamp_law.glsl"
+#include "trained.glsl"
 
 void main() {
     uint chunk = WORKGROUP_INDEX;
@@ -42,7 +43,8 @@ void main() {
     float sums[LAMP_WIDTH];
     [[unroll]] for (uint n = 0; n < LAMP_WIDTH; n++) sums[n] = 0.0;
     for (uint i = chunk * CHUNK + gl_SubgroupInvocationID; i < end; i += SUBGROUP_SIZE) {
-        vec3 d_dc = LOAD_VEC3(gradients, DC_COLUMN, gaussian_count, i);
+        uint dc = trained_place(DC_COLUMN * gaussian_count + 3 * i);
+        vec3 d_dc = vec3(gradients[dc], gradients[dc + 1], gradients[dc + 2]);
         if (d_dc == vec3(0.0)) continue;
         vec3 mean = LOAD_VEC3(parameters, MEANS_COLUMN, gaussian_count, i);
         LampPoint at = lamp_at(own, cameras[camera_index].view_from_world * vec4(mean, 1.0));

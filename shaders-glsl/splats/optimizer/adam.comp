@@ -24,11 +24,11 @@ layout(push_constant) uniform Params {
 };
 
 layout(constant_id = 0) const bool HALF_MOMENTS = false;
-layout(constant_id = 15) const uint FROZEN_COLUMNS = 0;  // from the first: not updated, nor their moments read
+#include "trained.glsl"
 
 layout(binding = 0)           buffer Parameters    { vec4 parameters[]; };      // planes
-layout(binding = 1) readonly  buffer Gradients     { vec4 gradients[]; };       // planes
-layout(binding = 2)           buffer FirstMoments  { vec4 first_moments[]; };   // planes; none with half moments
+layout(binding = 1) readonly  buffer Gradients     { vec4 gradients[]; };       // trained planes
+layout(binding = 2)           buffer FirstMoments  { vec4 first_moments[]; };   // as many; none with half moments
 layout(binding = 3)           buffer SecondMoments { vec4 second_moments[]; };  // as many
 layout(binding = 4)           buffer BothMoments   { uvec4 both_moments[]; };    // their bits, with half moments
 layout(binding = 5) readonly  buffer Status        { uint status[]; };
@@ -49,12 +49,13 @@ void main() {
     uint end = column_count * gaussian_count;
     if (4 * quad >= end || status[0] != 0) return;
     uvec4 i = 4 * quad + uvec4(0, 1, 2, 3);
+    uint own = trained_place(4 * quad) / 4;
     // The first and the last quad can extend into a column that is not updated. Unsigned: before `begin`, it wraps.
     bvec4 takes_part = lessThan(i - begin, uvec4(end - begin));
-    vec4 gradient = clamp_gradient(gradients[quad]);
+    vec4 gradient = clamp_gradient(gradients[own]);
     Moments moments;
-    if (HALF_MOMENTS) moments = from_halves(both_moments[quad]);
-    else moments = Moments(first_moments[quad], second_moments[quad]);
+    if (HALF_MOMENTS) moments = from_halves(both_moments[own]);
+    else moments = Moments(first_moments[own], second_moments[own]);
     moments = updated(moments, gradient);
     if (HALF_MOMENTS) moments = flushed(moments);
     vec4 before = parameters[quad];
@@ -66,9 +67,9 @@ void main() {
     if (HALF_MOMENTS) {
         // As integers: a device may flush a float whose bits are those of a second moment alone.
         uvec4 halves = in_halves(moments, chance_of(before, moments, step));
-        both_moments[quad] = mix(both_moments[quad], halves, takes_part);
+        both_moments[own] = mix(both_moments[own], halves, takes_part);
     } else {
-        first_moments[quad] = mix(first_moments[quad], moments.first, takes_part);
-        second_moments[quad] = mix(second_moments[quad], moments.second, takes_part);
+        first_moments[own] = mix(first_moments[own], moments.first, takes_part);
+        second_moments[own] = mix(second_moments[own], moments.second, takes_part);
     }
 }

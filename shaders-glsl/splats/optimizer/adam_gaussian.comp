@@ -27,13 +27,13 @@ layout(push_constant) uniform Params {
 
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 1) const uint FEATURE_COUNT = 0;
-layout(constant_id = 15) const uint FROZEN_COLUMNS = 0;  // from the first: not updated, nor their moments read
 const bool HALF_REST = false;
+#include "trained.glsl"
 
 layout(binding = 0)           buffer Parameters    { float parameters[]; };      // planes
-layout(binding = 1) readonly  buffer Gradients     { float gradients[]; };       // planes
-layout(binding = 2)           buffer FirstMoments  { float first_moments[]; };   // planes
-layout(binding = 3)           buffer SecondMoments { float second_moments[]; };  // planes
+layout(binding = 1) readonly  buffer Gradients     { float gradients[]; };       // trained planes
+layout(binding = 2)           buffer FirstMoments  { float first_moments[]; };   // as many
+layout(binding = 3)           buffer SecondMoments { float second_moments[]; };  // as many
 layout(binding = 4) readonly  buffer Status        { uint status[]; };
 layout(binding = 5) readonly  buffer Cameras       { Camera cameras[]; };
 
@@ -46,8 +46,8 @@ void update(uvec4 at, uint count, vec4 gradient, vec4 rate, bool is_log_scale) {
     [[unroll]] for (uint k = 0; k < 4; k++) {
         uint own = k < count ? at[k] : at[0];
         value[k] = parameters[own];
-        first[k] = first_moments[own];
-        second[k] = second_moments[own];
+        first[k] = first_moments[trained_place(own)];
+        second[k] = second_moments[trained_place(own)];
     }
     Moments moments = updated(Moments(first, second), clamp_gradient(gradient));
     value -= adam_step(moments, rate, second_correction);
@@ -55,8 +55,8 @@ void update(uvec4 at, uint count, vec4 gradient, vec4 rate, bool is_log_scale) {
     [[unroll]] for (uint k = 0; k < 4; k++) {
         if (k >= count) continue;
         parameters[at[k]] = value[k];
-        first_moments[at[k]] = moments.first[k];
-        second_moments[at[k]] = moments.second[k];
+        first_moments[trained_place(at[k])] = moments.first[k];
+        second_moments[trained_place(at[k])] = moments.second[k];
     }
 }
 
@@ -65,7 +65,7 @@ void update_plane(uint i, uint plane, uint column, uint width, uint first) {
     uint at = column * gaussian_count + width * i + first;
     uint count = min(width - first, 4);
     vec4 gradient = vec4(0.0);
-    [[unroll]] for (uint k = 0; k < 4; k++) if (k < count) gradient[k] = gradients[at + k];
+    [[unroll]] for (uint k = 0; k < 4; k++) if (k < count) gradient[k] = gradients[trained_place(at + k)];
     update(at + uvec4(0, 1, 2, 3), count, gradient, vec4(rates[plane]), column == LOG_SCALES_COLUMN);
 }
 
@@ -78,7 +78,7 @@ void main() {
     vec3 offset = offset_from_camera(mean, camera.view_from_world);
     [[unroll]] for (uint plane = 0; plane < PLANE_COUNT - 1; plane++) {
         uint column = plane_column(plane, FEATURE_COUNT, 0);
-        if (column < FROZEN_COLUMNS) continue;
+        if (!is_trained(column)) continue;
         uint width = plane + 2 == PLANE_COUNT ? FEATURE_COUNT : plane_column(plane + 1, FEATURE_COUNT, 0) - column;
         [[unroll]] for (uint first = 0; first < width; first += 4) update_plane(i, plane, column, width, first);
     }
@@ -87,7 +87,9 @@ void main() {
     float unused_scale, unused_distance, basis[16];
     sh_basis(sh_degree, direction_of(offset, unused_scale, unused_distance), basis);
     vec3 d_color;
-    for (uint c = 0; c < 3; c++) d_color[c] = gradients[rest_word(REST_COLUMN, rest_width(), gaussian_count, i, c)];
+    for (uint c = 0; c < 3; c++) {
+        d_color[c] = gradients[trained_place(rest_word(REST_COLUMN, rest_width(), gaussian_count, i, c))];
+    }
     [[unroll]] for (uint first = 0; first < 3 * (MAX_COEFFICIENTS - 1); first += 4) {
         if (first >= rest_width()) break;
         uvec4 at;

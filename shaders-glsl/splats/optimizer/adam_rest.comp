@@ -16,7 +16,7 @@ layout(local_size_x = 256) in;
 
 layout(push_constant) uniform Params {
     uint  gaussian_count;
-    uint  first_column;       // columns before the coefficients, in parameters, gradients and moments
+    uint  first_column;       // columns before the coefficients
     uint  coefficient_count;  // of each Gaussian
     float rate;               // learning rate / (1 - b1^t)
     float second_correction;  // 1 / sqrt(1 - b2^t)
@@ -24,12 +24,13 @@ layout(push_constant) uniform Params {
 };
 
 layout(constant_id = 0) const bool HALF_MOMENTS = false;
+#include "trained.glsl"
 
 layout(binding = 0)           buffer Parameters    { uint parameters[]; };       // planes, halves after first_column
-layout(binding = 1) readonly  buffer Gradients     { float gradients[]; };       // planes
-layout(binding = 2)           buffer FirstMoments  { float first_moments[]; };   // planes; none with half moments
+layout(binding = 1) readonly  buffer Gradients     { float gradients[]; };       // trained planes
+layout(binding = 2)           buffer FirstMoments  { float first_moments[]; };   // as many; none with half moments
 layout(binding = 3)           buffer SecondMoments { float second_moments[]; };  // as many
-layout(binding = 4)           buffer BothMoments   { uint both_moments[]; };     // planes; only with half moments
+layout(binding = 4)           buffer BothMoments   { uint both_moments[]; };     // as many; only with half moments
 layout(binding = 5) readonly  buffer Status        { uint status[]; };
 
 // The two halves of a word, or zero beyond a Gaussian's.
@@ -43,7 +44,7 @@ void main() {
     uint i = REST_BY_COLUMN ? THREAD_INDEX % gaussian_count : THREAD_INDEX / quads;
     uint first = 4 * (REST_BY_COLUMN ? THREAD_INDEX / gaussian_count : THREAD_INDEX % quads);
     uint count = min(coefficient_count - first, 4);
-    uint at = rest_word(first_column, coefficient_count, gaussian_count, i, first);
+    uint at = trained_place(rest_word(first_column, coefficient_count, gaussian_count, i, first));
     uint word = rest_word(first_column, words_of(coefficient_count), gaussian_count, i, first / 2);
     uint next = REST_BY_COLUMN ? gaussian_count : 1;  // from a word of a Gaussian to the next
 

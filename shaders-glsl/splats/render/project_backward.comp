@@ -33,9 +33,7 @@ layout(push_constant, scalar) uniform Params {
 layout(constant_id = 0) const uint SH_DEGREE = 3;  // stored
 layout(constant_id = 5) const bool RAW_COLORS = false;
 layout(constant_id = 6) const bool HALF_REST = false;  // SH above degree 0 in the format of include/half.glsl
-// Columns of the parameters, from the first, that are not trained: their gradients are not written, and neither are the
-// statistics of density control.
-layout(constant_id = 15) const uint FROZEN_COLUMNS = 0;
+#include "trained.glsl"
 // Of the gradients of SH above degree 0, only that of the colour is written, as `adam_gaussian` reads it; it requires
 // REST_BY_COLUMN.
 layout(constant_id = 13) const bool COLOR_GRADIENTS = false;
@@ -50,7 +48,7 @@ layout(binding = 3) readonly  buffer TileCounts { uint tile_counts[]; };
 layout(binding = 4) readonly  buffer IntersectionRanges    { uvec2 intersection_ranges[]; };
 layout(binding = 5) readonly  buffer GradientRecords    { vec4 gradient_records[]; };      // (slots, RECORD_VECTORS)
 layout(binding = 6)           buffer Status     { uint status[]; };
-layout(binding = 7) writeonly buffer Gradients  { float gradients[]; };   // (columns x gaussian_count)
+layout(binding = 7) writeonly buffer Gradients  { float gradients[]; };   // trained planes
 layout(binding = 8) buffer GradNormSums { float grad_norm_sums[]; };
 layout(binding = 9) buffer VisitCounts  { uint visit_counts[]; };
 layout(binding = 10) readonly buffer Cameras { Camera cameras[]; };
@@ -64,16 +62,16 @@ const uint FEATURE_COUNT = CHANNELS - 3;
 #include "lamp_law.glsl"
 
 #define STORE_VEC3(column, i, v) { \
-    uint at = (column) * gaussian_count + 3 * (i); \
+    uint at = trained_place((column) * gaussian_count + 3 * (i)); \
     gradients[at] = (v).x; gradients[at + 1] = (v).y; gradients[at + 2] = (v).z; }
 #define STORE_VEC4(column, i, v) { \
-    uint at = (column) * gaussian_count + 4 * (i); \
+    uint at = trained_place((column) * gaussian_count + 4 * (i)); \
     gradients[at] = (v).x; gradients[at + 1] = (v).y; gradients[at + 2] = (v).z; gradients[at + 3] = (v).w; }
 
 // The place of the gradient of an SH coefficient above degree 0.
-uint rest_gradient(uint i, uint k) { return rest_word(REST_COLUMN, rest_width(), gaussian_count, i, k); }
-
-bool is_trained(uint column) { return column >= FROZEN_COLUMNS; }
+uint rest_gradient(uint i, uint k) {
+    return trained_place(rest_word(REST_COLUMN, rest_width(), gaussian_count, i, k));
+}
 
 // Those that are written, of each Gaussian.
 uint written_rest() { return COLOR_GRADIENTS ? min(rest_width(), 3) : rest_width(); }
@@ -120,9 +118,9 @@ void store_zero(uint i) {
     if (is_trained(MEANS_COLUMN)) STORE_VEC3(MEANS_COLUMN, i, vec3(0.0));
     if (is_trained(QUATS_COLUMN)) STORE_VEC4(QUATS_COLUMN, i, vec4(0.0));
     if (is_trained(LOG_SCALES_COLUMN)) STORE_VEC3(LOG_SCALES_COLUMN, i, vec3(0.0));
-    if (is_trained(RAW_OPACITIES_COLUMN)) gradients[RAW_OPACITIES_COLUMN * gaussian_count + i] = 0.0;
+    if (is_trained(RAW_OPACITIES_COLUMN)) gradients[trained_place(RAW_OPACITIES_COLUMN * gaussian_count + i)] = 0.0;
     if (is_trained(DC_COLUMN)) STORE_VEC3(DC_COLUMN, i, vec3(0.0));
-    uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
+    uint features = trained_place(FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i);
     for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = 0.0;
     for (uint k = 0; k < written_rest(); k++) gradients[rest_gradient(i, k)] = 0.0;
 }
@@ -152,7 +150,7 @@ void main() {
         if (RAW_COLORS) passes = true;
         d_color[c] = passes ? record[RECORD_HEAD + c] : 0.0;
     }
-    uint features = FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i;
+    uint features = trained_place(FEATURES_COLUMN * gaussian_count + FEATURE_COUNT * i);
     [[unroll]] for (uint k = 0; k < FEATURE_COUNT; k++) gradients[features + k] = record[RECORD_HEAD + 3 + k];
 
     // The forward pass again.
@@ -211,7 +209,7 @@ void main() {
     uint raw_opacity = RAW_OPACITIES_COLUMN * gaussian_count + i;
     // Of an opaque Gaussian 1 - opacity is rounding; its complement is not.
     float d_raw_opacity = d_opacity * splat.opacity * sigmoid(-parameters[raw_opacity]);
-    if (is_trained(RAW_OPACITIES_COLUMN)) gradients[raw_opacity] = d_raw_opacity;
+    if (is_trained(RAW_OPACITIES_COLUMN)) gradients[trained_place(raw_opacity)] = d_raw_opacity;
 
     // No basis function is beyond 8.
     uint bits = largest_bits(8.0 * d_color);
@@ -226,6 +224,7 @@ void main() {
         if ((flags & ~STATUS_GRADIENT) == 0) atomicOr(status[0], STATUS_GRADIENT);
         return;
     }
+    // For density control, which leaves Gaussians with frozen attributes as they are.
     if (flags == 0 && FROZEN_COLUMNS == 0) {
         float nearness = min(1.0, camera_depth(mean_in_view, camera) / damping_depth);
         float damping = damping_weight * nearness * nearness + 1.0 - damping_weight;

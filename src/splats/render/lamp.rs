@@ -42,12 +42,13 @@ impl DeviceLamp {
         gpu: &Gpu,
         settings: &RenderSettings,
         tile: Tile,
+        frozen_columns: u32,
         lamp: &Lamp,
     ) -> Result<Self> {
         lamp.check()?;
         let backward = match settings.purpose {
             Purpose::Show => None,
-            Purpose::Train => Some(LampBackward::new(gpu, settings, tile)?),
+            Purpose::Train => Some(LampBackward::new(gpu, settings, tile, frozen_columns)?),
         };
         Ok(Self {
             numbers: gpu.buffer("lamp", &lamp.numbers())?,
@@ -72,13 +73,14 @@ pub(super) fn bound<'a>(
 }
 
 impl LampBackward {
-    fn new(gpu: &Gpu, settings: &RenderSettings, tile: Tile) -> Result<Self> {
+    fn new(gpu: &Gpu, settings: &RenderSettings, tile: Tile, frozen_columns: u32) -> Result<Self> {
         let [tile_width, tile_height] = tile.size;
         let constants = lamp_backward::Constants {
             alpha_max: settings.max_alpha,
             channels: settings.channels() as u32,
             tile_width,
             tile_height,
+            frozen_columns,
             ..lamp_backward::Constants::default()
         };
         Ok(Self {
@@ -141,11 +143,11 @@ impl Renderer {
         gradients: &Buffer<f32>,
     ) -> Result<()> {
         let (first, channels) = (self.context_count(), self.settings.channels());
-        let Self { gpu, frame, lamp, .. } = self;
+        let Self { gpu, frame, lamp, frozen_columns, .. } = self;
         let Some(DeviceLamp { numbers, gradients: to, backward: Some(own), .. }) = lamp else {
             return Ok(());
         };
-        let batches = layout.batches(gpu);
+        let batches = layout.batches(gpu).without(*frozen_columns);
         let chunk_count = own.chunks(batches);
         let mut first_chunk = 0;
         for batch in batches.iter() {

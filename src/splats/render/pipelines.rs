@@ -62,6 +62,8 @@ impl Renderer {
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
         let pinhole = (CameraModel::Pinhole.number(), false);
+        let lamp = settings.lamp;
+        let lamp = lamp.map(|lamp| DeviceLamp::new(gpu, &settings, tile, frozen_columns, &lamp));
         let written = (gradients, frozen_columns);
         let projections = Projections::new(gpu, &settings, tile.size, pinhole, written)?;
         let shaping_channels = settings.shaping_channels();
@@ -109,10 +111,7 @@ impl Renderer {
             limits: gpu.uninit("limits", 1)?,
             host_targets: None,
             context: None,
-            lamp: settings
-                .lamp
-                .map(|lamp| DeviceLamp::new(gpu, &settings, tile, &lamp))
-                .transpose()?,
+            lamp: lamp.transpose()?,
         })
     }
 
@@ -143,7 +142,9 @@ impl Renderer {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn set_lamp(&mut self, lamp: Option<Lamp>) -> Result<()> {
         let settings = RenderSettings { lamp, ..self.settings };
-        let own = lamp.map(|lamp| DeviceLamp::new(&self.gpu, &settings, self.tile, &lamp));
+        let (tile, frozen_columns) = (self.tile, self.frozen_columns);
+        let new = |lamp| DeviceLamp::new(&self.gpu, &settings, tile, frozen_columns, &lamp);
+        let own = lamp.map(new);
         let own = own.transpose()?;
         if lamp.is_some() != self.settings.lamp.is_some() {
             self.projections = self.built_with(&settings)?;
