@@ -49,9 +49,10 @@ use crate::gpu::CheckReport;
 use crate::gpu::{Gpu, PassTime, Recorder};
 use crate::loss::Term;
 use crate::photographs::dataset::{Dataset, Fingerprint};
+use crate::photographs::tone::SceneLaw;
 use crate::splats::optimizer::{Adam, FiniteCheck, GaussianStep, LearningRates};
 use crate::splats::render::{Damping, Gradients, RenderOptions, Renderer};
-use crate::splats::scene::{ATTRIBUTES, Gaussians};
+use crate::splats::scene::{ATTRIBUTES, Facts, Gaussians};
 use crate::splats::smoothing::SmoothingFloor;
 use crate::{Error, Result, splats};
 
@@ -155,6 +156,8 @@ pub struct Trainer {
     frame: TrainingFrame,
     /// The scene's extent, in units of the frame.
     extent: f64,
+    /// The curve from the photographs to the model's colours, where it can be stated.
+    law: Option<SceneLaw>,
     /// Steps done.
     step: u64,
     supervision: Supervision,
@@ -233,7 +236,8 @@ impl Trainer {
 
     /// Gaussians in [`Trainer::frame`] with what a renderer must know of them in the dataset's world.
     pub(crate) fn model_of(&self, in_frame: &Gaussians) -> splats::model::Model {
-        splats::model::Model::of(in_frame.to_world(&self.frame), &self.config.facts(&self.frame))
+        let facts = Facts { law: self.law, ..self.config.facts(&self.frame) };
+        splats::model::Model::of(in_frame.to_world(&self.frame), &facts)
     }
 
     /// The Gaussians in [`Trainer::frame`], bit for bit as trained.

@@ -52,9 +52,6 @@ pub struct ExportArgs {
     /// stops that the file states. For ply and glb, whose numbers are floats
     #[arg(long)]
     pub linear: bool,
-    /// State the photographs' tone law in the file, for engines that draw their light. For ply, spz and sog
-    #[arg(long, conflicts_with = "linear")]
-    pub law: bool,
     /// Version of SPZ; more programs read 3
     #[arg(long, value_name = "3|4", default_value_t = 4, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub spz: u8,
@@ -70,7 +67,7 @@ pub struct ExportArgs {
     /// For html: number of views to start from, with photographs
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub views: usize,
-    /// For html, --linear and --law: dataset, if it moved since training [default: the run's]
+    /// For html and --linear: dataset, if it moved since training [default: the run's]
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the run's]
@@ -136,7 +133,6 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     check_ending(args)?;
     check_levels(args)?;
     check_linear(args)?;
-    check_law(args)?;
     let joined = if is_model(&args.run) { None } else { Manifest::of_scene(&args.run)? };
     if let (To::StreamedSog, Some(manifest)) = (args.to, &joined) {
         return Ok(tiles::write(args, manifest)?);
@@ -144,10 +140,6 @@ pub(super) fn write(args: &ExportArgs) -> Result<(PathBuf, String)> {
     let (gaussians, facts, config) = opened(args)?;
     let (gaussians, facts) =
         if args.linear { linear(args, &config, gaussians, facts)? } else { (gaussians, facts) };
-    let facts = match args.law {
-        true => Facts { law: Some(scene_light(args, &config)?.law()?), ..facts },
-        false => facts,
-    };
     let own = own_file(args);
     let out = args.out.as_ref().unwrap_or(&own);
     if args.to == To::Ply && is_same_file(out, &own) {
@@ -254,24 +246,6 @@ fn check_linear(args: &ExportArgs) -> crate::Result<()> {
             )
         }
         To::Ply | To::Glb => return Ok(()),
-    };
-    Err(Error::Usage(problem))
-}
-
-/// Refuses the law for formats that the library does not draw, and for model files, whose tone curve is unknown.
-fn check_law(args: &ExportArgs) -> crate::Result<()> {
-    let problem = match args.to {
-        _ if !args.law => return Ok(()),
-        To::Glb | To::StreamedSog | To::Html => {
-            "--law is for engines that draw with this library; export to ply, spz or sog".to_owned()
-        }
-        _ if is_model(&args.run) => {
-            let run = args.run.display();
-            format!(
-                "--law states the tone curve of a run, and {run} is a model file; pass the run directory"
-            )
-        }
-        To::Ply | To::Spz | To::Sog => return Ok(()),
     };
     Err(Error::Usage(problem))
 }

@@ -358,6 +358,7 @@ impl Editor {
             let problem = "renders with other colours, alpha limit or antialiasing than the model; train both alike";
             return refused(problem.to_owned());
         }
+        self.facts.law = self.facts.law.filter(|law| facts.law == Some(*law));
         let mut own = self.content.whole()?.into_owned();
         if other.shape.features != own.shape.features {
             tracing::warn!("{}: has other features; those of both are dropped", file.display());

@@ -32,8 +32,9 @@ impl Model {
 /// if the near plane is missing.
 pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
     if path.is_dir() {
-        let config = run::load_config(path)?;
-        return Ok((run::load_gaussians(path)?, config.facts(&config.frame.unwrap_or_default())));
+        let gaussians = run::load_gaussians(path)?;
+        let file = PartFile::open(&path.join("model.ply"), 1)?;
+        return Ok((gaussians, facts_of_run(path, file.as_ref())?));
     }
     let bytes = input::bytes(path)?;
     let parsed = match FileKind::of(&bytes) {
@@ -53,9 +54,9 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
 /// Those of [`Model::load`], except for the numbers of the Gaussians.
 pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, Facts)>> {
     if path.is_dir() {
-        let config = run::load_config(path)?;
         let file = PartFile::open(&path.join("model.ply"), part)?;
-        return Ok(file.map(|file| (file, config.facts(&config.frame.unwrap_or_default()))));
+        let facts = facts_of_run(path, file.as_ref())?;
+        return Ok(file.map(|file| (file, facts)));
     }
     let file = PartFile::open(path, part)?;
     Ok(file.map(|file| {
@@ -63,6 +64,13 @@ pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, F
         warn_of(path, &facts);
         (file, facts)
     }))
+}
+
+/// The facts of a run's configuration, and the law that its model states; that of joined blocks states none.
+fn facts_of_run(run: &Path, model: Option<&PartFile>) -> Result<Facts> {
+    let config = run::load_config(run)?;
+    let law = model.and_then(|model| model.facts().law);
+    Ok(Facts { law, ..config.facts(&config.frame.unwrap_or_default()) })
 }
 
 fn warn_of(path: &Path, facts: &Facts) {

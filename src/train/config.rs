@@ -88,7 +88,8 @@ pub struct TrainConfig {
     /// in use from the first step.
     init: Option<PathBuf> = None, "the dataset's points" => Rule::PATH, "--init MODEL.ply";
     /// Leave these attributes of the initial model as they are: with means,quats,scales,opacities, only its colours
-    /// learn, without density control, and leading attributes cost no pass. For night colours on geometry from day.
+    /// learn, without density control, and leading attributes cost neither memory nor passes. For night colours on
+    /// geometry from day.
     freeze: Option<Freeze> = None, "nothing" => FREEZE, "--freeze PLANES";
     /// Masks (masks/NAME.png or masks/NAME.jpg.png) hide white instead of black.
     invert_masks: bool = false => Rule::Flag, "--invert-masks";

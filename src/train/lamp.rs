@@ -109,11 +109,16 @@ impl Trainer {
 }
 
 /// The lamp of the first step, in the training frame: that of the configuration at the median distance of what the
-/// views show, with the tone law of the dataset. The unit of light is that on the median of the points.
+/// views show, with the tone law of the photographs. The unit of light is that on the median of the points.
 ///
 /// # Errors
-/// A photograph can no longer be read, or the device is out of memory or lost.
-pub(super) fn start(pseudo_gt: &PseudoGt, dataset: &Dataset, config: &TrainConfig) -> Result<Lamp> {
+/// The device is out of memory or lost.
+pub(super) fn start(
+    pseudo_gt: &PseudoGt,
+    light: &SceneLight,
+    dataset: &Dataset,
+    config: &TrainConfig,
+) -> Result<Lamp> {
     let views = dataset.train_views().count();
     if views < FEWEST_VIEWS {
         tracing::warn!(
@@ -138,8 +143,7 @@ pub(super) fn start(pseudo_gt: &PseudoGt, dataset: &Dataset, config: &TrainConfi
     }
     let all = distances.into_iter().flatten().collect();
     let reference_distance = median(all).unwrap_or_else(|| config.extent_of(dataset));
-    let Encoding { black, slope, reach } =
-        SceneLight::of(&config.tone, dataset)?.encoding(pseudo_gt)?;
+    let Encoding { black, slope, reach } = light.encoding(pseudo_gt)?;
     let lamp = Lamp {
         ambient: config.lamp.ambient,
         exponent: config.lamp.exponent,

@@ -2,7 +2,6 @@
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::path::Path;
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -49,43 +48,19 @@ pub(super) fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &Vi
     views.filter(|(_, view)| view.is_train() && view.has_photograph())
 }
 
-/// The scene's tone, and the tone mapping of each training photograph: measured, or read from the recorded law.
+/// The scene's tone: of these training photographs, or that of the recorded law.
 ///
 /// # Errors
-/// Every photograph is black and their exposure is needed, a photograph can no longer be read, or the law cannot be
-/// used.
-pub(super) fn tone_mapped(
+/// Every photograph is black and their exposure is needed, or the law cannot be used.
+pub(super) fn scene_of(
     settings: &ToneSettings,
     dataset: &Dataset,
-) -> Result<(SceneTone, Vec<ToneMapping>)> {
-    let Some(path) = &settings.law else {
-        let (scene, measured) = measured(settings, dataset)?;
-        let mappings = measured.iter().map(|own| settings.tone_mapping(&scene, own)).collect();
-        return Ok((scene, mappings));
-    };
-    let scene = recorded(path, settings)?;
-    let mapping = |(_, view): (usize, &View)| scene.recorded_mapping(&view.name).transpose();
-    let mappings = photographs(dataset).filter_map(mapping).collect::<Result<_>>()?;
-    Ok((scene, mappings))
-}
-
-/// The scene's tone alone, measured or recorded.
-///
-/// # Errors
-/// Those of [`tone_mapped`].
-pub(super) fn scene_of(settings: &ToneSettings, dataset: &Dataset) -> Result<SceneTone> {
+    training: &[MeasuredPhotograph],
+) -> Result<SceneTone> {
     match &settings.law {
-        Some(path) => recorded(path, settings),
-        None => Ok(measured(settings, dataset)?.0),
+        Some(path) => Ok(SceneTone::recorded(ToneLaw::load(path)?.check(path, settings)?)),
+        None => settings.scene(training).ok_or_else(|| all_black(&dataset.root)),
     }
-}
-
-/// The scene of a recorded law.
-///
-/// # Errors
-/// The law cannot be read, or was measured for another curve.
-pub(super) fn recorded(path: &Path, settings: &ToneSettings) -> Result<SceneTone> {
-    Ok(SceneTone::recorded(ToneLaw::load(path)?.check(path, settings)?))
 }
 
 /// The tone mapping of a photograph of the scene: as recorded, or measured.
@@ -110,31 +85,32 @@ pub(super) fn tone_mapping_of(
 /// # Errors
 /// Every photograph is black and their exposure is needed, or a photograph can no longer be read.
 pub(crate) fn law_of(settings: &ToneSettings, dataset: &Dataset) -> Result<ToneLaw> {
-    let (scene, measured) = measured(settings, dataset)?;
+    let tone = ToneSettings { law: None, ..settings.clone() };
+    let training = measured(&tone, dataset)?;
+    let scene = scene_of(&tone, dataset, &training)?;
     let mut mappings = BTreeMap::new();
-    for ((_, view), own) in photographs(dataset).zip(&measured) {
-        mappings.insert(view.name.clone(), settings.tone_mapping(&scene, own));
+    for ((_, view), own) in photographs(dataset).zip(&training) {
+        mappings.insert(view.name.clone(), tone.tone_mapping(&scene, own));
     }
     let gains: Vec<f64> = mappings.values().filter_map(|own: &ToneMapping| own.gain).collect();
-    let is_exposed = scene.exposure.is_some() && settings.profile.is_none();
+    let is_exposed = scene.exposure.is_some() && tone.profile.is_none();
     let model_gain = is_exposed.then(|| geometric_mean(gains.into_iter()));
     for view in dataset.views.iter().filter(|view| !view.is_train() && view.has_photograph()) {
-        if let Some(own) = measured_of(view, settings.full_resolution)? {
-            mappings.insert(view.name.clone(), settings.tone_mapping(&scene, &own));
+        if let Some(own) = measured_of(view, tone.full_resolution)? {
+            mappings.insert(view.name.clone(), tone.tone_mapping(&scene, &own));
         }
     }
-    let tone = ToneSettings { law: None, ..settings.clone() };
     Ok(ToneLaw { tone, exposure: scene.exposure, model_gain, mappings })
 }
 
-/// Measures the training photographs, together and each.
+/// Measures each training photograph.
 ///
 /// # Errors
-/// Every photograph is black and their exposure is needed, or a photograph can no longer be read.
+/// A photograph can no longer be read.
 pub(super) fn measured(
     settings: &ToneSettings,
     dataset: &Dataset,
-) -> Result<(SceneTone, Vec<MeasuredPhotograph>)> {
+) -> Result<Vec<MeasuredPhotograph>> {
     let views: Vec<&View> = photographs(dataset).map(|(_, view)| view).collect();
     let pixels = |view: &&View| u64::from(view.camera.width) * u64::from(view.camera.height);
     let largest = views.iter().map(pixels).max().unwrap_or_default();
@@ -143,8 +119,7 @@ pub(super) fn measured(
         let of_views = views.par_iter().map(|view| measured_of(view, settings.full_resolution));
         measured.extend(of_views.collect::<Result<Vec<_>>>()?.into_iter().flatten());
     }
-    let scene = settings.scene(&measured).ok_or_else(|| all_black(&dataset.root))?;
-    Ok((scene, measured))
+    Ok(measured)
 }
 
 /// The measurements of a view, already known if its photograph was measured while it was decoded.

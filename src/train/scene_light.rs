@@ -1,6 +1,6 @@
 //! The light of a scene's photographs: the inverse of the curves that made the targets.
 
-use super::measuring::{measured, measured_of, recorded};
+use super::measuring::{measured, measured_of, photographs, scene_of};
 use crate::Result;
 use crate::camera::Camera;
 use crate::photographs::dataset::{Dataset, View};
@@ -8,7 +8,7 @@ use crate::photographs::image::{Image, linear_from_srgb};
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
     InverseTone, LuminanceHistogram, MeasuredPhotograph, SceneLaw, SceneTone, Statistics,
-    ToneSettings,
+    ToneMapping, ToneSettings,
 };
 use crate::splats::lamp::Lamp;
 
@@ -64,6 +64,7 @@ fn line(points: &[[f64; 2]]) -> (f64, f64) {
 pub struct SceneLight {
     settings: ToneSettings,
     scene: SceneTone,
+    training: Vec<MeasuredPhotograph>,
     /// All training photographs as one.
     together: MeasuredPhotograph,
 }
@@ -72,19 +73,34 @@ impl SceneLight {
     /// Measures the training photographs.
     ///
     /// # Errors
-    /// Every photograph is black and their exposure is needed, or one can no longer be read.
+    /// Every photograph is black and their exposure is needed, one can no longer be read, or the recorded law cannot be
+    /// used.
     pub fn of(settings: &ToneSettings, dataset: &Dataset) -> Result<Self> {
-        let (scene, training) = measured(settings, dataset)?;
+        let training = measured(settings, dataset)?;
+        let scene = scene_of(settings, dataset, &training)?;
         let mut luminance = LuminanceHistogram::default();
         training.iter().for_each(|one| luminance.add(&one.luminance));
-        let scene = match &settings.law {
-            Some(path) => recorded(path, settings)?,
-            None => scene,
-        };
         let statistics: Vec<Statistics> = training.iter().map(|one| one.statistics).collect();
         let statistics = Statistics::mean_of(&statistics).unwrap_or_default();
         let together = MeasuredPhotograph { statistics, luminance, camera: None };
-        Ok(Self { settings: settings.clone(), scene, together })
+        Ok(Self { settings: settings.clone(), scene, training, together })
+    }
+
+    /// The scene's tone.
+    pub(super) fn scene(&self) -> &SceneTone {
+        &self.scene
+    }
+
+    /// The tone mapping of each training photograph of the dataset.
+    ///
+    /// # Errors
+    /// The recorded law lacks a view.
+    pub(super) fn tone_mappings(&self, dataset: &Dataset) -> Result<Vec<ToneMapping>> {
+        let mapping = |((_, view), own): ((usize, &View), &MeasuredPhotograph)| {
+            let recorded = self.scene.recorded_mapping(&view.name)?;
+            Ok(recorded.unwrap_or_else(|| self.settings.tone_mapping(&self.scene, own)))
+        };
+        photographs(dataset).zip(&self.training).map(mapping).collect()
     }
 
     /// The inverse for a view: that of the curve of its photograph; of a view without one, [`SceneLight::at`] its

@@ -15,6 +15,7 @@ use super::masks::Masks;
 use super::measuring::TargetExposure;
 use super::model::Model;
 use super::passes::{Kernels, first_sh_degree};
+use super::scene_light::SceneLight;
 use super::submission::{MAX_STEPS, Submissions};
 use super::supervision::Supervision;
 use super::target_views::TargetViews;
@@ -130,8 +131,9 @@ impl Trainer {
         }
         let frame = config.frame.unwrap_or_default();
         let pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
-        let (views, scene, target_exposure) =
-            Views::upload(gpu, &pseudo_gt, dataset, &frame, &config)?;
+        let light = SceneLight::of(&config.tone, dataset)?;
+        let (views, target_exposure) = Views::upload(gpu, &pseudo_gt, &light, dataset, &config)?;
+        let scene = light.scene().clone();
         let sizes = views.sizes();
         let probes = probes(&pseudo_gt, dataset, &config, &scene, &sizes)?;
         let convergence = Convergence::new(&pseudo_gt, dataset, &config, &scene)?;
@@ -139,8 +141,8 @@ impl Trainer {
             tracing::info!("{}", scene.reason());
         }
         config.model.log_parts(&sizes);
-        let lamp =
-            config.model.lamp.then(|| lamp::start(&pseudo_gt, dataset, &config)).transpose()?;
+        let lamp = config.model.lamp.then(|| lamp::start(&pseudo_gt, &light, dataset, &config));
+        let lamp = lamp.transpose()?;
         let starts = views.exposures(&pseudo_gt, dataset, &scene, &config)?;
         let gaussians = match &initial.gaussians {
             Some(gaussians) => given(gaussians, &config)?,
@@ -207,6 +209,8 @@ impl Trainer {
             fingerprint,
             frame,
             extent: config.extent_of(dataset) * frame.scale,
+            // A curve without an inverse has no law.
+            law: light.law().ok(),
             step: 0,
             supervision,
             model: Model::upload(gpu, &gaussians, degree, precision, frozen_columns)?,

@@ -9,17 +9,17 @@ use glam::UVec2;
 use super::TrainConfig;
 use super::cache::{Cache, CacheSize, Slot};
 use super::epochs::Epochs;
-use super::measuring::{TargetExposure, photographs, tone_mapped};
+use super::measuring::{TargetExposure, photographs};
 use super::precision::Encoder;
+use super::scene_light::SceneLight;
 use crate::Result;
-use crate::camera::{Patch, TrainingFrame};
+use crate::camera::Patch;
 use crate::gpu::{Buffer, Download, Gpu, Recorder};
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
 use crate::photographs::dataset::Dataset;
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::SceneTone;
 use crate::splats::render::{Viewpoint, Viewpoints};
 use crate::splats::scene::COLOR_CHANNELS;
 
@@ -74,29 +74,29 @@ pub(super) struct Views {
 const SHORTEST_SIDE: u32 = 32;
 
 impl Views {
-    /// Measures every training photograph, and uploads it or its target for every level, and the photograph if a
-    /// network uses it. Only one photograph at a time is in memory at its own size.
+    /// Uploads every training photograph or its target for every level, and the photograph if a network uses it. Only
+    /// one photograph at a time is in memory at its own size.
     ///
     /// # Errors
-    /// Every photograph is black and their exposure is needed; a photograph can no longer be read; the device is out of
-    /// memory or lost.
+    /// The recorded law lacks a view; a photograph can no longer be read; the device is out of memory or lost.
     pub(super) fn upload(
         gpu: &Gpu,
         pseudo_gt: &PseudoGt,
+        light: &SceneLight,
         dataset: &Dataset,
-        frame: &TrainingFrame,
         config: &TrainConfig,
-    ) -> Result<(Self, SceneTone, Option<TargetExposure>)> {
+    ) -> Result<(Self, Option<TargetExposure>)> {
         let settings = pseudo_gt.settings().clone();
         let keeps_photographs = config.model.denoiser || config.model.tonemapper;
-        let (scene, mappings) = tone_mapped(&settings, dataset)?;
+        let frame = config.frame.unwrap_or_default();
         let mut encoder = Encoder::new(gpu, config.precision.photographs);
         let budget = CacheSize::on_device(config.cache, config.max_vram, gpu);
         let mut cache = Cache::new(gpu, budget, config.spool.clone());
         let mut views = vec![];
         views.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
         let (mut gains, mut curves) = (BTreeMap::new(), vec![]);
-        for (place, ((index, view), tone_mapping)) in photographs(dataset).zip(mappings).enumerate()
+        for (place, ((index, view), tone_mapping)) in
+            photographs(dataset).zip(light.tone_mappings(dataset)?).enumerate()
         {
             gains.extend(tone_mapping.gain.map(|gain| (view.name.clone(), gain)));
             curves.push(tone_mapping.parameters);
@@ -143,9 +143,10 @@ impl Views {
             curves: gpu.buffer("curves", &curves)?,
         };
         // A profile determines the brightness of its targets.
+        let scene = light.scene();
         let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
         let exposure = exposure.map(|own| TargetExposure::new(own, gains, scene.recorded_gain()));
-        Ok((views, scene, exposure))
+        Ok((views, exposure))
     }
 
     /// Makes the images of the next steps resident, for as many steps as fit but at least one; returns the last of

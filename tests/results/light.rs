@@ -92,7 +92,7 @@ fn a_model_in_linear_light_states_it_and_has_other_colours() {
 }
 
 #[test]
-fn an_exported_model_states_the_law_whose_inverse_is_the_linear_light() {
+fn a_trained_model_states_the_law_whose_inverse_is_the_linear_light() {
     let place = Place::new();
     succeed(&training(&place, "--steps 40"));
     let at = |name: &str| place.path(name).display().to_string();
@@ -104,18 +104,24 @@ fn an_exported_model_states_the_law_whose_inverse_is_the_linear_light() {
     let stops: f32 = stated.unwrap().parse().unwrap();
     for format in ["ply", "spz", "sog"] {
         let out = format!("law.{format}");
-        succeed(&export(&format!("--format {format} --law"), &out));
-        let law = Model::load(place.path(&out)).unwrap().law.unwrap();
-        assert!((law.stops() - stops).abs() < 1e-4, "{format}: {law:?}, {stops}");
+        succeed(&export(&format!("--format {format}"), &out));
     }
-    assert_eq!(Model::load(place.path("run")).unwrap().law, None);
-    refused(
-        &export("--format glb --law", "law.glb"),
-        2,
-        &["--law is for engines", "ply, spz or sog"],
-    );
-    let of_file = format!("export {} --law --format spz", at("law.ply"));
-    refused(&of_file, 2, &["is a model file", "pass the run directory"]);
+    for model in ["run/model.ply", "run", "law.ply", "law.spz", "law.sog"] {
+        let law = Model::load(place.path(model)).unwrap().law.expect(model);
+        assert!((law.stops() - stops).abs() < 1e-4, "{model}: {law:?}, {stops}");
+    }
+    assert_eq!(Model::load(place.path("linear.ply")).unwrap().law, None);
+    // Colours of another law are not made of these photographs.
+    let other = format!("--out {} --curve ase --steps 40", at("other"));
+    succeed(&format!("train {} --sh-degree 1 --plan none {other}", at("set")));
+    let merge = |file: &str, out: &str| {
+        let [run, file, out] = ["run", file, out].map(at);
+        format!("edit {run} --merge {file} --out {out}")
+    };
+    succeed(&merge("law.ply", "both.ply"));
+    succeed(&merge("other/model.ply", "mixed.ply"));
+    assert!(Model::load(place.path("both.ply")).unwrap().law.is_some());
+    assert_eq!(Model::load(place.path("mixed.ply")).unwrap().law, None);
 }
 
 #[test]

@@ -10,7 +10,7 @@ use super::{ToneCurve, ToneParameters};
 use crate::{Error, Result};
 
 /// The curve from the values of a scene's photographs to the colours of its model, at the exposure of all photographs
-/// together. A model file states it where it was exported with `--law`.
+/// together. The file of a trained model states it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SceneLaw {
     pub(crate) curve: ToneCurve,
@@ -29,7 +29,8 @@ impl SceneLaw {
     pub(crate) fn of(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {
         let stops = InverseTone::new(settings, parameters)?.stops_to_target() as f32;
         if settings.curve == ToneCurve::Table {
-            let problem = "a table of values is too long for a model to state; train with a named curve for --law";
+            let problem =
+                "a table of values is too long for a model to state; train with a named curve";
             return Err(Error::Usage(problem.to_owned()));
         }
         Ok(Self { curve: settings.curve, parameters: *parameters, stops })
@@ -121,6 +122,9 @@ mod tests {
         let parameters =
             ToneParameters { white: 1.0, gain: 1.0, weight: 1.0, ..Default::default() };
         let refused = SceneLaw::of(&settings, &parameters).unwrap_err().to_string();
-        assert!(refused.contains("a table of values") && refused.contains("--law"), "{refused}");
+        assert!(
+            refused.contains("a table of values") && refused.contains("named curve"),
+            "{refused}"
+        );
     }
 }

@@ -140,7 +140,7 @@ impl Target<'_> {
         }
         if self.is_photograph && law.is_none() {
             return refused(
-                "the model states no tone law, and its photographs are unknown; export it from its run with --law"
+                "the model states no tone law, and its photographs are unknown; train one with a named tone curve"
                     .to_owned(),
             );
         }

@@ -115,7 +115,7 @@ fn every_bad_render_is_refused_by_code_and_name_and_nothing_is_recorded() {
     refuse(
         &|own| own.flags = NSP_RENDER_PHOTOGRAPH,
         NSP_ERROR_USAGE,
-        &["states no tone law", "--law"],
+        &["states no tone law", "named tone curve"],
     );
     refuse(&|own| own.color = null(), NSP_ERROR_USAGE, &["no target"]);
     refuse(&|own| own.exposure = f32::INFINITY, NSP_ERROR_USAGE, &["exposure"]);
