@@ -45,11 +45,10 @@ vec4 rates_at(uvec4 i) {
 
 void main() {
     uint begin = FROZEN_COLUMNS * gaussian_count;
-    uint quad = begin / 4 + THREAD_INDEX;
+    uint own = THREAD_INDEX, quad = frozen_quads() + own;
     uint end = column_count * gaussian_count;
     if (4 * quad >= end || status[0] != 0) return;
     uvec4 i = 4 * quad + uvec4(0, 1, 2, 3);
-    uint own = trained_place(4 * quad) / 4;
     // The first and the last quad can extend into a column that is not updated. Unsigned: before `begin`, it wraps.
     bvec4 takes_part = lessThan(i - begin, uvec4(end - begin));
     vec4 gradient = clamp_gradient(gradients[own]);
