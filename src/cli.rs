@@ -257,16 +257,3 @@ mod tests {
         assert_eq!(quoted(""), "''");
     }
 }
-
-#[cfg(all(test, not(feature = "fit")))]
-mod without_fit {
-    use super::*;
-
-    #[test]
-    fn fit_names_its_missing_feature() {
-        let cli =
-            Cli::read(["nightsplat", "tone", "fit", "pairs"].map(Into::into).to_vec()).unwrap();
-        let message = cli.run().unwrap_err().to_string();
-        assert!(message.contains("feature `fit`"), "{message}");
-    }
-}

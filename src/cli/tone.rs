@@ -51,3 +51,16 @@ pub fn run(args: &ToneArgs) -> Result<()> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_build_without_fit_names_the_feature() {
+        // What such a build makes of `tone fit`.
+        let command = Command::Other(vec!["fit".into()]);
+        let problem = run(&ToneArgs { command }).unwrap_err().to_string();
+        assert!(problem.contains("feature `fit`"), "{problem}");
+    }
+}

@@ -9,10 +9,11 @@ use super::architecture::files;
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
 /// The limits of documents, in bytes.
-const MAX_BYTES: [(&str, usize); 4] = [
+const MAX_BYTES: [(&str, usize); 5] = [
     ("README.md", 8 << 10),
     ("docs/guide.md", 30 << 10),
     ("docs/benchmarks.md", 20 << 10),
+    ("docs/parts.md", 12 << 10),
     ("docs/embedding.md", 12 << 10),
 ];
 
