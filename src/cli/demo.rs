@@ -20,13 +20,16 @@ pub struct DemoArgs {
     /// Folder to write to: new, empty or with an earlier demo
     #[arg(long, value_name = "DIR", default_value = "demo")]
     pub out: PathBuf,
+    /// Steps of each curve; fewer give a coarser picture sooner
+    #[arg(long, value_name = "N", default_value_t = 500, value_parser = clap::value_parser!(u64).range(1..))]
+    pub steps: u64,
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the best]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
 }
 
-/// The default curve and others, including the paper's, with enough steps for a clear picture.
-const SWEEP: [&str; 6] = ["--curves", "auto,ase,ap3,linear", "--steps", "500", "--sh-degree", "1"];
+/// The default curve and others, including the paper's.
+const SWEEP: [&str; 4] = ["--curves", "auto,ase,ap3,linear", "--sh-degree", "1"];
 /// The size of the photographs.
 const SIZE: [u32; 2] = [384, 288];
 /// The run whose model is exported.
@@ -52,7 +55,9 @@ pub fn run(args: &DemoArgs) -> Result<()> {
         std::iter::once(OsString::from(name)).chain(paths).chain(options).collect::<Vec<_>>()
     };
     let paths = [set.as_path(), Path::new("--out"), &args.out];
-    let sweep: SweepArgs = parsed("demo", command("sweep", &paths, &SWEEP))?;
+    let steps = ["--steps", &args.steps.to_string()];
+    let sweep: SweepArgs =
+        parsed("demo", command("sweep", &paths, &[&SWEEP[..], &steps].concat()))?;
     let intro = format!(
         "Trained on photographs that were exposed {} times too short, with shot and read noise, at 8 bits. Each \
          tone curve maps the photographs to the targets of training. The reference images in normal light are used \
