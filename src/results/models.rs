@@ -10,6 +10,7 @@ use crate::results::run;
 use crate::splats::model::{FileKind, Model};
 use crate::splats::scene::ply::parts::PartFile;
 use crate::splats::scene::{Facts, Gaussians, ply};
+use crate::train::TrainConfig;
 
 impl Model {
     /// Reads a model: a PLY in the INRIA layout, of any trainer, SPZ, SOG, or a run directory. A file is recognised by
@@ -32,9 +33,10 @@ impl Model {
 /// if the near plane is missing.
 pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
     if path.is_dir() {
+        let config = run::load_config(path)?;
         let gaussians = run::load_gaussians(path)?;
         let file = PartFile::open(&path.join("model.ply"), 1)?;
-        return Ok((gaussians, facts_of_run(path, file.as_ref())?));
+        return Ok((gaussians, facts_of_run(&config, file.as_ref())));
     }
     let bytes = input::bytes(path)?;
     let parsed = match FileKind::of(&bytes) {
@@ -54,8 +56,9 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
 /// Those of [`Model::load`], except for the numbers of the Gaussians.
 pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, Facts)>> {
     if path.is_dir() {
+        let config = run::load_config(path)?;
         let file = PartFile::open(&path.join("model.ply"), part)?;
-        let facts = facts_of_run(path, file.as_ref())?;
+        let facts = facts_of_run(&config, file.as_ref());
         return Ok(file.map(|file| (file, facts)));
     }
     let file = PartFile::open(path, part)?;
@@ -67,10 +70,9 @@ pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, F
 }
 
 /// The facts of a run's configuration, and the law that its model states; that of joined blocks states none.
-fn facts_of_run(run: &Path, model: Option<&PartFile>) -> Result<Facts> {
-    let config = run::load_config(run)?;
+fn facts_of_run(config: &TrainConfig, model: Option<&PartFile>) -> Facts {
     let law = model.and_then(|model| model.facts().law);
-    Ok(Facts { law, ..config.facts(&config.frame.unwrap_or_default()) })
+    Facts { law, ..config.facts(&config.frame.unwrap_or_default()) }
 }
 
 fn warn_of(path: &Path, facts: &Facts) {

@@ -159,7 +159,7 @@ fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_de
             None => model.save(&path).unwrap(),
         }
         let back = Model::load(&path).unwrap();
-        let facts = |model: &Model| (model.near, model.max_alpha, model.raw_colors);
+        let facts = |model: &Model| (model.near, model.max_alpha, model.raw_colors, model.law);
         assert_eq!(facts(&back), facts(&model), "{name}");
         assert_eq!(back.gaussians.count, model.gaussians.count, "{name}");
     }
@@ -172,10 +172,10 @@ fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_de
     assert_eq!(stated["near"].to_string(), model.near.to_string());
     assert_eq!(stated["raw_colors"], true);
 
-    // A run of a version whose files stated no facts uses its configuration.
+    // A run of a version whose files stated no facts uses its configuration, which has no law.
     let shown = Gaussians::open(&file).unwrap();
     without_facts(&file);
-    assert_eq!(Model::load(&own).unwrap(), model);
+    assert_eq!(Model::load(&own).unwrap(), Model { law: None, ..model });
     assert_eq!(Model::load(&file).unwrap(), Model::from(shown));
     let set = place.path("set");
     let silent = format!("eval {} --dataset {}", file.display(), set.display());
