@@ -107,7 +107,7 @@ impl View {
     /// The photograph at the size of the view's camera; `None` if the view has none.
     ///
     /// # Errors
-    /// [`Error::Input`] if it was not kept and its file can no longer be read.
+    /// [`Error::Input`](crate::Error::Input) if it was not kept and its file can no longer be read.
     pub fn loaded(&self) -> Result<Option<Cow<'_, Image>>> {
         self.kept_or_read(self.image.as_ref(), self.original.as_ref())
     }
@@ -142,7 +142,7 @@ impl View {
     /// The undistorted photograph at its original size; `None` if the view has none.
     ///
     /// # Errors
-    /// [`Error::Input`] if it was downscaled on loading and its file can no longer be read.
+    /// [`Error::Input`](crate::Error::Input) if it was downscaled on loading and its file can no longer be read.
     pub fn photograph(&self) -> Result<Option<Cow<'_, Image>>> {
         match &self.original {
             Some(original) => original.load().map(Cow::Owned).map(Some),
