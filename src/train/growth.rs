@@ -153,7 +153,7 @@ mod tests {
     use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
     use crate::photographs::pseudo_gt::PseudoGt;
     use crate::train::Preset;
-    use crate::train::measuring::{measured, scene_of};
+    use crate::train::measuring::scene_of;
     use crate::train::target_views::TargetViews;
 
     /// The most dB that a round may cost the training views.
@@ -165,8 +165,7 @@ mod tests {
         let dataset = Dataset::load(&config.dataset, &config.load_options()).unwrap();
         let frame = dataset.frame();
         let pseudo_gt = PseudoGt::new(&gpu, &config.tone).unwrap();
-        let scene =
-            scene_of(&config.tone, &dataset, &measured(&config.tone, &dataset).unwrap()).unwrap();
+        let scene = scene_of(pseudo_gt.settings(), &dataset).unwrap();
         let all = [usize::MAX; 2];
         let views = TargetViews::probes(&pseudo_gt, &dataset, &frame, &scene, all).unwrap();
         let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();

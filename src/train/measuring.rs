@@ -48,11 +48,20 @@ pub(super) fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &Vi
     views.filter(|(_, view)| view.is_train() && view.has_photograph())
 }
 
-/// The scene's tone: of these training photographs, or that of the recorded law.
+/// The scene's tone: that of the recorded law, or of the training photographs, which only then are measured.
+///
+/// # Errors
+/// Those of [`scene_of_measured`], or a photograph can no longer be read.
+pub(super) fn scene_of(settings: &ToneSettings, dataset: &Dataset) -> Result<SceneTone> {
+    let training = if settings.law.is_some() { vec![] } else { measured(settings, dataset)? };
+    scene_of_measured(settings, dataset, &training)
+}
+
+/// The scene's tone: that of the recorded law, or of these training photographs.
 ///
 /// # Errors
 /// Every photograph is black and their exposure is needed, or the law cannot be used.
-pub(super) fn scene_of(
+pub(super) fn scene_of_measured(
     settings: &ToneSettings,
     dataset: &Dataset,
     training: &[MeasuredPhotograph],
@@ -87,7 +96,7 @@ pub(super) fn tone_mapping_of(
 pub(crate) fn law_of(settings: &ToneSettings, dataset: &Dataset) -> Result<ToneLaw> {
     let tone = ToneSettings { law: None, ..settings.clone() };
     let training = measured(&tone, dataset)?;
-    let scene = scene_of(&tone, dataset, &training)?;
+    let scene = scene_of_measured(&tone, dataset, &training)?;
     let mut mappings = BTreeMap::new();
     for ((_, view), own) in photographs(dataset).zip(&training) {
         mappings.insert(view.name.clone(), tone.tone_mapping(&scene, own));

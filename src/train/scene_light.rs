@@ -1,6 +1,6 @@
 //! The light of a scene's photographs: the inverse of the curves that made the targets.
 
-use super::measuring::{measured, measured_of, photographs, scene_of};
+use super::measuring::{measured, measured_of, photographs, scene_of_measured};
 use crate::Result;
 use crate::camera::Camera;
 use crate::photographs::dataset::{Dataset, View};
@@ -77,7 +77,7 @@ impl SceneLight {
     /// used.
     pub fn of(settings: &ToneSettings, dataset: &Dataset) -> Result<Self> {
         let training = measured(settings, dataset)?;
-        let scene = scene_of(settings, dataset, &training)?;
+        let scene = scene_of_measured(settings, dataset, &training)?;
         let mut luminance = LuminanceHistogram::default();
         training.iter().for_each(|one| luminance.add(&one.luminance));
         let statistics: Vec<Statistics> = training.iter().map(|one| one.statistics).collect();

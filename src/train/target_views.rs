@@ -3,7 +3,7 @@
 use glam::{DVec2, UVec2};
 
 use super::Trainer;
-use super::measuring::{TargetExposure, measured, scene_of, tone_map_source, tone_mapping_of};
+use super::measuring::{TargetExposure, scene_of, tone_map_source, tone_mapping_of};
 use super::terms::NetworkTerms;
 use super::views::ImageKind;
 use crate::Result;
@@ -167,7 +167,7 @@ impl TestTargets {
     /// Every training photograph is black and their exposure is needed; a photograph can no longer be read; the device
     /// is out of memory or lost.
     pub fn new(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
-        let scene = scene_of(tone, dataset, &measured(tone, dataset)?)?;
+        let scene = scene_of(tone, dataset)?;
         Self::in_scene(gpu, tone, &scene)
     }
 

@@ -71,7 +71,7 @@ fn frozen_geometry_keeps_its_bits_and_colours_learn_on_any_device() {
     }
 }
 
-/// More Gaussians than a binding holds, of a number that is odd in each batch.
+/// More Gaussians than a binding holds, the last batch with an odd number.
 #[test]
 fn frozen_geometry_in_batches_gives_the_bits_of_one_batch_and_resumes() {
     let folder = tempfile::tempdir().unwrap();

@@ -144,8 +144,7 @@ impl Renderer {
         let settings = RenderSettings { lamp, ..self.settings };
         let (tile, frozen_columns) = (self.tile, self.frozen_columns);
         let new = |lamp| DeviceLamp::new(&self.gpu, &settings, tile, frozen_columns, &lamp);
-        let own = lamp.map(new);
-        let own = own.transpose()?;
+        let own = lamp.map(new).transpose()?;
         if lamp.is_some() != self.settings.lamp.is_some() {
             self.projections = self.built_with(&settings)?;
         }
