@@ -44,9 +44,6 @@ pub(crate) struct Ceiling {
 
 impl Ceiling {
     /// With as many vectors as the device is fast.
-    ///
-    /// # Errors
-    /// The device is out of memory, or refuses the kernel.
     pub(crate) fn large(gpu: &Gpu) -> Result<Self> {
         let properties = gpu.properties();
         let bound = properties.max_storage_buffer_range as usize / (COMPONENTS * size_of::<f32>());
@@ -86,9 +83,6 @@ impl Ceiling {
     }
 
     /// Checks each operation on a few vectors.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     #[cfg(feature = "check")]
     pub(crate) fn check(gpu: &Gpu) -> Result<CheckReport> {
         const VECTORS: usize = 1000;
@@ -104,9 +98,6 @@ impl Ceiling {
     }
 
     /// Computes for about this time, so that the clocks of a device that was idle have risen.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub(crate) fn warm(&mut self, gpu: &Gpu, time: Duration) -> Result<()> {
         let begin = Instant::now();
         while begin.elapsed() < time {
@@ -118,9 +109,6 @@ impl Ceiling {
     }
 
     /// The seconds of one run.
-    ///
-    /// # Errors
-    /// The device was lost, or has no timestamps.
     pub(crate) fn seconds(&mut self, gpu: &Gpu, operation: Operation) -> Result<f64> {
         let times = gpu.profile("ceilings", |pass| self.record(pass, operation))?;
         Ok(times.iter().map(|time| time.milliseconds).sum::<f64>() * 1e-3)

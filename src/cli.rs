@@ -116,9 +116,6 @@ enum Command {
 
 impl Cli {
     /// Reads a command line, the program's name first.
-    ///
-    /// # Errors
-    /// The requested help, or the problem of the command line.
     pub fn read(arguments: Vec<OsString>) -> Result<Self, clap::Error> {
         let everything = arguments.iter().any(|argument| argument == "--help-all");
         Self::from_arg_matches(&help::command(everything).try_get_matches_from(arguments)?)
@@ -130,9 +127,6 @@ impl Cli {
     }
 
     /// Runs the command.
-    ///
-    /// # Errors
-    /// Those of the command.
     pub fn run(self) -> Result<()> {
         match self.command {
             Command::Train(args) => train::run(&args),

@@ -210,15 +210,9 @@ impl TermInputs<'_> {
 /// A term of the render.
 pub trait LossTerm: std::fmt::Debug + Send {
     /// Allocates scratch memory for these views, and prepares the target of each.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()>;
 
     /// Records the term of a step: its part of `d_render`, (channels, H, W), and its values in the log.
-    ///
-    /// # Errors
-    /// A buffer is shorter than the view, or the view is larger than those prepared for.
     fn record_step(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -234,9 +228,6 @@ pub struct Losses(Vec<Box<dyn LossTerm>>);
 
 impl Losses {
     /// Builds the terms; [`Losses::prepare`] prepares them for views.
-    ///
-    /// # Errors
-    /// A weight is invalid, or the device refuses a pipeline.
     pub fn new(gpu: &Gpu, config: &LossConfig) -> Result<Self> {
         let (mut terms, mut gradient) = (vec![], Gradient::Written);
         for spec in config.specs() {
@@ -255,17 +246,11 @@ impl Losses {
     }
 
     /// Prepares the data that is constant for these views, and allocates for them.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()> {
         self.0.iter_mut().try_for_each(|term| term.prepare(views))
     }
 
     /// Records every term of a step: dL/d render, (channels, H, W), and the values in the log.
-    ///
-    /// # Errors
-    /// Those of [`LossTerm::record_step`].
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,

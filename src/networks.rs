@@ -69,9 +69,6 @@ pub(crate) fn conv_shape(gpu: &Gpu) -> [u32; 2] {
 }
 
 /// The number of pixels of a view.
-///
-/// # Errors
-/// The view is empty.
 fn pixel_count(size: UVec2) -> Result<usize> {
     let UVec2 { x: width, y: height } = size;
     match width as usize * height as usize {
@@ -93,8 +90,6 @@ fn check_images<const N: usize>(pixels: usize, images: [&Buffer<f32>; N]) -> Res
     }
 }
 
-/// # Errors
-/// `len` floats of `what` exceed one binding.
 fn check_binding(gpu: &Gpu, what: &str, size: UVec2, len: usize) -> Result<()> {
     let properties = gpu.properties();
     let (bytes, limit) = (float_bytes(len), properties.max_storage_buffer_range);

@@ -109,9 +109,6 @@ impl Gpu {
     }
 
     /// Compiles every kernel with its default constants, and calls `begins` with its name before.
-    ///
-    /// # Errors
-    /// The driver refuses one.
     #[cfg(feature = "cli")]
     pub(crate) fn compile_all(&self, mut begins: impl FnMut(&str)) -> Result<()> {
         // Those with matrices have other constants on each device.

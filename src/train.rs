@@ -241,9 +241,6 @@ impl Trainer {
     }
 
     /// The Gaussians in [`Trainer::frame`], bit for bit as trained.
-    ///
-    /// # Errors
-    /// The device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn gaussians_in_frame(&self) -> Result<Gaussians> {
         self.model.download(&self.gpu)
@@ -261,9 +258,6 @@ impl Trainer {
     }
 
     /// Reserves memory for this number of intersections of a view.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     #[cfg(feature = "testing")]
     pub fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
         self.renderer.set_intersection_capacity(intersections)
@@ -331,9 +325,6 @@ impl Trainer {
     }
 
     /// Trains one step and measures its milliseconds on the device, as a whole.
-    ///
-    /// # Errors
-    /// Those of [`Trainer::profile_step`].
     pub(crate) fn profile_whole_step(&mut self) -> Result<f64> {
         self.timed_step(|gpu, trainer, step| {
             gpu.profile_whole("step", |pass| trainer.record_step(pass, step, 0))
@@ -426,9 +417,6 @@ impl Trainer {
     }
 
     /// [`Trainer::render`] in even light, as [`Trainer::model`] is, if the model has a lamp.
-    ///
-    /// # Errors
-    /// Those of [`Trainer::render`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn render_in_even_light(&mut self, camera: &Camera) -> Result<Rendered> {
         self.renderer.set_even_light(true);

@@ -10,9 +10,6 @@ use crate::{Error, Result};
 const MOST: u64 = 1 << 28;
 
 /// The bytes of a file.
-///
-/// # Errors
-/// [`Error::Input`] if it cannot be read, or has no end.
 pub fn bytes(path: &Path) -> Result<Vec<u8>> {
     let cannot = |error: std::io::Error| Error::input(path, format!("cannot be read: {error}"));
     #[cfg(feature = "io")]
@@ -32,9 +29,6 @@ pub fn bytes(path: &Path) -> Result<Vec<u8>> {
 }
 
 /// The text of a file in UTF-8, or in UTF-16 with a byte-order mark, which is removed.
-///
-/// # Errors
-/// Those of [`bytes`], or the file is not text.
 pub fn text(path: &Path) -> Result<String> {
     let cannot = |what: String| Error::input(path, format!("cannot be read: {what}"));
     let bytes = bytes(path)?;

@@ -6,18 +6,12 @@ use std::path::Path;
 use crate::{Error, Result};
 
 /// Writes a file under a temporary name and renames it when complete.
-///
-/// # Errors
-/// [`Error::Output`] if it cannot be written; no partial file is left.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     write_whole_with(path, |path| std::fs::write(path, bytes))
 }
 
 /// [`write_whole`] with a function that writes the file under the given name. The target of a link is replaced, and the
 /// link kept; a device or a pipe is written to, not replaced.
-///
-/// # Errors
-/// Those of [`write_whole`].
 pub fn write_whole_with(
     path: &Path,
     write: impl FnOnce(&Path) -> std::io::Result<()>,
@@ -41,9 +35,6 @@ pub fn write_whole_with(
 }
 
 /// Creates a folder unless it exists.
-///
-/// # Errors
-/// [`Error::Output`].
 pub fn create_folder(folder: &Path) -> Result<()> {
     std::fs::create_dir_all(folder)
         .map_err(|error| Error::output(folder, format!("cannot be created: {error}")))
@@ -55,9 +46,6 @@ pub fn is_same_file(a: &Path, b: &Path) -> bool {
 }
 
 /// Checks, before any work, that a file or a folder can be created.
-///
-/// # Errors
-/// [`Error::Output`] if not.
 #[cfg(feature = "io")]
 pub fn check_writable(path: &Path) -> Result<()> {
     let absolute = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());

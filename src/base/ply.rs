@@ -90,9 +90,6 @@ pub struct Header {
 
 impl Header {
     /// Reads the header at the beginning of a file.
-    ///
-    /// # Errors
-    /// What is wrong with it, in words that follow the name of the file.
     pub fn parse(bytes: &[u8]) -> Result<Self, String> {
         const END: &[u8] = b"end_header";
         if !bytes.starts_with(b"ply") {

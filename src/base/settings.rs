@@ -176,9 +176,6 @@ impl Setting {
     }
 
     /// Checks a value; values of a special type, such as an enum, are valid by their type.
-    ///
-    /// # Errors
-    /// [`Error::Setting`].
     pub fn check(&self, value: &dyn Any) -> Result<()> {
         let rule = match self.rule {
             Rule::List(_, _, rule) => *rule,
@@ -262,9 +259,6 @@ macro_rules! settings {
             };
 
             /// Checks every value by its row.
-            ///
-            /// # Errors
-            /// [`Error::Setting`](crate::Error::Setting).
             pub(crate) fn check_rows(&self) -> $crate::Result<()> {
                 let values = [$(&self.$field as &dyn std::any::Any),*];
                 let mut rows = Self::SETTINGS.iter().zip(values);

@@ -37,9 +37,6 @@ pub(crate) fn is_dir(path: &Path) -> bool {
 }
 
 /// The paths of the entries of a folder, in any order.
-///
-/// # Errors
-/// It cannot be read.
 pub(crate) fn entries(folder: &Path) -> io::Result<Vec<PathBuf>> {
     match archived(folder) {
         Some((archive, entry)) => {
@@ -62,9 +59,6 @@ pub(crate) fn metadata(path: &Path) -> io::Result<(u64, Option<SystemTime>)> {
 }
 
 /// Opens a file.
-///
-/// # Errors
-/// It cannot be read.
 pub(crate) fn open(path: &Path) -> io::Result<Box<dyn Source>> {
     match archived(path) {
         Some((archive, entry)) => Ok(Box::new(Cursor::new(archive.read(&entry)?))),
@@ -86,9 +80,6 @@ pub(crate) fn archive_of(path: &Path) -> Option<&Path> {
 }
 
 /// Checks a path that names an archive.
-///
-/// # Errors
-/// The archive is damaged, or expands to too much.
 pub(crate) fn check(path: &Path) -> io::Result<()> {
     archive_of(path)
         .map_or(Ok(()), |path| Archive::open(path, [MOST_OF_ENTRY, MOST_OF_ALL]).map(drop))

@@ -20,9 +20,6 @@ const CONFIG: &str = "config.toml";
 
 impl BlockPlan {
     /// Writes the plan into a folder, `tasks.jsonl` last. The same plan may be written again.
-    ///
-    /// # Errors
-    /// The folder contains another plan, or cannot be written.
     pub(crate) fn save(mut self, folder: &Path) -> Result<Vec<Task>> {
         let path = folder.join(PLAN);
         if path.is_file() && PlanFile::load(folder)? != self.file {

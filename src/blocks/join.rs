@@ -31,10 +31,6 @@ pub(crate) struct Joined {
 
 /// Joins the blocks of a round of the plan in a folder, by default of the last. With `same_device`, blocks of several
 /// devices are refused; else they are recorded. `observe` is called with every tile that is written.
-///
-/// # Errors
-/// The folder contains no plan, or no such round; its photographs have changed; a block is missing, not done or of
-/// another plan; another process joins; or a file cannot be read or written.
 pub(crate) fn join(
     folder: &Path,
     round: Option<u8>,

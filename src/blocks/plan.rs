@@ -109,9 +109,6 @@ pub(crate) struct BlockPlan {
 
 impl PlanFile {
     /// The plan in a folder.
-    ///
-    /// # Errors
-    /// There is none, or it is damaged.
     pub(crate) fn load(folder: &Path) -> Result<Self> {
         let path = folder.join(PLAN);
         if !path.is_file() {
@@ -124,9 +121,6 @@ impl PlanFile {
     }
 
     /// Refuses a plan whose photographs have changed since.
-    ///
-    /// # Errors
-    /// [`Error::Input`] with the dataset.
     pub(crate) fn check_photographs(&self, config: &TrainConfig) -> Result<()> {
         if Dataset::stamp(&config.dataset, &config.load_options())? == self.stamp {
             return Ok(());

@@ -18,10 +18,6 @@ const MOST_SHARED: f64 = 0.75;
 const LEAST_VIEWS: usize = 3;
 
 /// Plans the blocks of a dataset. Nothing is written.
-///
-/// # Errors
-/// The dataset has no points, or all at one place; blocks do not pay; a block has too few views; the memory is too
-/// small; a photograph can no longer be read.
 pub(crate) fn plan(planned: &PlannedRun, request: &Request) -> Result<BlockPlan> {
     let PlannedRun { config, dataset, .. } = planned;
     let mut config = config.clone();

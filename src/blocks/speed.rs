@@ -17,9 +17,6 @@ const MAX_POINTS: usize = 100_000;
 const STEPS: [u64; 2] = [8, 32];
 
 /// Milliseconds of a step at full size from the first Gaussians, and their number.
-///
-/// # Errors
-/// Those of [`Trainer::new`] and [`Trainer::advance`].
 pub(crate) fn speed(gpu: &Gpu, planned: &PlannedRun) -> Result<(f64, usize)> {
     let mut dataset = planned.dataset.clone();
     let training: Vec<&View> = dataset.train_views().filter(|view| view.has_photograph()).collect();

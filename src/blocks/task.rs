@@ -31,9 +31,6 @@ pub(crate) struct Task {
 }
 
 /// The tasks as lines.
-///
-/// # Errors
-/// Never.
 pub(crate) fn lines(tasks: &[Task]) -> Result<String> {
     let line = |task| {
         let text = serde_json::to_string(task).map_err(|error| Error::Usage(error.to_string()))?;
@@ -43,9 +40,6 @@ pub(crate) fn lines(tasks: &[Task]) -> Result<String> {
 }
 
 /// Reads the tasks of a plan; each comes after those that it needs.
-///
-/// # Errors
-/// The file is missing or damaged, or a task needs one that does not precede it.
 pub(crate) fn load(folder: &Path) -> Result<Vec<Task>> {
     let path = folder.join(TASKS);
     if !path.is_file() {

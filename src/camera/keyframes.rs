@@ -133,9 +133,6 @@ pub(crate) struct PathOptions {
 
 impl FramePath {
     /// Reads a file; keyframes with a target are upright about `up`.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if the file is no path, of another version, or has a number that is not finite.
     pub(crate) fn load(path: &Path, up: DVec3, options: &PathOptions) -> Result<Self> {
         let refused = |problem: String| Error::input(path, problem);
         let json: Value = serde_json::from_str(&input::text(path)?)

@@ -93,9 +93,6 @@ struct Findings {
 }
 
 /// Checks, times and prints.
-///
-/// # Errors
-/// A kernel disagrees with its reference, or the device does not exist.
 pub fn run(args: &BenchArgs) -> Result<()> {
     let [width, height] = [args.width.unwrap_or(SIZE[0]), args.height.unwrap_or(SIZE[1])];
     let sizes_hold = (16..=8192).contains(&width)

@@ -98,9 +98,6 @@ pub struct JoinArgs {
 }
 
 /// Plans, trains or joins.
-///
-/// # Errors
-/// Those of the subcommand.
 pub fn run(args: &BlocksArgs) -> Result<()> {
     match &args.command {
         BlocksCommand::Plan(args) => plan(args),

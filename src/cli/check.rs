@@ -27,9 +27,6 @@ pub struct CheckArgs {
 }
 
 /// Checks and prints.
-///
-/// # Errors
-/// [`crate::Error::Disagrees`] if something differs, and the errors of `train`.
 pub fn run(args: &CheckArgs) -> Result<()> {
     // The schedule is that of a complete run, whose first steps are checked.
     let steps = args.options.config(&args.dataset, None)?.steps;

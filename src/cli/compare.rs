@@ -48,9 +48,6 @@ const EXAMPLES: &str = "Examples:
   nightsplat compare run clean.ply --dataset photos       a run and its edited model";
 
 /// Compares the runs.
-///
-/// # Errors
-/// The runs are of different datasets, one has no model, or the page cannot be written.
 pub fn run(args: &CompareArgs) -> Result<()> {
     if args.runs.len() < 2 {
         let problem = "compare takes two runs or more";

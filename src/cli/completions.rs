@@ -17,9 +17,6 @@ pub struct CompletionsArgs {
 }
 
 /// Prints the script.
-///
-/// # Errors
-/// Standard output is closed.
 pub fn run(args: CompletionsArgs) -> Result<()> {
     let mut script = vec![];
     clap_complete::generate(args.shell, &mut help::command(true), "nightsplat", &mut script);

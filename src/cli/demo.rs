@@ -36,9 +36,6 @@ const SIZE: [u32; 2] = [384, 288];
 const SHOWN: &str = "curve=auto";
 
 /// Runs the demo.
-///
-/// # Errors
-/// The folder holds something else, a file cannot be written, or there is no device.
 pub fn run(args: &DemoArgs) -> Result<()> {
     claim(&args.out)?;
     let set = args.out.join("dataset");

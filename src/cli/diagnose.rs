@@ -89,9 +89,6 @@ const EXAMPLES: &str = "Examples:
   nightsplat train photos --out run --plan plan.toml";
 
 /// Measures, plans and prints.
-///
-/// # Errors
-/// The dataset is unusable or black, there is no device, or a file cannot be written.
 pub fn run(args: &DiagnoseArgs) -> Result<()> {
     let mut config = TrainConfig { dataset: args.dataset.clone(), ..TrainConfig::default() };
     args.preset.unwrap_or(Preset::Balanced).apply(&mut config)?;

@@ -50,10 +50,6 @@ struct Listed<'a> {
 }
 
 /// Prints the report.
-///
-/// # Errors
-/// There is no Vulkan, no device meets every requirement and passes the self-test, or a scheduler's variables name
-/// none; the list is printed nevertheless.
 pub fn run(args: &DoctorArgs) -> Result<()> {
     if let Some(index) = args.compile {
         return compile(index);

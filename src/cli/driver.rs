@@ -15,9 +15,6 @@ use crate::{Error, Result};
 const COMPILES: &str = "compiles";
 
 /// [`Gpu::new`], after a driver that is new on this machine was seen to compile every kernel.
-///
-/// # Errors
-/// Those of [`Gpu::new`], and [`Error::Kernel`] for a driver that crashes.
 pub(super) fn open(choice: &DeviceChoice) -> Result<Gpu> {
     check_new(choice)?;
     Gpu::new(choice)
@@ -29,9 +26,6 @@ pub(super) fn opener(device: Option<&DeviceChoice>) -> Opener {
 }
 
 /// Refuses a driver that is new on this machine and crashes when it compiles a kernel.
-///
-/// # Errors
-/// [`Error::Kernel`] for such a driver, and those of listing devices.
 pub(super) fn check_new(choice: &DeviceChoice) -> Result<()> {
     let wanted = std::env::var(TEST_VARIABLE).unwrap_or_default();
     if wanted != "off" {

@@ -54,10 +54,6 @@ const EXAMPLES: &str = "Examples:
   nightsplat edit a.ply --rotate y:90 --move 2,0,0 --merge b.ply --out both.ply";
 
 /// Applies the operations and writes the model.
-///
-/// # Errors
-/// A file cannot be read or written, an operation is invalid or leaves nothing, or its dataset is missing; no file is
-/// written then.
 pub fn run(args: &EditArgs) -> Result<()> {
     let list = args.edits.as_deref().map(EditList::load).transpose()?;
     if list.is_none() && args.operations.is_empty() {

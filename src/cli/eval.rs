@@ -103,9 +103,6 @@ fn as_photograph(
 }
 
 /// Scores the run and prints the scores.
-///
-/// # Errors
-/// The folder contains no run with a model, its dataset is missing, or a file cannot be written.
 pub fn run(args: &EvalArgs) -> Result<()> {
     args.report.iter().try_for_each(|path| check_writable(path))?;
     if let Some(downscale) = args.downscale.filter(|&own| !DOWNSCALE.takes_number(own)) {

@@ -112,10 +112,6 @@ impl To {
 }
 
 /// Writes the file.
-///
-/// # Errors
-/// The folder contains no run with a model, the model does not fit the format, or the file cannot be written;
-/// no partial file is left.
 pub fn run(args: &ExportArgs) -> Result<()> {
     let (out, wrote) = write(args)?;
     let out = word(&out);

@@ -19,9 +19,6 @@ pub struct ManArgs {
 }
 
 /// Writes the pages.
-///
-/// # Errors
-/// The folder cannot be written.
 pub fn run(args: &ManArgs) -> anyhow::Result<()> {
     let problem = |error: std::io::Error| Error::output(&args.dir, error.to_string());
     std::fs::create_dir_all(&args.dir).map_err(problem)?;

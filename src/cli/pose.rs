@@ -74,9 +74,6 @@ const EXAMPLE: &str = "Example:
 const MAX_LISTED: usize = 3;
 
 /// Estimates the cameras and writes the dataset.
-///
-/// # Errors
-/// Those of `estimate`.
 pub fn run(args: &PoseArgs) -> Result<()> {
     let begin = Instant::now();
     let bar: RefCell<Option<ProgressBar>> = RefCell::default();

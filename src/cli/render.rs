@@ -254,10 +254,6 @@ impl SplitChoice {
 }
 
 /// Renders the views or the path.
-///
-/// # Errors
-/// The folder contains no run with a model, its dataset is missing or has no such view, a file cannot be written, or a
-/// video requires ffmpeg, which is missing.
 pub fn run(args: &RenderArgs) -> Result<()> {
     let RenderArgs { run, out, layer, view_exposure, format, device, .. } = args;
     if let Some(video) = args.video.as_ref().filter(|_| *format == ImageFormat::Exr) {

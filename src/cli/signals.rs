@@ -11,9 +11,6 @@ use crate::results::run::Requests;
 use crate::{Error, Result, Stop};
 
 /// Installs the handlers and returns the requests that they set.
-///
-/// # Errors
-/// The system refuses a handler.
 pub(super) fn requests() -> Result<Requests> {
     let requests = Requests::default();
     let refused =

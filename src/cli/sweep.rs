@@ -109,9 +109,6 @@ const EXAMPLES: &str = "A LIST is comma-separated. Examples:
   nightsplat sweep photos --out density --grid density.gradient_threshold=1e-4,2e-4 --jobs 2";
 
 /// Trains the unfinished points and writes the results.
-///
-/// # Errors
-/// Before training, an invalid grid, option or dataset, or a folder with another sweep; after it, failed points.
 pub fn run(args: &SweepArgs) -> Result<()> {
     if !args.more.is_empty() {
         return scenes::run(args);
@@ -256,9 +253,6 @@ fn plan(args: &SweepArgs) -> crate::Result<(Vec<Run>, Dataset)> {
 }
 
 /// Claims a folder that is empty, has this sweep, or has no file that a sweep would replace.
-///
-/// # Errors
-/// The folder is in use or cannot be written.
 fn claim(args: &SweepArgs, runs: &[Run]) -> crate::Result<()> {
     let (folder, manifest) = (&args.out, manifest(args, runs)?);
     let path = folder.join("sweep.toml");

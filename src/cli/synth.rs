@@ -40,9 +40,6 @@ pub struct SynthArgs {
 }
 
 /// Writes the dataset.
-///
-/// # Errors
-/// [`Error::Output`] if the folder is not empty and `--overwrite` is not given, and those of [`synthetic::write`].
 pub fn run(args: SynthArgs) -> anyhow::Result<()> {
     let SynthArgs { dir, street, views, width, height, seed, fisheye, lamp, overwrite } = args;
     let usual = street.map_or_else(SyntheticOptions::default, SyntheticOptions::street);

@@ -30,9 +30,6 @@ enum Command {
 }
 
 /// Runs the subcommand.
-///
-/// # Errors
-/// What stopped it, in one line.
 pub fn run(args: &ToneArgs) -> Result<()> {
     match &args.command {
         Command::List(args) => list::run(args),

@@ -80,9 +80,6 @@ const EXAMPLE: &str = "Example:
   nightsplat train photos --out run --preset fast --max-vram 4G";
 
 /// Trains, scores and writes the run directory.
-///
-/// # Errors
-/// Anything that stops the run.
 pub fn run(args: &TrainArgs) -> Result<()> {
     let mut requested = args.options.requested(&args.dataset)?;
     requested.settings(None)?.config()?.check()?;

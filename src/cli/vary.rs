@@ -58,9 +58,6 @@ impl FromStr for Gamma {
 }
 
 /// Writes the set.
-///
-/// # Errors
-/// [`Error::Output`] if the folder is not empty and `--overwrite` is not given, and those of writing the set.
 pub fn run(args: &VaryArgs) -> anyhow::Result<()> {
     let VaryArgs { bright, out, stops, gamma, seed, downscale, test_every, overwrite } = args;
     let is_empty = std::fs::read_dir(out).map_or(true, |mut entries| entries.next().is_none());

@@ -72,9 +72,6 @@ const EXAMPLES: &str = "Examples:
   ssh -L 7007:127.0.0.1:7007 server             then open the printed address here: a run on a server";
 
 /// Serves the page until the process is ended.
-///
-/// # Errors
-/// The path is no run, model or dataset, the dataset is missing, or the address cannot be used.
 pub fn run(args: &ViewArgs) -> Result<()> {
     if args.window {
         return Ok(windows::run(args)?);
@@ -87,9 +84,6 @@ pub fn run(args: &ViewArgs) -> Result<()> {
 }
 
 /// The page of a training in this process.
-///
-/// # Errors
-/// The address cannot be used.
 pub(super) fn of_training(
     listen: Listen,
     run: &Path,

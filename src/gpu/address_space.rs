@@ -8,8 +8,6 @@ use crate::{Error, Result};
 /// Measured on lavapipe: a tiny run with two threads takes this much; with a tenth less its kernels crash.
 const LEAST: u64 = 1 << 30;
 
-/// # Errors
-/// [`Error::NoDevice`] names limit and remedy.
 pub(super) fn check() -> Result<()> {
     match std::fs::read_to_string("/proc/self/limits").ok().and_then(|text| limit(&text)) {
         Some(bytes) if bytes < LEAST => {

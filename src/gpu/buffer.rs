@@ -88,9 +88,6 @@ impl<'a, T: bytemuck::Pod> From<&'a mut Buffer<T>> for SliceMut<'a, T> {
 
 impl Gpu {
     /// A buffer of `len` elements whose contents are undefined.
-    ///
-    /// # Errors
-    /// The buffer exceeds the binding limit or the memory of the device.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn uninit<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<Buffer<T>> {
         let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
@@ -104,9 +101,6 @@ impl Gpu {
 
     /// [`Gpu::uninit`] for a buffer of which passes only bind windows of `window` elements, from multiples of that on:
     /// only memory limits its length.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub(crate) fn uninit_in_windows<T: bytemuck::Pod>(
         &self,
         name: &str,

@@ -116,9 +116,6 @@ impl SchedulerVariables {
 
     /// The device of a choice. Where it is the best and none meets all requirements, the first, so that an error can
     /// name what it lacks.
-    ///
-    /// # Errors
-    /// There is no such device, or the variables name one that Vulkan does not have, or leave none.
     pub(crate) fn pick(
         &self,
         choice: &DeviceChoice,

@@ -205,8 +205,6 @@ impl Gpu {
     }
 }
 
-/// # Errors
-/// The family does not exist, or does not compute.
 fn check_family(instance: &ash::Instance, physical: vk::PhysicalDevice, family: u32) -> Result<()> {
     // SAFETY: the handle was enumerated from the instance.
     let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
@@ -220,9 +218,6 @@ fn check_family(instance: &ash::Instance, physical: vk::PhysicalDevice, family: 
 }
 
 /// Whether a physical device of a host's can be used.
-///
-/// # Errors
-/// It lacks a requirement, which is named.
 ///
 /// # Safety
 /// The handles are valid.

@@ -38,10 +38,6 @@ impl Gpu {
 
 impl Recorder<'_> {
     /// Copies a buffer, or a slice of one, as it is at this point of the recording to the host.
-    ///
-    /// # Errors
-    /// The device is out of memory, or the recording is [`Gpu::record_into`]'s: only the host knows when the copy is
-    /// done.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn download<'a, T: bytemuck::Pod>(
         &mut self,
@@ -83,9 +79,6 @@ impl Recorder<'_> {
 
 impl<T: bytemuck::Pod> Download<T> {
     /// Waits for the submission that the copy is part of.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub fn wait(self) -> Result<Vec<T>> {
         self.shared.wait(self.value)?;
         let bytes: u64 = self.host.iter().map(|(_, size)| size).sum();

@@ -32,8 +32,6 @@ pub(super) struct Faults {
 }
 
 impl Faults {
-    /// # Errors
-    /// [`Error::Usage`] where the variable names another fault.
     pub(super) fn from_environment() -> Result<Self> {
         let mut faults = Self::default();
         let Ok(text) = std::env::var(VARIABLE) else { return Ok(faults) };
@@ -76,9 +74,6 @@ impl Faults {
     }
 
     /// What a driver does that has to compile this kernel.
-    ///
-    /// # Errors
-    /// It refuses.
     pub(super) fn compile(&self, kernel: &str) -> Result<(), ash::vk::Result> {
         if self.crashing_kernel.as_deref() == Some(kernel) {
             std::process::abort();

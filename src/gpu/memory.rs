@@ -120,8 +120,6 @@ pub(super) struct MemoryLimitExceeded {
 }
 
 impl MemoryUsage {
-    /// # Errors
-    /// `bytes` more exceed the limit.
     pub(super) fn admit(&self, bytes: u64) -> Result<(), MemoryLimitExceeded> {
         let (now, limit) = (self.now.load(Ordering::Acquire), self.limit.load(Ordering::Acquire));
         if now.saturating_add(bytes) > limit {

@@ -19,9 +19,6 @@ pub(super) struct Parts {
 
 impl Parts {
     /// `bytes` of device memory; no window of `window` bytes from a multiple of that on is divided.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn new(shared: &Arc<Shared>, name: &str, bytes: u64, window: u64) -> Result<Self> {
         let most = shared.properties.max_buffer_size;
         let part =

@@ -31,9 +31,6 @@ pub(super) struct Objects {
 
 impl Gpu {
     /// Specialises kernel `K` with `constants`.
-    ///
-    /// # Errors
-    /// The driver refuses the kernel, or the file of its statistics cannot be written.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn pipeline<K: Kernel>(&self, constants: &K::Constants) -> Result<Pipeline<K>> {
         let objects = self.objects(K::INTERFACE, K::constants(constants))?;
@@ -47,9 +44,6 @@ impl Gpu {
     }
 
     /// Compiles a kernel, which the pipeline cache then has.
-    ///
-    /// # Errors
-    /// The driver refuses the kernel.
     pub(crate) fn compile(
         &self,
         interface: &'static Interface,
@@ -98,9 +92,6 @@ impl Gpu {
 
 impl<K: Kernel> Pipeline<K> {
     /// The driver's statistics of the kernel; `None` where the driver has none. Compiles it again.
-    ///
-    /// # Errors
-    /// The driver refuses the kernel.
     pub fn statistics(&self) -> Result<Option<Vec<Statistic>>> {
         let shared = &self.objects.shared;
         let Some(functions) = &shared.executables else { return Ok(None) };

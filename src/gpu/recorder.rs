@@ -68,15 +68,9 @@ pub(super) enum Timestamps {
 #[cfg(feature = "check")]
 pub(super) trait PassObserver: std::fmt::Debug {
     /// Does what recording and submitting the pass would do.
-    ///
-    /// # Errors
-    /// The extent exceeds what the device can launch, or the device was lost.
     fn pass(&mut self, recorder: &mut Recorder<'_>, pass: &ObservedPass<'_>) -> Result<()>;
 
     /// Submits the recording so far, waits for it, and starts a new one.
-    ///
-    /// # Errors
-    /// The device was lost.
     fn run_recorded(&mut self, recorder: &mut Recorder<'_>, label: &str) -> Result<()>;
 }
 
@@ -195,9 +189,6 @@ impl<'g> Recorder<'g> {
     }
 
     /// Records one pass: label, barrier if a hazard requires it, bindings, parameters, dispatch, timestamp.
-    ///
-    /// # Errors
-    /// The extent exceeds what the device can launch.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn dispatch<K: Recordable>(
         &mut self,
@@ -269,9 +260,6 @@ impl<'g> Recorder<'g> {
 
     /// Overwrites the first elements of `buffer` with `data`, which is stored in the command buffer: for a few numbers
     /// that the host knows when it records.
-    ///
-    /// # Errors
-    /// `data` is longer than the buffer, or than the 64 KiB that Vulkan takes.
     pub(crate) fn update<T: bytemuck::Pod>(
         &mut self,
         buffer: &mut Buffer<T>,

@@ -126,8 +126,6 @@ pub fn required_device_features()
 }
 
 impl Supported {
-    /// # Errors
-    /// The first requirement that is not met, by its name.
     pub(super) fn check(&self) -> Result<()> {
         self.missing().map_or(Ok(()), |requirement| {
             let (device, feature) = (self.device_name(), requirement.name.to_owned());

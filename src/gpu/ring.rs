@@ -28,8 +28,6 @@ struct Slot {
 }
 
 impl Gpu {
-    /// # Errors
-    /// The device is out of memory.
     pub(crate) fn ring(&self, name: &str, words: usize) -> Result<Ring> {
         let bytes = (SLOTS * words * size_of::<u32>()) as u64;
         let memory = DeviceMemory::new(&self.shared, name, bytes, MemoryLocation::GpuToCpu)?;

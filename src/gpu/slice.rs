@@ -87,9 +87,6 @@ impl<'a, T: bytemuck::Pod> Slice<'a, T> {
     }
 
     /// A range of its elements.
-    ///
-    /// # Errors
-    /// The range is out of bounds, or starts at no multiple of 256 bytes, where every device lets a binding start.
     pub(crate) fn range(self, range: Range<usize>) -> Result<Self> {
         let first = self.first + offset_of::<T>(self.memory, self.len, &range)?;
         Ok(Self { first, len: range.len(), ..self })
@@ -135,18 +132,12 @@ impl<'a, T: bytemuck::Pod> SliceMut<'a, T> {
     }
 
     /// A range of its elements.
-    ///
-    /// # Errors
-    /// As `Slice::range`.
     pub fn range(self, range: Range<usize>) -> Result<Self> {
         let first = self.first + offset_of::<T>(self.memory, self.len, &range)?;
         Ok(Self { first, len: range.len(), ..self })
     }
 
     /// Several parts of it, for a pass that binds each separately. Parts may be empty, in any order and with gaps.
-    ///
-    /// # Errors
-    /// Two parts overlap, or as `Slice::range`.
     pub fn split<const N: usize>(self, ranges: [Range<usize>; N]) -> Result<[Self; N]> {
         for (i, a) in ranges.iter().enumerate() {
             offset_of::<T>(self.memory, self.len, a)?;

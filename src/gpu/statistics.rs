@@ -110,9 +110,6 @@ pub(super) fn file() -> Option<PathBuf> {
 }
 
 /// Appends a line for a pipeline to the file.
-///
-/// # Errors
-/// The file cannot be written.
 pub(super) fn log(
     path: &Path,
     kernel: &str,

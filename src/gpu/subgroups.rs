@@ -58,9 +58,6 @@ impl SubgroupSizes {
 }
 
 /// The lanes of the kernels: the built-in number, or the requested one.
-///
-/// # Errors
-/// The device does not have the requested size; the message names those that it has.
 pub(super) fn lanes(
     sizes: SubgroupSizes,
     vendor: u32,

@@ -33,9 +33,6 @@ pub struct PassTime {
 
 impl Submission {
     /// Blocks until the work is done.
-    ///
-    /// # Errors
-    /// The device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn wait(&self) -> Result<()> {
         self.shared.wait(self.value)
@@ -49,8 +46,6 @@ struct Recording<'a> {
 }
 
 impl Shared {
-    /// # Errors
-    /// This thread is recording already.
     pub(super) fn refuse_nested(&self, label: &str) -> Result<()> {
         match lock(&self.progress).recorded_here() {
             Some(outer) => Err(Error::Usage(format!(
@@ -87,9 +82,6 @@ impl Gpu {
     /// The queue is locked while `record` runs: other threads that submit wait. Calls that submit themselves, such as
     /// [`Gpu::write`], [`Gpu::zeros`] or [`crate::splats::render::Renderer::reserve`], must come before or after the
     /// recording.
-    ///
-    /// # Errors
-    /// The error of `record` (nothing is submitted then), this thread is recording already, or the device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn submit(
         &self,
@@ -112,9 +104,6 @@ impl Gpu {
     }
 
     /// As [`Gpu::run`], and measures the time of each pass.
-    ///
-    /// # Errors
-    /// As [`Gpu::submit`]; [`Error::MissingFeature`] where the device's queue has no timestamps.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn profile(
         &self,
@@ -126,9 +115,6 @@ impl Gpu {
 
     /// As [`Gpu::run`], and measures the milliseconds from the start of the first pass to the end of the last, with
     /// nothing between the passes that a run without measurement lacks.
-    ///
-    /// # Errors
-    /// Those of [`Gpu::profile`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn profile_whole(
         &self,

@@ -137,9 +137,6 @@ impl Supported {
     }
 
     /// The subgroup size of the kernels: the built-in one, or that of the variable.
-    ///
-    /// # Errors
-    /// The variable names a size that the device does not have.
     pub(super) fn lanes(&self) -> Result<u32> {
         let wanted = std::env::var(SUBGROUP_VARIABLE).ok().filter(|value| !value.is_empty());
         lanes(self.subgroups, self.properties.vendor_id, wanted.as_deref()).map_err(|problem| {

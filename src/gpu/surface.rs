@@ -14,9 +14,6 @@ use super::{Gpu, HostImage, ImageFormat, ImageState, Shared, lock};
 use crate::{DeviceChoice, Error, Result};
 
 /// The instance extensions that windows of a display need.
-///
-/// # Errors
-/// [`Error::Usage`] if the display is none that Vulkan presents to.
 pub(super) fn extensions(display: &dyn HasDisplayHandle) -> Result<&'static [*const c_char]> {
     let display = display.display_handle().map_err(|error| no_window(&error))?.as_raw();
     ash_window::enumerate_required_extensions(display)
@@ -29,9 +26,6 @@ fn no_window(error: &HandleError) -> Error {
 
 impl Gpu {
     /// [`Gpu::new`] for a device that presents to windows of a display.
-    ///
-    /// # Errors
-    /// As [`Gpu::new`]; the loader or the device presents to no window.
     pub(crate) fn with_display(
         choice: &DeviceChoice,
         display: &dyn HasDisplayHandle,
@@ -76,8 +70,6 @@ impl std::fmt::Debug for Surface {
 }
 
 impl Surface {
-    /// # Errors
-    /// [`Error::NoDevice`] if the device does not present to the window.
     pub(crate) fn new<W: HasDisplayHandle + HasWindowHandle + 'static>(
         gpu: &Gpu,
         window: &Arc<W>,
@@ -125,9 +117,6 @@ impl Surface {
 
     /// An image to draw into, of the size of the window, which is `size` where the surface leaves that open; `None` if
     /// the window has no area, or has just changed.
-    ///
-    /// # Errors
-    /// The device is lost or out of memory, or the window has no images of 8 bits that are copied to.
     pub(crate) fn acquire(&mut self, size: [u32; 2]) -> Result<Option<Acquired>> {
         let shared = &Arc::clone(&self.gpu.shared);
         let fail = |call| move |result| shared.error(call, result);
@@ -168,9 +157,6 @@ impl Surface {
     }
 
     /// Shows an image, whose drawing is done.
-    ///
-    /// # Errors
-    /// The device is lost or out of memory.
     pub(crate) fn present(&mut self, acquired: Acquired) -> Result<()> {
         let Some(chain) = &self.chain else { return Ok(()) };
         let shared = &self.gpu.shared;

@@ -122,9 +122,6 @@ impl Gpu {
     }
 
     /// Saves the measurements for later runs; returns the file, or `None` where there is none.
-    ///
-    /// # Errors
-    /// The file cannot be written.
     pub(crate) fn keep_tuned_tiles(&self, tiles: &[TunedTile]) -> Result<Option<PathBuf>> {
         let Some(path) = self.tuning_path() else { return Ok(None) };
         let Properties { name, driver, .. } = self.properties();

@@ -17,9 +17,6 @@ impl Gpu {
     }
 
     /// Zeroes a buffer.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub(crate) fn zeroed<T: bytemuck::Pod>(&self, buffer: Buffer<T>) -> Result<Buffer<T>> {
         if !buffer.is_empty() {
             let fills = buffer.pieces().map(|target| Ok(Upload::Fill { target, word: 0 }));
@@ -40,9 +37,6 @@ impl Gpu {
 
     /// Overwrites the first elements of a buffer, or of a slice of one, with `data`; blocks until that is done. On a
     /// device that a host lends, the next recording begins with it instead.
-    ///
-    /// # Errors
-    /// `data` is longer than the buffer, or the device is out of memory or lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn write<'a, T: bytemuck::Pod>(
         &self,

@@ -74,9 +74,6 @@ pub struct DenoisingLoss {
 
 impl DenoisingLoss {
     /// Builds the kernel; [`DenoisingLoss::reserve`] allocates.
-    ///
-    /// # Errors
-    /// A weight is negative or not finite, or the device is out of memory.
     pub fn new(gpu: &Gpu, weights: DenoisingWeights) -> Result<Self> {
         check_weight("the denoising", weights.mse)?;
         check_weight("the total variation", weights.total_variation)?;
@@ -98,9 +95,6 @@ impl DenoisingLoss {
     }
 
     /// Allocates scratch memory for views up to `size`; it never shrinks.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         let workgroups = self.workgroups(size) as usize;
         if workgroups > self.mse_partials.len() {
@@ -111,10 +105,6 @@ impl DenoisingLoss {
     }
 
     /// Writes both gradients for the whole view, 0 outside the loss region, and both terms to the log.
-    ///
-    /// # Errors
-    /// The view is empty or larger than those reserved for, the loss region is empty or not inside it, a buffer is too
-    /// short, or the log has no such slot.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,

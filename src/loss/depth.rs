@@ -162,9 +162,6 @@ impl Chunks {
 
 impl DepthLoss {
     /// Builds the kernels; [`DepthLoss::reserve`] allocates.
-    ///
-    /// # Errors
-    /// The weight is negative or not finite, a box has fewer than 2 x 2 pixels, or the device is out of memory.
     pub fn new(gpu: &Gpu, settings: DepthSettings) -> Result<Self> {
         check_weight("the depth", settings.weight)?;
         if !(2..=4096).contains(&settings.box_side) {
@@ -196,9 +193,6 @@ impl DepthLoss {
     }
 
     /// Allocates scratch memory for views up to `size`; it never shrinks.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         let chunks = self.chunks(size);
         let regions = chunks.boxes.count as usize + 1;
@@ -215,9 +209,6 @@ impl DepthLoss {
 
     /// Writes the plane of `d_render`, (channels, H, W), and both values to the log; without boxes, the global one
     /// only.
-    ///
-    /// # Errors
-    /// The view is empty or larger than those reserved for, a buffer is too short, or the log has no such slot.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,

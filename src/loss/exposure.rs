@@ -69,9 +69,6 @@ pub struct Exposures {
 impl Exposures {
     /// Exposures with these initial values, centred, of views in whose targets white has these values;
     /// [`Exposures::reserve`] allocates for views.
-    ///
-    /// # Errors
-    /// There is no view, one has no white, a gain is not above 0, or the device is out of memory.
     pub fn new(
         gpu: &Gpu,
         rates: ExposureRates,
@@ -111,9 +108,6 @@ impl Exposures {
     }
 
     /// Allocates for views up to `size`; it never shrinks.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         let values = COLOR_CHANNELS * pixels(size) as usize;
         if values > self.exposed.len() {
@@ -128,9 +122,6 @@ impl Exposures {
 
     /// Records `view`'s exposure of a render, (3 or more, H, W), to [`Exposures::exposed`]; at most the target, (3, H,
     /// W), where that is clipped.
-    ///
-    /// # Errors
-    /// There is no such view, it is larger than those reserved for, or the render or the target is smaller.
     pub fn expose(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -143,9 +134,6 @@ impl Exposures {
     }
 
     /// Records the target of `view`, (3, H, W), with its exposure removed, to [`Exposures::exposed`].
-    ///
-    /// # Errors
-    /// Those of [`Exposures::expose`].
     pub fn neutralize(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -186,9 +174,6 @@ impl Exposures {
 
     /// Records the gradient of the exposures after [`Exposures::expose`] of the same render and target, and replaces
     /// dL/d exposed in the colours of `d_render` by dL/d render.
-    ///
-    /// # Errors
-    /// Those of [`Exposures::expose`].
     pub fn backward(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -227,9 +212,6 @@ impl Exposures {
     }
 
     /// Records the centring after Adam's step: the mean over the views is the identity again.
-    ///
-    /// # Errors
-    /// There is no status word.
     pub fn center(&mut self, pass: &mut Recorder<'_>, status: &Buffer<u32>) -> Result<()> {
         if status.is_empty() {
             return Err(Error::Usage("exposures need a status word".to_owned()));
@@ -246,9 +228,6 @@ impl Exposures {
     }
 
     /// The current exposure of every view.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub fn affines(&self) -> Result<Vec<Affine>> {
         let parameters = self.gpu.read(&self.parameters)?;
         Ok(parameters.chunks_exact(EXPOSURE_WIDTH as usize).map(Affine::of_parameters).collect())

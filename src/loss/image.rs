@@ -114,9 +114,6 @@ enum Kernels {
 
 impl Loss {
     /// Builds the kernels; [`Loss::reserve`] allocates.
-    ///
-    /// # Errors
-    /// The weight is outside [0, 1], or the device is out of memory.
     pub fn new(gpu: &Gpu, settings: LossSettings) -> Result<Self> {
         let LossSettings { ssim_weight, terms, gradient } = settings;
         let adds = gradient == Gradient::Added;
@@ -148,9 +145,6 @@ impl Loss {
     }
 
     /// Allocates scratch memory for views up to `size`; it never shrinks.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         self.max_values = self.max_values.max(value_count(size));
         let workgroups = self.kernels.workgroups(size) as usize;
@@ -166,10 +160,6 @@ impl Loss {
 
     /// Writes dL/d render, (3, H, W), to `d_render` or adds it, also outside the loss region, and writes the means of
     /// |a - b| and of SSIM to the log. If the SSIM weight is 0, SSIM is neither evaluated nor logged.
-    ///
-    /// # Errors
-    /// The view is empty or larger than those reserved for, the loss region is empty or not inside it, a buffer is
-    /// shorter than the view, or the log has no such slot.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,

@@ -76,9 +76,6 @@ pub(super) struct PartialSums<'a> {
 
 impl LossLog {
     /// A log of zeros.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub fn new(gpu: &Gpu, slots: usize) -> Result<Self> {
         Ok(Self {
             pipeline: gpu.pipeline(&loss_log::Constants::default())?,
@@ -93,9 +90,6 @@ impl LossLog {
     }
 
     /// Copies the log at this point of the recording to the host.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn download(&self, pass: &mut Recorder<'_>) -> Result<LossLogDownload> {
         Ok(LossLogDownload {
             values: pass.download(&self.values)?,
@@ -106,9 +100,6 @@ impl LossLog {
 
 impl LossLogDownload {
     /// Waits for the submission of the copy; returns one element per slot.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub fn wait(self) -> Result<Vec<StepLosses>> {
         let (values, statuses) = (self.values.wait()?, self.statuses.wait()?);
         let rows = values.chunks_exact(Term::all().count()).map(<[f32]>::to_vec).zip(statuses);

@@ -93,9 +93,6 @@ pub struct ParameterTerms {
 
 impl ParameterTerms {
     /// `None` if no weight is above 0. The first `frozen_columns` columns are not trained.
-    ///
-    /// # Errors
-    /// The device refuses the pipeline.
     pub fn new(gpu: &Gpu, weights: ParameterWeights, frozen_columns: u32) -> Result<Option<Self>> {
         let constants = parameter_terms::Constants { frozen_columns, ..Default::default() };
         let new = || {
@@ -115,9 +112,6 @@ impl ParameterTerms {
 
     /// Records the terms of a step: adds to the gradients, planes of floats in the same batches, and writes the means
     /// to the log.
-    ///
-    /// # Errors
-    /// A buffer is shorter than its batches, the log has no such slot, or the device is out of memory.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,

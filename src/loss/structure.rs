@@ -94,9 +94,6 @@ pub struct StructureLoss {
 
 impl StructureLoss {
     /// Builds the kernel; [`StructureLoss::reserve`] allocates.
-    ///
-    /// # Errors
-    /// The weight is negative or not finite, or the device is out of memory.
     pub fn new(gpu: &Gpu, weight: f64) -> Result<Self> {
         check_weight("the structure", weight)?;
         let constants = structure_l1::Constants::default();
@@ -110,9 +107,6 @@ impl StructureLoss {
     }
 
     /// Allocates scratch memory for views up to `size`; it never shrinks.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         let workgroups = pixel_count(size).div_ceil(self.values_per_workgroup) as usize;
         if workgroups > self.partials.len() {
@@ -122,9 +116,6 @@ impl StructureLoss {
     }
 
     /// Writes the plane of `d_render`, (channels, H, W), and the mean to the log.
-    ///
-    /// # Errors
-    /// The view is empty or larger than those reserved for, a buffer is too short, or the log has no such slot.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,

@@ -90,9 +90,6 @@ pub(super) struct WeightGradientInputs<'a> {
 
 impl Conv {
     /// Builds the kernels. A buffer that is accumulated into keeps its content in the sum.
-    ///
-    /// # Errors
-    /// The driver refuses a kernel.
     pub(super) fn new(
         gpu: &Gpu,
         [inputs, outputs]: [u32; 2],

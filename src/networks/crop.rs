@@ -65,9 +65,6 @@ pub struct CropKernels {
 
 impl CropKernels {
     /// Builds the kernels.
-    ///
-    /// # Errors
-    /// The device refuses a pipeline.
     pub fn new(gpu: &Gpu) -> Result<Self> {
         Ok(Self {
             gather: gpu.pipeline(&crop_gather::Constants::default())?,
@@ -76,9 +73,6 @@ impl CropKernels {
     }
 
     /// Records `content = image[planes, crop]`; `image` is (planes, H, W) of a view of `size`.
-    ///
-    /// # Errors
-    /// A buffer is too short for it.
     pub fn gather(
         &self,
         pass: &mut Recorder<'_>,
@@ -101,9 +95,6 @@ impl CropKernels {
     }
 
     /// Records `image[planes, crop] += content`.
-    ///
-    /// # Errors
-    /// A buffer is too short for it.
     pub fn scatter(
         &self,
         pass: &mut Recorder<'_>,

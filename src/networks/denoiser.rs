@@ -66,8 +66,6 @@ impl DenoiserSettings {
         }
     }
 
-    /// # Errors
-    /// A value is out of range.
     pub(crate) fn check(&self) -> Result<()> {
         self.check_rows()
     }
@@ -127,9 +125,6 @@ impl Denoiser {
     pub const LEARNING_RATE: f64 = 5e-5;
 
     /// Draws the weights; [`Denoiser::reserve`] allocates for views.
-    ///
-    /// # Errors
-    /// A setting is out of range, the driver refuses a kernel, or the device is out of memory.
     pub fn new(gpu: &Gpu, settings: DenoiserSettings, seed: u64) -> Result<Self> {
         settings.check()?;
         let mut layout = Layout::new(Stream::new(seed, STREAM));
@@ -183,9 +178,6 @@ impl Denoiser {
     }
 
     /// Zeroes the last layer of every stage: in the identity variant the output is the input.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub fn become_identity(&mut self) -> Result<()> {
         let mut values = self.gpu.read(&self.parameters.values)?;
         for tensor in self.parameters.tensors().iter().filter(|of| of.name.contains("conv_out")) {
@@ -218,9 +210,6 @@ impl Denoiser {
     }
 
     /// Allocates for views up to `size`; it never shrinks.
-    ///
-    /// # Errors
-    /// A map exceeds what the device can bind, or the device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         let needed = DenoiserExtent::of(self.held, size);
         if needed.fits(self.reserved) {
@@ -239,9 +228,6 @@ impl Denoiser {
 
     /// Keeps the activations of every stage in views up to `size` from now on, if that takes at most `most` bytes and
     /// the device has them; returns whether it does. Results are bit-identical either way.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub fn keep_activations(&mut self, size: UVec2, most: u64) -> Result<bool> {
         let (settings, needed) = (self.held, DenoiserExtent::of(self.held, size));
         if needed.fits(self.earlier.extent()) {
@@ -267,9 +253,6 @@ impl Denoiser {
 
     /// Records the forward pass from `I_0`, the noise map or in the identity variant the render, and the render, each
     /// (3, H, W), to [`Denoiser::denoised`].
-    ///
-    /// # Errors
-    /// The view is empty or no memory is reserved for it, or an image is shorter than the view.
     pub fn forward(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -310,9 +293,6 @@ impl Denoiser {
     /// Records the backward pass from `dL/dR_K`: overwrites the gradients of the parameters, writes `d_input` and adds
     /// to `d_render`, each (3, H, W), the gradient of the render other than through `I_0`: zero in the identity
     /// variant. Inputs and parameters must be those of the preceding forward pass.
-    ///
-    /// # Errors
-    /// There is no forward pass of that size before it, or an image is shorter than the view.
     #[expect(clippy::too_many_arguments, reason = "three images in, two gradients out")]
     pub fn backward(
         &mut self,

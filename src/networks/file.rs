@@ -24,8 +24,6 @@ pub(crate) struct TensorFile<'a> {
 }
 
 impl<'a> TensorFile<'a> {
-    /// # Errors
-    /// The header is damaged, or does not match the size of the data.
     pub(crate) fn of(bytes: &'a [u8]) -> std::result::Result<Self, SafeTensorError> {
         let (header_bytes, metadata) = SafeTensors::read_metadata(bytes)?;
         // The length of the header precedes it.
@@ -69,9 +67,6 @@ impl<'a> TensorFile<'a> {
 }
 
 /// Writes each network's tensors as `network.tensor`.
-///
-/// # Errors
-/// The file cannot be written, or the device was lost.
 pub fn save(path: &Path, networks: &[&Parameters], gpu: &Gpu) -> Result<()> {
     let mut settings = BTreeMap::new();
     let mut values = vec![];
@@ -103,9 +98,6 @@ pub fn save(path: &Path, networks: &[&Parameters], gpu: &Gpu) -> Result<()> {
 }
 
 /// Reads each network's values from the tensors `network.tensor`: all networks, or none on failure.
-///
-/// # Errors
-/// The file is missing or damaged, a value is not finite, or a network in the file has another configuration.
 pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<()> {
     let bytes = input::bytes(path)?;
     let damaged =

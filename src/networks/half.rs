@@ -30,9 +30,6 @@ pub(super) struct PackedMap {
 
 impl PackedMap {
     /// Allocates this number of groups of eight halves.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn new(gpu: &Gpu, packed_count: usize) -> Result<Self> {
         let largest = gpu.uninit("largest", packed_count.min(1))?;
         Ok(Self { largest, halves: gpu.uninit("packed_map", packed_count)? })
@@ -80,8 +77,6 @@ pub(super) struct HalfConv {
 }
 
 impl HalfConv {
-    /// # Errors
-    /// The driver refuses a kernel.
     pub(super) fn new(
         gpu: &Gpu,
         channels: u32,
@@ -121,9 +116,6 @@ impl HalfConv {
     }
 
     /// Allocates for the weights of a layer.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn packed_weights(&self, gpu: &Gpu) -> Result<PackedWeights> {
         let halves = || gpu.uninit("packed_weights", self.packed_weight_count() as usize);
         let largest = gpu.uninit("largest_weight", 1)?;

@@ -30,8 +30,6 @@ pub(super) struct Map<'a> {
 }
 
 impl Inner {
-    /// # Errors
-    /// The driver refuses a kernel, or the device is out of memory.
     pub(super) fn new(
         gpu: &Gpu,
         channels: u32,

@@ -90,10 +90,6 @@ pub struct Lpips {
 impl Lpips {
     /// Loads the weights of a safetensors file: the tensors of `lpips.LPIPS(net='alex')` or `(net='vgg')` under its
     /// names. They determine the network.
-    ///
-    /// # Errors
-    /// [`Error::Input`]: the file is not of a known network, or a tensor is missing, of another shape or not finite;
-    /// the device is out of memory.
     pub fn load(gpu: &Gpu, path: impl AsRef<Path>, range: Range) -> Result<Self> {
         let path = path.as_ref();
         let bytes = input::bytes(path)?;
@@ -114,10 +110,6 @@ impl Lpips {
     }
 
     /// The distance between two images of one size, sRGB in [0, 1]; 0 for equal ones.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] if the sizes differ, are too small, or too large for a binding of the device; the device is out
-    /// of memory or lost.
     pub fn distance(&self, gpu: &Gpu, render: &Image, reference: &Image) -> Result<f64> {
         let size = |image: &Image| UVec2::new(image.width, image.height);
         if size(render) != size(reference) {

@@ -79,8 +79,6 @@ macro_rules! params {
 }
 
 impl Norm {
-    /// # Errors
-    /// The driver refuses a kernel.
     pub(super) fn new(gpu: &Gpu, channels: u32) -> Result<Self> {
         let chunk = CHUNK;
         Ok(Self {
@@ -188,8 +186,6 @@ impl Norm {
 }
 
 impl NormMemory {
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn new(gpu: &Gpu, pixels: usize, channels: usize, uses: usize) -> Result<Self> {
         Ok(Self {
             statistics: gpu.uninit("norm_statistics", uses * channels)?,

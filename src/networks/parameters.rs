@@ -120,8 +120,6 @@ impl Layout {
         offset as u32
     }
 
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn upload(
         self,
         gpu: &Gpu,

@@ -9,8 +9,6 @@ use crate::kernels::relu_backward;
 pub(super) struct ReluBackward(Pipeline<relu_backward::Kernel>);
 
 impl ReluBackward {
-    /// # Errors
-    /// The device refuses the kernel.
     pub(super) fn new(gpu: &Gpu) -> Result<Self> {
         Ok(Self(gpu.pipeline(&relu_backward::Constants::default())?))
     }

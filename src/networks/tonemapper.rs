@@ -58,9 +58,6 @@ impl Tonemapper {
     pub const LEARNING_RATE: f64 = 1e-4;
 
     /// Draws the weights; [`Tonemapper::reserve`] allocates for views.
-    ///
-    /// # Errors
-    /// The driver refuses a kernel, or the device is out of memory.
     pub fn new(gpu: &Gpu, variant: NetworkVariant, seed: u64) -> Result<Self> {
         let mut layout = Layout::new(Stream::new(seed, STREAM));
         let offsets = [
@@ -116,9 +113,6 @@ impl Tonemapper {
     }
 
     /// Allocates for views up to `size`; it never shrinks.
-    ///
-    /// # Errors
-    /// A map exceeds what the device can bind, or the device is out of memory.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         if self.fits(size) {
             return Ok(());
@@ -144,9 +138,6 @@ impl Tonemapper {
     }
 
     /// Records the forward pass from illumination and denoised image, each (3, H, W), to [`Tonemapper::output`].
-    ///
-    /// # Errors
-    /// The view is empty or no memory is reserved for it, or an image is shorter than the view.
     pub fn forward(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -185,9 +176,6 @@ impl Tonemapper {
 
     /// Records the backward pass from dL/d output: overwrites the gradients of the parameters, writes `d_illumination`
     /// and adds to `d_denoised`, each (3, H, W). Inputs and parameters must be those of the preceding forward pass.
-    ///
-    /// # Errors
-    /// There is no forward pass of that size before it, or an image is shorter than the view.
     #[expect(clippy::too_many_arguments, reason = "three images in, two gradients out")]
     pub fn backward(
         &mut self,
@@ -252,8 +240,6 @@ fn lengths(size: UVec2) -> [usize; 2] {
     ]
 }
 
-/// # Errors
-/// A view of `size` exceeds what the device can bind.
 fn check_maps(gpu: &Gpu, size: UVec2) -> Result<()> {
     let [pixels, _] = lengths(size);
     check_binding(gpu, "the tonemapper's feature maps", size, CHANNELS as usize * pixels)

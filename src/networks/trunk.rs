@@ -131,9 +131,6 @@ impl Network {
     }
 
     /// The network of a file, by its last convolution.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if it has none of a known network.
     pub(crate) fn of(path: &Path, file: &TensorFile<'_>) -> Result<Self> {
         let is_held = |network: &Self| file.tensor(&network.last_tensor()).is_some();
         Self::ALL.into_iter().find(is_held).ok_or_else(|| {
@@ -159,10 +156,6 @@ pub(crate) struct Trunk {
 
 impl Trunk {
     /// Loads the network of a file, whose tensors have the names of `lpips`.
-    ///
-    /// # Errors
-    /// The file lacks a tensor, or has one of another shape or with a value that is not finite; the device is out of
-    /// memory.
     pub(crate) fn new(
         gpu: &Gpu,
         path: &Path,
@@ -189,8 +182,6 @@ impl Trunk {
         })
     }
 
-    /// # Errors
-    /// The last layer would have no pixel, or one of its images exceeds one binding.
     pub(crate) fn check(&self, gpu: &Gpu, size: UVec2) -> Result<()> {
         let UVec2 { x: width, y: height } = size;
         let (title, least) = (self.network.title(), self.network.min_size());
@@ -219,9 +210,6 @@ impl Trunk {
 
     /// The activations of each compared layer for an image (3, H, W) whose size was [checked](Self::check), (channels,
     /// pixels).
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(crate) fn activations(
         &self,
         gpu: &Gpu,
@@ -322,9 +310,6 @@ fn floats(channels: u32, UVec2 { x, y }: UVec2) -> usize {
 }
 
 /// A tensor of the published weights.
-///
-/// # Errors
-/// [`Error::Input`] if the file lacks it, or it has another shape or non-finite values.
 pub(crate) fn published(
     path: &Path,
     file: &TensorFile<'_>,

@@ -141,9 +141,6 @@ impl Dataset {
     }
 
     /// As [`Dataset::load`]; `look` is called with every training photograph as stored while it is in memory.
-    ///
-    /// # Errors
-    /// As [`Dataset::load`].
     pub(crate) fn load_and_look(
         root: &Path,
         options: &LoadOptions,
@@ -211,9 +208,6 @@ impl Dataset {
 
     /// Of the models that COLMAP wrote into the subfolders of `folder`, the one with the most registered photographs of
     /// which `counts` is true, with the names of all its photographs.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if a model is damaged.
     pub(crate) fn largest_model(
         folder: &Path,
         counts: impl Fn(&str) -> bool,
@@ -226,9 +220,6 @@ impl Dataset {
 
     /// The file of the images of a binary COLMAP model, with those that `renamed` gives a name, under that name. Points
     /// that only others see stay.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if the model is damaged.
     #[cfg(feature = "cli")]
     pub(crate) fn images_renamed(
         model: &Path,
@@ -238,27 +229,18 @@ impl Dataset {
     }
 
     /// The calibrated lenses of a COLMAP model.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if the model is damaged.
     #[cfg(feature = "cli")]
     pub(crate) fn lenses(model: &Path) -> Result<Vec<Lens>> {
         Ok(colmap::read_cameras(model)?.into_values().collect())
     }
 
     /// The folder with the contents of an archive: its only folder, if there is nothing else.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if it is not a readable archive.
     #[cfg(feature = "cli")]
     pub(crate) fn folder_of(archive: &Path) -> Result<PathBuf> {
         Ok(Layout::of(archive)?.root)
     }
 
     /// The files of the views below `root`, sorted by name, without decoding any.
-    ///
-    /// # Errors
-    /// As [`Dataset::load`], except for problems of pixels.
     pub(crate) fn photographs(root: &Path, options: &LoadOptions) -> Result<Vec<Photograph>> {
         let (photographs, skipped, remarks) = Self::listed(root, options)?;
         warn(&remarks);
@@ -287,9 +269,6 @@ impl Dataset {
 }
 
 /// The gains of the photographs; `None` without a white balance.
-///
-/// # Errors
-/// The photograph is missing, or has nothing neutral to measure.
 fn white_balance_gains(
     root: &Path,
     sources: &[Source],

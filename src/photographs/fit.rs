@@ -205,10 +205,6 @@ fn mean_squared_error(settings: &ToneSettings, pairs: &[&Pair]) -> f64 {
 
 /// Fits the family's constants to the pairs; for curves that adapt to a photograph, also black level (alpha) and gain
 /// (c, g0); for those that scale by a mean, also the target mean theta.
-///
-/// # Errors
-/// [`Error::Usage`] if the options are invalid or the family has nothing to fit; [`Error::Input`] if the pairs contain
-/// fewer different values than there are constants.
 pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Result<Fit> {
     options.check()?;
     let model = Model::new(family, options)?;

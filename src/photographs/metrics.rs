@@ -36,9 +36,6 @@ impl Scores {
     }
 
     /// Every score of the unmasked pixels; see [`counted`].
-    ///
-    /// # Errors
-    /// Those of [`Scores::of`], or every pixel is masked.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn of_counted(
         render: &Image,
@@ -90,18 +87,12 @@ pub fn counted<'a>(render: &'a Image, reference: &Image, mask: Option<&Mask>) ->
 }
 
 /// Peak signal-to-noise ratio over all pixels and channels, dB; infinite for equal images.
-///
-/// # Errors
-/// [`Error::Usage`] if the images differ in size.
 pub fn psnr(render: &Image, reference: &Image) -> Result<f64> {
     let errors = channel_mean_squared_errors(render, reference)?;
     Ok(decibels(mean(&errors)))
 }
 
 /// [`psnr`] of the unmasked pixels.
-///
-/// # Errors
-/// Those of [`psnr`], or every pixel is masked.
 pub fn psnr_of_counted(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<f64> {
     let Some(mask) = mask else { return psnr(render, reference) };
     Ok(decibels(mean(&weighted_errors(
@@ -112,18 +103,12 @@ pub fn psnr_of_counted(render: &Image, reference: &Image, mask: Option<&Mask>) -
 }
 
 /// The mean of the PSNRs of the three channels, dB: as the paper's code computes it, never below [`psnr`].
-///
-/// # Errors
-/// [`Error::Usage`] if the images differ in size.
 pub fn psnr_channel_mean(render: &Image, reference: &Image) -> Result<f64> {
     Ok(mean(&channel_mean_squared_errors(render, reference)?.map(decibels)))
 }
 
 /// Mean structural similarity over all pixels and channels (Wang et al. 2004): an 11x11 Gaussian window with sigma 1.5
 /// and zero padding, C1 = 0.01^2, C2 = 0.03^2, as in 3DGS.
-///
-/// # Errors
-/// [`Error::Usage`] if the images differ in size.
 pub fn ssim(render: &Image, reference: &Image) -> Result<f64> {
     let pairs = channels(render, reference)?;
     let width = render.width as usize;

@@ -97,10 +97,6 @@ pub struct Posed {
 const MIN_CAMERAS: usize = 3;
 
 /// Estimates the cameras and writes the dataset.
-///
-/// # Errors
-/// [`Error::Usage`] if an option is invalid or a program is missing, [`Error::Input`] if the photographs are unusable
-/// or a program fails or finds too few cameras, [`Error::Output`] if the dataset exists or cannot be written.
 pub fn estimate(options: &PoseOptions, report: &dyn Fn(Progress<'_>)) -> Result<Posed> {
     if !(options.fps > 0.0 && options.fps <= 240.0) {
         let problem = format!("--fps is {}; it must be above 0 and at most 240", options.fps);
@@ -160,9 +156,6 @@ pub fn estimate(options: &PoseOptions, report: &dyn Fn(Progress<'_>)) -> Result<
 }
 
 /// The pairs that are matched.
-///
-/// # Errors
-/// [`Error::Usage`] if dark and bright photographs would not be matched with each other.
 fn matcher(options: &PoseOptions, is_clip: bool) -> Result<Matcher> {
     let follows = is_clip && options.with.is_none();
     let default = if follows { Matcher::Sequential } else { Matcher::Exhaustive };
@@ -226,9 +219,6 @@ fn folder_of(photos: &Path) -> Result<PathBuf> {
 }
 
 /// The bright photographs, which are not in the folder of the dark ones.
-///
-/// # Errors
-/// Those of [`distinct_photographs`], or both are in one folder.
 fn bright_photographs(with: &Path, dark: &Path) -> Result<Vec<PathBuf>> {
     let bright = folder_of(with)?;
     if is_same_file(&bright, dark) {
@@ -250,9 +240,6 @@ fn by_hand(photos: &Path, out: &Path) -> String {
 }
 
 /// The photographs of a folder.
-///
-/// # Errors
-/// [`Error::Input`] if there are too few, or two differ in their extension alone: COLMAP sees both as one PNG.
 fn distinct_photographs(folder: &Path) -> Result<Vec<PathBuf>> {
     let mut paths = photographs_in(folder)?;
     paths.retain(|path| !is_mask(path));

@@ -39,9 +39,6 @@ pub struct PseudoGt {
 
 impl PseudoGt {
     /// Builds the kernels for one curve.
-    ///
-    /// # Errors
-    /// The curve is undefined with these settings ([`ToneSettings::check`]), or the device is out of memory.
     pub fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
         settings.check()?;
         let numbers = match (&settings.table, &settings.profile) {
@@ -67,9 +64,6 @@ impl PseudoGt {
     }
 
     /// Records `target = curve(image)` with `parameters[view]`; both planar `(3, pixels)`.
-    ///
-    /// # Errors
-    /// `target` and `image` differ in length, or `parameters` ends before `view`.
     pub fn map(
         &self,
         pass: &mut Recorder<'_>,
@@ -92,9 +86,6 @@ impl PseudoGt {
     /// Records the pseudo-GT of a stored photograph: decoded, and tone-mapped with `parameters[view]` if that is given.
     /// `target`, (3, pixels), may be longer. Values that are neither coded nor tone-mapped need no pass: their own
     /// buffer is returned.
-    ///
-    /// # Errors
-    /// `target` is shorter, `parameters` ends before `view`, or the device refuses the kernel.
     pub fn record<'a>(
         &self,
         pass: &mut Recorder<'_>,

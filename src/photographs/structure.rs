@@ -34,9 +34,6 @@ pub struct StructureTarget {
 
 impl StructureTarget {
     /// Builds the kernels.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn new(gpu: &Gpu) -> Result<Self> {
         Ok(Self {
             gpu: gpu.clone(),
@@ -54,9 +51,6 @@ impl StructureTarget {
     }
 
     /// Records the structure of `target`, a pseudo-GT of shape (3, H, W), into `structure`, (H, W), in [0, 1].
-    ///
-    /// # Errors
-    /// The view has no pixels, a buffer is shorter than it, or the device is out of memory.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,

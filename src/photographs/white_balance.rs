@@ -50,10 +50,6 @@ impl WhiteBalance {
         VIEW,x,y,w,h of a neutral area in whole pixels, or VIEW,x1,y1,..,x4,y4, the corners of a colour chart";
 
     /// The gains, measured in one of the named photographs of `root` if necessary.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] if the area is outside, black or clipped; [`Error::Input`] if there is no such photograph, or
-    /// it cannot be read.
     pub(crate) fn gains<'a>(
         &self,
         root: &Path,

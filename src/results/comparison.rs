@@ -54,9 +54,6 @@ pub(crate) struct CompareOptions<'a> {
 impl RunComparison {
     /// Scores the test views of every run against the same images: the references or, without any, the targets of the
     /// first run.
-    ///
-    /// # Errors
-    /// Those of opening a run; [`Error::Usage`] for runs of different test views.
     pub(crate) fn of(paths: &[PathBuf], options: &CompareOptions<'_>) -> Result<Self> {
         let names = names(paths);
         let mut first: Option<(Dataset, ScoreReference)> = None;

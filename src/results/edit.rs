@@ -57,9 +57,6 @@ pub(crate) struct Editor {
 
 impl Editor {
     /// Opens a run or a model file.
-    ///
-    /// # Errors
-    /// Those of reading a model.
     pub(crate) fn open(path: &Path, dataset: Option<&Path>, opener: Opener) -> Result<Self> {
         let (content, facts) = Content::open(path)?;
         Ok(Self {
@@ -77,9 +74,6 @@ impl Editor {
     }
 
     /// Refuses an output that is the model itself, has no extension of a model, or cannot be written.
-    ///
-    /// # Errors
-    /// The reason.
     pub(crate) fn check_output(model: &Path, out: &Path) -> Result<()> {
         Format::of(out)?;
         if is_same_file(out, model) || is_same_file(out, &model.join("model.ply")) {
@@ -89,9 +83,6 @@ impl Editor {
     }
 
     /// Refuses an edit list that was made for another model.
-    ///
-    /// # Errors
-    /// [`Error::Input`] with both fingerprints.
     pub(crate) fn check_list(&self, path: &Path, list: &EditList) -> Result<()> {
         if list.model == self.fingerprint {
             return Ok(());
@@ -105,10 +96,6 @@ impl Editor {
     }
 
     /// Applies an operation and says in a line what it did.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] for invalid numbers and for an operation that leaves nothing; [`Error::Input`] for files and
-    /// datasets; the device is out of memory or lost.
     pub(crate) fn apply(&mut self, operation: &Operation) -> Result<String> {
         operation.check().map_err(Error::Usage)?;
         if operation.needs_dataset() {
@@ -168,9 +155,6 @@ impl Editor {
 
     /// Writes the model in the format of the file's extension, with the edit list in its header, and says in a line
     /// what it has.
-    ///
-    /// # Errors
-    /// The model does not fit the format, or the file cannot be written; no partial file is left.
     pub(crate) fn save(&self, out: &Path) -> Result<String> {
         let (dataset, curve) = match is_model(&self.path) {
             true => Default::default(),
@@ -193,9 +177,6 @@ impl Editor {
     }
 
     /// Writes the edit list.
-    ///
-    /// # Errors
-    /// [`Error::Output`].
     pub(crate) fn save_list(&self, out: &Path) -> Result<()> {
         let mut list = self.list();
         for operation in &mut list.edits {

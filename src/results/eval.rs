@@ -84,17 +84,11 @@ pub struct ScoreReference {
 impl ScoreReference {
     /// The reference images of the test views that have one; without any, the targets that `tone apply` gives the test
     /// views, with the statistics of the training photographs.
-    ///
-    /// # Errors
-    /// Every photograph is almost black, one can no longer be read, or the device is out of memory or lost.
     pub fn of(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
         Self::made_by(tone, dataset, || TestTargets::new(gpu, tone, dataset))
     }
 
     /// [`ScoreReference::of`] with given statistics of the training photographs.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn in_scene(
         gpu: &Gpu,
         tone: &ToneSettings,
@@ -193,9 +187,6 @@ pub struct ScoredImages<'a> {
 
 impl ScoredImages<'_> {
     /// LPIPS of the unmasked pixels.
-    ///
-    /// # Errors
-    /// Those of [`Lpips::distance`].
     pub fn lpips(&self, gpu: &Gpu, lpips: &Lpips) -> Result<f64> {
         let Self { view, render, target } = self;
         let mask = view.mask.as_ref().map(|mask| mask.resized(render.width, render.height));
@@ -203,18 +194,12 @@ impl ScoredImages<'_> {
     }
 
     /// The scores after the gain and bias of each channel that minimise the squared error to the target.
-    ///
-    /// # Errors
-    /// None for images from [`score_by`].
     pub fn aligned(&self) -> Result<Scores> {
         let affine = Affine::least_squares(&self.render, &self.target)?;
         Scores::of(&quantized(&affine.applied(&self.render)), &self.target)
     }
 
     /// The scores of the render by some stops of linear light brighter.
-    ///
-    /// # Errors
-    /// None for images from [`score_by`].
     pub(crate) fn exposed(&self, stops: f64) -> Result<Scores> {
         let light = stops.exp2() as f32;
         let brighter = |&x: &f32| srgb_from_linear(light * linear_from_srgb(x));
@@ -225,9 +210,6 @@ impl ScoredImages<'_> {
 
     /// Writes `renders/NAME.png` and `references/NAME.png` in `folder`; `targets/NAME.png` if there are no reference
     /// images.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
     pub fn save(&self, folder: &Path, against: ReferenceKind) -> Result<()> {
         let targets = match against {
             ReferenceKind::References => "references",
@@ -289,17 +271,11 @@ impl ModelRenderer {
     }
 
     /// Lights what is rendered from now on by a lamp at the camera, in units of the dataset's world, or evenly.
-    ///
-    /// # Errors
-    /// A number is out of range, the driver refuses a kernel, or the device is out of memory.
     pub(crate) fn set_lamp(&mut self, lamp: Option<Lamp>) -> Result<()> {
         self.renderer.set_lamp(lamp.map(|lamp| lamp.scaled(self.frame.scale)))
     }
 
     /// Renders a view as [`ScoreReference`] shows it: in the light of its photograph, or evenly lit.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(crate) fn render_as(&mut self, view: &View, in_even_light: bool) -> Result<Rendered> {
         self.renderer.set_even_light(in_even_light);
         let rendered = self.render(view);
@@ -341,9 +317,6 @@ impl ModelRenderer {
 
 /// Scores every test view that has a reference image; `render` renders a view. Both images are clamped and rounded to 8
 /// bits first, as they are saved.
-///
-/// # Errors
-/// Those of `render`; a reference image that is not cached can no longer be read.
 #[cfg(feature = "testing")]
 pub fn score(
     dataset: &Dataset,
@@ -353,10 +326,6 @@ pub fn score(
 }
 
 /// [`score`] against any reference; `inspect` is called with the images of each view.
-///
-/// # Errors
-/// Those of [`score`] and `inspect`; a photograph that is not cached can no longer be read, or the device is out of
-/// memory or lost.
 pub fn score_by(
     score_reference: &mut ScoreReference,
     dataset: &Dataset,

@@ -36,17 +36,11 @@ pub(crate) struct FinishedRun {
 impl FinishedRun {
     /// Loads configuration, model and dataset; dataset and device default to the run's. Warns if the run is incomplete
     /// or the dataset has changed.
-    ///
-    /// # Errors
-    /// The folder contains no run with a model, its dataset is missing, or there is no such device.
     pub(crate) fn open(folder: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
         Self::open_with(folder, dataset, opener, |_| {})
     }
 
     /// [`Self::open`] with a change of the configuration.
-    ///
-    /// # Errors
-    /// Those of [`Self::open`].
     pub(crate) fn open_with(
         folder: &Path,
         dataset: Option<&Path>,
@@ -103,9 +97,6 @@ impl FinishedRun {
     }
 
     /// [`Self::open`] with renders in the light of the photographs, for scores.
-    ///
-    /// # Errors
-    /// Those of [`Self::open`].
     pub(crate) fn open_lit(folder: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
         let mut own = Self::open(folder, dataset, opener)?;
         own.model_renderer.set_lamp(own.lamp)?;

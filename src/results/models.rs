@@ -51,9 +51,6 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
 }
 
 /// [`read`], but part by part: `None` if it is no PLY.
-///
-/// # Errors
-/// Those of [`Model::load`], except for the numbers of the Gaussians.
 pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, Facts)>> {
     if path.is_dir() {
         let config = run::load_config(path)?;

@@ -9,9 +9,6 @@ use crate::photographs::image::Image;
 use crate::{Error, Result};
 
 /// Makes a video of `files`.
-///
-/// # Errors
-/// ffmpeg is missing, and the message has the command to run later; ffmpeg fails; or the file cannot be written.
 pub(crate) fn make(video: &Path, folder: &Path, files: &[PathBuf], fps: u16) -> Result<()> {
     let extension = video.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     if ["png", "apng"].contains(&extension.as_str()) {

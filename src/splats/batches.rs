@@ -109,9 +109,6 @@ impl Batches {
     }
 
     /// A buffer of planes in batches, from the planes of all Gaussians.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     #[cfg(feature = "testing")]
     pub fn upload(&self, gpu: &Gpu, name: &str, planes: &[f32]) -> Result<Buffer<f32>> {
         let mut buffer = self.uninit(gpu, name)?;
@@ -120,25 +117,16 @@ impl Batches {
     }
 
     /// A buffer of uninitialised planes.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn uninit(&self, gpu: &Gpu, name: &str) -> Result<Buffer<f32>> {
         gpu.uninit_in_windows(name, self.floats(), self.window())
     }
 
     /// A buffer of zeroed planes.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub fn zeros(&self, gpu: &Gpu, name: &str) -> Result<Buffer<f32>> {
         gpu.zeroed(self.uninit(gpu, name)?)
     }
 
     /// Overwrites the planes in a buffer by those of all Gaussians.
-    ///
-    /// # Errors
-    /// The buffer is shorter, or the device is out of memory or lost.
     pub fn write<'a>(
         &self,
         gpu: &Gpu,
@@ -157,9 +145,6 @@ impl Batches {
     }
 
     /// The planes of all Gaussians, from those in a buffer.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub fn read<'a>(&self, gpu: &Gpu, buffer: impl Into<Slice<'a, f32>>) -> Result<Vec<f32>> {
         let mut batched = gpu.read(buffer)?;
         batched.truncate(self.floats());
@@ -228,17 +213,11 @@ struct Part {
 
 impl Batch {
     /// Its slice of a buffer of planes in batches.
-    ///
-    /// # Errors
-    /// The buffer is shorter.
     pub fn planes<'a>(&self, planes: impl Into<Slice<'a, f32>>) -> Result<Slice<'a, f32>> {
         planes.into().range(self.floats())
     }
 
     /// [`Self::planes`], mutable.
-    ///
-    /// # Errors
-    /// The buffer is shorter.
     pub fn planes_mut<'a>(
         &self,
         planes: impl Into<SliceMut<'a, f32>>,
@@ -253,9 +232,6 @@ impl Batch {
     }
 
     /// Its slice of a buffer of `each` elements per Gaussian, Gaussian-major.
-    ///
-    /// # Errors
-    /// The buffer is shorter.
     pub fn rows<'a, T: bytemuck::Pod>(
         &self,
         rows: impl Into<Slice<'a, T>>,
@@ -265,9 +241,6 @@ impl Batch {
     }
 
     /// [`Self::rows`], mutable.
-    ///
-    /// # Errors
-    /// The buffer is shorter.
     pub fn rows_mut<'a, T: bytemuck::Pod>(
         &self,
         rows: impl Into<SliceMut<'a, T>>,

@@ -169,9 +169,6 @@ impl Scratch {
 impl Densifier {
     /// Builds the kernels. A Gaussian is not split if that would change the view of one of `cameras`, in world space;
     /// the paper's control ignores them.
-    ///
-    /// # Errors
-    /// A setting is invalid, or the device refuses a pipeline.
     pub fn new(gpu: &Gpu, settings: DensifySettings, cameras: &[Camera]) -> Result<Self> {
         let DensifySettings { gradient_threshold, split_scale, min_opacity, .. } = settings;
         for (name, value, upper) in [
@@ -212,10 +209,6 @@ impl Densifier {
     /// `keeps` inspects the new Gaussians before they are committed and returns the fraction of the splits that may
     /// stay: 1 or more for all of them. Otherwise the round is repeated with that fraction, those with the largest
     /// gradients first, and at last with none.
-    ///
-    /// # Errors
-    /// A buffer is shorter than the Gaussians need, `keeps` fails, or the device is out of memory (the Gaussians are
-    /// then unchanged) or lost.
     pub fn densify(
         &mut self,
         gaussians: &mut DeviceGaussians,

@@ -54,18 +54,12 @@ pub(crate) struct Tile {
 
 impl Manifest {
     /// The manifest of the model of a scene; `None` if it is not in tiles.
-    ///
-    /// # Errors
-    /// Those of [`Self::load`].
     pub(crate) fn of_scene(folder: &Path) -> Result<Option<Self>> {
         let model = folder.join(MODEL);
         if model.join(MANIFEST).is_file() { Self::load(&model).map(Some) } else { Ok(None) }
     }
 
     /// The manifest in a folder.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if there is none, or it is damaged or of another version.
     pub(crate) fn load(folder: &Path) -> Result<Self> {
         let path = folder.join(MANIFEST);
         let wrong =
@@ -91,9 +85,6 @@ impl Manifest {
     }
 
     /// The whole model.
-    ///
-    /// # Errors
-    /// A tile is missing or damaged, or has another number of Gaussians.
     pub(crate) fn gaussians(&self) -> Result<Gaussians> {
         let mut whole: Option<Gaussians> = None;
         for tile in &self.tiles {
@@ -104,9 +95,6 @@ impl Manifest {
     }
 
     /// Reads a tile.
-    ///
-    /// # Errors
-    /// Those of [`Self::gaussians`].
     pub(crate) fn read(&self, tile: &Tile) -> Result<Gaussians> {
         let path = self.folder.join(&tile.file);
         let gaussians = ply::load(&path)?;

@@ -152,9 +152,6 @@ impl Lamp {
     }
 
     /// Refuses numbers out of range.
-    ///
-    /// # Errors
-    /// [`Error::Usage`], with the number.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn check(&self) -> Result<()> {
         let Self { position, axis, ambient, exponent, falloffs, .. } = *self;

@@ -95,10 +95,6 @@ impl Model {
     /// One model of several, each turned and moved by a rigid pose, so that all are sorted together. Near plane, alpha
     /// limit and colours are the first one's, and its law where all have it; positions are relative to its origin, and
     /// to none where they are moved.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] where there is no part, a pose is not rigid, or a part has other colours or another alpha
-    /// limit.
     #[cfg(feature = "capi")]
     pub(crate) fn join(parts: &[(&Self, DAffine3)]) -> Result<Self> {
         let [(first, _), ..] = parts else {

@@ -35,9 +35,6 @@ pub enum Moments<P = Buffer<f32>> {
 
 impl Moments {
     /// Zero moments for `len` parameters.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn zeros(gpu: &Gpu, len: usize) -> Result<Self> {
         Self::of(StorageFormat::Single, |name| gpu.zeros(name, len))
     }
@@ -66,9 +63,6 @@ impl Moments {
     }
 
     /// Borrows those of a batch of Gaussians.
-    ///
-    /// # Errors
-    /// The planes are shorter.
     pub fn of_batch(&mut self, batch: &Batch) -> Result<Moments<SliceMut<'_, f32>>> {
         Ok(match self {
             Self::Single { first, second } => Moments::Single {
@@ -208,9 +202,6 @@ pub(crate) struct GaussianStep<'a> {
 
 impl Adam {
     /// [`Adam::with_frozen`] without frozen columns.
-    ///
-    /// # Errors
-    /// The device refuses a kernel.
     #[cfg(any(test, feature = "testing"))]
     pub fn new(gpu: &Gpu) -> Result<Self> {
         Self::with_frozen(gpu, 0)
@@ -218,9 +209,6 @@ impl Adam {
 
     /// Builds the kernel, which leaves the first columns of Gaussians as they are; those for packed coefficients are
     /// built on first use.
-    ///
-    /// # Errors
-    /// The device refuses it.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn with_frozen(gpu: &Gpu, frozen_columns: u32) -> Result<Self> {
         let adam = Self {
@@ -238,9 +226,6 @@ impl Adam {
 
     /// Records step number `step`, from 1, over `planes`, which may be a part of all. Nothing changes while the first
     /// word of `status` is nonzero.
-    ///
-    /// # Errors
-    /// A buffer is too short, the step is 0, or the device refuses the kernel.
     pub fn record(
         &self,
         pass: &mut Recorder<'_>,
@@ -254,9 +239,6 @@ impl Adam {
     }
 
     /// [`Adam::record`] for Gaussians, whose frozen columns have neither gradients nor moments.
-    ///
-    /// # Errors
-    /// Those of [`Adam::record`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn record_trained(
         &self,
@@ -311,9 +293,6 @@ impl Adam {
     }
 
     /// [`Adam::record`] for the packed SH coefficients above degree 0 of `planes`.
-    ///
-    /// # Errors
-    /// Those of [`Adam::record`].
     pub fn record_halves(
         &self,
         pass: &mut Recorder<'_>,
@@ -358,9 +337,6 @@ impl Adam {
     }
 
     /// Records a step over all columns of `planes`, of the SH degree in use.
-    ///
-    /// # Errors
-    /// Those of [`Adam::record`], or the moments are not 32-bit floats.
     pub(crate) fn record_gaussians(
         &self,
         pass: &mut Recorder<'_>,

@@ -128,9 +128,6 @@ struct DepthChannel {
 
 impl Renderer {
     /// The number of intersections of the last render; waits for it.
-    ///
-    /// # Errors
-    /// The device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn intersections(&self) -> Result<u32> {
         Ok(self.gpu.read(&self.frame.counts)?[0])
@@ -153,9 +150,6 @@ impl Renderer {
     }
 
     /// The driver's statistics of the blending kernels, forward and backward; empty where it has none.
-    ///
-    /// # Errors
-    /// The driver refuses a kernel.
     pub(crate) fn blend_statistics(&self) -> Result<Option<[Vec<Statistic>; 2]>> {
         let forward = self.blend_forward.statistics()?;
         let backward = match &self.blend_backward {

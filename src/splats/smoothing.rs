@@ -19,9 +19,6 @@ pub struct SmoothingFloor {
 impl SmoothingFloor {
     /// The floor is a Gaussian of `variance` square pixels of the view, among those of `cameras`, that samples a
     /// Gaussian most finely. `near` is the near plane in world units.
-    ///
-    /// # Errors
-    /// The device refuses the pipeline, or is out of memory.
     pub fn new(gpu: &Gpu, variance: f64, near: f32, cameras: &[Camera]) -> Result<Self> {
         let cameras: Vec<kernels::Camera> =
             cameras.iter().map(|camera| (&Patch::from(camera)).into()).collect();
@@ -35,9 +32,6 @@ impl SmoothingFloor {
     }
 
     /// Records a pass that raises the standard deviations; nothing changes while the first word of `status` is not 0.
-    ///
-    /// # Errors
-    /// A buffer is shorter than its batches, or the pass exceeds what the device can launch.
     pub fn record(
         &self,
         pass: &mut Recorder<'_>,

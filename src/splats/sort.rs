@@ -26,8 +26,6 @@ pub struct Count<'a> {
 }
 
 impl Count<'_> {
-    /// # Errors
-    /// The index is outside the counts.
     fn check(&self) -> Result<()> {
         if (self.index as usize) < self.counts.len() {
             return Ok(());
@@ -38,9 +36,6 @@ impl Count<'_> {
 }
 
 /// The common length of `lens` in 32 bits, for kernels.
-///
-/// # Errors
-/// The lengths differ, or exceed 32 bits.
 fn common_len(what: &str, lens: &[usize]) -> Result<u32> {
     let same = lens.windows(2).all(|pair| pair[0] == pair[1]);
     let len = lens.first().and_then(|&len| u32::try_from(len).ok()).filter(|_| same);

@@ -17,17 +17,11 @@ fn is_parameters(name: &str) -> bool {
 
 impl Trainer {
     /// Reads back the current parameters.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub(super) fn snapshot(&mut self) -> Result<Snapshot> {
         self.tensors(is_parameters)
     }
 
     /// Restores the parameters; moments and statistics are reset.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn restore_snapshot(&mut self, snapshot: &Snapshot) -> Result<()> {
         let gpu = self.gpu.clone();
         let shape = |(name, shape, _): &Tensor| (name == Model::PARAMETERS).then(|| shape.clone());

@@ -139,9 +139,6 @@ impl Cache {
     }
 
     /// Adds a photograph, which stays on the device if it fits.
-    ///
-    /// # Errors
-    /// The file cannot be written, or the device was lost.
     pub(super) fn keep(&mut self, photograph: Encoded) -> Result<Slot> {
         let place = self.kept.len();
         let bytes = photograph.bytes();
@@ -165,18 +162,12 @@ impl Cache {
     }
 
     /// A resident photograph.
-    ///
-    /// # Errors
-    /// It is not resident.
     pub(super) fn on_device(&self, Slot(place): Slot) -> Result<&Encoded> {
         let absent = || Error::Usage("a training photograph is not on the device".to_owned());
         self.kept[place].on_device.as_deref().ok_or_else(absent)
     }
 
     /// A photograph, resident or not.
-    ///
-    /// # Errors
-    /// The file cannot be read, or the device is out of memory or lost.
     pub(super) fn load(&self, Slot(place): Slot) -> Result<Arc<Encoded>> {
         match &self.kept[place] {
             CachedImage { on_device: Some(photograph), .. } => Ok(Arc::clone(photograph)),
@@ -196,9 +187,6 @@ impl Cache {
     }
 
     /// Makes `wanted` resident until the next call, evicting the least recently used.
-    ///
-    /// # Errors
-    /// The file cannot be read or written, or the device is out of memory or lost.
     pub(super) fn make_resident(&mut self, wanted: &[Slot]) -> Result<()> {
         self.clock += 1;
         for &Slot(place) in wanted {

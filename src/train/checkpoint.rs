@@ -86,9 +86,6 @@ impl Header {
 }
 
 /// Verifies a checkpoint's checksum.
-///
-/// # Errors
-/// [`Error::Input`] if it does not match or the file cannot be read.
 pub fn check_checkpoint(path: &Path) -> Result<()> {
     let bytes = input::bytes(path)?;
     let damaged =
@@ -186,9 +183,6 @@ impl Trainer {
     }
 
     /// Reads back the tensors of the state whose names `wants` accepts.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub(super) fn tensors(&mut self, wants: impl Fn(&str) -> bool) -> Result<Vec<Tensor>> {
         let gpu = self.gpu.clone();
         let state = self.state().into_iter().filter(|state| wants(&state.name));
@@ -283,9 +277,6 @@ impl Trainer {
     }
 
     /// Refuses Gaussians with NaN or infinity.
-    ///
-    /// # Errors
-    /// [`Error::ParameterNotFinite`], with step and plane.
     pub(crate) fn refuse_not_finite(&self, gaussians: &Gaussians) -> Result<()> {
         match first_not_finite(&gaussians.parameters) {
             Some(at) => Err(self.not_finite_in(at, width(gaussians.shape))),

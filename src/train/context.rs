@@ -26,9 +26,6 @@ pub(super) struct Initial {
 impl Initial {
     /// The Gaussians of [`TrainConfig::init`], divided by the halo of the dataset's block if it is one. A model in
     /// tiles is read one tile after the other.
-    ///
-    /// # Errors
-    /// A file cannot be read or does not fit the model, or none of its Gaussians is in the halo.
     pub(super) fn of(config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
         let Some(path) = &config.init else { return Ok(Self::default()) };
         let files = match path.join(MANIFEST).is_file() {
@@ -57,9 +54,6 @@ impl Initial {
 
     /// The context alone, for a training whose Gaussians come from a checkpoint. Where there is no block,
     /// [`TrainConfig::init`] is not read.
-    ///
-    /// # Errors
-    /// Those of [`Self::of`].
     pub(super) fn of_restored(config: &TrainConfig, dataset: &Dataset) -> Result<Self> {
         match Block::at(&dataset.root)? {
             None => Ok(Self::default()),

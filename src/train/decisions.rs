@@ -86,27 +86,18 @@ impl Trainer {
     }
 
     /// Allocates memory for the SH degree of the next step.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn allocate_sh_degree(&mut self) -> Result<()> {
         let degree = self.sh_degree(self.step + 1);
         if degree > self.model.shape().sh_degree { self.set_sh_degree(degree) } else { Ok(()) }
     }
 
     /// Changes the SH degree of model and renderer.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn set_sh_degree(&mut self, degree: u32) -> Result<()> {
         self.model.set_sh_degree(&self.gpu, degree)?;
         self.renderer.set_sh_degree(degree)
     }
 
     /// The limit of Gaussians from the held-out views, decided before every round of density control.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn growth_limit(&mut self) -> Result<usize> {
         let growth_gain = self.config.stop.growth_gain;
         let [_, whole] = self.config.schedule.resolution_steps;
@@ -150,9 +141,6 @@ impl Trainer {
 
     /// Compares the held-out views with and without the SH degree in use; a degree that gains too little is removed for
     /// good.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn decide_degree(&mut self) -> Result<()> {
         let (degree, least) = (self.sh_degree(self.step), self.config.stop.degree_gain);
         let with = self.held_out_psnr_of_degree(degree)?;

@@ -62,9 +62,6 @@ impl Trainer {
     }
 
     /// Adds Gaussians until there are `wanted`.
-    ///
-    /// # Errors
-    /// A photograph can no longer be read, or the device is out of memory or lost; the model is then unchanged.
     pub(super) fn seed_depths(&mut self, wanted: usize) -> Result<()> {
         let more = wanted.saturating_sub(self.model.count());
         if more == 0 {

@@ -157,9 +157,6 @@ pub struct Diagnosis {
 
 impl Diagnosis {
     /// Loads a dataset and diagnoses its training photographs, as stored, while they are decoded.
-    ///
-    /// # Errors
-    /// Those of [`Dataset::load`], or every photograph is black.
     pub fn load(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
         let looked_at = Mutex::new(HashMap::new());
         let look = |name: &str, image: &Image, mask: Option<&Mask>| {
@@ -174,9 +171,6 @@ impl Diagnosis {
     }
 
     /// Diagnoses a loaded dataset, whose photographs are read again; `options` are those that it was loaded with.
-    ///
-    /// # Errors
-    /// Every photograph is black, or one can no longer be read.
     pub fn of(dataset: &Dataset, options: &LoadOptions) -> Result<Self> {
         Self::with_photographs(dataset, options, HashMap::new())
     }

@@ -57,9 +57,6 @@ impl TrainConfig {
     }
 
     /// A checksum of every setting that affects results.
-    ///
-    /// # Errors
-    /// Never for a configuration that [`TrainConfig::check`] accepts.
     pub(crate) fn checksum(&self) -> Result<String> {
         let own = self.clone().with_absolute_paths();
         let mut hasher = Hasher::default();

@@ -68,9 +68,6 @@ pub(super) struct Convergence {
 
 impl Convergence {
     /// The state before the first step, with the targets of the held-out views.
-    ///
-    /// # Errors
-    /// A photograph cannot be read again, or the device is out of memory or lost.
     pub(super) fn new(
         pseudo_gt: &PseudoGt,
         dataset: &Dataset,
@@ -154,9 +151,6 @@ impl Trainer {
     }
 
     /// Scores the held-out views, keeps the model if it is the best so far, and decides whether the run has converged.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn score_held_out(&mut self) -> Result<()> {
         let Some(psnr) = self.held_out_psnr()? else { return Ok(()) };
         let [_, whole] = self.config.schedule.resolution_steps;

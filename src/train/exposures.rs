@@ -15,9 +15,6 @@ use crate::{Error, Result};
 
 impl Trainer {
     /// The exposure of each training view, by name; `None` if exposures are not learned.
-    ///
-    /// # Errors
-    /// The device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn exposures(&self) -> Result<Option<Vec<(String, Affine)>>> {
         let Some(exposures) = &self.supervision.exposures else { return Ok(None) };
@@ -28,9 +25,6 @@ impl Trainer {
 
 /// The stops of linear light by which photographs are brighter than the mean of the training views, by view: from the
 /// table of the configuration or the dataset, else from EXIF. Empty where no exposure is known, or all are alike.
-///
-/// # Errors
-/// The table cannot be read.
 pub(crate) fn known_stops(
     dataset: &Dataset,
     config: &TrainConfig,
@@ -77,9 +71,6 @@ impl Views {
     ///
     /// Initial values come from a table, else from the photographs' EXIF, else from points that several views show; a
     /// view without one starts at the identity.
-    ///
-    /// # Errors
-    /// The table cannot be read or names an unknown view; the device is out of memory or lost.
     pub(super) fn exposures(
         &self,
         pseudo_gt: &PseudoGt,

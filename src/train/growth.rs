@@ -70,9 +70,6 @@ impl Trainer {
     }
 
     /// A round of density control with as many splits as the probes allow.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     fn densify(&mut self, round: Round) -> Result<DensifyReport> {
         let options = RenderOptions { sh_degree: self.sh_degree(self.step), background: [0.0; 3] };
         let affines = self.affines()?;
@@ -126,9 +123,6 @@ fn share_that_stays(lost: f64) -> f64 {
 }
 
 /// Density control in the frame, for the cameras of the training views.
-///
-/// # Errors
-/// A setting is invalid, or the device refuses a pipeline.
 pub(super) fn densifier(gpu: &Gpu, config: &TrainConfig, dataset: &Dataset) -> Result<Densifier> {
     let frame = config.frame.unwrap_or_default();
     let cameras = dataset.train_views().map(|view| frame.camera(&view.camera));

@@ -33,8 +33,6 @@ pub(super) struct LampLearning {
 }
 
 impl LampLearning {
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn new(gpu: &Gpu, rates: LampRates) -> Result<Self> {
         Ok(Self { rates, moments: Moments::zeros(gpu, LAMP_WIDTH as usize)? })
     }
@@ -70,9 +68,6 @@ pub(super) const LEARNED: &str = "lamp";
 
 impl Optimizer {
     /// Records a step of the lamp, if one is learned.
-    ///
-    /// # Errors
-    /// A pass exceeds the device's launch limits.
     pub(super) fn update_lamp(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -99,9 +94,6 @@ impl Optimizer {
 
 impl Trainer {
     /// The lamp as learned so far, in units of the dataset's world; `None` without one.
-    ///
-    /// # Errors
-    /// The device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn lamp(&self) -> Result<Option<Lamp>> {
         Ok(self.renderer.lamp()?.map(|lamp| lamp.scaled(1.0 / self.frame.scale)))
@@ -110,9 +102,6 @@ impl Trainer {
 
 /// The lamp of the first step, in the training frame: that of the configuration at the median distance of what the
 /// views show, with the tone law of the photographs. The unit of light is that on the median of the points.
-///
-/// # Errors
-/// The device is out of memory or lost.
 pub(super) fn start(
     pseudo_gt: &PseudoGt,
     light: &SceneLight,

@@ -59,9 +59,6 @@ pub struct SettingsLayer(pub(super) Vec<(String, Value, Origin)>);
 
 impl SettingsLayer {
     /// Every setting of a TOML text.
-    ///
-    /// # Errors
-    /// The text is not TOML, or has an unknown key or an invalid value. The message has the line.
     pub fn of_toml(text: &str, origin: &Origin) -> Result<Self> {
         let table: Table = text.parse().map_err(|error: toml::de::Error| {
             let at = error.span().map(|span| line_at(text, span.start));
@@ -77,18 +74,12 @@ impl SettingsLayer {
     }
 
     /// The settings of a file.
-    ///
-    /// # Errors
-    /// The file cannot be read; and those of [`Self::of_toml`].
     pub fn load(path: &Path) -> Result<Self> {
         let layer = Self::of_toml(&input::text(path)?, &Origin::File(path.to_owned()));
         layer.map_err(|problem| Error::input(path, problem.to_string()))
     }
 
     /// Adds `KEY=VALUE`, such as `tone.alpha=0.1`.
-    ///
-    /// # Errors
-    /// There is no `=`; and those of [`Self::say`].
     pub fn assign(&mut self, assignment: &str) -> Result<()> {
         let (key, value) = assignment.split_once('=').ok_or_else(|| {
             let problem =
@@ -99,9 +90,6 @@ impl SettingsLayer {
     }
 
     /// Adds a setting with a value as on a command line: TOML, or text without quotes.
-    ///
-    /// # Errors
-    /// The key is unknown, or the value invalid.
     pub fn say(&mut self, key: &str, text: &str, origin: Origin) -> Result<()> {
         let value = value(text);
         // A device may be named 0.
@@ -118,9 +106,6 @@ impl SettingsLayer {
     }
 
     /// Adds a setting with its value.
-    ///
-    /// # Errors
-    /// The key is unknown, or the value invalid.
     pub fn push(&mut self, key: &str, value: Value, origin: Origin) -> Result<()> {
         let key = old_keys::current(key);
         // The constants of a curve can be set one by one.
@@ -209,9 +194,6 @@ impl Settings {
     }
 
     /// The configuration.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] for an incomplete curve.
     pub(crate) fn config(&self) -> Result<TrainConfig> {
         let mut table = Table::new();
         for (key, (value, _)) in &self.0 {
@@ -236,9 +218,6 @@ impl Settings {
     }
 
     /// Every setting of a configuration with value, origin and help.
-    ///
-    /// # Errors
-    /// Never for a configuration that [`TrainConfig::check`] accepts.
     pub(crate) fn explained(&self, config: &TrainConfig) -> Result<String> {
         let values = values(config)?;
         let line = |row: &Setting| {
@@ -256,9 +235,6 @@ impl Settings {
     }
 
     /// The text of config.toml: every setting with its help and the origin of its value.
-    ///
-    /// # Errors
-    /// None for a configuration that [`TrainConfig::check`] accepts.
     pub(crate) fn written(&self, config: &TrainConfig) -> Result<String> {
         let (mut written, mut section) = (String::new(), String::new());
         for line in config.to_toml()?.lines() {
@@ -322,9 +298,6 @@ impl TrainConfig {
 }
 
 /// The values in a configuration's TOML, by key.
-///
-/// # Errors
-/// None for a configuration that [`TrainConfig::check`] accepts.
 pub fn values(config: &TrainConfig) -> Result<BTreeMap<String, Value>> {
     Ok(SettingsLayer::of(config)?.0.into_iter().map(|(key, value, _)| (key, value)).collect())
 }

@@ -22,9 +22,6 @@ pub(super) struct Masks {
 
 impl Masks {
     /// The masks of the dataset's views at the sizes that they are trained on.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn new(gpu: &Gpu, dataset: &Dataset, views: &Views) -> Result<Self> {
         let (mut weights, mut largest) = (vec![], 0);
         for view in views.all() {
@@ -50,9 +47,6 @@ impl Masks {
     }
 
     /// The image for the loss, (3, H, W): `render`, with the target at masked pixels.
-    ///
-    /// # Errors
-    /// The pass cannot be recorded.
     pub(super) fn shown<'a>(
         &'a mut self,
         pass: &mut Recorder<'_>,
@@ -69,9 +63,6 @@ impl Masks {
     }
 
     /// Turns dL/d shown into dL/d render, in each of `channels` channels.
-    ///
-    /// # Errors
-    /// The pass cannot be recorded.
     pub(super) fn hide(
         &self,
         pass: &mut Recorder<'_>,
@@ -97,9 +88,6 @@ pub(super) struct Masking {
 
 impl Masking {
     /// Kernels for images of at most `values` values.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn new(gpu: &Gpu, values: usize) -> Result<Self> {
         Ok(Self {
             render: gpu.pipeline(&mask_render::Constants {})?,
@@ -109,9 +97,6 @@ impl Masking {
     }
 
     /// `render`, (3, H, W), with the target at pixels that `weights`, (H, W), mask.
-    ///
-    /// # Errors
-    /// The pass cannot be recorded.
     pub(super) fn shown(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -136,9 +121,6 @@ impl Masking {
     }
 
     /// Turns dL/d shown into dL/d render, in each of `channels` channels.
-    ///
-    /// # Errors
-    /// The pass cannot be recorded.
     pub(super) fn hide(
         &self,
         pass: &mut Recorder<'_>,

@@ -49,18 +49,12 @@ pub(super) fn photographs(dataset: &Dataset) -> impl Iterator<Item = (usize, &Vi
 }
 
 /// The scene's tone: that of the recorded law, or of the training photographs, which only then are measured.
-///
-/// # Errors
-/// Those of [`scene_of_measured`], or a photograph can no longer be read.
 pub(super) fn scene_of(settings: &ToneSettings, dataset: &Dataset) -> Result<SceneTone> {
     let training = if settings.law.is_some() { vec![] } else { measured(settings, dataset)? };
     scene_of_measured(settings, dataset, &training)
 }
 
 /// The scene's tone: that of the recorded law, or of these training photographs.
-///
-/// # Errors
-/// Every photograph is black and their exposure is needed, or the law cannot be used.
 pub(super) fn scene_of_measured(
     settings: &ToneSettings,
     dataset: &Dataset,
@@ -73,9 +67,6 @@ pub(super) fn scene_of_measured(
 }
 
 /// The tone mapping of a photograph of the scene: as recorded, or measured.
-///
-/// # Errors
-/// The recorded law lacks the view.
 pub(super) fn tone_mapping_of(
     settings: &ToneSettings,
     scene: &SceneTone,
@@ -90,9 +81,6 @@ pub(super) fn tone_mapping_of(
 }
 
 /// The tone law of a dataset: the mapping of every photograph for training and of every test photograph.
-///
-/// # Errors
-/// Every photograph is black and their exposure is needed, or a photograph can no longer be read.
 pub(crate) fn law_of(settings: &ToneSettings, dataset: &Dataset) -> Result<ToneLaw> {
     let tone = ToneSettings { law: None, ..settings.clone() };
     let training = measured(&tone, dataset)?;
@@ -113,9 +101,6 @@ pub(crate) fn law_of(settings: &ToneSettings, dataset: &Dataset) -> Result<ToneL
 }
 
 /// Measures each training photograph.
-///
-/// # Errors
-/// A photograph can no longer be read.
 pub(super) fn measured(
     settings: &ToneSettings,
     dataset: &Dataset,
@@ -132,9 +117,6 @@ pub(super) fn measured(
 }
 
 /// The measurements of a view, already known if its photograph was measured while it was decoded.
-///
-/// # Errors
-/// Those of [`tone_map_source`].
 pub(super) fn measured_of(
     view: &View,
     full_resolution: bool,
@@ -153,9 +135,6 @@ pub(super) fn measured_of(
 
 /// The image from which the target of a view is made: the photograph at full resolution if it is tone-mapped before it
 /// is resized, else as it was loaded; `None` if the view has no photograph.
-///
-/// # Errors
-/// Those of [`View::photograph`].
 pub(super) fn tone_map_source(
     view: &View,
     full_resolution: bool,

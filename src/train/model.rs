@@ -15,9 +15,6 @@ use crate::splats::scene::{
 
 impl Trainer {
     /// The gradients of all parameters in the last step, in the frame.
-    ///
-    /// # Errors
-    /// The device was lost.
     #[cfg(feature = "testing")]
     pub fn gradients(&self) -> Result<Gaussians> {
         let Model { gaussians, gradients, .. } = &self.model;
@@ -54,9 +51,6 @@ pub(super) struct Model {
 
 impl Model {
     /// Uploads Gaussians with memory for the SH degree `in_use`, or for their own degree if that is higher.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn upload(
         gpu: &Gpu,
         gaussians: &Gaussians,
@@ -95,9 +89,6 @@ impl Model {
     }
 
     /// Allocates `count` Gaussians of the same shape.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn zeros_like(&self, gpu: &Gpu, count: usize, in_use: u32) -> Result<Self> {
         let (rest, moments) = (self.gaussians.layout.sh_rest, self.moments.bits());
         let precision = PrecisionConfig { rest, moments, ..PrecisionConfig::default() };
@@ -116,9 +107,6 @@ impl Model {
     }
 
     /// Changes the SH degree; coefficients beyond it are dropped with their moments.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost; the model is then unchanged.
     pub(super) fn set_sh_degree(&mut self, gpu: &Gpu, sh_degree: u32) -> Result<()> {
         let own = self.gaussians.layout;
         let new = Layout { shape: Shape { sh_degree, ..own.shape }, ..own };
@@ -164,9 +152,6 @@ impl Model {
 
     /// Records a step of Adam over the columns of the SH degree in use, the second of the step's degrees, with
     /// gradients of this kind. Nothing changes while the first element of its status is not zero.
-    ///
-    /// # Errors
-    /// A pass exceeds the device's launch limits.
     pub(super) fn update(
         &mut self,
         (gpu, pass): (&Gpu, &mut Recorder<'_>),
@@ -200,9 +185,6 @@ impl Model {
     }
 
     /// Records the terms on parameters, which add to the gradients.
-    ///
-    /// # Errors
-    /// Those of [`ParameterTerms::record`].
     pub(super) fn record_terms(
         &mut self,
         (gpu, pass): (&Gpu, &mut Recorder<'_>),
@@ -221,9 +203,6 @@ impl Model {
 
     /// One round of density control, if `keeps` accepts the new parameters ([`Densifier::densify`]); the statistics are
     /// reset.
-    ///
-    /// # Errors
-    /// Those of `keeps`, or the device is out of memory or lost.
     pub(super) fn densify(
         &mut self,
         gpu: &Gpu,
@@ -247,9 +226,6 @@ impl Model {
     }
 
     /// The index of the first parameter that is not finite, in the planes of all Gaussians.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub(super) fn first_not_finite(
         &self,
         gpu: &Gpu,
@@ -281,8 +257,6 @@ impl Model {
         )
     }
 
-    /// # Errors
-    /// The device was lost.
     pub(super) fn download(&self, gpu: &Gpu) -> Result<Gaussians> {
         self.gaussians.download(gpu)
     }

@@ -28,9 +28,6 @@ pub struct Networks {
 
 impl Networks {
     /// The networks of the enabled parts, with initial weights, for renders of Gaussians with these features.
-    ///
-    /// # Errors
-    /// The Gaussians lack a feature that a network requires, or the device is out of memory.
     pub(crate) fn new(
         gpu: &Gpu,
         model: &ModelConfig,
@@ -74,9 +71,6 @@ impl Networks {
     }
 
     /// Reserves memory for crops up to `size`.
-    ///
-    /// # Errors
-    /// The device is out of memory, or a feature map exceeds the size that it binds.
     pub(super) fn reserve(&mut self, size: UVec2) -> Result<()> {
         let values = COLOR_CHANNELS * size.x as usize * size.y as usize;
         if self.colors.len() < values {
@@ -118,9 +112,6 @@ impl Networks {
     }
 
     /// R_K of a whole render, (channels, H, W); R_0 without a denoiser.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(crate) fn denoised_image(&mut self, render: &[f32], size: UVec2) -> Result<Image> {
         self.reserve(size)?;
         let gpu = self.gpu.clone();
@@ -143,9 +134,6 @@ impl Networks {
     }
 
     /// Writes the weights of every network.
-    ///
-    /// # Errors
-    /// The file cannot be written, or the device was lost.
     pub(crate) fn save(&self, path: &Path) -> Result<()> {
         let denoiser = self.denoiser.as_ref().map(Denoiser::parameters);
         let tonemapper = self.tonemapper.as_ref().map(Tonemapper::parameters);
@@ -154,9 +142,6 @@ impl Networks {
     }
 
     /// Reads the weights of every network.
-    ///
-    /// # Errors
-    /// The file is missing, damaged, or of another configuration.
     pub(crate) fn load(&mut self, path: &Path) -> Result<()> {
         let gpu = self.gpu.clone();
         let mut parameters: Vec<&mut Parameters> = self.parameters_mut().collect();

@@ -211,8 +211,6 @@ impl ModelConfig {
         }
     }
 
-    /// # Errors
-    /// [`Error::Setting`].
     pub(super) fn check(&self) -> Result<()> {
         self.check_rows()?;
         self.network.check_rows()?;

@@ -73,9 +73,6 @@ impl Views {
     }
 
     /// The target of a photograph, at its full size.
-    ///
-    /// # Errors
-    /// Those of [`Views::pictures`].
     pub(super) fn picture(&self, gpu: &Gpu, pseudo_gt: &PseudoGt, place: usize) -> Result<Image> {
         let pictures = self.pictures(gpu, pseudo_gt, place..place + 1, ImageKind::Targets)?;
         let gone = || Error::Usage(format!("there is no training photograph {place}"));
@@ -83,9 +80,6 @@ impl Views {
     }
 
     /// Images of photographs at full size, assembled from their patches.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn pictures(
         &self,
         gpu: &Gpu,

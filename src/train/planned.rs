@@ -50,9 +50,6 @@ pub struct PlannedRun {
 
 impl RequestedSettings {
     /// The requested settings, completed by a plan.
-    ///
-    /// # Errors
-    /// A number of a plan written by hand is out of range.
     pub fn settings(&self, plan: Option<&Plan>) -> Result<Settings> {
         let requested = [&self.file, &self.options, &self.set];
         let get = |key: &str| requested.iter().rev().find_map(|layer| layer.get(key));
@@ -92,9 +89,6 @@ impl RequestedSettings {
     }
 
     /// Loads the dataset and plans what is not requested.
-    ///
-    /// # Errors
-    /// A setting is invalid, the dataset cannot be used, or the plan is another dataset's.
     pub fn planned(&self, planning: PlanSource<'_>, gpu: &Gpu) -> Result<PlannedRun> {
         let config = self.settings(None)?.config()?;
         config.check()?;
@@ -153,9 +147,6 @@ impl Preset {
 impl Trainer {
     /// A trainer on the dataset in a folder, with settings in the format of config.toml; a diagnosis of the photographs
     /// decides the rest.
-    ///
-    /// # Errors
-    /// A setting is invalid, the dataset cannot be used, or the device is out of memory or lost.
     #[cfg(feature = "capi")]
     pub(crate) fn with_settings(gpu: &Gpu, dataset: &str, toml: &str) -> Result<Self> {
         let file = SettingsLayer::of_toml(toml, &Origin::Default)?;

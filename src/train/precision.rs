@@ -70,8 +70,6 @@ impl Encoder {
         Self { gpu: gpu.clone(), bits, grids: [None, None] }
     }
 
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn upload(&mut self, name: &str, values: &[f32]) -> Result<Encoded> {
         let plain = |gpu: &Gpu| Encoded::plain(gpu, Arc::new(gpu.buffer(name, values)?));
         if self.bits == PhotographBits::Single {

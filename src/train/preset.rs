@@ -96,9 +96,6 @@ impl Preset {
 
     /// The preset's settings for a named `curve`. A benchmark has the paper's constants and, if its code has a file for
     /// the scene that the dataset's folder is named after, that file's.
-    ///
-    /// # Errors
-    /// None for the existing presets.
     pub(super) fn layer(self, curve: Option<ToneCurve>, dataset: &Path) -> Result<SettingsLayer> {
         let origin = Origin::Preset(self.name());
         let mut layer = SettingsLayer::of_toml(self.toml(), &origin)?;

@@ -11,9 +11,6 @@ use crate::Result;
 use crate::base::settings::Setting;
 
 /// The text of docs/settings.md: every setting and every preset.
-///
-/// # Errors
-/// Never.
 pub fn reference() -> Result<String> {
     let mut text = "# Settings\n\n\
         Every setting of a training run, by its key in `config.toml` and for `train --set KEY=VALUE`, with its \

@@ -21,9 +21,6 @@ pub struct Rendered {
 impl Rendered {
     /// Renders `gaussians` from `camera` and applies the networks; in patches if the view exceeds the device, with a
     /// denoiser's norms over each patch.
-    ///
-    /// # Errors
-    /// Those of [`Renderer::render_image`]; the device is out of memory for the view or the networks.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn new<'a>(
         renderer: &mut Renderer,

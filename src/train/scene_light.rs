@@ -71,10 +71,6 @@ pub struct SceneLight {
 
 impl SceneLight {
     /// Measures the training photographs.
-    ///
-    /// # Errors
-    /// Every photograph is black and their exposure is needed, one can no longer be read, or the recorded law cannot be
-    /// used.
     pub fn of(settings: &ToneSettings, dataset: &Dataset) -> Result<Self> {
         let training = measured(settings, dataset)?;
         let scene = scene_of_measured(settings, dataset, &training)?;
@@ -92,9 +88,6 @@ impl SceneLight {
     }
 
     /// The tone mapping of each training photograph of the dataset.
-    ///
-    /// # Errors
-    /// The recorded law lacks a view.
     pub(super) fn tone_mappings(&self, dataset: &Dataset) -> Result<Vec<ToneMapping>> {
         let mapping = |((_, view), own): ((usize, &View), &MeasuredPhotograph)| {
             let recorded = self.scene.recorded_mapping(&view.name)?;
@@ -105,9 +98,6 @@ impl SceneLight {
 
     /// The inverse for a view: that of the curve of its photograph; of a view without one, [`SceneLight::at`] its
     /// camera.
-    ///
-    /// # Errors
-    /// The curve has no inverse, or the photograph can no longer be read.
     pub fn of_view(&self, view: &View) -> Result<InverseTone> {
         if let Some(mapping) = self.scene.recorded_mapping(&view.name)? {
             return InverseTone::new(&self.settings, &mapping.parameters);
@@ -122,27 +112,18 @@ impl SceneLight {
     }
 
     /// The inverse of the whole scene, at the exposure of all photographs together.
-    ///
-    /// # Errors
-    /// The curve has no inverse.
     pub fn of_scene(&self) -> Result<InverseTone> {
         let mapping = self.settings.tone_mapping(&self.scene, &self.together);
         InverseTone::new(&self.settings, &mapping.parameters)
     }
 
     /// The curve of the whole scene, whose inverse is [`SceneLight::of_scene`].
-    ///
-    /// # Errors
-    /// The curve has no inverse, or is a table.
     pub fn law(&self) -> Result<SceneLaw> {
         let mapping = self.settings.tone_mapping(&self.scene, &self.together);
         SceneLaw::of(&self.settings, &mapping.parameters)
     }
 
     /// The tone law of grey, fitted to the targets of all photographs together; light is linear.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn encoding(&self, pseudo_gt: &PseudoGt) -> Result<Encoding> {
         /// The shares of the pixels that are darker than the greys that it is fitted to.
         const SHARES: [f64; 9] = [0.05, 0.1, 0.25, 0.4, 0.5, 0.6, 0.75, 0.9, 0.99];
@@ -170,9 +151,6 @@ impl SceneLight {
 
     /// The inverse for a camera, at the exposure of the photographs around it: all cameras share one unit of light, as
     /// far as the photographs share an exposure.
-    ///
-    /// # Errors
-    /// The curve has no inverse.
     pub fn at(&self, camera: &Camera) -> Result<InverseTone> {
         let mapping = self.settings.tone_mapping_at(&self.scene, camera, &self.together);
         InverseTone::new(&self.settings, &mapping.parameters)

@@ -19,9 +19,6 @@ pub(crate) struct ShownModel {
 
 impl Trainer {
     /// A copy of the model that stays on the device.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(crate) fn shown(&self) -> Result<ShownModel> {
         let own = &self.model.gaussians;
         let mut gaussians = DeviceGaussians::uninit(&self.gpu, own.layout)?;

@@ -35,9 +35,6 @@ use crate::{Error, Result};
 impl TrainConfig {
     /// The Gaussians of a file of [`TrainConfig::init`] in the shape of the configured model; further features are
     /// dropped.
-    ///
-    /// # Errors
-    /// The file is not a model, has a higher SH degree, or lacks a feature of the configured model.
     pub(super) fn initial_model(&self, path: &Path) -> Result<Gaussians> {
         let mut gaussians = ply::load(path)?;
         let (Shape { sh_degree, features }, own) = (self.render_settings().shape, gaussians.shape);
@@ -72,9 +69,6 @@ impl TrainConfig {
 
 impl Trainer {
     /// A trainer for [`Trainer::restore`], which does not read [`TrainConfig::init`].
-    ///
-    /// # Errors
-    /// Those of [`Trainer::new`].
     pub(crate) fn to_restore(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> Result<Self> {
         let initial = Initial::of_restored(&config, dataset)?;
         Self::on_patches(gpu, config, dataset, &initial)
@@ -235,9 +229,6 @@ impl Trainer {
 }
 
 /// Initial Gaussians, in the frame. The model of a run that ended early may lack the highest SH degree.
-///
-/// # Errors
-/// Their shape differs from the configured model's.
 fn given(gaussians: &Gaussians, config: &TrainConfig) -> Result<Gaussians> {
     let shape = config.render_settings().shape;
     if !shape.holds(gaussians.shape) {

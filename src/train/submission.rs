@@ -204,9 +204,6 @@ impl Trainer {
     }
 
     /// Checks every parameter of the Gaussians on the device.
-    ///
-    /// # Errors
-    /// [`Error::ParameterNotFinite`], with the last step and the plane.
     fn check_finite(&mut self) -> Result<()> {
         self.optimizer.checked = self.step;
         match self.model.first_not_finite(&self.gpu, &mut self.optimizer.finite)? {

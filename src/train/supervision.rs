@@ -51,9 +51,6 @@ impl Supervision {
     }
 
     /// Records the loss terms of a step, in a slot of the log, and their gradient with respect to the render.
-    ///
-    /// # Errors
-    /// A pass exceeds the device's launch limits.
     pub(super) fn compare(
         &mut self,
         pass: &mut Recorder<'_>,
@@ -100,9 +97,6 @@ impl Supervision {
     }
 
     /// Records the terms on parameters, which add to the gradients of the model.
-    ///
-    /// # Errors
-    /// Those of [`Supervision::compare`].
     pub(super) fn regularise(
         &mut self,
         (gpu, pass): (&Gpu, &mut Recorder<'_>),
@@ -116,9 +110,6 @@ impl Supervision {
     }
 
     /// Records Adam's step of the learned parameters other than the Gaussians.
-    ///
-    /// # Errors
-    /// Those of [`Supervision::compare`].
     pub(super) fn update(
         &mut self,
         pass: &mut Recorder<'_>,

@@ -35,9 +35,6 @@ struct TargetView {
 impl TargetViews {
     /// The views with their targets, made as for training views. Views that are entirely black or masked are left out,
     /// with a warning.
-    ///
-    /// # Errors
-    /// A photograph can no longer be read, or the device is out of memory or lost.
     pub(super) fn new<'a>(
         pseudo_gt: &PseudoGt,
         views: impl IntoIterator<Item = &'a View>,
@@ -64,9 +61,6 @@ impl TargetViews {
 
     /// `count` training views that cover the cameras, to measure the cost of a change. Views with more than `pixels`
     /// are resized to about that.
-    ///
-    /// # Errors
-    /// Those of [`TargetViews::new`].
     pub(super) fn probes(
         pseudo_gt: &PseudoGt,
         dataset: &Dataset,
@@ -92,9 +86,6 @@ impl TargetViews {
     /// The mean PSNR, dB, of colours and output of `render` for each camera; `None` without views. `affines` are the
     /// exposures of the training photographs; where these are learned, a view of unknown exposure is compared after the
     /// least-squares gain and bias of each channel, since its brightness says nothing about the model.
-    ///
-    /// # Errors
-    /// Those of `render`.
     pub(super) fn mean_psnr(
         &self,
         affines: &[Affine],
@@ -162,27 +153,17 @@ pub struct TestTargets {
 
 impl TestTargets {
     /// Measures the training photographs.
-    ///
-    /// # Errors
-    /// Every training photograph is black and their exposure is needed; a photograph can no longer be read; the device
-    /// is out of memory or lost.
     pub fn new(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
         let scene = scene_of(tone, dataset)?;
         Self::in_scene(gpu, tone, &scene)
     }
 
     /// [`TestTargets::new`] for training photographs that are already measured.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn in_scene(gpu: &Gpu, tone: &ToneSettings, scene: &SceneTone) -> Result<Self> {
         Ok(Self { pseudo_gt: PseudoGt::new(gpu, tone)?, scene: scene.clone() })
     }
 
     /// The target of a view, of its camera's size; `None` without a photograph.
-    ///
-    /// # Errors
-    /// The photograph can no longer be read, or the device is out of memory or lost.
     pub fn of(&mut self, view: &View) -> Result<Option<Image>> {
         let photograph = tone_map_source(view, self.pseudo_gt.settings().full_resolution)?;
         let target = |photograph| target_of(&self.pseudo_gt, view, photograph, &self.scene);
@@ -204,9 +185,6 @@ impl Trainer {
 
     /// The mean PSNR, dB, of the Gaussians' colours on the held-out views against their targets; `None` without
     /// held-out views.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn held_out_psnr(&mut self) -> Result<Option<f64>> {
         self.held_out_psnr_of_degree(self.sh_degree(self.step))
@@ -230,9 +208,6 @@ impl Trainer {
 
     /// Resets the denoiser to the identity if it hardly improves the held-out views (or, without any, some training
     /// views) over R_0. Called at the end of a run; the paper's denoiser is kept.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(crate) fn drop_unused_degree(&mut self) -> Result<()> {
         /// In dB; on few views, smaller gains are chance.
         const MIN_GAIN: f64 = 0.05;
@@ -284,9 +259,6 @@ impl Trainer {
     }
 
     /// The exposure of every training photograph, if exposures are learned.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub(super) fn affines(&self) -> Result<Vec<Affine>> {
         self.supervision.exposures.as_ref().map_or_else(|| Ok(vec![]), Exposures::affines)
     }

@@ -81,9 +81,6 @@ impl CropMask {
 impl NetworkTerms {
     /// The networks and terms of the enabled parts, with memory for views of these sizes, some with masks; `None` if no
     /// part has a network.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn new(
         gpu: &Gpu,
         config: &TrainConfig,
@@ -139,9 +136,6 @@ impl NetworkTerms {
 
     /// Keeps the activations of every stage of the denoiser, for crops of views of these sizes, if they take at most
     /// `most` bytes and the device has that memory.
-    ///
-    /// # Errors
-    /// The device was lost.
     pub(super) fn keep_activations(&mut self, sizes: &[UVec2], most: u64) -> Result<()> {
         let crops: Vec<UVec2> = sizes.iter().map(|&size| self.max_of(size)).collect();
         let Some(denoiser) = &mut self.networks.denoiser else { return Ok(()) };

@@ -76,9 +76,6 @@ const SHORTEST_SIDE: u32 = 32;
 impl Views {
     /// Uploads every training photograph or its target for every level, and the photograph if a network uses it. Only
     /// one photograph at a time is in memory at its own size.
-    ///
-    /// # Errors
-    /// The recorded law lacks a view; a photograph can no longer be read; the device is out of memory or lost.
     pub(super) fn upload(
         gpu: &Gpu,
         pseudo_gt: &PseudoGt,
@@ -151,9 +148,6 @@ impl Views {
 
     /// Makes the images of the next steps resident, for as many steps as fit but at least one; returns the last of
     /// them.
-    ///
-    /// # Errors
-    /// The spool file cannot be read, or the device is out of memory or lost.
     pub(super) fn make_resident(
         &mut self,
         config: &TrainConfig,
@@ -199,9 +193,6 @@ impl Views {
     }
 
     /// Records the target of a resident view, (3, H, W), which is either `scratch` or the stored image.
-    ///
-    /// # Errors
-    /// The photograph is not resident, or `scratch` is too short.
     pub(super) fn record_target<'a>(
         &'a self,
         pass: &mut Recorder<'_>,
@@ -213,9 +204,6 @@ impl Views {
     }
 
     /// [`Self::record_target`] for the dark photograph of a view, if that is kept.
-    ///
-    /// # Errors
-    /// Those of [`Self::record_target`].
     pub(super) fn record_photograph<'a>(
         &'a self,
         pass: &mut Recorder<'_>,
@@ -279,9 +267,6 @@ impl Views {
     }
 
     /// The target of white of each photograph.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn whites(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Vec<[f32; 3]>> {
         /// Photographs of one submission.
         const AT_ONCE: usize = 256;

@@ -18,8 +18,6 @@ pub(super) struct Ceilings {
 }
 
 impl Ceilings {
-    /// # Errors
-    /// The device was lost, or has no timestamps.
     pub(super) fn measure(bench: &Bench, ceiling: &mut Ceiling) -> Result<Self> {
         let mut speed = |operation| -> Result<f64> {
             let seconds = bench.median(|| ceiling.seconds(&bench.gpu, operation))?;

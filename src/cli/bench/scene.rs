@@ -64,8 +64,6 @@ pub(super) struct Trainers {
     pub(super) intersections: u32,
 }
 
-/// # Errors
-/// The device is out of memory or lost.
 pub(super) fn trainers(gpu: &Gpu, scene: &BenchScene) -> Result<Trainers> {
     let plain = plain(gpu, scene)?;
     let (lita, lita_begins) = gpu.checked(|| lita(gpu));
@@ -83,9 +81,6 @@ fn config() -> TrainConfig {
 }
 
 /// The plain model after the steps that enable all SH degrees.
-///
-/// # Errors
-/// The device is out of memory or lost.
 pub fn plain(gpu: &Gpu, scene: &BenchScene) -> Result<Trainer> {
     let dataset = scene.dataset();
     let mut config = config();

@@ -36,9 +36,6 @@ pub(super) struct Stages {
 }
 
 /// A checked step of each model, and the pseudo-GT of a Full-HD photograph.
-///
-/// # Errors
-/// The device is out of memory or lost.
 pub(super) fn check(bench: &Bench, trainers: &mut Trainers) -> Result<CheckReport> {
     let mut photograph = BenchPhotograph::new(&bench.gpu)?;
     let (done, mut report) =
@@ -59,9 +56,6 @@ pub(super) fn check(bench: &Bench, trainers: &mut Trainers) -> Result<CheckRepor
 }
 
 /// Each kernel's time over all its passes: of the plain step, then of the others.
-///
-/// # Errors
-/// The device is out of memory or lost.
 pub(super) fn time_kernels(
     bench: &Bench,
     trainers: &mut Trainers,
@@ -102,9 +96,6 @@ pub(super) fn of_kernels(times: &[PassTime], names: &[&str]) -> f64 {
 }
 
 /// Times every stage.
-///
-/// # Errors
-/// The device is out of memory or lost.
 pub(super) fn time(bench: &Bench, trainers: &mut Trainers) -> Result<Stages> {
     let steps = repeated(bench, || trainers.plain.profile_step())?;
     let of_step = |names: &[&str]| median(steps.iter().map(|t| of_kernels(t, names)).collect());

@@ -21,8 +21,6 @@ pub(super) struct Steady {
     processor: Option<f64>,
 }
 
-/// # Errors
-/// The device is out of memory or lost.
 pub(super) fn time(bench: &Bench, trainer: &mut Trainer, steps: u64) -> Result<Steady> {
     let passes = bench.median(|| Ok(total(&trainer.profile_step()?)))?;
     let device = bench.median(|| trainer.profile_whole_step())?;

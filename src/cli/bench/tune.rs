@@ -49,9 +49,6 @@ struct TileTiming {
 }
 
 /// Measures every case, stores the fastest tiles and prints.
-///
-/// # Errors
-/// The device gives no timestamps, is out of memory or lost, or the file cannot be written.
 pub(super) fn run(
     bench: &Bench,
     sizes: &[[u32; 2]],

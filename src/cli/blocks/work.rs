@@ -10,10 +10,6 @@ use crate::{Error, Result, Stop};
 
 /// Runs the tasks of the plan in a folder that are not done, in order; `begin` is called before each, with its number,
 /// the number of all, and whether it is done already. A signal is passed on, and no further task begins.
-///
-/// # Errors
-/// The folder contains no plan, a task fails, or [`Error::BatchStopped`] after a signal or when a training's time is
-/// up.
 pub(super) fn work(folder: &Path, mut begin: impl FnMut(&Task, [usize; 2], bool)) -> Result<()> {
     let tasks = load_tasks(folder)?;
     let requests = signals::requests()?;

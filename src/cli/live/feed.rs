@@ -72,9 +72,6 @@ impl Feed {
     }
 
     /// Of a model file, with its Gaussians.
-    ///
-    /// # Errors
-    /// The file cannot be read.
     pub(in crate::cli) fn of_file(path: &Path) -> Result<(Self, Gaussians, Facts)> {
         let mut state = State::of(Source::File(path.to_owned()));
         // Before reading: a file that changes meanwhile is read again.

@@ -52,9 +52,6 @@ pub(in crate::cli) struct Pictures {
 
 impl Pictures {
     /// Loads the dataset of a configuration, but no photograph. Without a device, one is opened for the first target.
-    ///
-    /// # Errors
-    /// Those of [`Dataset::load`].
     pub(in crate::cli) fn load(config: TrainConfig, gpu: Option<Gpu>) -> Result<Self> {
         let dataset = Dataset::load(&config.dataset, &options(&config))?;
         Ok(Self::new(dataset.into(), BTreeSet::new(), config, gpu))
@@ -62,9 +59,6 @@ impl Pictures {
 
     /// The dataset that a training has loaded, unless it has a fisheye: then it is loaded again for the pinhole cameras
     /// of the viewer.
-    ///
-    /// # Errors
-    /// Those of [`Dataset::load`].
     pub(in crate::cli) fn of_training(
         config: TrainConfig,
         gpu: Gpu,
@@ -128,9 +122,6 @@ impl Pictures {
     }
 
     /// An image of the view at `place` in the dataset, upright, as JPEG; `None` if there is none.
-    ///
-    /// # Errors
-    /// Its file can no longer be read, or the device is lost or out of memory.
     pub(super) fn of(&mut self, place: usize, kind: &str) -> Result<Option<Bytes>> {
         let Some((_, kind)) = KINDS.iter().find(|(name, _)| *name == kind) else { return Ok(None) };
         let wanted = (place, *kind);

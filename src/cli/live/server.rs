@@ -60,9 +60,6 @@ pub(in crate::cli) struct Server {
 
 impl Server {
     /// Starts to listen. Port 0 is any free one.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] if the port is in use or the address is not of this machine.
     pub(in crate::cli) fn start(Listen(asked): Listen, site: Arc<Site>) -> Result<Self> {
         let unusable = |error: std::io::Error| {
             let problem = match error.kind() {

@@ -24,9 +24,6 @@ const FRAMES: usize = 120;
 const FPS: u16 = 30;
 
 /// The images to render, and the frames per second of their video.
-///
-/// # Errors
-/// The dataset has no such view, the path is no path, or a fisheye is to have another field of view.
 pub(super) fn shots(
     args: &RenderArgs,
     config: &TrainConfig,

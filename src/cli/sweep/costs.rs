@@ -104,9 +104,6 @@ fn front(points: &[(f64, f64)]) -> Vec<usize> {
 
 impl Rows {
     /// Writes [`FILES`] to `folder`; `notes` are paragraphs of the page.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
     pub(super) fn save_costs(&self, folder: &Path, title: &str, notes: &[String]) -> Result<()> {
         let counters = energy_counters();
         let energy = if counters.is_empty() {

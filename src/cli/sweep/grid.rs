@@ -101,9 +101,6 @@ impl Grid {
 
 /// The points of the axes, the first varying slowest. `given` replaces axes of a named grid with the same key, and
 /// adds to the others.
-///
-/// # Errors
-/// [`Error::Usage`] without an axis, for an axis given twice, or for a fixed black level with alpha or beta.
 pub(super) fn points(given: &[Axis], table: Option<Grid>) -> Result<Vec<Point>> {
     for (index, axis) in given.iter().enumerate() {
         if given[..index].iter().any(|other| other.key == axis.key) {

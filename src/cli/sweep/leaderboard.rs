@@ -43,9 +43,6 @@ pub(super) struct Leaderboard<'a> {
 
 impl Leaderboard<'_> {
     /// Writes [`FILES`] to `folder`.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
     pub(super) fn save(&self, folder: &Path, pictures: Option<Comparison>) -> Result<()> {
         let [csv, markdown, html] = FILES.map(|file| folder.join(file));
         write_whole(&csv, self.csv().as_bytes())?;
@@ -132,9 +129,6 @@ impl Leaderboard<'_> {
     }
 
     /// The first test view with a reference image: photograph, reference, renders of the best rows.
-    ///
-    /// # Errors
-    /// A model cannot be read, or the device is lost.
     pub(super) fn pictures(
         &self,
         runs: &[Run],

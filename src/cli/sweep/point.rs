@@ -46,9 +46,6 @@ pub(super) struct Axis {
 
 impl Axis {
     /// The axis of a comma-separated list; commas within brackets or quotes do not separate.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] for empty or duplicate values.
     pub(super) fn new(key: &str, list: &str) -> Result<Self> {
         let key = key.trim();
         let name = AXES.iter().find(|(_, setting)| *setting == key).map_or(key, |(name, _)| name);
@@ -77,9 +74,6 @@ impl Axis {
     }
 
     /// The axis of `KEY=LIST`, as `--grid` takes it.
-    ///
-    /// # Errors
-    /// As [`Self::new`], and if the list is missing.
     pub(super) fn parse(text: &str) -> Result<Self> {
         let (key, list) = text
             .split_once('=')

@@ -36,9 +36,6 @@ impl Run {
     /// The run of a point with the options `shared`, in a folder of `out`; both paths are absolute. Points with a
     /// preset train with its plan for the photographs, as `train --preset` does; others train without a plan, so that
     /// they differ in nothing but their settings.
-    ///
-    /// # Errors
-    /// Those of `train` for these options, after the name of the point.
     pub(super) fn new(point: Point, dataset: &str, shared: &[String], out: &Path) -> Result<Self> {
         let name = point.name();
         let folder = out.join(&name);
@@ -86,9 +83,6 @@ impl Run {
     }
 
     /// Renders a view with the model of the finished run.
-    ///
-    /// # Errors
-    /// Its model cannot be read, or the device is lost.
     pub(super) fn render(&self, gpu: &Gpu, view: &View) -> Result<Image> {
         let config = run::load_config(&self.folder)?;
         let model = Model::load(&self.folder)?;
@@ -109,9 +103,6 @@ impl Run {
 }
 
 /// Parses the arguments of a command, its name first.
-///
-/// # Errors
-/// Those of the parser, after the name `what`.
 pub(in crate::cli) fn parsed<A: Args>(
     what: &str,
     arguments: impl IntoIterator<Item: Into<OsString> + Clone>,
@@ -133,9 +124,6 @@ pub(super) fn difference(found: &str, wanted: &str) -> String {
 }
 
 /// The absolute path as an argument.
-///
-/// # Errors
-/// It is not Unicode.
 pub(super) fn absolute(path: &Path) -> Result<String> {
     let path = std::path::absolute(path)
         .map_err(|error| Error::input(path, format!("cannot be found: {error}")))?;

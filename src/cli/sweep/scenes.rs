@@ -29,9 +29,6 @@ struct Scene {
 }
 
 /// Sweeps one dataset after the other, and writes the tables.
-///
-/// # Errors
-/// Two datasets have one name; those of a sweep; after the tables, failed points.
 pub(super) fn run(args: &SweepArgs) -> Result<()> {
     let datasets = std::iter::once(&args.dataset).chain(&args.more);
     let mut names: Vec<String> = vec![];

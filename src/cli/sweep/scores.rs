@@ -17,9 +17,6 @@ use crate::{Error, Result};
 pub(super) const FILE: &str = "lpips.json";
 
 /// Measures the finished runs in these folders that have no value of this network and range yet.
-///
-/// # Errors
-/// The weights or a run cannot be read, a file cannot be written, or the device is out of memory or lost.
 pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range) -> Result<()> {
     let key = Lpips::load(gpu, weights, range)?.measure().key();
     for run in runs {

@@ -178,9 +178,6 @@ impl Measures {
 }
 
 /// Applies the curve and prints the measurements.
-///
-/// # Errors
-/// As [`apply`], or standard output cannot be written to.
 pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
     let output = apply(args)?;
     if args.json {
@@ -232,11 +229,6 @@ fn text_table(output: &ToneOutput) -> String {
 
 /// Maps every photograph and writes it to `args.out` under its own name. Of several photographs, unusable ones are
 /// skipped with a warning.
-///
-/// # Errors
-/// [`Error::Usage`] for invalid settings; [`Error::Input`] if there is nothing to map, two photographs have the same
-/// name, or a reference has another size; [`Error::Output`] if a file cannot be written or a photograph would be
-/// replaced; those of the device.
 pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     let settings = match &args.profile {
         Some(file) => ToneSettings {

@@ -150,9 +150,6 @@ impl Fitted {
 }
 
 /// Fits and prints what was found, as tables or as JSON.
-///
-/// # Errors
-/// As [`apply`], or standard output cannot be written to.
 pub fn run(args: &FitArgs) -> anyhow::Result<()> {
     args.out.iter().chain(&args.plot).try_for_each(|path| check_writable(path))?;
     let text = if args.profile {
@@ -181,10 +178,6 @@ fn check(args: &FitArgs) -> Result<()> {
 }
 
 /// Fits the families of `args`, best first, and writes the files.
-///
-/// # Errors
-/// [`Error::Usage`] for invalid options; [`Error::Input`] for unusable pairs; [`Error::Output`] if a
-/// file cannot be written.
 pub fn apply(args: &FitArgs) -> Result<Vec<Fitted>> {
     check(args)?;
     let options = FitOptions {

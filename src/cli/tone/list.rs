@@ -59,18 +59,12 @@ struct Curve {
 }
 
 /// Lists, prints or plots.
-///
-/// # Errors
-/// As [`text`], or standard output cannot be written to.
 pub fn run(args: &ListArgs) -> anyhow::Result<()> {
     write!(std::io::stdout(), "{}", text(args)?)?;
     finish("", "nightsplat tone apply photos --curve NAME --out toned")
 }
 
 /// Writes the plot and returns what the command prints.
-///
-/// # Errors
-/// A file cannot be read or written, or a t is negative.
 pub fn text(args: &ListArgs) -> Result<String> {
     if let Some(t) = args.at.iter().find(|&&t| t.is_nan() || t < 0.0) {
         return Err(Error::Usage(format!("--at {t}: t must be 0 or more")));

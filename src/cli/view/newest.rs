@@ -15,9 +15,6 @@ use crate::train::ShownModel;
 /// What a window shows.
 pub(crate) trait Newest {
     /// The model, if it is newer than the last one.
-    ///
-    /// # Errors
-    /// There is none to show, or the device is out of memory or lost.
     fn newest(&mut self, gpu: &Gpu) -> Result<Option<ShownModel>>;
 
     /// Progress in words that follow the name of the model.
@@ -47,9 +44,6 @@ pub(crate) struct Files {
 
 impl Files {
     /// Reads a run or a model file.
-    ///
-    /// # Errors
-    /// Those of reading a model.
     pub(crate) fn open(path: &Path) -> Result<Self> {
         let (file, run) = match path.is_dir() {
             true => (path.join("model.ply"), Some(WatchedRun::new(path.to_owned()))),

@@ -19,22 +19,15 @@ fn refused<T>() -> Result<T> {
     Err(Error::Usage(problem.to_owned()))
 }
 
-/// # Errors
-/// Always.
 pub(super) fn run(_: &ViewArgs) -> Result<()> {
     refused()
 }
 
-/// # Errors
-/// Always.
 pub(in crate::cli) fn screen(_: &DeviceChoice) -> Result<Screen> {
     refused()
 }
 
 /// Trains; there is no screen to show it on.
-///
-/// # Errors
-/// Those of the training.
 pub(in crate::cli) fn beside<T>(
     _: Screen,
     _: (&Path, &Dataset),

@@ -76,8 +76,6 @@ pub(crate) struct Screen {
 }
 
 impl Screen {
-    /// # Errors
-    /// [`Error::Usage`] without a display; those of opening a device.
     pub(crate) fn open(choice: &DeviceChoice) -> Result<Self> {
         let events = EventLoop::new().map_err(|error| {
             let problem = format!(
@@ -90,9 +88,6 @@ impl Screen {
     }
 
     /// Shows models until the window is closed.
-    ///
-    /// # Errors
-    /// The window cannot be made, the device is lost or out of memory, or the screenshot cannot be written.
     pub(crate) fn show(self, opening: Opening, models: &mut dyn Newest) -> Result<()> {
         let camera = opening.cameras[0];
         let mut app = App {

@@ -16,9 +16,6 @@ use crate::results::finished_run::{config_of_file, is_model};
 use crate::results::run::{self, Requests};
 
 /// Shows a run or a model until the window is closed.
-///
-/// # Errors
-/// The path is no run or model, its dataset is missing, or there is no display or no device that presents to it.
 pub(super) fn run(args: &ViewArgs) -> Result<()> {
     let path = &args.path;
     let mut files = Files::open(path)?;
@@ -45,17 +42,11 @@ pub(super) fn run(args: &ViewArgs) -> Result<()> {
 }
 
 /// The display of this machine, for a training that is watched in a window.
-///
-/// # Errors
-/// There is none, or no device that presents to it.
 pub(in crate::cli) fn screen(choice: &DeviceChoice) -> Result<Screen> {
     Screen::open(choice)
 }
 
 /// Trains in another thread, and shows the model in a window until it is closed or the training is over.
-///
-/// # Errors
-/// Those of the training. A window that fails is a warning.
 pub(in crate::cli) fn beside<T: Send>(
     screen: Screen,
     (run, dataset): (&Path, &Dataset),

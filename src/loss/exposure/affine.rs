@@ -20,9 +20,6 @@ impl Affine {
 
     /// The affine that maps `from` to `to`, by least squares for each channel. A channel that is constant in `from`
     /// gets a bias only.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] if the images differ in size or have no pixels.
     pub fn least_squares(from: &Image, to: &Image) -> Result<Self> {
         let pixels = from.pixel_count();
         let is_pair = (from.width, from.height) == (to.width, to.height);

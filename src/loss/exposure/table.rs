@@ -45,9 +45,6 @@ impl Affine {
 }
 
 /// Writes the exposure of each view.
-///
-/// # Errors
-/// The file cannot be written.
 pub fn save(path: &Path, exposures: &[(String, Affine)]) -> Result<()> {
     let mut text = COLUMNS.join(",") + "\n";
     for (name, affine) in exposures {
@@ -60,9 +57,6 @@ pub fn save(path: &Path, exposures: &[(String, Affine)]) -> Result<()> {
 }
 
 /// Reads the rows of a table; a name may have the extension of its photograph.
-///
-/// # Errors
-/// The file cannot be read, has an unknown column, an invalid line, or a view twice.
 pub fn load(path: &Path) -> Result<Vec<KnownExposure>> {
     let text = input::text(path)?;
     let refused = |problem: String| Error::input(path, problem);

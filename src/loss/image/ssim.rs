@@ -85,9 +85,6 @@ fn layout_of(
 
 impl Ssim {
     /// Builds the kernels; `adds`: the gradient is added to that of earlier terms.
-    ///
-    /// # Errors
-    /// The driver refuses a kernel.
     pub(super) fn new(gpu: &Gpu, weight: f64, adds: bool) -> Result<Self> {
         let kernel = |layout| {
             let Layout { columns, rows, alignment } = layout;
@@ -110,9 +107,6 @@ impl Ssim {
     }
 
     /// Allocates scratch memory for views of up to `values` values; it never shrinks.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn reserve(&mut self, gpu: &Gpu, values: u32) -> Result<()> {
         let Kernels::Two { derivatives, .. } = &mut self.kernels else { return Ok(()) };
         for buffer in derivatives.iter_mut().filter(|buffer| buffer.len() < values as usize) {
@@ -132,9 +126,6 @@ impl Ssim {
     }
 
     /// Returns whether both terms are in the log already.
-    ///
-    /// # Errors
-    /// A pass exceeds what the device can launch.
     pub(super) fn record(
         &mut self,
         pass: &mut Recorder<'_>,

@@ -42,8 +42,6 @@ impl DenoiserExtent {
             && self.packed <= reserved.packed
     }
 
-    /// # Errors
-    /// A view of `size` exceeds what the device can bind.
     pub(super) fn check(self, gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> Result<()> {
         let channels = settings.channels;
         let map = settings.channels().max(RGB as usize) * self.pixels;
@@ -176,8 +174,6 @@ pub(super) struct EarlierStages {
 }
 
 impl EarlierStages {
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn new(
         gpu: &Gpu,
         settings: DenoiserSettings,
@@ -227,8 +223,6 @@ pub(super) struct DenoiserMemory {
 }
 
 impl DenoiserMemory {
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn new(
         gpu: &Gpu,
         settings: DenoiserSettings,

@@ -85,9 +85,6 @@ impl Block {
     }
 
     /// The block in a folder; `None` if it contains none.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if it is damaged or of another version.
     pub(crate) fn at(folder: &Path) -> Result<Option<Self>> {
         let path = folder.join(BLOCK);
         if !tree::is_file(&path) {
@@ -116,9 +113,6 @@ impl Block {
     }
 
     /// Writes the block into an existing folder.
-    ///
-    /// # Errors
-    /// A file cannot be written.
     pub(crate) fn save(&self, folder: &Path) -> Result<()> {
         let points: Vec<u8> = self.points.iter().flat_map(|point| point.to_le_bytes()).collect();
         output::write_whole(&folder.join(POINTS), &points)?;
@@ -127,9 +121,6 @@ impl Block {
     }
 
     /// Keeps the views of the block, with their splits in the dataset.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if the dataset lacks one.
     pub(super) fn restrict(&self, frames: &mut Vec<ListedView>) -> Result<()> {
         let own: BTreeSet<&str> = self.views.iter().map(String::as_str).collect();
         frames.retain(|frame| own.contains(frame.name.as_str()));
@@ -143,9 +134,6 @@ impl Block {
     }
 
     /// The points of the block, of all points of the dataset.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if the dataset has fewer.
     pub(super) fn points_of(&self, all: Vec<Point>) -> Result<Vec<Point>> {
         let count = all.len();
         if self.points.last().is_some_and(|last| *last as usize >= count) {

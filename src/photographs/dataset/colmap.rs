@@ -86,9 +86,6 @@ pub(super) fn read_images(folder: &Path) -> Result<Vec<ModelImage>> {
 }
 
 /// The binary file of the images of a model, with those that `renamed` gives a name, under that name.
-///
-/// # Errors
-/// The model is damaged, or is text.
 #[cfg(feature = "cli")]
 pub(super) fn images_renamed(
     folder: &Path,

@@ -7,9 +7,6 @@ use crate::photographs::image::Image;
 use crate::{Error, Result};
 
 /// The depth map as seen by the view's camera, (H, W); larger is farther.
-///
-/// # Errors
-/// The file is not an image, has far more pixels than its view, is constant, or has a value that is not finite.
 pub(super) fn depth_map(
     path: &Path,
     preparation: &Preparation<'_>,

@@ -15,9 +15,6 @@ pub(crate) fn is_pattern(text: &str) -> bool {
 }
 
 /// The patterns of a file, one a line; empty lines and lines after # are skipped.
-///
-/// # Errors
-/// The file cannot be read, or a line is no pattern.
 pub(crate) fn patterns_of(path: &Path) -> Result<Vec<String>> {
     let text = input::text(path)?;
     let lines = (1..).zip(text.lines().map(str::trim));
@@ -35,9 +32,6 @@ pub(crate) fn patterns_of(path: &Path) -> Result<Vec<String>> {
 
 /// Removes the views that a pattern matches: their name, their file name, or their path as listed. Other views keep
 /// their split.
-///
-/// # Errors
-/// A pattern matches no view.
 pub(super) fn exclude(
     root: &Path,
     frames: &mut Vec<ListedView>,

@@ -21,9 +21,6 @@ pub struct Fingerprint {
 
 impl Fingerprint {
     /// Reads every pixel once.
-    ///
-    /// # Errors
-    /// A photograph that was not kept can no longer be read.
     pub fn of(dataset: &Dataset) -> Result<Self> {
         let views = dataset.views.par_iter().filter(|view| view.is_for_training());
         let views = views

@@ -37,9 +37,6 @@ const MOST_ABOVE: usize = 3;
 impl Layout {
     /// The layout of a path that a user gives: a dataset's folder or archive, its transforms file, its COLMAP model, or
     /// a block of it.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if it is none of these, or an unreadable archive.
     pub(super) fn of(given: &Path) -> Result<Self> {
         tree::check(given)
             .map_err(|error| Error::input(given, format!("cannot be read: {error}")))?;

@@ -13,9 +13,6 @@ use crate::photographs::image::files::{self, Files};
 use crate::{Error, Result};
 
 /// The views that the options select, split, by name.
-///
-/// # Errors
-/// There is no usable view, two have one name, a pattern matches none, or a block names one that is not there.
 pub(super) fn select(layout: &Layout, options: &LoadOptions, files: &Files) -> Result<Listing> {
     let mut listing = list(layout, options.images.as_deref(), files)?;
     split(&layout.root, &mut listing.frames, options.test_every, files)?;

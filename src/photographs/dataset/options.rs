@@ -120,9 +120,6 @@ impl LoadOptions {
     }
 
     /// Refuses invalid options.
-    ///
-    /// # Errors
-    /// [`Error::Setting`], and [`Error::Input`] for a missing folder.
     pub(super) fn check(&self) -> Result<()> {
         let refused = |key: &str, value: f64, rule: &dyn ToString| {
             let (key, value, rule) = (key.to_owned(), value.to_string(), rule.to_string());

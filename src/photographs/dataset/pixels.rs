@@ -169,9 +169,6 @@ fn resolved(groups: &[(Lens, Vec<Source>)], options: &LoadOptions) -> LoadOption
 impl Source {
     /// Finds the rotation of its images, and fits the listed lens to the photograph, or to the reference image if there
     /// is none.
-    ///
-    /// # Errors
-    /// [`Error::Input`] where the picture has another shape than its camera.
     fn fit(&mut self, headers: [Option<Header>; 2], pixels: Pixels) -> Result<()> {
         let lens = self.lens;
         // What has no readable header is named when it is decoded.
@@ -331,9 +328,6 @@ impl ViewLoader<'_> {
     }
 
     /// Decodes a file; `None`, and a problem, where that is no picture.
-    ///
-    /// # Errors
-    /// The picture does not fit its camera.
     fn decode(
         &self,
         (path, read, turns): (Option<PathBuf>, Option<Arc<PictureFile>>, Turns),

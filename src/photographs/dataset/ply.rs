@@ -17,9 +17,6 @@ pub(super) struct Cloud {
 }
 
 /// The finite points of a file. Normals and colours are skipped: they may come from normal-light photographs.
-///
-/// # Errors
-/// [`Error::Input`] where it cannot be read, is no PLY file of points or is cut short; a model of Gaussians is none.
 pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
     let bytes = input::bytes(path)?;
     let no_points =

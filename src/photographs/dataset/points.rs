@@ -110,9 +110,6 @@ fn placed(cloud: &Cloud, points: Vec<DVec3>, views: &[View]) -> Vec<Point> {
 }
 
 /// The points of the dataset's COLMAP model, with indices into `sources`.
-///
-/// # Errors
-/// [`Error::Input`](crate::Error::Input) where the model is damaged.
 pub(super) fn of_sources(layout: &Layout, sources: &[Source]) -> Result<Vec<Point>> {
     of_model(layout, &sources.iter().map(Place::of_source).collect::<Vec<_>>())
 }

@@ -23,10 +23,6 @@ pub(super) struct Preparation<'a> {
 
 impl<'a> Preparation<'a> {
     /// With `undistort`, a fisheye is undistorted as a polynomial lens always is.
-    ///
-    /// # Errors
-    /// No pinhole sees only the inside of the photograph: the distortion is not that of a lens. `name` is the view or
-    /// file in the message.
     pub(super) fn new(
         lens: &'a Lens,
         undistort: bool,
@@ -42,9 +38,6 @@ impl<'a> Preparation<'a> {
     }
 
     /// The image as its view shows it, at the lens's size: undistorted if requested.
-    ///
-    /// # Errors
-    /// Its aspect ratio is not that of the lens.
     pub(super) fn whole(&self, image: Image, path: &Path) -> Result<Image> {
         let &Lens { width, height, .. } = self.lens;
         let size = (image.width, image.height);
@@ -57,9 +50,6 @@ impl<'a> Preparation<'a> {
     }
 
     /// As [`Self::whole`], at the size of the loaded view.
-    ///
-    /// # Errors
-    /// Those of [`Self::whole`].
     pub(super) fn loaded(&self, image: Image, path: &Path) -> Result<Image> {
         self.whole(image, path).map(|image| self.shrunk(image))
     }
@@ -77,9 +67,6 @@ impl<'a> Preparation<'a> {
     }
 
     /// The usable pixels of a view, for a mask of the photograph as stored; `None` if all are usable.
-    ///
-    /// # Errors
-    /// The photograph's aspect ratio is not that of the lens.
     pub(super) fn mask(
         &self,
         stored: &Mask,
@@ -104,9 +91,6 @@ impl<'a> Preparation<'a> {
 
     /// Refuses a natively rendered lens that sees nothing at three quarters of its pixels: the circle of a fisheye in a
     /// wide image covers more than a quarter.
-    ///
-    /// # Errors
-    /// The lens is refused; `name` is the view in the message.
     pub(super) fn check_coverage(&self, name: &str) -> Result<()> {
         const MOST_UNSEEN: f64 = 0.75;
         let &Lens { width, height, .. } = self.lens;
@@ -139,9 +123,6 @@ fn native_camera(lens: &Lens) -> Camera {
 }
 
 /// Refuses a file by its declared size, before memory is allocated.
-///
-/// # Errors
-/// The image has another aspect ratio than its camera, or far more pixels.
 pub(super) fn check_size(path: &Path, file: &PictureFile, turns: Turns, lens: &Lens) -> Result<()> {
     // A file without a readable header is reported when it is decoded.
     let Ok(size) = file.size() else { return Ok(()) };
@@ -152,8 +133,6 @@ pub(super) fn check_size(path: &Path, file: &PictureFile, turns: Turns, lens: &L
     check_excess(path, (width, height), lens)
 }
 
-/// # Errors
-/// The image has far more pixels than its camera.
 pub(super) fn check_excess(path: &Path, size: (u32, u32), lens: &Lens) -> Result<()> {
     const MAX_TIMES: u64 = 64;
     if pixel_count(size) > MAX_TIMES * pixel_count((lens.width, lens.height)) {

@@ -15,9 +15,6 @@ impl Dataset {
     /// A checksum of the listing below `root`: views with their cameras and splits, and path, length and time of change
     /// of every file of the views or the points. Equal stamps mean the same dataset; one that was copied, or whose
     /// photographs were rewritten, has another stamp even with the same pixels; one that was moved has the same.
-    ///
-    /// # Errors
-    /// As [`Dataset::photographs`].
     pub(crate) fn stamp(root: &Path, options: &LoadOptions) -> Result<String> {
         options.check()?;
         let files = Files::default();

@@ -22,9 +22,6 @@ const HALF_SIDE: f64 = 1.0 / 250.0;
 
 /// The pixels that the cameras are of where sizes do not tell. One program found them all, so that one answer holds for
 /// all photographs. `points` gives the dataset's points, with indices into `sources`.
-///
-/// # Errors
-/// Those of `points`.
 pub(super) fn pixels(
     sources: &[Source],
     headers: &[Option<Header>],

@@ -85,9 +85,6 @@ struct Read<'a> {
 }
 
 /// Reads the files of a listing; frames without a usable pose or size are added to `skipped`.
-///
-/// # Errors
-/// [`Error::Input`] if a file is not a listing, or a frame has unsupported intrinsics.
 pub(super) fn read(
     (root, images): (&Path, Option<&Path>),
     listings: &[(PathBuf, Option<Split>)],

@@ -66,8 +66,6 @@ impl Exposure {
 }
 
 impl Model {
-    /// # Errors
-    /// [`Error::Usage`] if the family has nothing to fit.
     pub(super) fn new(family: &'static Family, options: &FitOptions) -> Result<Self> {
         let mut places: Vec<SettingSlot> =
             (0..family.constants.len()).map(SettingSlot::Shape).collect();

@@ -40,9 +40,6 @@ pub struct Pair {
 
 impl Pair {
     /// The pair of two images; `path` is its name.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if the images differ in size or have no pixels.
     pub fn new(path: impl Into<PathBuf>, dark: &Image, reference: &Image) -> Result<Self> {
         let path = path.into();
         let size = |image: &Image| (image.width, image.height);
@@ -84,9 +81,6 @@ impl FitScene {
     /// of `folder`'s subfolders `low` and `high`, `normal` or `images`.
     ///
     /// Photographs without a partner, and black ones, are left out with a warning.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if the folder has no pair left, a file cannot be read, or the sizes of a pair differ.
     pub fn load(folder: &Path, normal: Option<&Path>) -> Result<Self> {
         let (files, dark) = files_of(folder, normal)?;
         let colours = ColourCounts::default();
@@ -122,9 +116,6 @@ pub(super) fn name_of(folder: &Path) -> String {
 }
 
 /// The pairs of a scene by name, at least one, and the folder of the dark photographs.
-///
-/// # Errors
-/// Those of [`FitScene::load`], except for the contents of files.
 pub(super) fn files_of(folder: &Path, normal: Option<&Path>) -> Result<(Vec<Files>, PathBuf)> {
     let (dark, normal) = match normal {
         Some(normal) => (folder.to_owned(), normal.to_owned()),

@@ -82,9 +82,6 @@ pub struct ProfileFold {
 
 impl ColourScene {
     /// The pairs that [`super::FitScene::load`] finds.
-    ///
-    /// # Errors
-    /// Those of [`super::FitScene::load`].
     pub fn load(folder: &Path, normal: Option<&Path>) -> Result<Self> {
         let (files, dark) = files_of(folder, normal)?;
         let share = (COLOURS / files.len()).max(1);
@@ -140,10 +137,6 @@ fn sampled(
 }
 
 /// Fits a profile to all pairs; residuals beyond `huber` times their scale are weighted down.
-///
-/// # Errors
-/// [`Error::Usage`] if there is no pair or `huber` is not above 0, [`Error::Input`] if the photographs have a single
-/// colour.
 pub fn fit_profile(scenes: &[(&str, Vec<&ColourPair>)], huber: f64) -> Result<Profile> {
     let pairs: Vec<&ColourPair> = scenes.iter().flat_map(|(_, pairs)| pairs).copied().collect();
     let Some(first) = pairs.first() else {
@@ -357,9 +350,6 @@ pub fn profile_scores(profile: &Profile, pairs: &[&ColourPair]) -> ProfileScores
 }
 
 /// Leaves out each scene in turn (of a single scene, every `folds`-th pair), and scores a profile of the others on it.
-///
-/// # Errors
-/// [`Error::Usage`] for a single pair or fold; those of [`fit_profile`].
 pub fn cross_validate_profile(
     scenes: &[ColourScene],
     folds: usize,

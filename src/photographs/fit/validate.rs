@@ -31,9 +31,6 @@ pub struct HeldOut {
 }
 
 /// Fits to all scenes except one, for each in turn; in a single scene, to all except every `folds`-th pair.
-///
-/// # Errors
-/// [`Error::Usage`] for a single pair or fewer than two folds; those of [`fit`].
 pub fn cross_validate(
     family: &'static Family,
     scenes: &[FitScene],

@@ -14,9 +14,6 @@ const MAX_PIXELS: u64 = 1 << 28;
 const MAX_BYTES: u64 = 1 << 33;
 
 /// Checks the declared size of a file.
-///
-/// # Errors
-/// [`Error::Input`] with the file and its size if it exceeds the limits.
 pub(super) fn check(path: &Path, bytes: &[u8]) -> Result<()> {
     // A file without a readable header is refused by its decoder.
     let excess = if bytes.starts_with(&exr_file::MAGIC) {

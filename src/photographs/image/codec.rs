@@ -28,8 +28,6 @@ pub(crate) struct PictureFile {
 }
 
 impl PictureFile {
-    /// # Errors
-    /// [`Error::Input`] if the file cannot be read.
     pub(crate) fn open(path: &Path) -> Result<Self> {
         #[cfg(test)]
         openings::count(path);
@@ -37,9 +35,6 @@ impl PictureFile {
     }
 
     /// Width and height, from its header alone.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if the file is not an image.
     pub(crate) fn size(&self) -> Result<(u32, u32)> {
         if is_raw(&self.path) {
             return raw_size(&self.path, self.bytes.clone());
@@ -55,17 +50,11 @@ impl PictureFile {
 
     /// The photograph in sRGB, and its alpha in all three planes: that of a PNG, WebP or TIFF file, or 0 at values of
     /// an EXR file that are not finite; `None` if nothing is transparent.
-    ///
-    /// # Errors
-    /// Those of [`Image::load`].
     pub(crate) fn decode(self) -> Result<(Image, Option<Image>)> {
         self.decode_counted(&ColourCounts::default())
     }
 
     /// [`Self::decode`] that counts colour conversions in `counters` instead of logging them.
-    ///
-    /// # Errors
-    /// Those of [`Image::load`].
     pub(crate) fn decode_counted(self, counters: &ColourCounts) -> Result<(Image, Option<Image>)> {
         let Decoded { image, alpha, conversion } = decode(&self.path, self.bytes, Meaning::Colour)?;
         counters.add(conversion);
@@ -178,18 +167,12 @@ impl Image {
     }
 
     /// [`Image::load`] that counts colour conversions in `counters` instead of logging them.
-    ///
-    /// # Errors
-    /// Those of [`Image::load`].
     pub(crate) fn load_counted(path: &Path, counters: &ColourCounts) -> Result<Self> {
         Ok(PictureFile::open(path)?.decode_counted(counters)?.0)
     }
 
     /// [`Image::load`] for values that are not colours, such as depth: they are read as stored, including negative ones
     /// of EXR.
-    ///
-    /// # Errors
-    /// Those of [`Image::load`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn load_as_stored(path: impl AsRef<Path>) -> Result<Self> {
         let PictureFile { path, bytes } = PictureFile::open(path.as_ref())?;
@@ -217,9 +200,6 @@ impl Image {
     }
 
     /// The bytes of the file that [`Image::save_png8`] writes.
-    ///
-    /// # Errors
-    /// [`Error::Output`] if the image cannot be encoded.
     pub(crate) fn to_png8(&self) -> Result<Vec<u8>> {
         let mut file = Vec::new();
         PngEncoder::new(&mut file)
@@ -234,9 +214,6 @@ impl Image {
     }
 
     /// A JPEG file of a quality from 1 to 100, values clamped to [0, 1].
-    ///
-    /// # Errors
-    /// [`Error::Output`] if the image has no pixels, or a longer side than JPEG allows.
     pub(crate) fn to_jpeg(&self, quality: u8) -> Result<Vec<u8>> {
         let mut file = Vec::new();
         JpegEncoder::new_with_quality(&mut file, quality)
@@ -246,9 +223,6 @@ impl Image {
     }
 
     /// Writes a JPEG of high quality, values clamped to [0, 1], with the given Exif segment.
-    ///
-    /// # Errors
-    /// [`Error::Output`] if the file cannot be written; no partial file is left.
     pub(crate) fn save_jpeg(&self, path: impl AsRef<Path>, exif: Option<&[u8]>) -> Result<()> {
         const QUALITY: u8 = 97;
         let file = self.to_jpeg(QUALITY)?;
@@ -276,9 +250,6 @@ impl Image {
     }
 
     /// [`Image::save_exr`] with these numbers in the header.
-    ///
-    /// # Errors
-    /// Those of [`Image::save_exr`].
     pub(crate) fn save_exr_with(
         &self,
         path: impl AsRef<Path>,
@@ -288,9 +259,6 @@ impl Image {
     }
 
     /// [`Image::save_exr`] for values that are not colours, without conversion.
-    ///
-    /// # Errors
-    /// Those of [`Image::save_exr`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn save_exr_as_stored(&self, path: impl AsRef<Path>) -> Result<()> {
         exr_file::save(self, path.as_ref(), |value| value, &[])

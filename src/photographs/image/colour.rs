@@ -136,9 +136,6 @@ struct ColourSpace {
 
 impl ColourSpace {
     /// `None` for sRGB.
-    ///
-    /// # Errors
-    /// The metadata that cannot be used, in words.
     fn of(statement: &Statement) -> Result<Option<Self>, String> {
         let space = match statement {
             Statement::Srgb => return Ok(None),

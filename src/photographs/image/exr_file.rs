@@ -18,9 +18,6 @@ pub(super) const MAGIC: [u8; 4] = [0x76, 0x2F, 0x31, 0x01];
 
 /// The first layer's R, G and B (or Y), and the mask of its finite pixels. Colours are encoded as sRGB; those that are
 /// negative or not finite become 0, with a warning that counts them.
-///
-/// # Errors
-/// [`Error::Input`] if the file is damaged or lacks these channels.
 pub(super) fn load(path: &Path, bytes: Vec<u8>, meaning: Meaning) -> Result<Decoded> {
     let (mut image, chromaticities) = decoded(path, bytes)?;
     let alpha = finite_part(&image);
@@ -96,9 +93,6 @@ fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>
 }
 
 /// Writes R, G and B as 32-bit floats, each value through `to_exr_value`, with these numbers in the header.
-///
-/// # Errors
-/// [`Error::Output`] if the file cannot be written; no partial file is left.
 pub(super) fn save(
     image: &Image,
     path: &Path,

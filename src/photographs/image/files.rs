@@ -45,9 +45,6 @@ pub(crate) fn stem(listed: &str) -> &str {
 }
 
 /// The photographs of a folder that can be read, by path.
-///
-/// # Errors
-/// [`Error::Input`] if the folder cannot be read.
 pub(crate) fn photographs_in(folder: &Path) -> Result<Vec<PathBuf>> {
     let unreadable = |error| Error::input(folder, format!("cannot be read: {error}"));
     let mut paths = files_in(folder).map_err(unreadable)?;

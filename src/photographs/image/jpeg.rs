@@ -17,9 +17,6 @@ use crate::{Error, Result};
 pub(super) const MAGIC: [u8; 2] = [0xFF, 0xD8];
 
 /// The image; `None` if libjpeg cannot convert its colour space to RGB.
-///
-/// # Errors
-/// [`Error::Input`] if the file is truncated, damaged or of a kind that libjpeg does not read.
 pub(super) fn load(path: &Path, bytes: &[u8]) -> Result<Option<Image>> {
     // Errors of libjpeg unwind. The structure is checked first, so there should be none; this catches the rest.
     let decoded = structure::is_sound(bytes).then(|| catch_unwind(|| decode(bytes)).ok()?.ok());

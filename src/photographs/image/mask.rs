@@ -59,9 +59,6 @@ impl Mask {
     }
 
     /// [`Mask::load`] for a decoded photograph with its alpha.
-    ///
-    /// # Errors
-    /// Those of [`Mask::load`].
     pub(crate) fn over(
         photograph: &Path,
         (image, alpha): (&Image, Option<&Image>),

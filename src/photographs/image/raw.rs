@@ -22,9 +22,6 @@ const STEPS: [ProcessingStep; 6] = [
 ];
 
 /// Reads a RAW file in the sensor's orientation, and encodes it.
-///
-/// # Errors
-/// [`Error::Input`] if the file is damaged, or its camera is unknown.
 pub(super) fn load(path: &Path, bytes: Vec<u8>) -> Result<Image> {
     let developed = decoded(path, bytes, false, |raw| {
         RawDevelop::new_with(&STEPS).develop_intermediate(raw).map_err(|error| error.to_string())
@@ -44,9 +41,6 @@ pub(super) fn load(path: &Path, bytes: Vec<u8>) -> Result<Image> {
 }
 
 /// Width and height of the image that [`load`] reads.
-///
-/// # Errors
-/// Those of [`load`].
 pub(super) fn size_of(path: &Path, bytes: Vec<u8>) -> Result<(u32, u32)> {
     decoded(path, bytes, true, |raw| {
         let area = raw.crop_area.or(raw.active_area).map(|area| area.d);

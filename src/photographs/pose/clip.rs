@@ -15,9 +15,6 @@ use crate::{Error, Result};
 const CANDIDATES: usize = 4;
 
 /// Extracts `fps` frames per second of a clip as PNG files in `folder`.
-///
-/// # Errors
-/// [`Error::Input`] if ffmpeg fails or the clip has no frame.
 pub(super) fn frames(
     ffmpeg: &Tool<'_>,
     clip: &Path,
@@ -75,9 +72,6 @@ const STANDARD_RANGE: &str = "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=
 
 /// The filters after `fps` for a clip with this transfer function: [`STANDARD_RANGE`] for HLG and PQ, else none. Frames
 /// with wide primaries have them in their metadata, and are converted when they are read.
-///
-/// # Errors
-/// [`Error::Input`] with the command to run if this ffmpeg lacks the filters.
 fn filters(ffmpeg: &Tool<'_>, clip: &Path, transfer: &str) -> Result<String> {
     let range = match transfer {
         "arib-std-b67" => "HLG",

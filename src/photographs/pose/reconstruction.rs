@@ -80,10 +80,6 @@ type Options = Vec<(String, OsString)>;
 
 impl<'a> Reconstruction<'a> {
     /// Sets up the folder, and checks that the programs exist.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] if the mapper is global and neither COLMAP nor GLOMAP has one, or no command has one of the
-    /// user's options.
     pub(super) fn new(
         settings: &'a PoseOptions,
         colmap: Tool<'a>,
@@ -135,9 +131,6 @@ impl<'a> Reconstruction<'a> {
     /// the dark photographs have no camera, all are matched again, guided: without it, the result of a small set
     /// depends on chance; always matching guided would double the time of a large one. If most still have none, the
     /// choice of the initial pair is relaxed.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if a program fails.
     pub(super) fn models(
         mut self,
         pictures: &Pictures,

@@ -30,9 +30,6 @@ impl<'a> Tool<'a> {
     }
 
     /// Checks that the program runs.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] with instructions to install it, and `alternative`, if any.
     pub(super) fn found(self, alternative: &str) -> Result<Self> {
         let started = Command::new(self.path).arg("-h").stdin(Stdio::null()).output();
         let Err(error) = started else { return Ok(self) };
@@ -76,17 +73,11 @@ impl<'a> Tool<'a> {
     }
 
     /// Runs one of its commands to completion.
-    ///
-    /// # Errors
-    /// [`Error::Input`] with its last lines if it fails.
     pub(super) fn run(&self, command: &str, arguments: &[&OsStr]) -> Result<()> {
         self.run_and_watch(command, arguments, |_| {})
     }
 
     /// [`Tool::run`] that passes the output so far to `watch`, twice a second.
-    ///
-    /// # Errors
-    /// Those of [`Tool::run`].
     pub(super) fn run_and_watch(
         &self,
         command: &str,

@@ -20,9 +20,6 @@ pub struct Encoded {
 
 impl Encoded {
     /// Uncoded values.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub fn plain(gpu: &Gpu, values: Arc<Buffer<f32>>) -> Result<Self> {
         let codes = gpu.uninit("no codes", 0)?;
         Ok(Self { code_bits: 32, value_count: values.len(), codes, values })

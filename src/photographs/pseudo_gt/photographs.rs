@@ -8,9 +8,6 @@ use crate::photographs::tone::ToneMapping;
 
 impl PseudoGt {
     /// The target of a photograph, at its own size.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub fn tone_mapped(&self, photograph: &Image, tone_mapping: &ToneMapping) -> Result<Image> {
         let parameters = self.gpu.buffer("tone parameters", &[tone_mapping.parameters])?;
         let Image { width, height, .. } = *photograph;

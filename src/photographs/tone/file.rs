@@ -57,9 +57,6 @@ impl From<ToneCurve> for CurveChoice {
 
 impl CurveChoice {
     /// The curve with the constants of its row or file.
-    ///
-    /// # Errors
-    /// [`Error::Input`] with the file and its problem.
     pub fn settings(&self) -> Result<ToneSettings> {
         match self {
             Self::Named(curve) => Ok(ToneSettings::new(*curve)),

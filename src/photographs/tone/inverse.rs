@@ -45,9 +45,6 @@ pub struct Inverted {
 
 impl InverseTone {
     /// The inverse of this curve with the parameters of a photograph.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] for a camera profile, which mixes channels and has no inverse.
     pub fn new(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {
         if settings.curve == ToneCurve::Profile {
             let problem = "a camera profile mixes and bends channels, and has no inverse; train with a curve for \

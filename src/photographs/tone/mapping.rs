@@ -56,9 +56,6 @@ impl SceneTone {
     }
 
     /// The recorded mapping of a view's photograph; `None` if photographs are measured.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] if mappings are recorded, but not that of this view.
     pub(crate) fn recorded_mapping(&self, view: &str) -> Result<Option<ToneMapping>> {
         let Some(law) = &self.law else { return Ok(None) };
         let missing =

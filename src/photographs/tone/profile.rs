@@ -39,10 +39,6 @@ pub struct Profile {
 
 impl Profile {
     /// Checks the profile.
-    ///
-    /// # Errors
-    /// A number is not finite or exceeds its limit, the rows of the matrix do not preserve grey, or a channel
-    /// decreases.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn check(&self) -> Result<(), String> {
         if self.pairs == 0 {

@@ -69,9 +69,6 @@ struct Line {
 
 impl ToneLaw {
     /// Reads a law.
-    ///
-    /// # Errors
-    /// [`Error::Input`] with the file and its problem.
     pub(crate) fn load(path: &Path) -> Result<Self> {
         let wrong = |problem: String| Error::input(path, format!("is not a tone law: {problem}"));
         let head: Head = toml::from_str(&input::text(path)?)
@@ -93,9 +90,6 @@ impl ToneLaw {
     }
 
     /// Writes the law; every number is read back to the bit.
-    ///
-    /// # Errors
-    /// The file cannot be written.
     pub(crate) fn save(&self, path: &Path) -> Result<()> {
         let head = Head {
             version: VERSION,
@@ -115,9 +109,6 @@ impl ToneLaw {
     }
 
     /// Refuses a law of another curve than a run's.
-    ///
-    /// # Errors
-    /// [`Error::Input`].
     pub(crate) fn check(self, path: &Path, tone: &ToneSettings) -> Result<Self> {
         let own = ToneSettings { law: None, ..tone.clone() };
         if self.tone == own {

@@ -20,10 +20,6 @@ pub struct SceneLaw {
 
 impl SceneLaw {
     /// The law of a scene with these parameters.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] for a camera profile, which has no inverse, and for a table, which has too many numbers to
-    /// state.
     #[cfg(feature = "io")]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn of(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {

@@ -219,9 +219,6 @@ impl ToneSettings {
     }
 
     /// Checks the constants: the curve must be defined, and its black level within [0, 1].
-    ///
-    /// # Errors
-    /// [`Error::Setting`], and [`Error::Usage`] for settings that exclude each other.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn check(&self) -> Result<()> {
         let values: [(&str, &dyn Any); 7] = [

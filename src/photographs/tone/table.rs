@@ -44,9 +44,6 @@ pub struct Table {
 impl Table {
     /// Reads lines of `t,y` or `t,red,green,blue`. A first line of names may have `x` instead of `t`: the table then
     /// acts on stored values. Blank lines and lines that begin with `#` are ignored.
-    ///
-    /// # Errors
-    /// The problem, with its line.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn from_csv(text: &str) -> Result<Self, String> {
         let mut rows = Rows::default();
@@ -71,9 +68,6 @@ impl Table {
     }
 
     /// Reads a one-dimensional .cube file; it acts on stored values.
-    ///
-    /// # Errors
-    /// The problem, with its line.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn from_cube(text: &str) -> Result<Self, String> {
         let mut rows = Rows::default();

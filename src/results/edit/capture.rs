@@ -36,8 +36,6 @@ pub(super) struct Capture {
 const LARGE_ERROR: f64 = 0.05;
 
 impl Capture {
-    /// # Errors
-    /// The dataset is missing, or there is no such device.
     pub(super) fn open(model: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
         let FinishedRun { gpu, config, dataset, .. } = FinishedRun::open(model, dataset, opener)?;
         let (is_model, learns) = (is_model(model), config.exposure.learn == OnOff::On);
@@ -51,9 +49,6 @@ impl Capture {
     }
 
     /// The targets of [`Capture::views`]; `None` without a photograph.
-    ///
-    /// # Errors
-    /// A photograph can no longer be read, or the device is out of memory or lost.
     pub(super) fn targets(&self) -> Result<Vec<Option<Image>>> {
         let mut targets = TestTargets::new(&self.gpu, &self.tone, &self.dataset)?;
         self.views().map(|view| targets.of(view)).collect()
@@ -67,18 +62,12 @@ impl Capture {
     }
 
     /// What the test views are scored against.
-    ///
-    /// # Errors
-    /// Those of [`Capture::targets`].
     pub(super) fn score_reference(&self) -> Result<ScoreReference> {
         ScoreReference::of(&self.gpu, &self.config.tone, &self.dataset)
     }
 
     /// The mean PSNR of a model on the test views, dB, with the networks of its run, if it is one; `None` without test
     /// views.
-    ///
-    /// # Errors
-    /// The networks do not fit the model, or the device is out of memory or lost.
     pub(super) fn psnr(
         &self,
         run: Option<&Path>,
@@ -113,9 +102,6 @@ impl Capture {
 
     /// Metres per unit of the dataset's world from a table of camera positions in metres: the least-squares ratio of
     /// the distances between all pairs of cameras. With a note on the fit.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if the table cannot be read, or names fewer than two cameras at different places.
     pub(super) fn metres_per_unit(&self, table: &Path) -> Result<(f64, String)> {
         let positions = camera_table(table)?;
         let pair = |view: &View| Some((view.camera.center(), *positions.get(&view.name)?));

@@ -30,9 +30,6 @@ enum Source {
 
 impl Content {
     /// Opens a run or a model file.
-    ///
-    /// # Errors
-    /// Those of reading a model; the numbers of a PLY are read later.
     pub(super) fn open(path: &Path) -> Result<(Self, Facts)> {
         if let Some((file, facts)) = models::open_parts(path, PART)? {
             return Ok((Self::of_parts(file), facts));
@@ -63,9 +60,6 @@ impl Content {
     }
 
     /// The checksum of a model by which an edit list names it.
-    ///
-    /// # Errors
-    /// Those of reading a part.
     pub(super) fn fingerprint(&self) -> Result<String> {
         let mut fingerprint = Fingerprint::new(self.count, self.none.shape, self.none.origin);
         self.each_part(|part| {
@@ -76,9 +70,6 @@ impl Content {
     }
 
     /// The distance from the origin within which half of the Gaussians are.
-    ///
-    /// # Errors
-    /// Those of reading a part.
     pub(super) fn size(&self) -> Result<f64> {
         let mut lengths = Lengths::default();
         self.each_part(|part| {
@@ -89,9 +80,6 @@ impl Content {
     }
 
     /// Takes a step; a model may have no Gaussians left after it.
-    ///
-    /// # Errors
-    /// Those of reading a part.
     pub(super) fn apply(&mut self, step: Step) -> Result<()> {
         let removes = step.removes();
         step.apply(0, &mut self.none);
@@ -116,9 +104,6 @@ impl Content {
     }
 
     /// All Gaussians, in memory.
-    ///
-    /// # Errors
-    /// Those of reading a part.
     pub(super) fn whole(&self) -> Result<Cow<'_, Gaussians>> {
         if let Source::Whole(gaussians) = &self.source {
             return Ok(Cow::Borrowed(gaussians));
@@ -140,9 +125,6 @@ impl Content {
     }
 
     /// Writes a PLY.
-    ///
-    /// # Errors
-    /// It cannot be written, or a part cannot be read; no partial file is left.
     pub(super) fn save_ply(&self, provenance: &Provenance, out: &Path) -> Result<()> {
         let comments = provenance.ply_comments(&self.none);
         save_parts(out, (&self.none, self.count), &comments, |take| {

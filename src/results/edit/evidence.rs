@@ -116,8 +116,6 @@ impl<'a> Measured<'a> {
         Ok(())
     }
 
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn evidence(&self, targets: &[Option<Image>]) -> Result<Evidence> {
         let zeros = || vec![0.0; self.gaussians.count];
         let mut evidence = Evidence { product: zeros(), square: zeros(), error: 0.0 };

@@ -56,9 +56,6 @@ pub(super) struct Found {
 
 /// Finds the floaters of Gaussians; `cameras` are the positions of the training cameras, and `near` the distance before
 /// them at which nothing is, in the same units.
-///
-/// # Errors
-/// The device is out of memory or lost.
 pub(super) fn found<'a>(
     gaussians: &Gaussians,
     targets: &[Option<Image>],

@@ -88,8 +88,6 @@ pub(crate) enum Scale {
 }
 
 impl Region {
-    /// # Errors
-    /// What is wrong with its numbers.
     fn check(&self) -> Result<(), String> {
         match *self {
             Self::Box(a, b) if !(a.is_finite() && b.is_finite() && a.cmplt(b).all()) => {
@@ -116,9 +114,6 @@ impl Region {
 
 impl Scale {
     /// The factor of a number, or of two points.
-    ///
-    /// # Errors
-    /// It is not finite and above 0.
     pub(super) fn factor(&self) -> Result<Option<f64>, String> {
         let factor = match *self {
             Self::Factor(factor) => factor,
@@ -135,9 +130,6 @@ impl Scale {
 
 impl Operation {
     /// Refuses numbers that no model takes.
-    ///
-    /// # Errors
-    /// What is wrong, in words that follow the operation's name.
     pub(crate) fn check(&self) -> Result<(), String> {
         let unit = |direction: DVec3| {
             let has_length = direction.is_finite() && direction.try_normalize().is_some();
@@ -205,9 +197,6 @@ impl EditList {
     }
 
     /// Reads a list; the files that it merges are relative to its own folder.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if the file is no list, of another version, or has an operation with an invalid number.
     pub(crate) fn load(path: &Path) -> Result<Self> {
         let refused = |problem: String| Error::input(path, problem);
         let text = input::text(path)?;

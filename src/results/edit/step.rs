@@ -26,9 +26,6 @@ pub(super) enum Step {
 
 impl Step {
     /// A removal by number from `count` Gaussians.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] if there are not as many.
     pub(super) fn delete(spans: &[Span], count: usize) -> Result<Self> {
         let mut ranges = vec![];
         for span in spans {

@@ -17,9 +17,6 @@ pub(super) fn lit_folder(dataset: &Dataset) -> PathBuf {
 }
 
 /// Adds the scores in the light of the lamp; `render` renders a view so.
-///
-/// # Errors
-/// Those of `render`, or an image of `lit/` cannot be read.
 pub(crate) fn score_lit(
     scored: &mut [ViewScore],
     dataset: &Dataset,

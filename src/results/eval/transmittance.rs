@@ -85,9 +85,6 @@ pub fn hole_warning<'a>(
 
 /// Warns of holes in the scored views of a model that was trained over `background`; without scored views, in some of
 /// the training views, which `render` renders.
-///
-/// # Errors
-/// Those of `render`.
 pub fn warn_of_holes(
     scored: &[ViewScore],
     dataset: &Dataset,

@@ -21,9 +21,6 @@ struct Plane {
 }
 
 /// Encodes a model.
-///
-/// # Errors
-/// [`Error::Usage`] if the file would exceed 4 GiB, the limit of the format.
 pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>> {
     let gaussians = half_turn(gaussians);
     let planes = planes(&gaussians, provenance.facts.linear.is_some());

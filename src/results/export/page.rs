@@ -73,9 +73,6 @@ pub struct Page<'a> {
 
 impl Page<'_> {
     /// The page as HTML.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] for a bookmark that is not a pinhole camera.
     pub fn html(&self) -> Result<String> {
         let Self { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up, lamp } =
             self;

@@ -24,18 +24,12 @@ use crate::{Error, Result};
 const SETS_PER_ROW: usize = 64;
 
 /// Encodes a model.
-///
-/// # Errors
-/// [`Error::Output`] if an image or the archive cannot be encoded.
 pub fn encode(gaussians: &Gaussians, provenance: &Provenance) -> Result<Vec<u8>> {
     archive(&encoded(gaussians, provenance, &[gaussians.count]))
 }
 
 /// Writes a model as files in a folder, which is created. The Gaussians of a cell stay together, and cells keep their
 /// order; `counts` are their Gaussians.
-///
-/// # Errors
-/// [`Error::Output`] if an image cannot be encoded or a file cannot be written.
 pub(super) fn write_folder(
     folder: &Path,
     gaussians: &Gaussians,
@@ -272,9 +266,6 @@ struct Rest {
 const MOST: u64 = 1 << 30;
 
 /// The Gaussians of a file of version 2, and the facts that it states.
-///
-/// # Errors
-/// The problem: another format or version, a truncated file, or an invalid fact.
 pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     let mut zip =
         ZipArchive::new(Cursor::new(file)).map_err(|error| format!("is not a SOG: {error}"))?;

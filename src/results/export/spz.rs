@@ -36,9 +36,6 @@ pub enum Version {
 }
 
 /// Encodes a model.
-///
-/// # Errors
-/// [`Error::Usage`] if a position is beyond the range of 24 bits in whole units.
 pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) -> Result<Vec<u8>> {
     let gaussians = half_turn(gaussians);
     let fraction = fractional_bits(&gaussians)?;
@@ -90,9 +87,6 @@ pub fn encode(gaussians: &Gaussians, provenance: &Provenance, version: Version) 
 }
 
 /// The Gaussians of a file of version 2, 3 or 4, and the facts that it states.
-///
-/// # Errors
-/// The problem: another format or version, a truncated file, or an invalid fact.
 pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     let (header, streams, text) = match file {
         [0x1f, 0x8b, ..] => unzipped(file)?,

@@ -15,9 +15,6 @@ pub(super) struct Backup(Option<PathBuf>);
 
 impl Backup {
     /// Moves the files of the run into the backup.
-    ///
-    /// # Errors
-    /// The directory cannot be written.
     pub(super) fn set(run: &Path) -> Result<Self> {
         let backup = run.join(BACKUP);
         let held: Vec<&str> = FILES.into_iter().filter(|file| run.join(file).exists()).collect();
@@ -34,9 +31,6 @@ impl Backup {
     }
 
     /// Deletes the previous run, once the new one has begun.
-    ///
-    /// # Errors
-    /// The directory cannot be written.
     pub(super) fn give_up(&mut self) -> Result<()> {
         let Some(run) = self.0.take() else { return Ok(()) };
         std::fs::remove_dir_all(run.join(BACKUP)).map_err(|error| unwritable(&run, &error))
@@ -54,9 +48,6 @@ impl Drop for Backup {
 
 /// Cleans up after a killed process: restores a run that was being replaced and deletes partial files. The caller must
 /// hold the lock.
-///
-/// # Errors
-/// The directory cannot be written.
 pub(super) fn recover(run: &Path) -> Result<()> {
     restore(run).map_err(|error| unwritable(run, &error))?;
     for entry in std::fs::read_dir(run).map_err(|error| unwritable(run, &error))?.flatten() {

@@ -62,10 +62,6 @@ pub struct RunDirectory {
 
 impl RunDirectory {
     /// Checks that a run can begin here, before anything is loaded or written.
-    ///
-    /// # Errors
-    /// Another process trains there; it contains a run and `overwrite` is false; it contains files with a run's names
-    /// but no run; or a parent is a file.
     pub fn check(path: &Path, overwrite: bool) -> Result<()> {
         let used = FILES.iter().find(|file| path.join(file).exists());
         match used.filter(|_| !overwrite) {
@@ -75,9 +71,6 @@ impl RunDirectory {
     }
 
     /// Checks that a run can begin or resume here.
-    ///
-    /// # Errors
-    /// Another process trains there, it contains files with a run's names but no run, or a parent is a file.
     pub fn check_resumed(path: &Path) -> Result<()> {
         RunLock::check(path)?;
         if let Some(file) = FILES.iter().find(|file| path.join(file).exists())
@@ -96,9 +89,6 @@ impl RunDirectory {
     }
 
     /// Creates the directory if necessary, locks it, and cleans up after a killed process.
-    ///
-    /// # Errors
-    /// Another process trains there, or it cannot be written.
     pub(crate) fn lock(path: &Path) -> Result<RunLock> {
         std::fs::create_dir_all(path).map_err(|error| unwritable(path, &error))?;
         let lock = RunLock::take(path)?;
@@ -107,9 +97,6 @@ impl RunDirectory {
     }
 
     /// Writes the configuration into a locked directory. A previous run is kept until [`RunDirectory::settle`].
-    ///
-    /// # Errors
-    /// It contains a run and `overwrite` is false, or it cannot be written.
     pub(super) fn create_locked(
         path: &Path,
         lock: RunLock,
@@ -128,18 +115,12 @@ impl RunDirectory {
     }
 
     /// Deletes the previous run, once this one has begun.
-    ///
-    /// # Errors
-    /// The directory cannot be written.
     pub fn settle(&mut self) -> Result<()> {
         self.backup.give_up()?;
         if std::mem::take(&mut self.is_new) { remove_events(&self.path) } else { Ok(()) }
     }
 
     /// Resumes a run after `step`: truncates its log there, and marks it as unfinished.
-    ///
-    /// # Errors
-    /// The directory cannot be written, or its log does not reach `step`.
     pub(super) fn resume(
         path: &Path,
         lock: RunLock,
@@ -185,9 +166,6 @@ impl RunDirectory {
     }
 
     /// Writes the scores of the held-out views: step, PSNR in dB.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub fn save_held_out(&self, scores: &[(u64, f64)]) -> Result<()> {
         let lines = scores.iter().map(|(step, psnr)| format!("{step},{psnr}\n"));
         let text = "step,psnr\n".to_owned() + &lines.collect::<String>();
@@ -202,9 +180,6 @@ impl RunDirectory {
     }
 
     /// Writes the intermediate scores.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub(super) fn save_progress(&self, progress: &[Progress]) -> Result<()> {
         let lines: String = progress.iter().map(Progress::line).collect();
         let text = format!("{}\n{lines}", Progress::COLUMNS);
@@ -212,9 +187,6 @@ impl RunDirectory {
     }
 
     /// Writes the configuration with the origin of each value.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub(super) fn save_config(
         &self,
         config: &TrainConfig,
@@ -227,17 +199,11 @@ impl RunDirectory {
     }
 
     /// Writes the plan that the configuration follows.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub fn save_plan(&self, plan: &Plan) -> Result<()> {
         write_whole(&self.path.join(PLAN), plan.to_toml()?.as_bytes())
     }
 
     /// Writes the list of views, to detect that a dataset has changed.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub fn save_views(&self, dataset: &Dataset) -> Result<()> {
         let lines: String = view_lines(dataset).into_iter().map(|line| line + "\n").collect();
         let text = format!("name,split,width,height\n{lines}");
@@ -256,9 +222,6 @@ impl RunDirectory {
 
     /// Flushes the log, then writes a checkpoint and the model. The previous checkpoint is kept, the only one until
     /// this is complete.
-    ///
-    /// # Errors
-    /// The disk is full or gone, the device was lost, or a parameter is not finite.
     pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
         let newest = generations::rotate(&self.path)?;
@@ -267,9 +230,6 @@ impl RunDirectory {
     }
 
     /// Writes the current model with its networks, lamp and exposures.
-    ///
-    /// # Errors
-    /// The disk is full or gone, the device was lost, or a parameter is not finite.
     pub(super) fn save_trained(&mut self, trainer: &mut Trainer) -> Result<()> {
         self.save_model(trainer)?;
         if let Some(networks) = trainer.networks() {
@@ -291,9 +251,6 @@ impl RunDirectory {
     }
 
     /// Appends the checksum of every parameter plane to `hashes.csv`.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub(super) fn log_hashes(&self, step: u64, gaussians: &Gaussians) -> Result<()> {
         let path = self.path.join(HASHES);
         let known = std::fs::read_to_string(&path).unwrap_or_default();
@@ -302,9 +259,6 @@ impl RunDirectory {
     }
 
     /// Appends a step to `train.csv`.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub fn log(&mut self, report: &StepReport) -> Result<()> {
         let StepReport { step, view, loss, gaussians, milliseconds, .. } = report;
         let terms: String =
@@ -314,17 +268,11 @@ impl RunDirectory {
     }
 
     /// Flushes the log for other readers.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub fn flush_log(&mut self) -> Result<()> {
         self.log.flush().map_err(|error| unwritable(&self.path, &error))
     }
 
     /// Writes `model.ply`, in the colours that viewers expect and in the dataset's world.
-    ///
-    /// # Errors
-    /// The disk is full or gone, or a parameter is not finite.
     pub fn save_model(&mut self, trainer: &Trainer) -> Result<()> {
         self.flush_log()?;
         let in_frame = trainer.gaussians_in_frame()?;
@@ -335,25 +283,16 @@ impl RunDirectory {
     }
 
     /// Writes the weights of the networks.
-    ///
-    /// # Errors
-    /// The disk is full or gone, or the device was lost.
     pub fn save_networks(&self, networks: &Networks) -> Result<()> {
         networks.save(&self.path.join(NETWORKS))
     }
 
     /// Writes the exposures of the training views.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub fn save_exposures(&self, exposures: &[(String, Affine)]) -> Result<()> {
         table::save(&self.path.join(EXPOSURES), exposures)
     }
 
     /// Writes `metrics.json`, which marks a complete run.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub fn save_metrics(&self, metrics: &serde_json::Value) -> Result<()> {
         write_whole(&self.path.join("metrics.json"), format!("{metrics:#}\n").as_bytes())
     }

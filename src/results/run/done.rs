@@ -60,9 +60,6 @@ fn load(run: &Path) -> Option<Done> {
 }
 
 /// The last step of the run in a directory, if it is complete and of this configuration and dataset.
-///
-/// # Errors
-/// None for a configuration that [`TrainConfig::check`] accepts.
 pub fn done_steps(run: &Path, config: &TrainConfig, dataset: &Dataset) -> Result<Option<u64>> {
     let Some(done) = load(run) else { return Ok(None) };
     let is_same = done.configuration == config.checksum()?
@@ -72,9 +69,6 @@ pub fn done_steps(run: &Path, config: &TrainConfig, dataset: &Dataset) -> Result
 
 /// [`done_steps`] without reading a photograph: `None` if the modification times of the dataset's files have changed,
 /// whatever their contents.
-///
-/// # Errors
-/// None for a configuration that [`TrainConfig::check`] accepts.
 pub fn done_steps_by_stamp(run: &Path, config: &TrainConfig) -> Result<Option<u64>> {
     let Some(Done { stamp: Some(stamp), configuration, steps, .. }) = load(run) else {
         return Ok(None);

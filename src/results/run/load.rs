@@ -64,9 +64,6 @@ pub fn stopped_at(run: &Path) -> Option<u64> {
 }
 
 /// The trained Gaussians of a run, or those of the joined blocks of a scene, in the colours that viewers show.
-///
-/// # Errors
-/// The run neither finished nor reached a checkpoint, or a file is missing or truncated.
 pub fn load_gaussians(run: &Path) -> Result<Gaussians> {
     let path = run.join("model.ply");
     if let Some(manifest) = Manifest::of_scene(run)? {
@@ -100,9 +97,6 @@ pub fn load_networks(
 }
 
 /// The learned lamp of a run, in units of its dataset's world; `None` if it has none.
-///
-/// # Errors
-/// The file is damaged, or a number of it is out of range.
 pub fn load_lamp(run: &Path) -> Result<Option<Lamp>> {
     let path = run.join(LAMP);
     if !path.is_file() {
@@ -116,9 +110,6 @@ pub fn load_lamp(run: &Path) -> Result<Option<Lamp>> {
 }
 
 /// The learned exposures of a run's training views relative to its model, by name; empty if none were learned.
-///
-/// # Errors
-/// The file is damaged.
 pub fn load_exposures(run: &Path) -> Result<BTreeMap<String, Affine>> {
     let path = run.join(EXPOSURES);
     let known = if path.is_file() { table::load(&path)? } else { vec![] };

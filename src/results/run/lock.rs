@@ -20,8 +20,6 @@ pub(crate) struct RunLock {
 const LOCK: &str = ".lock";
 
 impl RunLock {
-    /// # Errors
-    /// Another process trains in the directory, or it cannot be written.
     pub(super) fn take(run: &Path) -> Result<Self> {
         let path = run.join(LOCK);
         let unusable = |error: std::io::Error| {
@@ -48,9 +46,6 @@ impl RunLock {
     }
 
     /// Checks that [`RunLock::take`] would succeed.
-    ///
-    /// # Errors
-    /// Those of [`RunLock::take`].
     pub(super) fn check(run: &Path) -> Result<()> {
         let path = run.join(LOCK);
         match File::open(&path).map(|file| file.try_lock_shared()) {

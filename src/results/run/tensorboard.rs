@@ -20,9 +20,6 @@ pub(super) struct EventFile {
 impl EventFile {
     /// Creates a new file in `folder` for events after `step`. It invalidates later events of earlier files, from an
     /// interrupted run.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
     pub(super) fn create(folder: &Path, step: u64) -> Result<Self> {
         let failed = |error: std::io::Error| unwritable(folder, &error);
         std::fs::create_dir_all(folder).map_err(failed)?;
@@ -44,9 +41,6 @@ impl EventFile {
     }
 
     /// Writes scalars of a step by name; a slash separates group and name.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub(super) fn scalars(&mut self, step: u64, values: &[(String, f64)]) -> Result<()> {
         let mut summary = Message::default();
         for (tag, value) in values {
@@ -57,9 +51,6 @@ impl EventFile {
     }
 
     /// Writes an image of a step, a PNG file.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub(super) fn picture(
         &mut self,
         step: u64,
@@ -75,9 +66,6 @@ impl EventFile {
     }
 
     /// Writes a line of text of a step.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub(super) fn text(&mut self, step: u64, tag: &str, text: &str) -> Result<()> {
         const DT_STRING: u64 = 7;
         let one = Message::default().message(2, &Message::default().varint(1, 1));
@@ -90,9 +78,6 @@ impl EventFile {
     }
 
     /// Flushes the file for other readers.
-    ///
-    /// # Errors
-    /// The disk is full or gone.
     pub(super) fn flush(&mut self) -> Result<()> {
         self.file.flush().map_err(|error| unwritable(&self.path, &error))
     }

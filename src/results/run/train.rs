@@ -80,9 +80,6 @@ pub fn train(
 }
 
 /// [`train`] with the options of a [`Session`].
-///
-/// # Errors
-/// Those of [`train`], and [`Error::Stopped`] on request or after `TrainConfig::max_minutes`.
 pub fn train_in(
     gpu: &Gpu,
     config: &TrainConfig,

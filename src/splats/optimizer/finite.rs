@@ -16,18 +16,12 @@ const NONE: u32 = u32::MAX;
 
 impl FiniteCheck {
     /// Builds the kernel.
-    ///
-    /// # Errors
-    /// The device refuses the pipeline.
     pub fn new(gpu: &Gpu) -> Result<Self> {
         let pipeline = gpu.pipeline(&first_not_finite::Constants::default())?;
         Ok(Self { pipeline, first: gpu.uninit("first_not_finite", 1)? })
     }
 
     /// The index of the first of `count` values that is not finite.
-    ///
-    /// # Errors
-    /// The buffer has fewer, or the device was lost.
     pub fn first<'a>(
         &mut self,
         gpu: &Gpu,

@@ -20,9 +20,6 @@ pub trait Learnable {
 impl Adam {
     /// Records step number `step`, from 1, of all parameters, at `rate` times its own learning rate; nothing changes
     /// while `status` is nonzero.
-    ///
-    /// # Errors
-    /// Those of [`Adam::record`].
     pub fn update(
         &self,
         pass: &mut Recorder<'_>,

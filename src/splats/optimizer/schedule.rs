@@ -133,9 +133,6 @@ impl LearningRates {
 
 impl Schedule {
     /// Checks the values.
-    ///
-    /// # Errors
-    /// [`Error::Setting`](crate::Error::Setting).
     pub(crate) fn check(&self) -> Result<()> {
         self.check_rows()?;
         LearningRates::settings()

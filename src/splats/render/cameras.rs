@@ -37,9 +37,6 @@ pub struct Viewpoints {
 
 impl Viewpoints {
     /// Uploads the cameras.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub fn new(gpu: &Gpu, patches: Vec<Patch>) -> Result<Self> {
         let cameras: Vec<kernels::Camera> = patches.iter().map(Into::into).collect();
         Ok(Self { cameras: gpu.buffer("cameras", &cameras)?, patches })
@@ -72,9 +69,6 @@ impl CameraGradient {
     pub const WIDTH: usize = CAMERA_WIDTH as usize;
 
     /// Builds the kernels for a camera model, and allocates for `capacity` Gaussians.
-    ///
-    /// # Errors
-    /// The driver refuses a kernel, or the device is out of memory.
     pub fn new(renderer: &Renderer, model: CameraModel, gaussian_count: usize) -> Result<Self> {
         let Renderer { gpu, settings, tile, .. } = renderer;
         let [tile_width, tile_height] = tile.size;
@@ -97,10 +91,6 @@ impl CameraGradient {
     /// Records the gradient of a viewpoint's camera ([`CameraGradient::WIDTH`]), after the [`Renderer::backward`] of
     /// the same viewpoint, whose parameter gradients it reads. The camera is moved in view space: a point p becomes p +
     /// translation + rotation x p.
-    ///
-    /// # Errors
-    /// The viewpoint is of another camera model, the Gaussians exceed the memory or are not those of the renderer, or a
-    /// pass exceeds what the device can launch.
     pub fn record<'a>(
         &mut self,
         pass: &mut Recorder<'_>,

@@ -25,9 +25,6 @@ impl Renderer {
     }
 
     /// The same for images of these sizes; where `gaussian_count` Gaussians need more memory, for `capacity` of them.
-    ///
-    /// # Errors
-    /// The device is out of memory, or the tiles exceed its limit.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn reserve_sizes(
         &mut self,
@@ -90,18 +87,12 @@ impl Renderer {
     }
 
     /// Sets the capacity to exactly `intersections`.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn set_intersection_capacity(&mut self, intersections: u32) -> Result<()> {
         self.frame.set_intersection_capacity(&self.gpu, intersections)
     }
 
     /// Takes the memory of the sorts ahead of a recording.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub(super) fn reserve_sorts(&mut self) -> Result<()> {
         self.depth_sort.reserve(self.frame.depth_keys.len())?;
         self.tile_sort.reserve(self.frame.tiles.len())

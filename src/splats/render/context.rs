@@ -11,9 +11,6 @@ const INVISIBLE: f32 = -100.0;
 impl Renderer {
     /// Renders these Gaussians together with those of every view from now on. They have neither gradients nor
     /// statistics. SH degrees that the renderer does not have are dropped. Memory must be reserved anew.
-    ///
-    /// # Errors
-    /// Their features are not those of the settings, or the device is out of memory or lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn set_context(&mut self, context: &Gaussians) -> Result<()> {
         // The Gaussians of a view come after, at an aligned index.
@@ -30,9 +27,6 @@ impl Renderer {
     }
 
     /// The context with another SH degree.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(super) fn set_context_degree(&mut self, sh_degree: u32) -> Result<()> {
         let Some(context) = &self.context else { return Ok(()) };
         let gaussians = context.download(&self.gpu)?.with_sh_degree(sh_degree);

@@ -12,9 +12,6 @@ const MEDIAN: DepthChannel = DepthChannel { takes_median: true, has_limits: fals
 impl Renderer {
     /// The median depth of each pixel, (H, W), world units: the depth in the view of the splat at which the
     /// transmittance passes 1/2; infinite where it does not.
-    ///
-    /// # Errors
-    /// As [`Renderer::render_image`].
     pub(crate) fn render_depths(
         &mut self,
         gaussians: &DeviceGaussians,

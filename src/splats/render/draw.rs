@@ -167,9 +167,6 @@ impl Renderer {
     }
 
     /// Takes memory for this many Gaussians, views of this size and this many intersections ahead of the first draw.
-    ///
-    /// # Errors
-    /// The device is out of memory, or the tiles exceed its limit.
     #[cfg(feature = "capi")]
     pub(crate) fn reserve_draw(
         &mut self,

@@ -20,8 +20,6 @@ pub(crate) struct ViewGradients {
 }
 
 impl ViewGradients {
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(crate) fn new(gpu: &Gpu, gaussians: &DeviceGaussians) -> Result<Self> {
         let layout = gaussians.layout;
         let batches = layout.batches(gpu);
@@ -40,9 +38,6 @@ impl Renderer {
     /// Renders the view patch by patch. `d_renders` returns one or more gradients with respect to the patch's render,
     /// (channels, h, w), from its channels and transmittance; `take` gets, for each of them in order, the gradients of
     /// an attribute, (count, width), which add up over patches.
-    ///
-    /// # Errors
-    /// As [`Renderer::render_image`] and [`Renderer::backward`].
     pub(crate) fn view_gradients(
         &mut self,
         gaussians: &DeviceGaussians,

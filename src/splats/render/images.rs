@@ -65,9 +65,6 @@ impl Renderer {
     }
 
     /// As [`Renderer::render_channels`], with the transmittance as the last channel, (channels + 1, H, W).
-    ///
-    /// # Errors
-    /// As [`Renderer::render_image`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn render_planes<'a>(
         &mut self,
@@ -98,9 +95,6 @@ impl Renderer {
     }
 
     /// The number of intersections of a patch, whether it exceeds the capacity or not.
-    ///
-    /// # Errors
-    /// The image exceeds what was reserved, or the device is lost.
     pub(crate) fn count_intersections(
         &mut self,
         gaussians: GaussianSlice<'_>,
@@ -131,9 +125,6 @@ impl Renderer {
 
     /// Renders a patch on the device, and grows the memory as it needs. Returns the patch's halves instead where the
     /// device cannot bind all its intersections.
-    ///
-    /// # Errors
-    /// As [`Renderer::render_image`].
     pub(super) fn render_or_halve(
         &mut self,
         gaussians: GaussianSlice<'_>,
@@ -163,9 +154,6 @@ impl Renderer {
 
     /// All channels of one patch, then its [`Renderer::transmittances`], (channels + 1, h, w); in two halves where the
     /// device cannot bind all its intersections.
-    ///
-    /// # Errors
-    /// As [`Renderer::render_image`].
     pub(crate) fn render_patch<'a>(
         &mut self,
         gaussians: impl Into<GaussianSlice<'a>>,

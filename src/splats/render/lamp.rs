@@ -36,8 +36,6 @@ struct LampBackward {
 }
 
 impl DeviceLamp {
-    /// # Errors
-    /// A number is out of range, the driver refuses a kernel, or the device is out of memory.
     pub(super) fn new(
         gpu: &Gpu,
         settings: &RenderSettings,
@@ -99,9 +97,6 @@ impl LampBackward {
 
 impl Renderer {
     /// The lamp with its present numbers; `None`: evenly lit.
-    ///
-    /// # Errors
-    /// The device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn lamp(&self) -> Result<Option<Lamp>> {
         let Some(lamp) = &self.lamp else { return Ok(None) };
@@ -115,9 +110,6 @@ impl Renderer {
     }
 
     /// Replaces the numbers of the lamp on the device, (`LAMP_NUMBERS`).
-    ///
-    /// # Errors
-    /// The device was lost.
     #[cfg(feature = "testing")]
     pub fn set_lamp_numbers(&mut self, numbers: &[f32]) -> Result<()> {
         let Some(lamp) = &mut self.lamp else { return Ok(()) };

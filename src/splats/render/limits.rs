@@ -49,9 +49,6 @@ impl RenderSettings {
 
     /// The tile for views of these sizes: that of `RenderSettings::tile_up_to` the largest, or a multiple of its
     /// height where the settings name none and a view would have too many tiles.
-    ///
-    /// # Errors
-    /// As `RenderSettings::tile_up_to`.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn tile_for(
         &self,
@@ -80,10 +77,6 @@ impl RenderSettings {
     }
 
     /// Refuses a view that this device cannot render and train on, from its size alone.
-    ///
-    /// # Errors
-    /// [`Error::Usage`] names the view, the limit, and the longest side that it leaves; the tile does not suit the
-    /// device.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn check_size(
         &self,

@@ -28,9 +28,6 @@ impl Renderer {
     }
 
     /// [`Renderer::new`] whose backward pass writes such gradients, but not those of the first `frozen_columns`.
-    ///
-    /// # Errors
-    /// Those of [`Renderer::new`].
     pub(crate) fn with_gradients(
         gpu: &Gpu,
         settings: RenderSettings,
@@ -43,9 +40,6 @@ impl Renderer {
     }
 
     /// [`Renderer::new`] with segments of `segment` splats, a multiple of the subgroup size; 0: a run has one segment.
-    ///
-    /// # Errors
-    /// Those of [`Renderer::new`].
     #[cfg(feature = "testing")]
     pub fn with_segments(gpu: &Gpu, settings: RenderSettings, segment: u32) -> Result<Self> {
         Self::build(gpu, settings, (GradientKind::All, 0), settings.tile_on(gpu)?, segment)
@@ -136,9 +130,6 @@ impl Renderer {
     }
 
     /// Lights the colours with another lamp, or with none.
-    ///
-    /// # Errors
-    /// The driver refuses a kernel, or the device is out of memory; the renderer is as it was.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn set_lamp(&mut self, lamp: Option<Lamp>) -> Result<()> {
         let settings = RenderSettings { lamp, ..self.settings };
@@ -162,9 +153,6 @@ impl Renderer {
     }
 
     /// Switches to another SH degree.
-    ///
-    /// # Errors
-    /// The driver refuses a kernel; the renderer is as it was.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn set_sh_degree(&mut self, sh_degree: u32) -> Result<()> {
         if sh_degree == self.settings.shape.sh_degree {

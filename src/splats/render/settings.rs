@@ -99,9 +99,6 @@ fn gpu_tile(properties: &Properties, channels: usize, pixels: Option<u64>) -> Ti
 
 impl RenderSettings {
     /// `RenderSettings::tile_up_to` for views of any size.
-    ///
-    /// # Errors
-    /// As `RenderSettings::tile_up_to`.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn tile_on(&self, gpu: &Gpu) -> Result<Tile> {
         self.tile_up_to(gpu, None)
@@ -109,9 +106,6 @@ impl RenderSettings {
 
     /// The tile on this device, in pixels: that of these settings, else the one that was measured to be the fastest
     /// (`Gpu::tuned_tile`), else the default for such devices and views of up to `pixels` pixels.
-    ///
-    /// # Errors
-    /// A subgroup's part has no whole number of rows of lanes, or more than 32.
     pub(super) fn tile_up_to(&self, gpu: &Gpu, pixels: Option<u64>) -> Result<Tile> {
         let built_in = match self.channels() {
             _ if !gpu.properties().is_cpu => gpu_tile(gpu.properties(), self.channels(), pixels),

@@ -122,8 +122,6 @@ impl Target<'_> {
         self.depth.is_some() || self.scene.is_some()
     }
 
-    /// # Errors
-    /// [`Error::Usage`] names the member and the remedy.
     pub(super) fn check(&self, cameras: &[Camera], law: Option<&SceneLaw>) -> Result<()> {
         if cameras.is_empty() {
             return refused("no camera: pass at least one".to_owned());

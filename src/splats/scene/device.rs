@@ -81,9 +81,6 @@ impl<'a> From<&'a DeviceGaussians> for GaussianSlice<'a> {
 
 impl DeviceGaussians {
     /// Allocates Gaussians with uninitialised parameters.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn uninit(gpu: &Gpu, layout: Layout) -> Result<Self> {
         let len = layout.capacity.max(layout.count) * layout.words();
@@ -99,9 +96,6 @@ impl DeviceGaussians {
     }
 
     /// Overwrites the parameters with planes of floats.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn write(&mut self, gpu: &Gpu, floats: &[f32]) -> Result<()> {
         let batches = self.layout.parameter_batches(gpu);
@@ -115,9 +109,6 @@ impl DeviceGaussians {
     }
 
     /// The parameters as planes of floats.
-    ///
-    /// # Errors
-    /// The device was lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn read(&self, gpu: &Gpu) -> Result<Vec<f32>> {
         let words = self.layout.parameter_batches(gpu).read(gpu, &self.parameters)?;
@@ -147,9 +138,6 @@ impl Gaussians {
     }
 
     /// A copy on the device, SH coefficients above degree 0 in the format `sh_rest`.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn upload_as(&self, gpu: &Gpu, sh_rest: StorageFormat) -> Result<DeviceGaussians> {
         let mut gaussians =

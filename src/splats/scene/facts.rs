@@ -74,9 +74,6 @@ impl Facts {
     }
 
     /// The facts of a JSON object; empty for any other value.
-    ///
-    /// # Errors
-    /// As [`Facts::set`].
     pub(crate) fn of_json(json: &Value) -> Result<Self, String> {
         let mut facts = Self::default();
         let word = |word: &Value| word.as_str().map_or_else(|| word.to_string(), str::to_owned);
@@ -89,9 +86,6 @@ impl Facts {
     }
 
     /// Sets a fact; keys of later versions are skipped.
-    ///
-    /// # Errors
-    /// The value is invalid for the key.
     pub(crate) fn set(&mut self, key: &str, value: &str) -> Result<(), String> {
         match key {
             "near" => self.near = Some(number(key, value, "above 0", |near| near > 0.0)?),
@@ -112,9 +106,6 @@ impl Facts {
     }
 
     /// Sets the fact of a line of text, if it states one.
-    ///
-    /// # Errors
-    /// As [`Facts::set`].
     pub(crate) fn set_line(&mut self, line: &str) -> Result<(), String> {
         let Some(fact) = line.trim().strip_prefix(Self::PREFIX) else { return Ok(()) };
         let (key, value) = fact.split_once(' ').unwrap_or((fact, ""));

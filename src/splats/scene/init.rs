@@ -41,9 +41,6 @@ impl Initialization {
     pub const PAPER: Self = Self { opacity: 0.1, scale: 1.0, min_axis_ratio: 1.0 };
 
     /// Checks the values.
-    ///
-    /// # Errors
-    /// [`Error::Usage`].
     pub(crate) fn check(&self) -> Result<()> {
         self.check_rows()
     }
@@ -241,9 +238,6 @@ fn radius(cameras: &[Camera]) -> f64 {
 ///
 /// The time is proportional to the pixels of the views and the length of all tracks; a point without a track counts as
 /// one of [`MAX_VIEWS`] views.
-///
-/// # Errors
-/// Those of `target`.
 pub fn colors_from_views<I: Borrow<Image>>(
     points: &[Point],
     views: &[View],

@@ -83,18 +83,12 @@ impl Gaussians {
 }
 
 /// Writes `gaussians` to `path` atomically.
-///
-/// # Errors
-/// [`Error::Output`] if the file cannot be written.
 #[cfg(any(test, feature = "testing"))]
 pub fn save(gaussians: &Gaussians, path: impl AsRef<Path>) -> Result<()> {
     save_with_comments(gaussians, path, &[""; 0])
 }
 
 /// [`save`] with comments in the header.
-///
-/// # Errors
-/// Those of [`save`].
 pub fn save_with_comments(
     gaussians: &Gaussians,
     path: impl AsRef<Path>,
@@ -176,10 +170,6 @@ impl Writer {
 }
 
 /// Reads Gaussians from a binary little-endian PLY; unknown properties are skipped.
-///
-/// # Errors
-/// [`Error::Input`] if the file is missing, of another format, truncated or longer than its header states, or if a
-/// required property is missing or not finite.
 pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
     let path = path.as_ref();
     let bytes = input::bytes(path)?;
@@ -188,9 +178,6 @@ pub fn load(path: impl AsRef<Path>) -> Result<Gaussians> {
 }
 
 /// The Gaussians of a file, and the facts that it states.
-///
-/// # Errors
-/// The problem, as in [`load`].
 pub(crate) fn parse(bytes: &[u8]) -> Result<(Gaussians, Facts), String> {
     let header = Header::parse(bytes)?;
     let body = &bytes[header.length..];

@@ -64,9 +64,6 @@ impl RadixSort {
     }
 
     /// A sort with scratch memory for `capacity` pairs, reallocated for buffers of another length.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self> {
         let partition_size = sort_upsweep::Constants::default().partition_size;
         let subgroup_size = gpu.properties().subgroup_size;
@@ -94,9 +91,6 @@ impl RadixSort {
     }
 
     /// Another sort with the same kernels and memory of its own, none yet.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub(crate) fn another(&self) -> Result<Self> {
         Ok(Self {
             gpu: self.gpu.clone(),
@@ -108,9 +102,6 @@ impl RadixSort {
     }
 
     /// Takes memory to sort buffers of `capacity` pairs, so that recording takes none.
-    ///
-    /// # Errors
-    /// The device is out of memory.
     pub(crate) fn reserve(&mut self, capacity: usize) -> Result<()> {
         if self.scratch.keys.len() != capacity {
             let capacity = common_len("sort", &[capacity])?;
@@ -124,9 +115,6 @@ impl RadixSort {
     /// Afterwards `keys` and `values` hold the result, whatever the number of passes, because they are swapped with the
     /// scratch memory: their elements beyond the count are lost. A count beyond the buffers' common length is clamped
     /// to it.
-    ///
-    /// # Errors
-    /// The buffers' lengths differ, the count's index is outside its buffer, or the device is out of memory.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,

@@ -20,9 +20,6 @@ pub struct Scan {
 
 impl Scan {
     /// A scan with scratch memory for `capacity` values; it grows with the buffers.
-    ///
-    /// # Errors
-    /// The device is out of memory or lost.
     pub fn new(gpu: &Gpu, capacity: u32) -> Result<Self> {
         let partition_size = scan_upsweep::Constants::default().partition_size;
         Ok(Self {
@@ -37,10 +34,6 @@ impl Scan {
 
     /// Records `offsets[i] = values[0] + .. + values[i - 1]` for each i below `count`, and `total[0]`, the sum of all
     /// values. Offsets beyond the count are unchanged; a count beyond the buffers' common length is clamped to it.
-    ///
-    /// # Errors
-    /// The buffers' lengths differ, `total` is empty, the count's index is outside its buffer, or the device is out of
-    /// memory.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,

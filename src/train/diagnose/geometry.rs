@@ -55,9 +55,6 @@ pub(super) struct Shared {
 
 impl Shared {
     /// Measures training views, in order.
-    ///
-    /// # Errors
-    /// A photograph can no longer be read.
     pub(super) fn of(dataset: &Dataset, views: &[(usize, &View)]) -> Result<Self> {
         let random;
         let points = if dataset.points.is_empty() {
@@ -171,9 +168,6 @@ fn light_around(image: &Image, at: DVec2) -> Option<(f64, bool)> {
 }
 
 /// log2 exposure of each training view at shared points, with mean 0, by name; without views that share too few.
-///
-/// # Errors
-/// A photograph can no longer be read.
 pub(in crate::train) fn exposures_at_points(dataset: &Dataset) -> Result<BTreeMap<String, f64>> {
     let views: Vec<(usize, &View)> =
         dataset.views.iter().enumerate().filter(|(_, view)| view.is_for_training()).collect();

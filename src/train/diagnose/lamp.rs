@@ -94,9 +94,6 @@ impl LampDiagnosis {
     }
 
     /// Measures the observations of points, by point, of this many views.
-    ///
-    /// # Errors
-    /// Why they do not determine a lamp.
     pub(super) fn of(points: &[Vec<Observation>], views: usize) -> Result<Self, String> {
         let rows = Rows::of(points, views)?;
         let left = Left::of(&rows);

@@ -164,9 +164,6 @@ impl Plan {
     }
 
     /// The plan's decisions as settings.
-    ///
-    /// # Errors
-    /// A number of a plan written by hand is out of range.
     pub(in crate::train) fn layer(&self) -> Result<SettingsLayer> {
         let mut layer = SettingsLayer::default();
         let mut say = |key: &str, value: Value| layer.push(key, value, Origin::Plan);
@@ -216,9 +213,6 @@ impl Plan {
     }
 
     /// The plan as TOML.
-    ///
-    /// # Errors
-    /// Never for a plan that was made or read.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn to_toml(&self) -> Result<String> {
         const HEAD: &str = "# What this capture needs, and why. Change what you know better and pass it to \
@@ -228,9 +222,6 @@ impl Plan {
     }
 
     /// Reads the plan of a dataset.
-    ///
-    /// # Errors
-    /// [`Error::Input`]: the file cannot be read, is not a plan, or is the plan of another dataset.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
         let plan = Self::read(path)?;
@@ -247,9 +238,6 @@ impl Plan {
     }
 
     /// Reads a plan of any dataset.
-    ///
-    /// # Errors
-    /// [`Error::Input`]: the file cannot be read or is not a plan.
     pub(crate) fn read(path: &Path) -> Result<Self> {
         let text = input::text(path)?;
         toml::from_str(&text).map_err(|error| {

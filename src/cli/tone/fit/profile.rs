@@ -24,9 +24,6 @@ pub struct FittedProfile {
 }
 
 /// Fits a profile to the pairs of `args`, and writes it.
-///
-/// # Errors
-/// [`crate::Error::Input`] for unusable pairs; [`crate::Error::Output`] if the file cannot be written.
 pub fn apply(args: &FitArgs) -> Result<FittedProfile> {
     super::check(args)?;
     let scenes = args.pairs.iter().map(|folder| ColourScene::load(folder, args.normal.as_deref()));

@@ -43,9 +43,6 @@ pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
 }
 
 /// The file of images with those that `renamed` gives a name, under that name.
-///
-/// # Errors
-/// Those of [`images`].
 #[cfg(feature = "cli")]
 pub(super) fn images_renamed(
     path: &Path,

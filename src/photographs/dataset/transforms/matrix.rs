@@ -55,9 +55,6 @@ pub(super) fn are_transposed<'a>(matrices: impl Iterator<Item = &'a Rows> + Clon
 }
 
 /// The pose of a camera from view to world in OpenGL axes, as 4x4 or 3x4 rows.
-///
-/// # Errors
-/// The problem, to follow "its `transform_matrix`".
 pub(super) fn pose(rows: &Rows, is_transposed: bool) -> Result<Pose, &'static str> {
     let world_from_gl = affine(rows, is_transposed)
         .filter(DAffine3::is_finite)

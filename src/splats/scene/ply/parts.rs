@@ -28,9 +28,6 @@ pub(crate) struct PartFile {
 impl PartFile {
     /// Opens a PLY in the INRIA layout; `None` for a file of another kind, and for what is not read twice, such as a
     /// pipe.
-    ///
-    /// # Errors
-    /// [`Error::Input`], as of [`super::load`], except for the numbers, which are checked when they are read.
     pub(crate) fn open(path: &Path, part: usize) -> Result<Option<Self>> {
         let cannot = |error: std::io::Error| Error::input(path, format!("cannot be read: {error}"));
         if !path.is_file() {
@@ -70,9 +67,6 @@ impl PartFile {
     }
 
     /// All Gaussians, a part at a time and in order.
-    ///
-    /// # Errors
-    /// [`Error::Input`] if the file can no longer be read, or a number is not finite; those of `take`.
     pub(crate) fn read(&self, mut take: impl FnMut(Gaussians) -> Result<()>) -> Result<()> {
         let Layout { count, stride, length, .. } = self.layout;
         let cannot =
@@ -92,9 +86,6 @@ impl PartFile {
 
 /// Writes a file of `count` Gaussians of the shape and origin of `of`, which `parts` hands over in order; the same
 /// bytes as of [`super::save_with_comments`].
-///
-/// # Errors
-/// [`Error::Output`] if the file cannot be written; those of `parts`. No partial file is left.
 pub(crate) fn save_parts(
     path: &Path,
     (of, count): (&Gaussians, usize),

@@ -52,9 +52,6 @@ pub(super) struct Fit {
 
 impl Rows {
     /// The unclipped observations of points that two views see.
-    ///
-    /// # Errors
-    /// Why they do not determine a lamp.
     pub(super) fn of(points: &[Vec<Observation>], views: usize) -> Result<Self, String> {
         let clean = |point: &Vec<Observation>| -> Vec<Observation> {
             point.iter().copied().filter(|one| !one.is_clipped).collect()
