@@ -97,6 +97,8 @@ impl CheckReport {
         }));
     }
 
+    /// # Errors
+    /// [`Error::Disagrees`] with the first difference, if there is one.
     pub fn agree(&self) -> Result<()> {
         match self.first_difference() {
             Some(difference) => Err(Error::Disagrees { what: difference.to_string() }),
