@@ -21,7 +21,6 @@ mod measuring;
 mod memory;
 mod model;
 mod networks;
-mod old_keys;
 mod parts;
 mod passes;
 mod patches;
@@ -60,7 +59,7 @@ pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
 pub use config::{
     AntialiasingConfig, Background, CheckConfig, DensityConfig, ExposureConfig, Freeze, LampConfig,
-    LampRates, NotFinite, OnOff, StopConfig, TrainConfig,
+    LampRates, NotFinite, StopConfig, TrainConfig,
 };
 use context::Initial;
 use early_stopping::Convergence;

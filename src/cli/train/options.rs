@@ -235,7 +235,7 @@ impl TrainOptions {
         self.push_law(options)?;
         several.push_parts(options)?;
         if self.gives("exposure.start") {
-            options.push("exposure.learn", "on".into(), Origin::Option("--exposures"))?;
+            options.push("exposure.learn", true.into(), Origin::Option("--exposures"))?;
         }
         for (row, text) in &self.single.0 {
             let origin = Origin::Option(
