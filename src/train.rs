@@ -33,8 +33,6 @@ mod reference;
 mod rendered;
 mod scene_light;
 pub mod settings;
-#[cfg(feature = "window")]
-mod shown;
 mod start;
 mod submission;
 mod supervision;
@@ -82,8 +80,6 @@ pub use preset::Preset;
 pub use reference::reference;
 pub use rendered::Rendered;
 pub use scene_light::SceneLight;
-#[cfg(feature = "window")]
-pub(crate) use shown::ShownModel;
 use submission::Submissions;
 use supervision::Supervision;
 pub use target_views::TestTargets;

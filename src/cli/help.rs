@@ -37,10 +37,7 @@ const GROUPS: [(&str, &str); 6] = [
         "Time, memory and checkpoints",
         "steps max-minutes checkpoint-every checkpoint-minutes device max-vram max-ram cache",
     ),
-    (
-        "Logs and checks",
-        "progress view window eval-every tensorboard hash-every check-every check-stops",
-    ),
+    ("Logs and checks", "progress view eval-every tensorboard hash-every check-every check-stops"),
 ];
 
 /// Whether a list of names contains a name.
