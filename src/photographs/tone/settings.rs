@@ -109,7 +109,7 @@ impl ToneSettings {
         base_gain => Rule::above(0.0, MOST);
         /// Use one curve for a scene: its statistics are the means over the training views, its gain that of all of
         /// them together.
-        scene_statistics => Rule::Flag;
+        scene_statistics => Rule::Flag, "--scene-statistics";
         /// Choose the gain from the photographs; c and g0 are then not used. Always on for the curve auto.
         auto_gain, "the curve's" => Rule::Flag;
         /// Mean luminance of the targets, with an automatic gain.
