@@ -26,7 +26,6 @@ publish = false
 
 [dependencies]
 nightsplat = {{ path = "{root}", default-features = false, features = {features} }}
-{more}
 
 [workspace]
 
@@ -45,20 +44,16 @@ def main() -> None:
     # The profile with which the dependencies are already compiled.
     manifest = (ROOT / "Cargo.toml").read_text()
     profile = re.search(r"^\[profile\.dev\].*?(?=^\[profile\.release\])", manifest, re.M | re.S)
-    # What the feature `window` adds for its example.
-    needed = re.findall(r'"dep:([^"]*)"', re.search(r"^window = \[(.*)\]$", manifest, re.M)[1])
-    window = [re.search(rf"^{name} = .*$", manifest, re.M)[0].replace(", optional = true", "") for name in needed]
 
-    def write_manifest(features: str, more: list[str]) -> None:
-        text = MANIFEST.format(root=ROOT, features=features, more="\n".join(more), profile=profile[0])
+    def write_manifest(features: str) -> None:
+        text = MANIFEST.format(root=ROOT, features=features, profile=profile[0])
         (package / "Cargo.toml").write_text(text)
 
-    write_manifest('["glslang", "io"]', window)
+    write_manifest('["glslang", "io"]')
     (package / "Cargo.lock").write_bytes((ROOT / "Cargo.lock").read_bytes())
     for example in (ROOT / "examples").glob("*.rs"):
         if example.stem not in INSTRUMENTS:
             (programs / example.name).write_text(example.read_text())
-    shutil.copytree(ROOT / "examples/window", programs / "window")
     lines = (ROOT / "src/lib.rs").read_text().splitlines()
     page = "\n".join(line.removeprefix("//!") for line in lines if line.startswith("//!"))
     for number, code in enumerate(re.findall(r"```no_run\n(.*?)```", page, re.DOTALL)):
@@ -68,7 +63,7 @@ def main() -> None:
     environment = os.environ | {"CARGO_TARGET_DIR": str(target)}
     subprocess.run(["cargo", "check", "--bins"], cwd=package, env=environment, check=True)
 
-    write_manifest('["glslang"]', [])
+    write_manifest('["glslang"]')
     model, picture = target / "outside/model.ply", target / "outside/frame.ppm"
     write_model(model)
     draw = ["cargo", "run", "--quiet", "--bin", "embed", "--", str(model), str(picture)]

@@ -43,8 +43,6 @@ DEFECTS = [
      "/ (z * z)\n        - dot(d_xy, free_slope);", "/ (z * z);", "--test splats gradients::"),
     ("a fisheye's gradient lacks that of the azimuth", "shaders-glsl/include/camera_fisheye.glsl",
      " + by_turn * side;", ";", "--test splats renderer_gives"),
-    ("a camera's rotation rotates no Gaussian", "shaders-glsl/splats/render/camera_backward.comp",
-     " + cross(d_row0, row0) + cross(d_row1, row1);", ";", "--test splats camera_gradient::"),
     ("guard: points that a fisheye would see twice are culled", "shaders-glsl/include/camera_fisheye.glsl",
      "point.z > 0.0 && angle_off_axis(length(point.xy), point.z) < camera.largest_angle", "point.z > 0.0",
      "--test splats nothing_is_seen"),

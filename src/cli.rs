@@ -33,6 +33,7 @@ pub mod man;
 pub mod pose;
 pub mod progress;
 pub mod render;
+mod settings;
 mod signals;
 pub mod sweep;
 pub mod synth;

@@ -42,8 +42,6 @@ mod statistics;
 mod subgroups;
 mod submission;
 mod supported;
-#[cfg(feature = "window")]
-mod surface;
 #[cfg(feature = "testing")]
 #[doc(hidden)]
 pub mod testing;
@@ -88,8 +86,6 @@ pub use statistics::{Resources, Statistic};
 pub use subgroups::SUBGROUP_VARIABLE;
 pub use submission::{PassTime, Submission};
 pub use supported::PUSH_VARIABLE;
-#[cfg(feature = "window")]
-pub(crate) use surface::Surface;
 pub use tuning::{TUNE_VARIABLE, Tile, TunedTile};
 
 use crate::{Error, Result};
@@ -144,8 +140,6 @@ pub struct Properties {
 struct Shared {
     properties: Properties,
     device: ash::Device,
-    #[cfg(feature = "window")]
-    physical: vk::PhysicalDevice,
     descriptors: descriptors::Descriptors,
     /// Names objects; absent without the validation layer.
     debug: Option<ext::debug_utils::Device>,

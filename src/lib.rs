@@ -11,8 +11,8 @@
 //! | handle errors | [`Error`]: one line that names the object and the remedy |
 //!
 //! Without default features there is the renderer, forward and backward, and nothing else. Feature `io` adds files,
-//! datasets and training; `check` the CPU references; `fit` the fitting of curves; `cli` the command. `glslang`
-//! compiles the kernels, which a checkout needs and a packaged crate does not.
+//! datasets and training; `check` the CPU references; `cli` the command. `glslang` compiles the kernels, which a checkout
+//! needs and a packaged crate does not.
 //!
 //! # Render a model
 //!
@@ -104,10 +104,7 @@
     not(feature = "testing"),
     allow(unreachable_pub, unused_imports, reason = "items outside the API are public to tests")
 )]
-#![cfg_attr(
-    not(any(feature = "testing", all(feature = "cli", feature = "fit"))),
-    expect(dead_code, reason = "the command and training use more")
-)]
+#![cfg_attr(not(feature = "cli"), expect(dead_code, reason = "the command and training use more"))]
 
 // Tests use every folder;
 #[cfg(feature = "testing")]
@@ -239,7 +236,7 @@ pub mod config {
     pub use crate::splats::optimizer::{LearningRates, Schedule};
     pub use crate::train::{
         AntialiasingConfig, Background, CacheSize, CheckConfig, DensityConfig, EndReason,
-        ExposureConfig, Freeze, LampConfig, LampRates, ModelConfig, NetworkRates, NotFinite, OnOff,
+        ExposureConfig, Freeze, LampConfig, LampRates, ModelConfig, NetworkRates, NotFinite,
         PhotographBits, PrecisionConfig, StopConfig,
     };
 }

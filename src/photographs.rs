@@ -14,7 +14,7 @@
 
 #[cfg(feature = "io")]
 pub mod dataset;
-#[cfg(feature = "fit")]
+#[cfg(feature = "cli")]
 pub mod fit;
 pub mod image;
 #[cfg(feature = "io")]

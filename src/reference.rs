@@ -13,10 +13,6 @@ pub mod blend_backward;
 pub mod blend_forward;
 mod blending;
 pub mod camera;
-#[cfg(feature = "testing")]
-pub mod camera_backward;
-#[cfg(feature = "testing")]
-mod camera_gradient;
 mod ceiling;
 mod ciconv_columns;
 mod ciconv_moments;

@@ -21,7 +21,6 @@ mod measuring;
 mod memory;
 mod model;
 mod networks;
-mod old_keys;
 mod parts;
 mod passes;
 mod patches;
@@ -34,8 +33,6 @@ mod reference;
 mod rendered;
 mod scene_light;
 pub mod settings;
-#[cfg(feature = "window")]
-mod shown;
 mod start;
 mod submission;
 mod supervision;
@@ -60,7 +57,7 @@ pub use cache::CacheSize;
 pub use checkpoint::check_checkpoint;
 pub use config::{
     AntialiasingConfig, Background, CheckConfig, DensityConfig, ExposureConfig, Freeze, LampConfig,
-    LampRates, NotFinite, OnOff, StopConfig, TrainConfig,
+    LampRates, NotFinite, StopConfig, TrainConfig,
 };
 use context::Initial;
 use early_stopping::Convergence;
@@ -83,8 +80,6 @@ pub use preset::Preset;
 pub use reference::reference;
 pub use rendered::Rendered;
 pub use scene_light::SceneLight;
-#[cfg(feature = "window")]
-pub(crate) use shown::ShownModel;
 use submission::Submissions;
 use supervision::Supervision;
 pub use target_views::TestTargets;

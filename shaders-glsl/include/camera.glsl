@@ -30,10 +30,6 @@ struct Jacobian {
     vec3 row1;
 };
 
-// Components of a camera's gradient: a translation of all points in view space and a rotation about the camera, (x, y,
-// z) each, then focal lengths, principal point and distortion.
-const uint CAMERA_WIDTH = 14;
-
 // The near plane of a renderer without one, in world units.
 const float NEAREST = 1e-4;
 
@@ -62,12 +58,6 @@ Jacobian camera_jacobian(vec3 point, Camera camera) {
 vec3 camera_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
     if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_backward(point, camera, d_pixel, d_row0, d_row1);
     return pinhole_backward(point, camera, d_pixel, d_row0, d_row1);
-}
-
-// The gradient of the distortion, from the same gradients.
-vec4 camera_distortion_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
-    if (CAMERA_MODEL == CAMERA_FISHEYE) return fisheye_distortion_backward(point, camera, d_pixel, d_row0, d_row1);
-    return vec4(0.0);
 }
 
 // The first-order change of depth between a point and another at an offset.

@@ -15,7 +15,6 @@ struct FisheyeRay {
     vec2  across;     // n
     float sine;       // of the angle
     float cosine;
-    float angle;      // radians
     float radius;     // r
     float slope;      // r'
     float bend;       // r''
@@ -52,9 +51,8 @@ FisheyeRay fisheye_ray(vec3 point, Camera camera) {
     ray.across = off_axis > 0.0 ? point.xy / off_axis : vec2(1.0, 0.0);
     ray.sine = off_axis / ray.distance;
     ray.cosine = point.z / ray.distance;
-    ray.angle = angle_off_axis(off_axis, point.z);
     vec4 k = camera.distortion;
-    float t = ray.angle, t2 = t * t;
+    float t = angle_off_axis(off_axis, point.z), t2 = t * t;
     float factor = 1.0 + t2 * (k.x + t2 * (k.y + t2 * (k.z + t2 * k.w)));
     float d_factor = t * (2.0 * k.x + t2 * (4.0 * k.y + t2 * (6.0 * k.z + t2 * 8.0 * k.w)));
     ray.radius = t * factor;
@@ -105,20 +103,6 @@ vec3 fisheye_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3
     vec2 d_xy = (by_distance * ray.sine + by_angle * ray.cosine) * n + by_turn * side;
     float d_z = by_distance * ray.cosine - by_angle * ray.sine;
     return vec3(d_xy, d_z) / ray.distance / ray.distance;
-}
-
-// d_pixel . pixel and S / d with respect to k1 to k4.
-vec4 fisheye_distortion_backward(vec3 point, Camera camera, vec2 d_pixel, vec3 d_row0, vec3 d_row1) {
-    FisheyeRay ray = fisheye_ray(point, camera);
-    vec2 n = ray.across, side = vec2(-n.y, n.x);
-    vec3 along_n = n.x * camera.focal.x * d_row0 + n.y * camera.focal.y * d_row1;
-    vec3 along_side = side.x * camera.focal.x * d_row0 + side.y * camera.focal.y * d_row1;
-    float ratio = ray.sine > 0.0 ? ray.angle / ray.sine : 1.0;
-    float by_factor = ratio * dot(along_side.xy, side) / ray.distance + ray.angle * dot(camera.focal * d_pixel, n);
-    float by_slope = (ray.cosine * dot(along_n.xy, n) - ray.sine * along_n.z) / ray.distance;
-    float t2 = ray.angle * ray.angle;
-    vec4 powers = t2 * vec4(1.0, t2, t2 * t2, t2 * t2 * t2);
-    return powers * (by_factor + by_slope * vec4(3.0, 5.0, 7.0, 9.0));
 }
 
 float fisheye_depth_change(vec3 point, vec3 offset) { return dot(point, offset) / length(point); }

@@ -9,7 +9,7 @@ use super::plan::{BlockPlan, LAW, PlanFile, Request, VERSION};
 use super::visibility::Visibility;
 use crate::base::hash::{self, Hasher};
 use crate::photographs::dataset::Dataset;
-use crate::train::{OnOff, PlannedRun, StopConfig, TrainConfig, law_of};
+use crate::train::{PlannedRun, StopConfig, TrainConfig, law_of};
 use crate::{Error, Result};
 
 /// Blocks whose mean share of the views is larger do not pay.
@@ -136,11 +136,11 @@ fn settle(config: &mut TrainConfig, dataset: &Dataset) {
     config.tone.law = Some(PathBuf::from(LAW));
     // A block runs for a fixed number of steps, on all its views.
     config.stop = StopConfig { views: 0, ..config.stop.clone() };
-    if config.exposure.learn == OnOff::On {
+    if config.exposure.learn {
         tracing::warn!(
             "exposures of views are not learned in blocks, in which they could drift apart; the tone law keeps them"
         );
-        config.exposure.learn = OnOff::Off;
+        config.exposure.learn = false;
     }
     if config.model.lamp {
         tracing::warn!(

@@ -7,17 +7,17 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 use serde::Serialize;
 
+use super::settings::{Selection, SettingOptions, push_dataset};
 use super::{driver, finish, table, word, words};
 use crate::Error;
 use crate::base::output::{check_writable, write_whole};
 use crate::gpu::DeviceChoice;
-use crate::photographs::dataset::{Dataset, PixelOrientation};
-use crate::photographs::white_balance::WhiteBalance;
+use crate::photographs::dataset::Dataset;
 use crate::results::diagnosis;
 use crate::results::eval::{ResidualTransmittance, hole_warning};
 use crate::results::finished_run::FinishedRun;
 use crate::train::diagnose::{Diagnosis, Plan};
-use crate::train::{Preset, TrainConfig, diagnosed};
+use crate::train::{Preset, RequestedSettings, diagnosed};
 
 /// Measure photographs before training, and choose a model for them.
 ///
@@ -29,7 +29,6 @@ use crate::train::{Preset, TrainConfig, diagnosed};
 /// other views of the same points; white and black: clipped and zero values; codes: distinct values; luma and chroma
 /// noise: standard deviations in the target, after the tone curve, with JPEG and quantisation noise; blur: width of
 /// edges, pixels; points: visible points; overlap: share of the view that other views see.
-#[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct DiagnoseArgs {
@@ -47,28 +46,24 @@ pub struct DiagnoseArgs {
     /// Also look for holes in the model of this run
     #[arg(long, value_name = "RUN")]
     pub run: Option<PathBuf>,
-    /// Plan for photographs shrunk by this factor [default: {downscale}]
-    #[arg(long, value_name = "F")]
-    pub downscale: Option<f64>,
-    /// Plan for photographs shrunk to this longest side, pixels; 0 or none: no limit [default: {max_resolution}]
-    #[arg(long, value_name = "N|none", value_parser = max_resolution)]
-    pub max_resolution: Option<u32>,
-    /// Balance the photographs' white before they are measured, as `train` has it: R,G,B, kelvin, VIEW,x,y,w,h or
-    /// VIEW,x1,y1,..,x4,y4
-    #[arg(long, value_name = "WHITE")]
-    pub white_balance: Option<WhiteBalance>,
-    /// Which pixels the cameras are of where Exif turns photographs, as `train` has it: auto, stored or exif
-    #[arg(long, value_name = "PIXELS")]
-    pub orientation: Option<PixelOrientation>,
     /// Plan for this preset: draft, fast, balanced or best [default: balanced]
     #[arg(long, value_name = "NAME", value_parser = words::presets())]
     pub preset: Option<Preset>,
-    /// Plan for this number of steps [default: the preset's]
-    #[arg(long, value_name = "N")]
-    pub steps: Option<u64>,
+    #[command(flatten)]
+    settings: SettingOptions<OfPhotographs>,
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the best]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
+}
+
+/// Settings on which measurements or plan depend.
+#[derive(Clone, Copy, Debug)]
+struct OfPhotographs;
+
+impl Selection for OfPhotographs {
+    fn has(key: &str) -> bool {
+        ["downscale", "max_resolution", "white_balance", "orientation", "steps"].contains(&key)
+    }
 }
 
 /// The output of `--json`.
@@ -90,14 +85,11 @@ const EXAMPLES: &str = "Examples:
 
 /// Measures, plans and prints.
 pub fn run(args: &DiagnoseArgs) -> Result<()> {
-    let mut config = TrainConfig { dataset: args.dataset.clone(), ..TrainConfig::default() };
-    args.preset.unwrap_or(Preset::Balanced).apply(&mut config)?;
-    config.steps = args.steps.unwrap_or(config.steps);
-    config.downscale = args.downscale.unwrap_or(config.downscale);
-    config.max_resolution = args.max_resolution.unwrap_or(config.max_resolution);
+    let mut requested = RequestedSettings { preset: args.preset, ..Default::default() };
+    push_dataset(&mut requested.options, &args.dataset)?;
+    args.settings.push(&mut requested.options)?;
+    let config = requested.settings(None)?.config()?;
     args.report.iter().chain(&args.plan).try_for_each(|path| check_writable(path))?;
-    config.white_balance.clone_from(&args.white_balance);
-    config.orientation = args.orientation.unwrap_or_default();
     let gpu = driver::open(&args.device.clone().unwrap_or_default())?;
     let options = diagnosed(&config);
     let (dataset, mut diagnosis) = Diagnosis::load(&config.dataset, &options)?;
@@ -157,14 +149,6 @@ fn holes(
     };
     let remark = hole_warning(views, config.background).unwrap_or_else(healthy);
     Ok((remark, residual_transmittances))
-}
-
-/// Parses `--max-resolution`.
-fn max_resolution(text: &str) -> Result<u32, String> {
-    match text {
-        "none" => Ok(0),
-        _ => text.parse().map_err(|_| "a number of pixels, or none".to_owned()),
-    }
 }
 
 fn text(device: &str, dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> String {

@@ -17,7 +17,7 @@ use crate::results::evaluation::{EvalPage, score_table};
 use crate::results::finished_run::{FinishedRun, is_model};
 use crate::results::linear_light::{photograph_of, slope_at, stops_between};
 use crate::results::run;
-use crate::train::{OnOff, SceneLight, known_stops};
+use crate::train::{SceneLight, known_stops};
 
 /// Score a run on the test views of its dataset.
 ///
@@ -140,7 +140,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     let mut scored = eval::score_by(&mut score_reference, &dataset, render, |score, compared| {
         let lpips = lpips.as_ref().map(|lpips| compared.lpips(&gpu, lpips));
         score.scores.lpips = lpips.transpose()?;
-        if args.align || config.exposure.learn == OnOff::On {
+        if args.align || config.exposure.learn {
             score.aligned = Some(compared.aligned()?);
         }
         if let Some(stops) = stops.get(&score.name) {
@@ -196,7 +196,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
                 metrics[what] = known.clone();
             }
         }
-        if config.exposure.learn == OnOff::On {
+        if config.exposure.learn {
             eval::add_exposure(&mut metrics, &scored);
         } else if args.align {
             eval::add_aligned(&mut metrics, &scored);

@@ -25,7 +25,10 @@ const GROUPS: [(&str, &str); 6] = [
         "images exclude exclude-file orientation reference white-balance downscale max-resolution patch-pixels \
          test-every invert-masks undistort",
     ),
-    ("Tone curve", "curve profile gain brightness colour theta law exposure exposures"),
+    (
+        "Tone curve",
+        "curve profile gain brightness colour theta scene-statistics law exposure exposures",
+    ),
     (
         "Model",
         "preset model parts sh-degree init freeze max-gaussians density near background ssim-weight raw-colors \
@@ -37,10 +40,7 @@ const GROUPS: [(&str, &str); 6] = [
         "Time, memory and checkpoints",
         "steps max-minutes checkpoint-every checkpoint-minutes device max-vram max-ram cache",
     ),
-    (
-        "Logs and checks",
-        "progress view window eval-every tensorboard hash-every check-every check-stops",
-    ),
+    ("Logs and checks", "progress view eval-every tensorboard hash-every check-every check-stops"),
 ];
 
 /// Whether a list of names contains a name.

@@ -16,7 +16,7 @@ use crate::base::output::{check_writable, printable};
 use crate::camera::frame;
 use crate::gpu::DeviceChoice;
 use crate::results::eval;
-use crate::results::run::{self, IfExists, RunDirectory, RunSummary, Session};
+use crate::results::run::{self, Event, IfExists, RunDirectory, RunSummary, Session};
 use crate::results::run_facts::RunFacts;
 use crate::train::diagnose::Plan;
 use crate::train::{Origin, PlanSource, PlannedRun, RequestedSettings};
@@ -62,13 +62,6 @@ pub struct TrainArgs {
     /// model.
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = live::DEFAULT_ADDRESS)]
     pub view: Option<live::Listen>,
-    /// Show the model in a window of this machine while it trains; needs a build with the feature `window`
-    ///
-    /// Show the model in a window of this machine while it trains, drawn by the same device from its own memory; needs
-    /// a build with the feature `window`. Space pauses the training, Esc closes the window and lets the training go on;
-    /// `nightsplat view --help` has the other keys. Watching changes no bit of the model.
-    #[arg(long)]
-    pub window: bool,
     /// Print every setting, its value and where that comes from; do not train
     #[arg(long)]
     pub explain: bool,
@@ -104,11 +97,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let device = requested.settings(None)?.config()?.device;
     let choice = device.parse::<DeviceChoice>()?;
-    let screen = args.window.then(|| view::screen(&choice)).transpose()?;
-    let gpu = match &screen {
-        Some(screen) => screen.gpu.clone(),
-        None => driver::open(&choice)?,
-    };
+    let gpu = driver::open(&choice)?;
     let planning = planning(args, file.as_deref(), is_resumed);
     let PlannedRun { config, settings, plan, dataset } = requested.planned(planning, &gpu)?;
     if args.explain {
@@ -144,18 +133,14 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         if_exists,
         requests: requests.clone(),
     };
-    let mut train = || {
-        run::train_in(&gpu, &config, &dataset, &args.out, &session, |event| {
-            progress.observe(event);
-            if let Some((site, _)) = &page {
-                site.feed.observe(event);
-            }
-        })
+    let observe = |event: Event<'_>| {
+        progress.observe(event);
+        if let Some((site, _)) = &page {
+            site.feed.observe(event);
+        }
     };
-    let RunSummary { trainer, ended, scored, spent, .. } = match screen {
-        Some(screen) => view::beside(screen, (&args.out, &dataset), &requests, train)?,
-        None => train()?,
-    };
+    let done = run::train_in(&gpu, &config, &dataset, &args.out, &session, observe)?;
+    let RunSummary { trainer, ended, scored, spent, .. } = done;
     if !is_text {
         return Ok(());
     }

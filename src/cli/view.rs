@@ -1,14 +1,4 @@
-//! `nightsplat view`: a live page of a run, a model or a dataset, or a window.
-
-#[cfg(feature = "window")]
-mod newest;
-#[cfg(feature = "window")]
-mod window;
-#[cfg(feature = "window")]
-mod windows;
-#[cfg(not(feature = "window"))]
-#[path = "view/no_windows.rs"]
-mod windows;
+//! `nightsplat view`: a live page of a run, a model or a dataset.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -17,7 +7,6 @@ use std::sync::{Arc, Mutex};
 use anyhow::Result;
 use glam::{DAffine3, DVec3, Vec3};
 
-pub(super) use self::windows::{beside, screen};
 use super::driver;
 use super::live::{DEFAULT_ADDRESS, Feed, Listen, Pictures, Server, Site};
 use crate::camera::Camera;
@@ -48,19 +37,6 @@ pub struct ViewArgs {
     /// Photographs of a model, or of a run whose dataset moved
     #[arg(long, value_name = "DIR")]
     pub dataset: Option<PathBuf>,
-    /// Show the model in a window of this machine instead, drawn by the device; needs a build with the feature `window`
-    ///
-    /// Show the model in a window of this machine instead, drawn by the device; needs a build with the feature
-    /// `window`. Drag to turn, scroll or press W and S to approach; the arrow keys go through the views, R goes back to
-    /// one, P saves nightsplat.png, Esc closes the window.
-    #[arg(long)]
-    pub window: bool,
-    /// Close the window after this number of frames
-    #[arg(long, value_name = "N", requires = "window")]
-    pub frames: Option<u64>,
-    /// Save the last of these frames as PNG
-    #[arg(long, value_name = "FILE", requires = "frames")]
-    pub screenshot: Option<PathBuf>,
     /// Vulkan device that makes the targets: its index, part of its name, uuid:..., pci:... or cpu [default: the run's]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
@@ -73,9 +49,6 @@ const EXAMPLES: &str = "Examples:
 
 /// Serves the page until the process is ended.
 pub fn run(args: &ViewArgs) -> Result<()> {
-    if args.window {
-        return Ok(windows::run(args)?);
-    }
     let site = opened(args)?;
     let _server = started(args.listen, site)?;
     loop {
@@ -154,7 +127,7 @@ fn of_dataset(path: &Path, feed: Feed, pictures: Pictures, facts: &Facts) -> Res
 /// The page of a model alone, which is seen from outside, with -y up.
 fn of_model(path: &Path, feed: Feed, gaussians: &Gaussians, facts: &Facts) -> Result<Arc<Site>> {
     let bookmark =
-        Bookmark { name: "overview".to_owned(), camera: overview(gaussians).0, pictures: vec![] };
+        Bookmark { name: "overview".to_owned(), camera: overview(gaussians), pictures: vec![] };
     let provenance = Provenance { facts: *facts, ..Provenance::default() };
     let shown = (vec![bookmark], DVec3::NEG_Y, provenance);
     page(path, feed, None, shown, gaussians.origin)
@@ -176,9 +149,8 @@ fn page(
     Ok(Arc::new(Site { html: html.into(), feed, pictures: pictures.map(Mutex::new) }))
 }
 
-/// A camera that sees nine tenths of the Gaussians along each axis, looking along +z, and the middle of what it sees,
-/// relative to the origin of the Gaussians.
-fn overview(gaussians: &Gaussians) -> (Camera, DVec3) {
+/// A camera that sees nine tenths of the Gaussians along each axis, looking along +z, relative to their origin.
+fn overview(gaussians: &Gaussians) -> Camera {
     const FOV: f64 = 0.9;
     const SIZE: [u32; 2] = [1280, 720];
     let range = |axis: usize| {
@@ -187,11 +159,10 @@ fn overview(gaussians: &Gaussians) -> (Camera, DVec3) {
         let at = |share: f64| values.get((share * values.len() as f64) as usize).copied();
         [at(0.05), at(0.5), at(0.95)].map(|value| f64::from(value.unwrap_or_default()))
     };
-    let [[left, x, right], [top, y, bottom], [front, z, back]] = [0, 1, 2].map(range);
+    let [[left, x, right], [top, y, bottom], [front, _, back]] = [0, 1, 2].map(range);
     let half = 0.5 * (right - left).max(bottom - top).max(1e-3);
     let eye = DVec3::new(x, y, front - half / (0.5 * FOV).tan() - 0.5 * (back - front));
-    let camera = Camera::perspective(DAffine3::from_translation(-eye), FOV, SIZE);
-    (camera, DVec3::new(x, y, z))
+    Camera::perspective(DAffine3::from_translation(-eye), FOV, SIZE)
 }
 
 /// The points of a dataset, in grey.

@@ -1,6 +1,6 @@
 //! Opens a device of our own, or takes one that a host application lends.
 
-use std::ffi::{CStr, c_char, c_void};
+use std::ffi::{CStr, c_void};
 use std::path::PathBuf;
 use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex, OnceLock};
@@ -38,36 +38,21 @@ impl Gpu {
     /// Opens a device that is still to be tested; see [`Gpu::new`].
     pub(crate) fn open(choice: &DeviceChoice) -> Result<Self> {
         let validate = cfg!(debug_assertions) && validation_is_installed();
-        Self::open_with(choice, validate, true, &[])
-    }
-
-    /// [`Gpu::open`] with the instance's extensions for windows of a display.
-    #[cfg(feature = "window")]
-    pub(super) fn open_to_present(
-        choice: &DeviceChoice,
-        extensions: &[*const c_char],
-    ) -> Result<Self> {
-        let validate = cfg!(debug_assertions) && validation_is_installed();
-        Self::open_with(choice, validate, true, extensions)
+        Self::open_with(choice, validate, true)
     }
 
     /// Opens a device that is still to be tested; see [`Gpu::with_validation`].
     pub(crate) fn open_validated(choice: &DeviceChoice) -> Result<Self> {
         if validation_is_installed() {
-            return Self::open_with(choice, true, false, &[]);
+            return Self::open_with(choice, true, false);
         }
         let package = "on Debian `apt install vulkan-validationlayers`";
         Err(Error::NoDevice(format!("the Vulkan validation layer is not installed: {package}")))
     }
 
-    fn open_with(
-        choice: &DeviceChoice,
-        validate: bool,
-        takes_tuning: bool,
-        surfaces: &[*const c_char],
-    ) -> Result<Self> {
+    fn open_with(choice: &DeviceChoice, validate: bool, takes_tuning: bool) -> Result<Self> {
         address_space::check()?;
-        let mut owned = instance(validate, surfaces)?;
+        let mut owned = instance(validate)?;
         let opened = choose(&owned, choice).and_then(|(physical, supported)| {
             owned.cache_path = cache_path(&supported);
             if takes_tuning {
@@ -84,8 +69,7 @@ impl Gpu {
                 has_pipeline_statistics: has_pipeline_statistics(&supported),
                 ..properties(instance, physical, &supported)?
             };
-            let presents = !surfaces.is_empty();
-            create_device(instance, physical, &supported, (&properties, presents)).map(
+            create_device(instance, physical, &supported, &properties).map(
                 |(device, queue, family)| DeviceParts {
                     physical,
                     properties,
@@ -180,8 +164,6 @@ impl Gpu {
                 executables,
                 tuned_tiles: OnceLock::new(),
                 device,
-                #[cfg(feature = "window")]
-                physical,
                 memory: Mutex::new(Some(memory)),
                 callbacks,
                 host,
@@ -396,7 +378,7 @@ fn create_device(
     instance: &ash::Instance,
     physical: vk::PhysicalDevice,
     supported: &Supported,
-    (properties, presents): (&Properties, bool),
+    properties: &Properties,
 ) -> Result<(ash::Device, vk::Queue, u32)> {
     let family = supported.compute_family.unwrap_or_default();
     let priorities = [1.0];
@@ -409,14 +391,6 @@ fn create_device(
     };
     let optional = OPTIONAL_EXTENSIONS.iter().copied().filter(is_wanted);
     let mut extensions: Vec<_> = optional.map(CStr::as_ptr).collect();
-    if presents {
-        if !supported.has(khr::swapchain::NAME) {
-            let name = supported.device_name();
-            let problem = format!("{name} presents to no window; name another --device");
-            return Err(Error::NoDevice(problem));
-        }
-        extensions.push(khr::swapchain::NAME.as_ptr());
-    }
     let (mut vulkan12, mut vulkan13) = required_device_features();
     let mut matrices =
         vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);

@@ -95,7 +95,7 @@ impl DeviceReport {
 /// # Errors
 /// There is no Vulkan loader, or no device at all.
 pub fn devices() -> Result<Vec<DeviceReport>> {
-    let owned = instance(false, &[])?;
+    let owned = instance(false)?;
     let reports = physical_devices(&owned.instance)
         .and_then(|all| all.into_iter().map(|physical| report(&owned, physical)).collect());
     // SAFETY: no device was created from the instance.

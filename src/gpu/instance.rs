@@ -1,6 +1,6 @@
 //! The Vulkan loader, our instance, and the physical devices that it lists.
 
-use std::ffi::{CStr, c_char};
+use std::ffi::CStr;
 use std::path::PathBuf;
 
 use ash::{ext, khr, vk};
@@ -90,8 +90,7 @@ fn instance_has(entry: &ash::Entry, extension: &CStr) -> Result<bool> {
     Ok(all.iter().any(|own| own.extension_name_as_c_str() == Ok(extension)))
 }
 
-/// An instance with further extensions, such as those of windows.
-pub(super) fn instance(validate: bool, more: &[*const c_char]) -> Result<OwnedInstance> {
+pub(super) fn instance(validate: bool) -> Result<OwnedInstance> {
     let entry = entry()?;
     let app = vk::ApplicationInfo::default()
         .application_name(c"nightsplat")
@@ -107,8 +106,7 @@ pub(super) fn instance(validate: bool, more: &[*const c_char]) -> Result<OwnedIn
         extensions.push(khr::portability_enumeration::NAME);
         flags |= vk::InstanceCreateFlags::ENUMERATE_PORTABILITY_KHR;
     }
-    let extensions = extensions.into_iter().map(CStr::as_ptr);
-    let extensions: Vec<_> = extensions.chain(more.iter().copied()).collect();
+    let extensions: Vec<_> = extensions.into_iter().map(CStr::as_ptr).collect();
     let checks = [vk::ValidationFeatureEnableEXT::SYNCHRONIZATION_VALIDATION];
     let mut features = vk::ValidationFeaturesEXT::default().enabled_validation_features(&checks);
     let messenger_info = validation::messenger();

@@ -262,7 +262,6 @@ impl Exposures {
 
 impl Learnable for Exposures {
     fn name(&self) -> &'static str {
-        // Those of earlier versions were differences of gains from 1.
         "log_exposures"
     }
 

@@ -54,7 +54,7 @@ pub use self::file::CurveChoice;
 pub use self::histogram::LuminanceHistogram;
 #[cfg(feature = "io")]
 pub use self::inverse::{InverseTone, Inverted};
-#[cfg(feature = "fit")]
+#[cfg(feature = "cli")]
 pub(crate) use self::law::{CurveInputs, PhotographCurve, law};
 #[cfg(feature = "io")]
 pub(crate) use self::law::{clamped, curve_at, tone_curve};
@@ -64,7 +64,7 @@ pub use self::mapping::{MeasuredPhotograph, SceneTone};
 pub use self::profile::Profile;
 #[cfg(feature = "check")]
 pub(crate) use self::profile::profiled;
-#[cfg(feature = "fit")]
+#[cfg(feature = "cli")]
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
 #[cfg(feature = "io")]

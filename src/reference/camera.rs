@@ -6,7 +6,7 @@ pub mod pinhole;
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::kernels;
-use crate::kernels::camera::{CAMERA_FISHEYE, CAMERA_WIDTH};
+use crate::kernels::camera::CAMERA_FISHEYE;
 
 use fisheye::Fisheye;
 use pinhole::Pinhole;
@@ -116,32 +116,6 @@ impl Camera {
             Model::Pinhole(pinhole) => pinhole.backward(point, d_place, d_rows),
             Model::Fisheye(fisheye) => fisheye.backward(point, d_place, d_rows),
         }
-    }
-
-    /// The gradient of the camera, from those of a point's projection: translation of all points in view space
-    /// (`d_shift`), their rotation about the camera, focal lengths, principal point and distortion.
-    #[cfg(feature = "testing")]
-    pub fn gradient(
-        &self,
-        point: DVec3,
-        d_shift: DVec3,
-        d_pixel: DVec2,
-        d_rows: [DVec3; 2],
-    ) -> [f64; CAMERA_WIDTH as usize] {
-        let rows = self.jacobian(point);
-        let of_rows = d_rows[0].cross(rows[0]) + d_rows[1].cross(rows[1]);
-        let turn = point.cross(self.backward(point, d_pixel, d_rows)) + of_rows;
-        let along = DVec2::new(d_rows[0].dot(rows[0]), d_rows[1].dot(rows[1])) / self.focal;
-        let focal = d_pixel * self.place(point).at + along;
-        let d_place = self.focal * d_pixel;
-        let d_rows = [self.focal.x * d_rows[0], self.focal.y * d_rows[1]];
-        let distortion = match &self.model {
-            Model::Pinhole(_) => [0.0; 4],
-            Model::Fisheye(fisheye) => fisheye.distortion_backward(point, d_place, d_rows),
-        };
-        let numbers = [&d_shift.to_array()[..], &turn.to_array(), &focal.to_array()].concat();
-        let mut numbers = numbers.into_iter().chain(d_pixel.to_array()).chain(distortion);
-        std::array::from_fn(|_| numbers.next().unwrap_or_default())
     }
 
     /// The first-order change of depth between a point and another at an offset.

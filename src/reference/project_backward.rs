@@ -100,7 +100,7 @@ pub fn project_gaussian_backward(
 
 /// From the gradients of a conic and of the logarithm of the compensation to those of the rows of U, where cov2d =
 /// U U^T + 0.3 I, and of the logarithms of the scales.
-pub(super) fn rows_backward(
+fn rows_backward(
     conic: DVec3,
     [u0, u1]: [DVec3; 2],
     (d_conic, d_dimming): (DVec3, f64),
@@ -284,11 +284,7 @@ impl<'a> ProjectionInputs<'a> {
 
 /// The sum of the records of a Gaussian with these slots. Those of few slots are added in f32 in the kernel's exact
 /// order; those of many by the lanes of a subgroup, in an order that depends on the device.
-pub(super) fn summed_record(
-    channels: u32,
-    intersection_ids: UVec2,
-    gradient_records: &[f32],
-) -> Vec<Rounded> {
+fn summed_record(channels: u32, intersection_ids: UVec2, gradient_records: &[f32]) -> Vec<Rounded> {
     let intersection_ids = intersection_ids.x as usize..intersection_ids.y as usize;
     let sum = |k: usize| {
         let numbers = intersection_ids

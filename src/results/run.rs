@@ -27,8 +27,6 @@ pub use load::{
 };
 pub use meter::{ResourceUsage, energy_counters};
 pub use requests::Requests;
-#[cfg(feature = "window")]
-pub(crate) use tail::RunTail;
 #[cfg(feature = "cli")]
 pub(crate) use tail::{Stamp, WatchedRun, stamp};
 pub use train::{IfExists, Session, train, train_in};

@@ -43,8 +43,6 @@ use crate::{Error, Result};
 pub use buffers::RenderBuffers;
 pub use buffers::Status;
 use buffers::{RANKS_PER_PARTITION, color_floats};
-#[cfg(feature = "testing")]
-pub use cameras::CameraGradient;
 pub use cameras::{Viewpoint, Viewpoints};
 pub use draw::Drawn;
 use draw::HostTargets;

@@ -47,17 +47,13 @@ struct Header {
     /// The settings of the run, as TOML.
     config: String,
     /// The decisions of the held-out views so far.
-    #[serde(default, rename = "ends")]
     decisions: Decisions,
     /// Views left out of training.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     left_out: Vec<String>,
-    /// The dataset's fingerprint; absent in older files.
-    #[serde(default)]
-    dataset: Option<Fingerprint>,
-    /// The checksum of the rest of the header and of the tensors; absent in older files.
-    #[serde(default)]
-    checksum: Option<String>,
+    /// The dataset's fingerprint.
+    dataset: Fingerprint,
+    /// The checksum of the rest of the header and of the tensors.
+    checksum: String,
 }
 
 impl Header {
@@ -65,11 +61,8 @@ impl Header {
     fn checksum_with(&self, mut tensors: Vec<(String, &[u8])>) -> String {
         let Self { format, step, config, decisions, left_out, dataset, .. } = self;
         let mut hasher = Hasher::default();
-        // Absent in older files.
-        left_out.iter().for_each(|name| hasher.write(name.as_bytes()));
-        hasher.write(
-            serde_json::json!([format, step, config, decisions, dataset]).to_string().as_bytes(),
-        );
+        let header = serde_json::json!([format, step, config, decisions, left_out, dataset]);
+        hasher.write(header.to_string().as_bytes());
         tensors.sort_unstable();
         for (name, bytes) in tensors {
             hasher.write(name.as_bytes());
@@ -80,8 +73,7 @@ impl Header {
 
     /// Whether the header's checksum matches the file.
     fn describes(&self, file: &TensorFile<'_>) -> bool {
-        let Some(checksum) = &self.checksum else { return true };
-        *checksum == self.checksum_with(file.tensors())
+        self.checksum == self.checksum_with(file.tensors())
     }
 }
 
@@ -139,8 +131,8 @@ impl Trainer {
             config: self.config.to_toml()?,
             decisions: self.convergence.decisions.clone(),
             left_out: self.supervision.views.left_out(),
-            dataset: Some(self.fingerprint.clone()),
-            checksum: None,
+            dataset: self.fingerprint.clone(),
+            checksum: String::new(),
         };
         let downloads = self.tensors(|_| true)?;
         for (name, _, values) in &downloads {
@@ -155,7 +147,7 @@ impl Trainer {
         let tensors =
             named.iter().map(|(name, (_, _, values))| (name.clone(), bytemuck::cast_slice(values)));
         let visit_counts = (VISIT_COUNTS.to_owned(), bytemuck::cast_slice(&visits));
-        header.checksum = Some(header.checksum_with(tensors.chain([visit_counts]).collect()));
+        header.checksum = header.checksum_with(tensors.chain([visit_counts]).collect());
         let header = serde_json::json!(header).to_string();
         let metadata = HashMap::from([(HEADER.to_owned(), header)]);
         let view = |name: &str, shape: &[usize], dtype, bytes| -> std::io::Result<_> {
@@ -255,17 +247,10 @@ impl Trainer {
                 "was made with {difference}; give the settings of the run, or {anew}"
             )));
         }
-        match dataset.as_ref().map(|dataset| dataset.difference(&self.fingerprint)) {
-            Some(None) => {}
-            Some(Some(difference)) => {
-                return Err(refused(format!(
-                    "was trained on another dataset ({difference}); give the dataset of the run, or {anew}"
-                )));
-            }
-            None => tracing::warn!(
-                "{}: is from an older version, which does not name its dataset; this one is assumed",
-                path.display()
-            ),
+        if let Some(difference) = dataset.difference(&self.fingerprint) {
+            return Err(refused(format!(
+                "was trained on another dataset ({difference}); give the dataset of the run, or {anew}"
+            )));
         }
         let steps = self.config.steps;
         if *step > steps {

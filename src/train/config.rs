@@ -38,7 +38,7 @@ use crate::splats::scene::{Facts, MAX_SH_DEGREE, Shape};
 use crate::{Error, Result};
 
 pub use antialiasing::AntialiasingConfig;
-pub use exposure::{ExposureConfig, OnOff};
+pub use exposure::ExposureConfig;
 pub use freeze::Freeze;
 pub use lamp::{LampConfig, LampRates};
 pub use stop::{NotFinite, StopConfig};
@@ -476,10 +476,10 @@ impl TrainConfig {
             let (key, value) = ("model.lamp".to_owned(), "true".to_owned());
             return Err(Error::Setting { key, value, rule: rule.to_owned() });
         }
-        if self.exposure.learn == OnOff::On && self.model.tonemapper {
+        if self.exposure.learn && self.model.tonemapper {
             let rule = "off with a tonemapper, which fits the dark photographs: a gain of the targets does not \
                         describe their exposures";
-            let (key, value) = ("exposure.learn".to_owned(), "on".to_owned());
+            let (key, value) = ("exposure.learn".to_owned(), "true".to_owned());
             return Err(Error::Setting { key, value, rule: rule.to_owned() });
         }
         Ok(())
@@ -500,10 +500,10 @@ mod tests {
     #[test]
     fn settings_that_exclude_each_other_are_named_by_key() {
         let mut config = TrainConfig::default();
-        (config.exposure.learn, config.model.tonemapper) = (OnOff::On, true);
+        (config.exposure.learn, config.model.tonemapper) = (true, true);
         let message = config.check().unwrap_err().to_string();
         assert!(
-            message.starts_with("exposure.learn is on; it must be off with a tonemapper"),
+            message.starts_with("exposure.learn is true; it must be off with a tonemapper"),
             "{message}"
         );
     }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use super::diagnose::exposures_at_points;
 use super::views::Views;
-use super::{OnOff, TrainConfig, Trainer};
+use super::{TrainConfig, Trainer};
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, View};
 use crate::photographs::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
@@ -78,7 +78,7 @@ impl Views {
         scene: &SceneTone,
         config: &TrainConfig,
     ) -> Result<Option<Vec<Affine>>> {
-        if config.exposure.learn == OnOff::Off {
+        if !config.exposure.learn {
             return Ok(None);
         }
         let starts = match table_of(dataset, config) {

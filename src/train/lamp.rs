@@ -6,7 +6,7 @@ use glam::DVec3;
 
 use super::LampRates;
 use super::scene_light::{Encoding, SceneLight};
-use super::{OnOff, Optimizer, TrainConfig, Trainer};
+use super::{Optimizer, TrainConfig, Trainer};
 use crate::Result;
 use crate::gpu::{Gpu, Recorder, Slice, SliceMut};
 use crate::kernels::lamp::LAMP_WIDTH;
@@ -124,7 +124,7 @@ pub(super) fn start(
     let points = in_views(dataset);
     let own = points.values().map(|points| points.iter().map(|point| point.length()).collect());
     let distances: Vec<Vec<f64>> = own.collect();
-    if config.exposure.learn == OnOff::On && spread(&distances) < LEAST_SPREAD {
+    if config.exposure.learn && spread(&distances) < LEAST_SPREAD {
         tracing::warn!(
             "all views are at about the same distance from what they show: exposures of views can take the lamp's \
              place; --exposure off leaves it the light"

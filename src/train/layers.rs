@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
+use super::TrainConfig;
 use super::settings::{SETTINGS, flat, number, setting, takes, unknown, value};
-use super::{TrainConfig, old_keys};
 use crate::base::input;
 use crate::base::settings::{Rule, Setting};
 use crate::photographs::tone::{OF_CURVE, ToneCurve};
@@ -107,7 +107,6 @@ impl SettingsLayer {
 
     /// Adds a setting with its value.
     pub fn push(&mut self, key: &str, value: Value, origin: Origin) -> Result<()> {
-        let key = old_keys::current(key);
         // The constants of a curve can be set one by one.
         let is_part = key.strip_prefix("tone.constants.").is_some_and(|name| !name.contains('.'));
         match setting(key) {
@@ -432,8 +431,6 @@ mod tests {
             let message = TrainConfig::load(&path).unwrap_err().to_string();
             assert!(parts.iter().all(|part| message.contains(part)), "{message}");
         }
-        std::fs::write(&path, "[tone]\nfamily = \"ap3\"\n").unwrap();
-        assert_eq!(TrainConfig::load(&path).unwrap().tone.curve, ToneCurve::Ap3, "an older name");
     }
 
     #[test]

@@ -16,20 +16,10 @@ impl TrainConfig {
         self
     }
 
-    /// The configuration of a run in `folder`: relative paths, in older or edited files, are relative to it or, with a
-    /// warning, to the current folder if they exist only there.
+    /// The configuration of a run in `folder`, to which relative paths, in edited files, are relative.
     pub(crate) fn with_paths_from(mut self, folder: &Path) -> Self {
         for path in self.paths().into_iter().filter(|path| path.is_relative()) {
-            let from_run = folder.join(&*path);
-            if from_run.exists() {
-                *path = from_run;
-            } else if path.exists() {
-                tracing::warn!(
-                    "{}: {} is relative to the current folder; make it absolute",
-                    folder.join("config.toml").display(),
-                    path.display()
-                );
-            }
+            *path = folder.join(&*path);
         }
         self
     }
@@ -50,11 +40,9 @@ mod tests {
 
     #[test]
     fn a_relative_path_starts_at_the_run_and_a_recorded_one_is_absolute() {
-        let folder = tempfile::tempdir().unwrap();
-        std::fs::create_dir(folder.path().join("photos")).unwrap();
         let config = TrainConfig { dataset: "photos".into(), ..TrainConfig::default() };
-        let resolved = config.clone().with_paths_from(folder.path());
-        assert_eq!(resolved.dataset, folder.path().join("photos"));
+        let resolved = config.clone().with_paths_from(Path::new("run"));
+        assert_eq!(resolved.dataset, Path::new("run/photos"));
         assert_eq!(resolved.reference, None);
         assert!(config.with_absolute_paths().dataset.is_absolute());
         let none = TrainConfig::default();

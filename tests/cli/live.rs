@@ -277,12 +277,6 @@ fn an_address_in_use_and_a_path_that_is_nothing_are_refused() {
     );
     refused("view nowhere", 3, &["nowhere", "does not exist", "run directory"]);
     refused(&format!("view {} --listen here", fixture().run()), 2, &["here", "127.0.0.1:7007"]);
-    if cfg!(not(feature = "window")) {
-        let remedy = &["--window", "--features window"];
-        refused(&format!("view {} --window", fixture().run()), 2, remedy);
-        refused(&format!("train {} --out no --window", fixture().set()), 2, remedy);
-        assert!(!Path::new("no").exists());
-    }
     let empty = tempfile::tempdir().unwrap();
     refused(&format!("view {}", empty.path().display()), 3, &["transforms"]);
 }

@@ -365,8 +365,6 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
     let everywhere: Vec<&str> = everywhere.collect();
     let elsewhere = [
         "adam_rest",
-        "camera_backward",
-        "camera_gradient",
         "conv3x3_half",
         "conv3x3_weight_gradient_half",
         "conv_strided",

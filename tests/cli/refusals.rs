@@ -160,7 +160,10 @@ fn misuse_is_one_line_with_exit_code_2() {
     train("--steps many", &["steps (--steps) is \"many\"; it must be a whole number, at least 1"]);
     train("--set stop.not_finite=skip", &["stop.not_finite is", "stop or skip-view"]);
     train("--set density.gradient=1", &["`density.gradient`", "`density.gradient_threshold`"]);
-    train("--exposure on --parts tonemapper", &["exposure.learn (--exposure) is on", "tonemapper"]);
+    train(
+        "--exposure on --parts tonemapper",
+        &["exposure.learn (--exposure) is true", "tonemapper"],
+    );
     refused("train", 2, &["--out", "required"]);
     refused("evaluate x", 2, &["evaluate"]);
     refused("render x --split none --out y", 2, &["none", "train, test, all"]);
@@ -183,7 +186,6 @@ fn options_of_other_trainers_get_a_hint() {
     ] {
         refused(&format!("train {options}"), 2, &["there is no `-", ours]);
     }
-    refused("bench --growth", 2, &["cargo run --release --example growth"]);
 }
 
 #[test]
@@ -250,7 +252,7 @@ fn every_setting_is_explained_with_its_origin_and_nothing_is_trained() {
         "steps = 400  (preset draft)\n",
         "seed = 4  (--seed)\n",
         "stop.margin = 1.0  (--set)\n",
-        "exposure.learn = \"off\"  (plan)\n",
+        "exposure.learn = false  (plan)\n",
         "ssim_weight = 0.2  (default)\n    Weight of the loss 1 - SSIM",
     ] {
         assert!(message.contains(line), "no {line} in {message}");

@@ -377,19 +377,6 @@ fn without_references_test_views_are_scored_against_their_own_targets() {
 }
 
 #[test]
-fn old_command_names_print_the_new_ones() {
-    for (old, new) in [
-        ("ablate photos --out out --steps 2", "sweep DATASET --out DIR --table parts"),
-        ("tradeoff --help", "sweep DATASET --out DIR --table presets"),
-        ("curves --table", "nightsplat tone list"),
-        ("fit pairs --family ase", "nightsplat tone fit"),
-        ("tone photos --curve ase", "nightsplat tone apply photos"),
-    ] {
-        refused(old, 2, &[new]);
-    }
-}
-
-#[test]
 fn help_names_the_lists_and_fits_its_lines() {
     let (help, _) = run("sweep --help-all", 0);
     assert!(help.lines().all(|line| line.chars().count() < 100), "{help}");

@@ -4,33 +4,29 @@
 
 use std::path::{Path, PathBuf};
 
+use clap::Parser as _;
 use nightsplat::Error;
-use nightsplat::cli::ImageFormat;
 use nightsplat::cli::tone::apply::{ApplyArgs, ToneReport, apply};
 use nightsplat::photographs::image::{Image, srgb_from_linear};
 use nightsplat::photographs::metrics::psnr;
-use nightsplat::photographs::tone::{GainChoice, Statistics, ToneCurve, ToneSettings};
+use nightsplat::photographs::tone::{Statistics, ToneCurve, ToneSettings};
 
-fn args(input: &Path, out: PathBuf) -> ApplyArgs {
-    ApplyArgs {
-        input: input.to_owned(),
-        curve: ToneCurve::Ap3.into(),
-        profile: None,
-        out: Some(out),
-        gain: None,
-        brightness: None,
-        colour: None,
-        theta: None,
-        scene_statistics: false,
-        white_balance: None,
-        reference: None,
-        invert_masks: false,
-        json: false,
-        report: None,
-        compare: vec![],
-        format: ImageFormat::Png,
-        device: None,
-    }
+#[derive(Debug, clap::Parser)]
+struct ToneApply {
+    #[command(flatten)]
+    args: ApplyArgs,
+}
+
+/// `tone apply INPUT` with these options.
+fn automatic(input: &Path, options: &str) -> ApplyArgs {
+    let words = ["apply".as_ref(), input.as_os_str()].into_iter();
+    ToneApply::parse_from(words.chain(options.split_whitespace().map(AsRef::as_ref))).args
+}
+
+/// `tone apply INPUT --curve ap3 --out OUT` with these options.
+fn args(input: &Path, out: &Path, options: &str) -> ApplyArgs {
+    let curve = if options.contains("--curve") { "" } else { "--curve ap3" };
+    automatic(input, &format!("--out {} {curve} {options}", out.display()))
 }
 
 /// A dark gradient.
@@ -50,12 +46,7 @@ fn a_folder_is_mapped_by_name_and_unreadable_files_are_left_out() {
     std::fs::write(photographs.join("notes.txt"), b"no image either").unwrap();
     for curve in [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Hybrid] {
         let out = dir.path().join(curve.name());
-        let args = ApplyArgs {
-            curve: curve.into(),
-            gain: Some(GainChoice::C(2.0)),
-            theta: Some(0.4),
-            ..args(&photographs, out.clone())
-        };
+        let args = args(&photographs, &out, &format!("--curve {curve} --gain 2 --theta 0.4"));
         let views = apply(&args).unwrap().views;
         assert_eq!(views.keys().collect::<Vec<_>>(), ["a", "b", "c"]);
         let settings = ToneSettings { gain_c: 2.0, theta: 0.4, ..ToneSettings::new(curve) };
@@ -85,11 +76,8 @@ fn exr_is_not_rounded_and_clipping_is_counted() {
     image.data[..30].fill(1.0);
     image.save_png8(&photograph).unwrap();
     let image = Image::load(&photograph).unwrap();
-    let linear = ApplyArgs {
-        curve: ToneCurve::Linear.into(),
-        format: ImageFormat::Exr,
-        ..args(&photograph, dir.path().join("out"))
-    };
+    let out = dir.path().join("out");
+    let linear = args(&photograph, &out, "--curve linear --format exr");
     let views = apply(&linear).unwrap().views;
     let settings = ToneSettings::new(ToneCurve::Linear);
     let parameters = settings.parameters(&Statistics::of(&image.data));
@@ -116,37 +104,33 @@ fn bad_input_is_named_in_one_line() {
         assert!(message.contains(part) && !message.contains('\n'), "{message}");
         assert_eq!(error.exit_code(), code, "{message}");
     };
-    fails(args(&path("absent"), out.clone()), "absent", 3);
+    fails(args(&path("absent"), &out, ""), "absent", 3);
 
     std::fs::create_dir(path("empty")).unwrap();
-    fails(args(&path("empty"), out.clone()), "no PNG, JPEG, WebP, TIFF or EXR", 3);
+    fails(args(&path("empty"), &out, ""), "no PNG, JPEG, WebP, TIFF or EXR", 3);
 
     std::fs::write(path("broken.png"), b"no image").unwrap();
-    fails(args(&path("broken.png"), out.clone()), "broken.png", 3);
+    fails(args(&path("broken.png"), &out, ""), "broken.png", 3);
 
     std::fs::create_dir(path("all_broken")).unwrap();
     for name in ["all_broken/a.png", "all_broken/b.png"] {
         std::fs::write(path(name), b"no image").unwrap();
     }
-    fails(args(&path("all_broken"), out.clone()), "b.png", 3);
+    fails(args(&path("all_broken"), &out, ""), "b.png", 3);
 
     std::fs::create_dir(path("twins")).unwrap();
     dark(4, 4).save_png8(path("twins/a.png")).unwrap();
     dark(4, 4).save_exr(path("twins/a.exr")).unwrap();
-    fails(args(&path("twins"), out.clone()), "same file", 3);
+    fails(args(&path("twins"), &out, ""), "same file", 3);
 
     dark(4, 4).save_png8(path("good.png")).unwrap();
     let before = std::fs::read(path("good.png")).unwrap();
-    fails(args(&path("good.png"), dir.path().to_owned()), "is one of the photographs", 1);
+    fails(args(&path("good.png"), dir.path(), ""), "is one of the photographs", 1);
     assert_eq!(std::fs::read(path("good.png")).unwrap(), before);
 
-    fails(args(&path("good.png"), path("broken.png")), "cannot be created", 1);
-    fails(
-        ApplyArgs { gain: Some(GainChoice::C(-1.0)), ..args(&path("good.png"), out.clone()) },
-        "tone.gain_c",
-        2,
-    );
-    fails(ApplyArgs { theta: Some(f64::NAN), ..args(&path("good.png"), out) }, "tone.theta", 2);
+    fails(args(&path("good.png"), &path("broken.png"), ""), "cannot be created", 1);
+    fails(args(&path("good.png"), &out, "--gain=-1"), "tone.gain_c", 2);
+    fails(args(&path("good.png"), &out, "--theta=nan"), "tone.theta", 2);
 }
 
 #[test]
@@ -163,8 +147,7 @@ fn a_photograph_that_exceeds_a_binding_is_mapped_in_tiles() {
     image.data[..4_000_000].fill(0.02);
     image.save_png8(&photograph).unwrap();
     let image = Image::load(&photograph).unwrap();
-    let args =
-        ApplyArgs { format: ImageFormat::Png16, ..args(&photograph, dir.path().join("out")) };
+    let args = args(&photograph, &dir.path().join("out"), "--format png16");
     let view = apply(&args).unwrap().views["vast"];
     let statistics = Statistics::of(&image.data);
     assert_eq!([view.before.p10, view.before.p90], statistics.percentiles());
@@ -194,12 +177,12 @@ fn references_give_scores_and_the_page_shows_the_distributions() {
     let dir = tempfile::tempdir().unwrap();
     let [low, high] = pairs(dir.path());
     let page = dir.path().join("page.html");
-    let args = ApplyArgs {
-        reference: Some(high.clone()),
-        report: Some(page.clone()),
-        compare: vec![ToneCurve::Linear.into(), ToneCurve::LumPreserve.into()],
-        ..args(&low, dir.path().join("out"))
-    };
+    let options = format!(
+        "--reference {} --report {} --compare linear,lum_preserve",
+        high.display(),
+        page.display()
+    );
+    let args = args(&low, &dir.path().join("out"), &options);
     let output = apply(&args).unwrap();
     let scores: Vec<f64> = output.views.values().map(|view| view.scores.unwrap().psnr).collect();
     let mean = scores.iter().sum::<f64>() / 3.0;
@@ -245,8 +228,8 @@ fn scene_statistics_give_every_photograph_one_curve() {
     dark(40, 30).save_png8(low.join("b.png")).unwrap();
     let out = dir.path().join("out");
     for scene_statistics in [false, true] {
-        let args =
-            ApplyArgs { scene_statistics, format: ImageFormat::Exr, ..args(&low, out.clone()) };
+        let options = if scene_statistics { "--scene-statistics" } else { "" };
+        let args = args(&low, &out, &format!("--format exr {options}"));
         let output = apply(&args).unwrap();
         let statistics = ["a", "b", "c"].map(|name| {
             Statistics::of(&Image::load(low.join(name).with_extension("png")).unwrap().data)
@@ -274,9 +257,7 @@ fn a_dataset_is_measured_on_training_views_and_scored_on_test_views() {
         ..Default::default()
     };
     nightsplat::photographs::dataset::synthetic::write(&set, &options).unwrap();
-    let mut args = args(&set, dir.path().join("out"));
-    args.out = None;
-    let output = apply(&args).unwrap();
+    let output = apply(&automatic(&set, "--curve ap3")).unwrap();
     assert!(output.scene.scores.is_some());
     let (test, training): (Vec<ToneReport>, Vec<ToneReport>) =
         output.views.into_values().partition(|view| view.scores.is_some());
@@ -301,14 +282,14 @@ fn values_that_are_not_finite_are_counted_and_excluded_from_the_statistics() {
     exr::prelude::write_rgb_file(&path, 40, 10, |x, _| (0.02, value(x), 0.03)).unwrap();
     let clean = dir.path().join("clean.exr");
     exr::prelude::write_rgb_file(&clean, 32, 10, |_, _| (0.02_f32, 0.01, 0.03)).unwrap();
-    let run = |path: &Path| apply(&args(path, dir.path().join("out"))).unwrap().scene;
+    let run = |path: &Path| apply(&args(path, &dir.path().join("out"), "")).unwrap().scene;
     let (found, expected) = (run(&path), run(&clean));
     assert_eq!((found.unusable_pixels, expected.unusable_pixels), (80, 0));
     assert_eq!((found.before.p10, found.before.p90), (expected.before.p10, expected.before.p90));
     assert!((found.before.mean_luminance - expected.before.mean_luminance).abs() < 1e-7);
 
     exr::prelude::write_rgb_file(&path, 4, 4, |_, _| (f32::NAN, 0.0, 0.0)).unwrap();
-    let error = apply(&args(&path, dir.path().join("out"))).unwrap_err().to_string();
+    let error = apply(&args(&path, &dir.path().join("out"), "")).unwrap_err().to_string();
     assert!(error.contains("no finite, unmasked pixel"), "{error}");
 }
 
@@ -326,7 +307,6 @@ fn degenerate_photographs_have_defined_results_under_every_kind_of_curve() {
     }
     let table = dir.path().join("curve.csv");
     std::fs::write(&table, "0,0\n1,0.7\n2,1\n").unwrap();
-    let table = nightsplat::photographs::tone::CurveChoice::File(table);
     let named = [
         ToneCurve::Linear,
         ToneCurve::Ap3,
@@ -335,8 +315,9 @@ fn degenerate_photographs_have_defined_results_under_every_kind_of_curve() {
         ToneCurve::LumPreserve,
         ToneCurve::PerChannel,
     ];
-    for curve in named.map(Into::into).into_iter().chain([table]) {
-        let args = ApplyArgs { curve, ..args(&photographs, dir.path().join("out")) };
+    let table = table.display().to_string();
+    for curve in named.map(|curve| curve.to_string()).into_iter().chain([table]) {
+        let args = args(&photographs, &dir.path().join("out"), &format!("--curve {curve}"));
         let output = apply(&args).unwrap();
         let text = serde_json::to_string(&output).unwrap();
         assert!(!text.contains("null"), "{text}");
@@ -347,24 +328,12 @@ fn degenerate_photographs_have_defined_results_under_every_kind_of_curve() {
 
 #[test]
 fn an_unknown_curve_is_misuse_and_lists_the_curves() {
-    #[derive(Debug, clap::Parser)]
-    struct Command {
-        #[command(flatten)]
-        tone: ApplyArgs,
-    }
-    let parse = |curve: &str| {
-        <Command as clap::Parser>::try_parse_from(["tone", "in", "--out", "out", "--curve", curve])
-    };
-    assert_eq!(parse("ase").unwrap().tone.curve, ToneCurve::Ase.into());
+    let parse = |curve: &str| ToneApply::try_parse_from(["tone", "in", "--curve", curve]);
+    assert!(parse("ase").is_ok());
     let error = parse("gama").unwrap_err();
     assert_eq!(error.exit_code(), 2);
     assert!(error.to_string().contains("linear, ase, ap3"), "{error}");
     assert!(matches!("gama".parse::<ToneCurve>(), Err(Error::Usage(_))));
-}
-
-/// The output of the automatic curve for a folder.
-fn automatic(input: &Path) -> ApplyArgs {
-    ApplyArgs { curve: ToneCurve::Auto.into(), out: None, ..args(input, PathBuf::new()) }
 }
 
 #[test]
@@ -380,27 +349,26 @@ fn the_automatic_curve_reports_its_brightness_which_other_curves_can_use() {
         image.data.copy_within(0..pixels, 2 * pixels);
         image.save_png8(path).unwrap();
     }
-    let output = apply(&automatic(&low)).unwrap();
+    let output = apply(&automatic(&low, "")).unwrap();
     let exposure = output.exposure.unwrap();
     assert!(exposure.reason().contains("gain"), "{}", exposure.reason());
     assert_eq!(output.curve.colour, 0.0, "single pictures keep their curve");
     let means: Vec<f64> = output.views.values().map(|view| view.after.mean_luminance).collect();
     assert!(means.iter().all(|mean| (0.43..0.55).contains(mean)), "{means:?}");
-    let json = serde_json::to_value(apply(&automatic(&low)).unwrap()).unwrap();
+    let json = serde_json::to_value(apply(&automatic(&low, "")).unwrap()).unwrap();
     for key in ["gain", "target", "mean", "brightening", "weight", "spread", "share", "black"] {
         assert!(json["exposure"][key].is_number(), "{key}");
     }
     assert!(json["views"]["a"]["gain"].is_number() && json["exposure"]["reason"].is_string());
     // Every curve with a gain has the same brightness, or a requested one.
     for curve in [ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Linear, ToneCurve::Gamma] {
-        let lent =
-            ApplyArgs { curve: curve.into(), gain: Some(GainChoice::Auto), ..automatic(&low) };
-        let views = apply(&lent).unwrap().views;
+        let lent = format!("--curve {curve} --gain auto");
+        let views = apply(&automatic(&low, &lent)).unwrap().views;
         for (view, mean) in views.values().zip(&means) {
             let found = view.after.mean_luminance;
             assert!((found - mean).abs() < 0.006, "{curve}: {found}, not {mean}");
         }
-        let brighter = apply(&ApplyArgs { brightness: Some(0.6), ..lent }).unwrap();
+        let brighter = apply(&automatic(&low, &format!("{lent} --brightness 0.6"))).unwrap();
         let found = brighter.scene.after.mean_luminance;
         assert!((found - 0.6).abs() < 0.02, "{curve}: {found}");
     }
@@ -418,8 +386,7 @@ fn targets_of_linear_light_are_equally_bright_for_any_exposure() {
         let photograph =
             Image::from_fn(40, 30, |x, y| [srgb_from_linear(exposure * light(x, y)); 3]);
         photograph.save_exr(folder.join("a.exr")).unwrap();
-        let args =
-            ApplyArgs { out: Some(out.clone()), format: ImageFormat::Exr, ..automatic(&folder) };
+        let args = automatic(&folder, &format!("--format exr --out {}", out.display()));
         let report = apply(&args).unwrap();
         (report.exposure.unwrap(), Image::load(out.join("a.exr")).unwrap())
     };
@@ -443,7 +410,7 @@ fn a_well_lit_folder_is_unchanged_and_a_black_one_refused() {
     let bright = Image::from_fn(40, 30, |x, y| [x, y, x + y].map(|v| 0.3 + v as f32 / 120.0));
     bright.save_png8(folder.join("a.png")).unwrap();
     let out = dir.path().join("out");
-    let args = ApplyArgs { out: Some(out.clone()), ..automatic(&folder) };
+    let args = automatic(&folder, &format!("--out {}", out.display()));
     assert!(apply(&args).unwrap().exposure.unwrap().reason().contains("well lit"));
     let stored = Image::load(folder.join("a.png")).unwrap();
     assert_eq!(Image::load(out.join("a.png")).unwrap(), stored);
@@ -452,17 +419,16 @@ fn a_well_lit_folder_is_unchanged_and_a_black_one_refused() {
     let error = apply(&args).unwrap_err();
     assert!(error.to_string().contains("almost black"), "{error}");
     assert_eq!(error.exit_code(), 3);
-    let refused = |args: ApplyArgs, part: &str| {
-        let message = apply(&args).unwrap_err().to_string();
+    for (options, part) in [
+        ("--gain 2", "tone.brightness"),
+        ("--curve ap3 --brightness 0.5", "tone.brightness"),
+        ("--brightness 2", "tone.brightness"),
+        ("--colour=-0.5", "tone.colour"),
+        ("--curve lum_preserve --gain auto", "no automatic gain"),
+    ] {
+        let message = apply(&automatic(&folder, options)).unwrap_err().to_string();
         assert!(message.contains(part) && !message.contains('\n'), "{message}");
-    };
-    let auto = Some(GainChoice::Auto);
-    let of = |curve: ToneCurve| ApplyArgs { curve: curve.into(), ..automatic(&folder) };
-    refused(ApplyArgs { gain: Some(GainChoice::C(2.0)), ..of(ToneCurve::Auto) }, "tone.brightness");
-    refused(ApplyArgs { brightness: Some(0.5), ..of(ToneCurve::Ap3) }, "tone.brightness");
-    refused(ApplyArgs { brightness: Some(2.0), ..of(ToneCurve::Auto) }, "tone.brightness");
-    refused(ApplyArgs { colour: Some(-0.5), ..of(ToneCurve::Auto) }, "tone.colour");
-    refused(ApplyArgs { gain: auto, ..of(ToneCurve::LumPreserve) }, "no automatic gain");
+    }
 }
 
 /// PSNR of the curve, without training, on the test views; ASE and AP3 with constant gains have means of 23.4 and 23.0
@@ -472,7 +438,7 @@ fn the_automatic_curve_has_its_known_scores() {
     let Some(lom) = crate::common::shared("data/lom") else { return };
     let mut mean = 0.0;
     for (scene, known) in [("chair", 25.82), ("sofa", 29.79), ("shrub", 18.86)] {
-        let output = apply(&automatic(&lom.join(scene))).unwrap();
+        let output = apply(&automatic(&lom.join(scene), "")).unwrap();
         let psnr = output.scene.scores.unwrap().psnr;
         assert!((psnr - known).abs() < 0.05, "{scene}: {psnr}");
         mean += psnr / 3.0;

@@ -5,14 +5,13 @@ use nightsplat::kernels::splat::RECORD_HEAD;
 use nightsplat::reference::blend_backward::blend_pixel_backward;
 use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::camera::Camera;
-use nightsplat::reference::camera_backward::camera_backward;
 use nightsplat::reference::lamp::{self, Lamp};
 use nightsplat::reference::project::{Projection, ProjectionSettings, project_gaussian};
 use nightsplat::reference::project_backward::{
     DSplat, Lit, project_gaussian_backward, splat_gradient,
 };
 use nightsplat::reference::splat::Splat;
-use nightsplat::splats::render::{CameraGradient, RenderSettings};
+use nightsplat::splats::render::RenderSettings;
 
 use super::setup::{Rendered, Setup};
 use super::{Random, assert_close};
@@ -45,8 +44,6 @@ pub(crate) struct Results {
     grad_norms: Vec<f64>,
     /// By channel.
     pub(crate) d_background: Vec<f64>,
-    /// With respect to the camera.
-    pub(crate) camera: [f64; CameraGradient::WIDTH],
     /// With respect to the lamp's numbers.
     pub(crate) lamp: [f64; lamp::WIDTH],
 }
@@ -109,17 +106,7 @@ impl<'a> Chain<'a> {
 
     /// The functional's value.
     pub(crate) fn loss(&self, parameters: &[f64], background: &[f64]) -> f64 {
-        self.loss_seen_by(&self.setup.camera(), parameters, background)
-    }
-
-    /// [`Self::loss`] for another camera.
-    pub(crate) fn loss_seen_by(
-        &self,
-        camera: &Camera,
-        parameters: &[f64],
-        background: &[f64],
-    ) -> f64 {
-        let Projected { splats, colors, .. } = self.project(camera, parameters);
+        let Projected { splats, colors, .. } = self.project(&self.setup.camera(), parameters);
         let pixel = |(center, d): (DVec2, Vec<f64>)| {
             let (render, _) = blend_pixel(&splats, &colors, background, center, self.alpha_max());
             render.iter().zip(d).map(|(value, d)| value * d).sum::<f64>()
@@ -141,7 +128,6 @@ impl<'a> Chain<'a> {
             gradient: vec![0.0; parameters.len()],
             grad_norms: vec![0.0; self.setup.count],
             d_background: vec![0.0; channels],
-            camera: [0.0; CameraGradient::WIDTH],
             lamp: [0.0; lamp::WIDTH],
         };
         let alpha_max = self.alpha_max();
@@ -176,10 +162,6 @@ impl<'a> Chain<'a> {
                 (results.lamp.iter_mut().zip(share)).for_each(|(sum, d)| *sum += d_log_factor * d);
             }
             planes.store(&d, i, |at, value| results.gradient[at] = value);
-            let dimming = if antialiased { d_splat.opacity * splat.opacity } else { 0.0 };
-            let arriving = (d_splat.mean2d, d_splat.conic, dimming);
-            let share = camera_backward(&camera, &gaussian, d.mean, splats[j].conic, arriving);
-            results.camera.iter_mut().zip(share).for_each(|(sum, share)| *sum += share);
             let damping = Rendered::DAMPING;
             let nearness = (depths[j] / f64::from(damping.depth)).min(1.0);
             let undamped = 1.0 - f64::from(damping.weight) * (1.0 - nearness * nearness);

@@ -12,7 +12,7 @@ use nightsplat::photographs::dataset::{Dataset, Split, View};
 use nightsplat::photographs::image::{linear_from_srgb, srgb_from_linear};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::results::run::{self, IfExists};
-use nightsplat::train::{OnOff, Part, TrainConfig, Trainer};
+use nightsplat::train::{Part, TrainConfig, Trainer};
 
 use crate::common::train::advance;
 
@@ -34,7 +34,7 @@ fn varied(folder: &Path) -> (TrainConfig, Dataset) {
     let mut config = TrainConfig { steps: 300, sh_degree: 0, tone, ..TrainConfig::bare() };
     config.schedule.densify_before = 0;
     config.schedule.resolution_steps = [0, 40];
-    config.exposure.learn = OnOff::On;
+    config.exposure.learn = true;
     let mut dataset = Dataset::load(folder, &config.load_options()).unwrap();
     for (at, view) in dataset.views.iter_mut().filter(|view| view.is_train()).enumerate() {
         let image = view.image.as_mut().unwrap();
@@ -77,7 +77,7 @@ fn exposures_explain_photographs_that_differ_in_brightness_and_their_mean_is_exa
     assert!(quarter < half && half < one && one < two, "{quarter} {half} {one} {two}");
     let with = l1_of_last_steps(&config, &dataset);
     let mut config = config;
-    config.exposure.learn = OnOff::Off;
+    config.exposure.learn = false;
     let without = l1_of_last_steps(&config, &dataset);
     assert!(with < 0.6 * without, "L1 is {with} with exposures and {without} without");
 }
@@ -88,7 +88,7 @@ fn exposures_that_are_off_leave_no_kernel_and_no_file() {
     let (mut config, dataset) = varied(&folder.path().join("set"));
     config.steps = 2;
     let out = folder.path().join("run");
-    for learn in [OnOff::On, OnOff::Off] {
+    for learn in [true, false] {
         config.exposure.learn = learn;
         let gpu = gpu();
         let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
@@ -96,12 +96,12 @@ fn exposures_that_are_off_leave_no_kernel_and_no_file() {
         reports.unwrap();
         checked.agree().unwrap();
         let own = checked.passes.iter().filter(|pass| pass.kernel.starts_with("expos")).count();
-        assert_eq!(own, if learn == OnOff::On { 4 } else { 0 });
+        assert_eq!(own, if learn { 4 } else { 0 });
         run::train(&gpu, &config, &dataset, &out, IfExists::Replace, |_| {}).unwrap();
         let exposures = run::load_exposures(&out).unwrap();
         let metrics = std::fs::read_to_string(out.join("metrics.json")).unwrap();
         let metrics: serde_json::Value = serde_json::from_str(&metrics).unwrap();
-        if learn == OnOff::On {
+        if learn {
             let learned = trainer.exposures().unwrap().unwrap();
             assert_eq!(exposures.len(), learned.len());
             assert!(metrics["exposure"].as_str().unwrap().starts_with("neutral"));
@@ -140,7 +140,7 @@ fn a_run_with_exposures_is_resumed_bit_for_bit() {
     assert!(state(&mut whole, "whole") == state(&mut resumed, "resumed"));
     assert_eq!(whole.exposures().unwrap(), resumed.exposures().unwrap());
     let mut off = config.clone();
-    off.exposure.learn = OnOff::Off;
+    off.exposure.learn = false;
     let mut off = Trainer::new(&gpu, off, &dataset).unwrap();
     let error = off.restore(&folder.path().join("checkpoint")).unwrap_err().to_string();
     assert!(error.contains("exposure.learn"), "{error}");

@@ -8,7 +8,7 @@ use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::image::{Image, Mask};
 use nightsplat::photographs::metrics::{Scores, psnr_of_counted};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
-use nightsplat::train::{OnOff, Part, TrainConfig, Trainer};
+use nightsplat::train::{Part, TrainConfig, Trainer};
 
 use crate::common::train::{advance, train};
 
@@ -87,7 +87,7 @@ fn every_pass_of_a_masked_step_agrees_with_its_reference() {
     with_parts.model.set_parts(&[Part::Structure, Part::Denoiser, Part::Tonemapper]);
     with_parts.model.network = DenoiserSettings { channels: 4, stages: 2, ..Default::default() };
     let mut with_exposures = config(ToneSettings::default());
-    with_exposures.exposure.learn = OnOff::On;
+    with_exposures.exposure.learn = true;
     for config in [with_parts, with_exposures] {
         let mut trainer = Trainer::new(&gpu(), config, &masked(dataset(), None)).unwrap();
         for _ in 0..2 {

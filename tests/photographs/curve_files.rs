@@ -127,16 +127,9 @@ fn another_curve_has_its_own_constants_and_the_same_curve_keeps_them() {
 }
 
 #[test]
-fn the_family_of_a_curve_has_one_key_and_its_old_name_is_read() {
-    let settings = load("my.toml", "family = \"AP3\"\ngain_c = 2.0\n").unwrap();
+fn the_name_of_a_curve_may_have_any_case() {
+    let settings = load("my.toml", "curve = \"AP3\"\ngain_c = 2.0\n").unwrap();
     assert_eq!((settings.curve, settings.gain_c), (ToneCurve::Ap3, 2.0));
-    let former = load("my.toml", "curve = \"auto\"\nlift_first = false\n").unwrap();
-    assert!(!former.full_resolution && ToneSettings::default().full_resolution);
-    let twice = load("my.toml", "family = \"ap3\"\ncurve = \"ase\"\n").unwrap_err().to_string();
-    assert!(twice.contains("twice"), "{twice}");
-    let tone = ToneSettings::new(ToneCurve::Ap3);
-    let text = TrainConfig { tone, ..TrainConfig::bare() }.to_toml().unwrap();
-    assert!(text.contains("curve = \"ap3\"") && !text.contains("family"), "{text}");
     for name in ["AP3", "Ap3", "ap3"] {
         assert_eq!(name.parse::<CurveChoice>().unwrap(), ToneCurve::Ap3.into());
     }

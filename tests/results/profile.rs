@@ -1,5 +1,5 @@
 //! A camera profile end to end: fitted, used, and named with all its results.
-#![cfg(all(feature = "cli", feature = "fit"))]
+#![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use std::fs;

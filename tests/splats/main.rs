@@ -8,7 +8,6 @@ mod common;
 
 mod antialiasing;
 mod batches;
-mod camera_gradient;
 mod checked;
 mod conditioning;
 mod context;

@@ -10,7 +10,7 @@ use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::image::{Image, Mask};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::scene::Gaussians;
-use nightsplat::train::{DensityConfig, OnOff, Part, TrainConfig, Trainer};
+use nightsplat::train::{DensityConfig, Part, TrainConfig, Trainer};
 
 use crate::common::train::{advance, train};
 
@@ -135,7 +135,7 @@ fn seeding_with_every_part_gives_the_same_bits_however_steps_are_submitted_and_i
         config.model.network.stages = 2;
         config.model.network.repeats = 2;
         config.model.denoiser_crop = 16;
-        config.exposure.learn = if parts.is_empty() { OnOff::On } else { OnOff::Off };
+        config.exposure.learn = parts.is_empty();
         let gpu = gpu();
         let new = || Trainer::new(&gpu, config.clone(), &dataset).unwrap();
         let end = |mut trainer: Trainer| {

@@ -13,7 +13,7 @@ use nightsplat::photographs::image::{Image, Mask};
 use nightsplat::photographs::metrics::Scores;
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::render::{self, Damping, RenderOptions, RenderSettings, Renderer};
-use nightsplat::train::{OnOff, Part, Rendered, TrainConfig, Trainer};
+use nightsplat::train::{Part, Rendered, TrainConfig, Trainer};
 
 use crate::common::command::{command, refused, succeed};
 use crate::common::place::Place;
@@ -175,7 +175,7 @@ fn every_part_of_the_model_trains_on_patches_and_two_runs_have_the_same_bits() {
     let mut config = TrainConfig { steps: 12, ..config(Some(800)) };
     config.schedule.resolution_steps = [0, 5];
     let mut exposed = config.clone();
-    exposed.exposure.learn = OnOff::On;
+    exposed.exposure.learn = true;
     config.model.set_parts(&Part::ALL);
     config.model.network.channels = 4;
     config.model.network.stages = 2;

@@ -16,7 +16,6 @@ use nightsplat::results::run::{self, Event, IfExists};
 use nightsplat::splats::scene::Attribute;
 use nightsplat::train::{Background, EndReason, Part, StepReport, TrainConfig, Trainer};
 use safetensors::SafeTensors;
-use serde_json::Value;
 
 use crate::common::command::{command, refused, succeed};
 use crate::common::train::advance;
@@ -261,46 +260,6 @@ fn a_checkpoint_that_does_not_fit_is_refused_and_changes_nothing() {
     let shorter = TrainConfig { steps: 5, ..config };
     let mut shorter = Trainer::new(&gpu, shorter, &dataset).unwrap();
     refuses(&mut shorter, &whole, &["at step 6", "ends at 5", "raise steps"]);
-}
-
-/// A checkpoint with an edited configuration text and without its own checksum.
-fn with_config(checkpoint: &[u8], edit: impl Fn(&str) -> String) -> Vec<u8> {
-    let (length, rest) = checkpoint.split_first_chunk().unwrap();
-    let (head, tensors) = rest.split_at(u64::from_le_bytes(*length) as usize);
-    let mut head: Value = serde_json::from_slice(head).unwrap();
-    let note = &mut head["__metadata__"]["checkpoint"];
-    let mut header: Value = serde_json::from_str(note.as_str().unwrap()).unwrap();
-    header["config"] = edit(header["config"].as_str().unwrap()).into();
-    header["checksum"] = Value::Null;
-    *note = header.to_string().into();
-    let mut head = head.to_string();
-    head.extend(std::iter::repeat_n(' ', head.len().next_multiple_of(8) - head.len()));
-    [&(head.len() as u64).to_le_bytes(), head.as_bytes(), tensors].concat()
-}
-
-#[test]
-fn a_checkpoint_with_former_names_of_settings_is_restored() {
-    let folder = tempfile::tempdir().unwrap();
-    make_set(folder.path());
-    let (gpu, path) = (gpu(), folder.path().join("checkpoint.safetensors"));
-    let config = config(&[]);
-    let dataset = Dataset::load(folder.path(), &config.load_options()).unwrap();
-    let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
-    advance(&mut trainer, 6);
-    trainer.save_checkpoint(&path).unwrap();
-    let former = |text: &str| {
-        let names =
-            [("cooldown_", "settle_"), ("min_axis_ratio", "thinnest"), ("depth_seeding", "fill")];
-        let former =
-            names.iter().fold(text.to_owned(), |text, (today, former)| text.replace(today, former));
-        assert!(names.iter().all(|(_, former_name)| former.contains(former_name)), "{former}");
-        former
-    };
-    fs::write(&path, with_config(&fs::read(&path).unwrap(), former)).unwrap();
-    let mut restored = Trainer::new(&gpu, config, &dataset).unwrap();
-    restored.restore(&path).unwrap();
-    assert_eq!(restored.steps_done(), 6);
-    assert_eq!(restored.gaussians().unwrap(), trainer.gaussians().unwrap());
 }
 
 #[test]

@@ -12,6 +12,7 @@ use serde::Serialize;
 use self::page::Page;
 use self::photographs::{Listed, listed};
 use crate::base::output::{check_writable, create_folder, printable};
+use crate::cli::settings::{CurveOptions, Selection, SettingOptions};
 use crate::cli::{ImageFormat, driver, finish, progress_bar, table, word, words};
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
@@ -19,16 +20,15 @@ use crate::photographs::image::{ColourCounts, Image, Mask, Orientation};
 use crate::photographs::metrics::Scores;
 use crate::photographs::pseudo_gt::PseudoGt;
 use crate::photographs::tone::{
-    CurveChoice, Exposure, GainChoice, MeasuredPhotograph, Profile, SceneTone, Statistics,
-    ToneCurve, ToneSettings, all_black,
+    CurveChoice, Exposure, MeasuredPhotograph, SceneTone, Statistics, ToneCurve, ToneSettings,
+    all_black,
 };
-use crate::photographs::white_balance::WhiteBalance;
 use crate::results::eval;
 use crate::results::report::Distribution;
+use crate::train::{RequestedSettings, TrainConfig};
 use crate::{Error, Result};
 
 /// Apply a tone curve to photographs, and measure the effect.
-#[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, clap::Args)]
 pub struct ApplyArgs {
     /// Photograph (PNG, JPEG, WebP, TIFF, EXR), folder of photographs, or dataset
@@ -36,42 +36,16 @@ pub struct ApplyArgs {
     /// Photograph (PNG, JPEG, WebP, TIFF, EXR), folder of photographs, or dataset. Photographs are turned upright by
     /// Exif; those of a dataset are taken as stored, and not undistorted.
     pub input: PathBuf,
-    /// Tone curve: a name from `nightsplat tone list`, or a .toml, .csv or .cube file
-    #[arg(long, value_name = "NAME|FILE", value_parser = words::curves::<CurveChoice>())]
-    #[arg(default_value_t = ToneSettings::default().curve.into())]
-    pub curve: CurveChoice,
-    /// Camera profile from `nightsplat tone fit --profile`, in place of a curve; scores are marked, as they depend on
-    /// its references
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["curve", "gain", "brightness", "colour", "theta"])]
-    pub profile: Option<PathBuf>,
+    #[command(flatten)]
+    tone: CurveOptions,
+    #[command(flatten)]
+    settings: SettingOptions<OfTargets>,
     /// Folder for the results, under the same names [default: write nothing]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Gain constant c of the curve, or auto to measure the gain, as the curve auto does [default: {tone.gain_c of
-    /// ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
-    #[arg(long, value_name = "C|auto")]
-    pub gain: Option<GainChoice>,
-    /// Mean luminance of the results, 0.1 to 0.9, with an automatic gain [default: chosen between 0.44 and 0.54]
-    #[arg(long, value_name = "T")]
-    pub brightness: Option<f64>,
-    /// Share of the curve auto that keeps the ratios of the channels, 0 to 1 [default: 1/3 for a dataset, else 0]
-    #[arg(long, value_name = "L")]
-    pub colour: Option<f64>,
-    /// Target mean of the curve linear [default: {tone.theta}]
-    #[arg(long, value_name = "T")]
-    pub theta: Option<f64>,
-    /// Use the mean statistics of all training photographs for each
-    #[arg(long)]
-    pub scene_statistics: bool,
-    /// White balance before anything is measured, as in `train`: R,G,B, kelvin, VIEW,x,y,w,h or VIEW,x1,y1,..,x4,y4
-    #[arg(long, value_name = "WHITE")]
-    pub white_balance: Option<WhiteBalance>,
     /// References in normal light to score against: a folder with the same names, or a file
     #[arg(long, value_name = "DIR|FILE")]
     pub reference: Option<PathBuf>,
-    /// Masks (masks/NAME.png or masks/NAME.jpg.png) hide white instead of black
-    #[arg(long)]
-    pub invert_masks: bool,
     /// Print JSON instead of a table
     #[arg(long)]
     pub json: bool,
@@ -88,6 +62,40 @@ pub struct ApplyArgs {
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the best]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
+}
+
+/// Settings of targets, without those of [`CurveOptions`].
+#[derive(Clone, Copy, Debug)]
+struct OfTargets;
+
+impl Selection for OfTargets {
+    fn has(key: &str) -> bool {
+        let of_tone = ["brightness", "colour", "theta", "scene_statistics"];
+        key.strip_prefix("tone.").is_some_and(|name| of_tone.contains(&name))
+            || ["white_balance", "invert_masks"].contains(&key)
+    }
+}
+
+impl ApplyArgs {
+    /// The settings of the command line; `curve`: with another curve.
+    fn config(&self, curve: Option<&CurveChoice>) -> Result<TrainConfig> {
+        let mut tone = self.tone.clone();
+        if let Some(curve) = curve {
+            (tone.curve, tone.profile) = (Some(curve.clone()), None);
+        }
+        let is_auto = tone.profile.is_none()
+            && tone.curve.as_ref().is_none_or(|curve| *curve == ToneCurve::Auto.into());
+        let mut requested = RequestedSettings::default();
+        tone.push(&mut requested.options)?;
+        self.settings.push(&mut requested.options)?;
+        let mut config = requested.settings(None)?.config()?;
+        if is_auto && self.settings.get("tone.colour").is_none() && !Dataset::is_at(&self.input) {
+            // References of single photographs are less saturated than those of scenes.
+            config.tone.colour = 0.0;
+        }
+        config.tone.check()?;
+        Ok(config)
+    }
 }
 
 /// Statistics of the sRGB-encoded values of a photograph or of a result.
@@ -191,7 +199,9 @@ pub fn run(args: &ApplyArgs) -> anyhow::Result<()> {
         .chain(args.report.iter().map(|page| page.display().to_string()))
         .collect();
     let next = match Dataset::is_at(&args.input) {
-        true => format!("nightsplat train {} --out run --curve {}", word(&args.input), args.curve),
+        true => {
+            format!("nightsplat train {} --out run --curve {}", word(&args.input), args.tone.name())
+        }
         false => format!("nightsplat pose {} --out scene", word(&args.input)),
     };
     finish(&wrote.join(", "), &next)
@@ -230,19 +240,14 @@ fn text_table(output: &ToneOutput) -> String {
 /// Maps every photograph and writes it to `args.out` under its own name. Of several photographs, unusable ones are
 /// skipped with a warning.
 pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
-    let settings = match &args.profile {
-        Some(file) => ToneSettings {
-            scene_statistics: args.scene_statistics,
-            ..ToneSettings::of_profile(Profile::load(file)?)
-        },
-        None => settings(args, &args.curve)?,
-    };
+    let config = args.config(None)?;
+    let settings = config.tone.clone();
     args.out.iter().chain(&args.report).try_for_each(|path| check_writable(path))?;
-    let photographs = listed(args)?;
+    let photographs = listed(args, config.white_balance.as_ref())?;
     args.out.iter().try_for_each(|out| create_folder(out))?;
     let gpu = driver::open(&args.device.clone().unwrap_or_default())?;
     let mut set =
-        CurveOnSet::new(&gpu, settings.clone(), &photographs, (&args.input, args.invert_masks))?;
+        CurveOnSet::new(&gpu, settings.clone(), &photographs, (&args.input, config.invert_masks))?;
     let mut page = args.report.as_ref().map(|_| Page::new(&gpu, args, &photographs)).transpose()?;
 
     let progress = progress_bar(photographs.len());
@@ -284,24 +289,6 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
         page.write(path, &output)?;
     }
     Ok(output)
-}
-
-/// The settings of a curve with the options of the command line.
-fn settings(args: &ApplyArgs, curve: &CurveChoice) -> Result<ToneSettings> {
-    let mut settings = curve.settings()?;
-    if *curve == ToneCurve::Auto.into() && !Dataset::is_at(&args.input) {
-        // References of single photographs are less saturated than those of scenes.
-        settings.colour = 0.0;
-    }
-    settings.theta = args.theta.unwrap_or(settings.theta);
-    if let Some(gain) = args.gain {
-        settings = settings.with_gain(gain);
-    }
-    settings.brightness = args.brightness.or(settings.brightness);
-    settings.colour = args.colour.unwrap_or(settings.colour);
-    settings.scene_statistics |= args.scene_statistics;
-    settings.check()?;
-    Ok(settings)
 }
 
 /// A curve with its statistics of the whole dataset, if it has any.

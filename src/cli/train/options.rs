@@ -1,18 +1,15 @@
 //! Options of a training. Those that set a single setting come from the table of settings; the others are defined here.
 
-use std::ops::Bound;
 use std::path::{Path, PathBuf};
 
-use clap::builder::ValueParser;
-use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches, ValueHint};
-use toml::{Table, Value};
+use clap::Args;
+use toml::Value;
 
-use crate::base::settings::{Rule, Setting};
+use crate::cli::settings::{CurveOptions, Selection, SettingOptions, push_curve, push_dataset};
 use crate::cli::words::{self, Words};
 use crate::photographs::dataset::exclude;
-use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneLaw, ToneSettings};
+use crate::photographs::tone::ToneLaw;
 use crate::train::diagnose::Plan;
-use crate::train::settings::SETTINGS;
 use crate::train::{
     ModelName, Origin, Part, Preset, RequestedSettings, SettingsLayer, TrainConfig,
 };
@@ -24,24 +21,24 @@ pub(crate) struct TrainOptions {
     #[command(flatten)]
     several: SeveralSettings,
     #[command(flatten)]
-    single: SingleSettings,
+    single: SettingOptions<OfTraining>,
+}
+
+/// Every setting with an option, without those of [`CurveOptions`].
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct OfTraining;
+
+impl Selection for OfTraining {
+    fn has(key: &str) -> bool {
+        !["tone.curve", "tone.gain_c"].contains(&key)
+    }
 }
 
 /// The options that set several settings.
-#[expect(clippy::doc_markdown, reason = "in help, {setting} stands for its default")]
 #[derive(Clone, Debug, Default, Args)]
 struct SeveralSettings {
-    /// Tone curve: a name from `nightsplat tone list`, or a .toml, .csv or .cube file [default: {tone.curve}]
-    #[arg(long, value_name = "NAME|FILE", value_parser = words::curves::<CurveChoice>())]
-    curve: Option<CurveChoice>,
-    /// Camera profile from `nightsplat tone fit --profile`, in place of a curve; scores are marked, as they depend on
-    /// its references
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["curve", "gain", "brightness", "colour", "theta"])]
-    profile: Option<PathBuf>,
-    /// Gain constant c of the curve, or auto to measure the gain, as the curve auto does [default: {tone.gain_c of
-    /// ase} for ase, {tone.gain_c of ap3} for ap3, else {tone.gain_c of linear}]
-    #[arg(long, value_name = "C|auto")]
-    gain: Option<GainChoice>,
+    #[command(flatten)]
+    curve: CurveOptions,
     /// TOML file with settings, such as the config.toml of a run
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -70,93 +67,19 @@ struct SeveralSettings {
     preset: Option<Preset>,
 }
 
-/// The options that a tone law sets.
-const OF_LAW: [&str; 6] = ["curve", "profile", "gain", "brightness", "colour", "theta"];
-
 /// What `--frame` sets.
 const OF_FRAME: [&str; 5] = ["frame.center", "frame.scale", "extent", "up", "near"];
-
-/// The options that set a single setting, with their values as text.
-#[derive(Clone, Debug, Default)]
-struct SingleSettings(Vec<(&'static Setting, String)>);
-
-impl SingleSettings {
-    /// The rows with an option, without those of [`SeveralSettings`].
-    fn rows() -> impl Iterator<Item = (&'static Setting, &'static str, Option<&'static str>)> {
-        let rows =
-            SETTINGS.iter().filter_map(|row| row.option().map(|(name, value)| (row, name, value)));
-        rows.filter(|(_, name, _)| !["curve", "gain"].contains(name))
-    }
-}
-
-impl Args for SingleSettings {
-    fn augment_args(command: Command) -> Command {
-        Self::rows().fold(command, |command, (row, name, value)| {
-            let arg = Arg::new(name).long(name).help(help(row));
-            // The name in other trainers.
-            let arg = if name == "steps" { arg.visible_alias("iterations") } else { arg };
-            let arg = if name == "law" { arg.conflicts_with_all(OF_LAW) } else { arg };
-            let is_path = matches!(row.rule, Rule::Text("a path", _));
-            let arg = if is_path { arg.value_hint(ValueHint::AnyPath) } else { arg };
-            command.arg(match (value, row.rule) {
-                (Some(value), Rule::OneOf(words)) => {
-                    let words = words.iter().copied();
-                    arg.value_name(value).value_parser(Words::<String>::new(words))
-                }
-                (Some(value), _) => arg.value_name(value).value_parser(ValueParser::string()),
-                (None, _) => arg.action(ArgAction::SetTrue),
-            })
-        })
-    }
-
-    fn augment_args_for_update(command: Command) -> Command {
-        Self::augment_args(command)
-    }
-}
-
-impl FromArgMatches for SingleSettings {
-    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
-        let given = |(row, name, value): (&'static Setting, &'static str, Option<&str>)| {
-            let text = match value {
-                Some(_) => matches.get_one::<String>(name).cloned(),
-                None => matches.get_flag(name).then(|| "true".to_owned()),
-            };
-            Some((row, text?))
-        };
-        Ok(Self(Self::rows().filter_map(given).collect()))
-    }
-
-    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
-        *self = Self::from_arg_matches(matches)?;
-        Ok(())
-    }
-}
-
-/// The help of an option: effect, range and default of its setting.
-fn help(row: &Setting) -> String {
-    let default = match row.absent {
-        Some(absent) => absent.to_owned(),
-        None if matches!(row.rule, Rule::Flag) => return row.help(),
-        None => format!("{{{}}}", row.key),
-    };
-    let range = match row.rule {
-        Rule::Number(_, Bound::Included(most)) if most < 1e6 => format!(", {}", row.rule),
-        Rule::Whole(_, most) if most < u32::MAX.into() => format!(", {}", row.rule),
-        _ => String::new(),
-    };
-    format!("{}{range} [default: {default}]", row.help())
-}
 
 impl TrainOptions {
     /// Whether the command line gives a setting.
     pub(in crate::cli) fn gives(&self, key: &str) -> bool {
-        self.single.0.iter().any(|(row, _)| row.key == key)
+        self.single.get(key).is_some()
     }
 
     /// These options without that of a setting.
     pub(in crate::cli) fn without(&self, key: &str) -> Self {
         let mut options = self.clone();
-        options.single.0.retain(|(row, _)| row.key != key);
+        options.single.remove(key);
         options
     }
 
@@ -171,7 +94,7 @@ impl TrainOptions {
             }
         };
         let mut lines = vec![];
-        for (row, _) in &self.single.0 {
+        for (row, _) in self.single.given() {
             let parts = of_parts(&row.key);
             if let (Some(first), Some((option, _))) = (parts.first(), row.option())
                 && !parts.iter().any(|&part| config.model.has(part))
@@ -225,27 +148,16 @@ impl TrainOptions {
             requested.set.assign(assignment)?;
         }
         let options = &mut requested.options;
-        let dataset = dataset
-            .to_str()
-            .ok_or_else(|| Error::input(dataset, "is not Unicode; move it to a path that is"))?;
-        options.push("dataset", dataset.into(), Origin::Option("argument"))?;
+        push_dataset(options, dataset)?;
         several.push_excluded(options)?;
         several.push_frame(options)?;
-        several.push_tone(options)?;
+        several.curve.push(options)?;
         self.push_law(options)?;
         several.push_parts(options)?;
         if self.gives("exposure.start") {
-            options.push("exposure.learn", "on".into(), Origin::Option("--exposures"))?;
+            options.push("exposure.learn", true.into(), Origin::Option("--exposures"))?;
         }
-        for (row, text) in &self.single.0 {
-            let origin = Origin::Option(
-                row.option.and_then(|option| option.split(' ').next()).unwrap_or_default(),
-            );
-            match (row.key.as_ref(), text.as_str()) {
-                ("max_resolution", "none") => options.push(&row.key, 0.into(), origin)?,
-                (key, text) => options.say(key, text, origin)?,
-            }
-        }
+        self.single.push(options)?;
         if self.gives("steps") {
             // An explicit length switches early stopping off, and with it the held-out views.
             options.push("stop.views", 0.into(), Origin::Option("--steps"))?;
@@ -257,22 +169,9 @@ impl TrainOptions {
 impl TrainOptions {
     /// The curve of the tone law, which its photographs were measured for.
     fn push_law(&self, options: &mut SettingsLayer) -> Result<()> {
-        let law = self.single.0.iter().find(|(row, _)| row.key == "tone.law");
-        let Some((_, path)) = law else { return Ok(()) };
+        let Some(path) = self.single.get("tone.law") else { return Ok(()) };
         push_curve(options, ToneLaw::load(Path::new(path))?.tone, "--law")
     }
-}
-
-/// Every setting of a curve.
-fn push_curve(
-    options: &mut SettingsLayer,
-    curve: ToneSettings,
-    option: &'static str,
-) -> Result<()> {
-    let table = Table::try_from(curve).map_err(|error| Error::Usage(error.to_string()))?;
-    table.into_iter().try_for_each(|(name, value)| {
-        options.push(&format!("tone.{name}"), value, Origin::Option(option))
-    })
 }
 
 impl SeveralSettings {
@@ -298,34 +197,6 @@ impl SeveralSettings {
         }
         let patterns: Vec<Value> = patterns.into_iter().map(Value::String).collect();
         options.push("exclude", Value::Array(patterns), Origin::Option("--exclude"))
-    }
-
-    fn push_tone(&self, options: &mut SettingsLayer) -> Result<()> {
-        let from_file = match (&self.curve, &self.profile) {
-            (_, Some(file)) => Some((ToneSettings::of_profile(Profile::load(file)?), "--profile")),
-            (Some(CurveChoice::Named(curve)), _) => {
-                options.push("tone.curve", curve.name().into(), Origin::Option("--curve"))?;
-                None
-            }
-            (Some(file), _) => {
-                let settings = file.settings()?;
-                let gain = |gain| settings.clone().with_gain(gain);
-                Some((self.gain.map_or_else(|| settings.clone(), gain), "--curve"))
-            }
-            (None, None) => None,
-        };
-        if let Some((settings, option)) = from_file {
-            return push_curve(options, settings, option);
-        }
-        let mut say = |key: &str, value: Value| options.push(key, value, Origin::Option("--gain"));
-        match self.gain {
-            Some(GainChoice::Auto) => say("tone.auto_gain", true.into()),
-            Some(GainChoice::C(gain)) => {
-                say("tone.auto_gain", false.into())?;
-                say("tone.gain_c", gain.into())
-            }
-            None => Ok(()),
-        }
     }
 
     fn push_parts(&self, options: &mut SettingsLayer) -> Result<()> {

@@ -111,7 +111,7 @@ fn from_toml(text: &str) -> Result<ToneSettings, String> {
     if tone.contains_key("segments") {
         return Err("it is a camera profile; name it with --profile".to_owned());
     }
-    if !["curve", "family", "table", "profile"].iter().any(|key| tone.contains_key(*key)) {
+    if !["curve", "table", "profile"].iter().any(|key| tone.contains_key(*key)) {
         return Err("it names no curve; add curve = \"NAME\"".to_owned());
     }
     tone.try_into().map_err(|error| one_line(&error))

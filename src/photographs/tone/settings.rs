@@ -109,7 +109,7 @@ impl ToneSettings {
         base_gain => Rule::above(0.0, MOST);
         /// Use one curve for a scene: its statistics are the means over the training views, its gain that of all of
         /// them together.
-        scene_statistics => Rule::Flag;
+        scene_statistics => Rule::Flag, "--scene-statistics";
         /// Choose the gain from the photographs; c and g0 are then not used. Always on for the curve auto.
         auto_gain, "the curve's" => Rule::Flag;
         /// Mean luminance of the targets, with an automatic gain.
@@ -427,9 +427,6 @@ impl Default for ToneSettings {
 #[serde(deny_unknown_fields)]
 struct SerializedToneSettings {
     curve: Option<ToneCurve>,
-    /// The former name of `curve`.
-    #[serde(skip_serializing)]
-    family: Option<ToneCurve>,
     gain_c: Option<f64>,
     theta: Option<f64>,
     alpha: Option<f64>,
@@ -440,7 +437,6 @@ struct SerializedToneSettings {
     #[serde(skip_serializing_if = "Option::is_none")]
     brightness: Option<f64>,
     colour: Option<f64>,
-    #[serde(alias = "lift_first")]
     full_resolution: Option<bool>,
     #[serde(skip_serializing_if = "Option::is_none")]
     constants: Option<BTreeMap<String, f64>>,
@@ -461,19 +457,7 @@ impl TryFrom<SerializedToneSettings> for ToneSettings {
             (None, Some(_)) => ToneCurve::Profile,
             (None, None) => ToneCurve::Auto,
         };
-        if written.family.is_some() {
-            static WARNED: std::sync::Once = std::sync::Once::new();
-            WARNED.call_once(|| {
-                tracing::warn!("`family` of a curve is called `curve` now; the old name is read");
-            });
-            if written.curve.is_some() {
-                return Err(
-                    "it names its curve twice, as `curve` and as `family`; remove `family`"
-                        .to_owned(),
-                );
-            }
-        }
-        let defaults = Self::new(written.curve.or(written.family).unwrap_or(given));
+        let defaults = Self::new(written.curve.unwrap_or(given));
         let family = defaults.curve.family();
         let constants = match written.constants {
             None => defaults.constants,
@@ -526,7 +510,6 @@ impl From<ToneSettings> for SerializedToneSettings {
             names.map(|constant| constant.name.to_owned()).zip(settings.constants).collect();
         Self {
             curve: Some(settings.curve),
-            family: None,
             gain_c: Some(settings.gain_c),
             theta: Some(settings.theta),
             alpha: Some(settings.alpha),

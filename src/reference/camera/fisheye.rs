@@ -99,22 +99,4 @@ impl Fisheye {
         let d_xy = (by_distance * sine + by_angle * cosine) * n + by_turn * side;
         d_xy.extend(by_distance * cosine - by_angle * sine) / (distance * distance)
     }
-
-    /// With respect to k1 to k4.
-    #[cfg(feature = "testing")]
-    pub(super) fn distortion_backward(
-        &self,
-        point: DVec3,
-        d_place: DVec2,
-        d_rows: [DVec3; 2],
-    ) -> [f64; 4] {
-        let Ray { distance, across: n, sine, cosine, .. } = self.ray(point);
-        let t = point.truncate().length().atan2(point.z);
-        let part = |by: DVec2| by.x * d_rows[0] + by.y * d_rows[1];
-        let (along, beside) = (part(n), part(n.perp()));
-        let ratio = if sine > 0.0 { t / sine } else { 1.0 };
-        let by_factor = ratio * beside.truncate().dot(n.perp()) / distance + t * d_place.dot(n);
-        let by_slope = (cosine * along.truncate().dot(n) - sine * along.z) / distance;
-        [1, 2, 3, 4].map(|i| t.powi(2 * i) * (by_factor + f64::from(2 * i + 1) * by_slope))
-    }
 }

@@ -18,7 +18,7 @@ use crate::results::run;
 use crate::splats::model::Model;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Facts, Gaussians};
-use crate::train::{OnOff, TestTargets, TrainConfig};
+use crate::train::{TestTargets, TrainConfig};
 use crate::{Error, Result};
 
 /// The photographs of a model.
@@ -38,7 +38,7 @@ const LARGE_ERROR: f64 = 0.05;
 impl Capture {
     pub(super) fn open(model: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
         let FinishedRun { gpu, config, dataset, .. } = FinishedRun::open(model, dataset, opener)?;
-        let (is_model, learns) = (is_model(model), config.exposure.learn == OnOff::On);
+        let (is_model, learns) = (is_model(model), config.exposure.learn);
         let tone = if is_model { ToneSettings::default() } else { config.tone.clone() };
         Ok(Self { gpu, config, dataset, tone, adjusts: is_model || learns })
     }

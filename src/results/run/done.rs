@@ -18,17 +18,15 @@ struct Done {
     configuration: String,
     /// Checksum of the training data.
     dataset: String,
-    /// [`Dataset::stamp`]; `None` if the dataset is not in a folder. Older files have none.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
+    /// [`Dataset::stamp`]; `None` if the dataset is not in a folder.
+    #[serde(skip_serializing_if = "Option::is_none")]
     stamp: Option<String>,
     /// The last step.
     steps: u64,
-    /// How it ended; missing in older files.
-    #[serde(default)]
-    ended: Option<Ended>,
-    /// Version and device; older files have none.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    trained_with: Option<serde_json::Value>,
+    /// How it ended.
+    ended: Ended,
+    /// Version and device.
+    trained_with: serde_json::Value,
 }
 
 /// Writes the file, after all others.
@@ -44,8 +42,8 @@ pub(super) fn save(
         dataset: dataset.checksum(),
         stamp,
         steps: ended.step,
-        ended: Some(*ended),
-        trained_with: Some(trained_with(gpu)),
+        ended: *ended,
+        trained_with: trained_with(gpu),
     };
     let text =
         serde_json::to_string_pretty(&done).map_err(|error| Error::Usage(error.to_string()))?;

@@ -2,12 +2,8 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-#[cfg(feature = "window")]
-use std::sync::{Mutex, PoisonError};
 
 use crate::Stop;
-#[cfg(feature = "window")]
-use crate::train::ShownModel;
 
 /// Requests that a run fulfils after the steps under way. Clones share their state.
 #[derive(Clone, Debug, Default)]
@@ -17,10 +13,6 @@ pub struct Requests {
     save: Arc<AtomicBool>,
     pause: Arc<AtomicBool>,
     snapshot: Arc<AtomicBool>,
-    #[cfg(feature = "window")]
-    show: Arc<AtomicBool>,
-    #[cfg(feature = "window")]
-    shown: Arc<Mutex<Option<ShownModel>>>,
 }
 
 const STOPS: [Stop; 3] = [Stop::Interrupted, Stop::Terminated, Stop::TimeUp];
@@ -58,30 +50,6 @@ impl Requests {
     /// Whether a snapshot was requested since the last call.
     pub(crate) fn takes_snapshot(&self) -> bool {
         self.snapshot.swap(false, Ordering::Relaxed)
-    }
-
-    /// Requests the model as it is, on the device.
-    #[cfg(feature = "window")]
-    pub(crate) fn show(&self) {
-        self.show.store(true, Ordering::Relaxed);
-    }
-
-    /// Whether the model is to be shown.
-    #[cfg(feature = "window")]
-    pub(super) fn takes_show(&self) -> bool {
-        self.show.swap(false, Ordering::Relaxed)
-    }
-
-    /// Answers [`Requests::show`].
-    #[cfg(feature = "window")]
-    pub(super) fn give_shown(&self, model: ShownModel) {
-        *self.shown.lock().unwrap_or_else(PoisonError::into_inner) = Some(model);
-    }
-
-    /// The newest answer to [`Requests::show`].
-    #[cfg(feature = "window")]
-    pub(crate) fn take_shown(&self) -> Option<ShownModel> {
-        self.shown.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
     /// The cause of a request to stop, if there is one.

@@ -13,7 +13,7 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::results::eval::{self, ScoreReference, ScoredImages, ViewScore};
 use crate::splats::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::train::diagnose::Plan;
-use crate::train::{Ended, MemoryEstimate, OnOff, Settings, StepReport, TrainConfig, Trainer};
+use crate::train::{Ended, MemoryEstimate, Settings, StepReport, TrainConfig, Trainer};
 use crate::{Error, Result, Stop};
 
 /// What to do with an existing run in the directory.
@@ -118,7 +118,7 @@ pub fn train_in(
     if let Some(exposure) = trainer.target_exposure() {
         metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
     }
-    if config.exposure.learn == OnOff::On {
+    if config.exposure.learn {
         eval::add_exposure(&mut metrics, &scored);
     }
     eval::add_lit(&mut metrics, &scored);
@@ -346,14 +346,6 @@ impl<'a> TrainLoop<'a> {
                 let seconds = begin.elapsed().as_secs_f64();
                 observe(Event::Snapshot { step, model, seconds });
             }
-            #[cfg(feature = "window")]
-            if requests.takes_show() {
-                // A window without a newer model is no reason to end a training.
-                match trainer.shown() {
-                    Ok(model) => requests.give_shown(model),
-                    Err(error) => tracing::debug!("the window gets no newer model: {error}"),
-                }
-            }
             if !requests.is_paused() || requests.stops().is_some() {
                 return Ok(());
             }
@@ -433,7 +425,7 @@ impl<'a> TrainLoop<'a> {
         };
         let mut scored =
             eval::score_by(&mut score_reference, self.dataset, render, |score, compared| {
-                if self.config.exposure.learn == OnOff::On {
+                if self.config.exposure.learn {
                     score.aligned = Some(compared.aligned()?);
                 }
                 if std::mem::take(&mut is_first) {

@@ -170,7 +170,7 @@ impl Plan {
         if !self.curve.on {
             say("tone.curve", ToneCurve::None.name().into())?;
         }
-        say("exposure.learn", if self.exposure.on { "on" } else { "off" }.into())?;
+        say("exposure.learn", self.exposure.on.into())?;
         say("model.lamp", self.lamp.on.into())?;
         if self.lamp.on {
             say("lamp.exponent", self.lamp.exponent.into())?;

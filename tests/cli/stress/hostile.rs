@@ -14,7 +14,7 @@ use nightsplat::photographs::dataset::{Dataset, Point, Split, View};
 use nightsplat::photographs::image::{Image, linear_from_srgb};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::scene::Gaussians;
-use nightsplat::train::{OnOff, TrainConfig};
+use nightsplat::train::TrainConfig;
 use nightsplat::{Error, Result};
 
 /// A dataset, its first Gaussians unless they come from its points, and the indices of the hostile ones.
@@ -152,7 +152,7 @@ impl Hostile {
         other.name = "view without gain".to_owned();
         table::save(&path, &[(self.dataset.views[0].name.clone(), affine)])?;
         self.dataset.views.push(other);
-        self.config.exposure.learn = OnOff::On;
+        self.config.exposure.learn = true;
         self.config.exposure.start = Some(path);
         self.files = Some(files);
         Ok(self)

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::photographs::Listed;
-use super::{ApplyArgs, CurveOnSet, Mapped, Measures, ToneOutput, settings, without};
+use super::{ApplyArgs, CurveOnSet, Mapped, Measures, ToneOutput, without};
 use crate::Result;
 use crate::base::output::write_whole;
 use crate::gpu::Gpu;
@@ -32,18 +32,12 @@ pub(super) struct Page {
 impl Page {
     pub(super) fn new(gpu: &Gpu, args: &ApplyArgs, photographs: &[Listed]) -> Result<Self> {
         let compared = args.compare.iter().map(|curve| {
-            let set = CurveOnSet::new(
-                gpu,
-                settings(args, curve)?,
-                photographs,
-                (&args.input, args.invert_masks),
-            )?;
+            let config = args.config(Some(curve))?;
+            let masks = (args.input.as_path(), config.invert_masks);
+            let set = CurveOnSet::new(gpu, config.tone, photographs, masks)?;
             Ok((set, Distribution::new(curve.to_string())))
         });
-        let curve = match &args.profile {
-            Some(_) => "profile".to_owned(),
-            None => args.curve.to_string(),
-        };
+        let curve = args.tone.name();
         Ok(Self {
             only_referenced: photographs.iter().any(|listed| listed.reference.is_some()),
             input: Distribution::new("photograph"),

@@ -11,7 +11,7 @@ use crate::cli::ImageFormat;
 use crate::photographs::dataset::{Borders, Dataset, LoadOptions, Photograph, Split};
 use crate::photographs::image::files::{photographs_in, unread_in};
 use crate::photographs::image::{ColourCounts, Image, Mask, MaskFile, Orientation, PictureFile};
-use crate::photographs::white_balance::WhiteBalanceGains;
+use crate::photographs::white_balance::{WhiteBalance, WhiteBalanceGains};
 use crate::{Error, Result};
 
 /// A photograph to map.
@@ -69,7 +69,7 @@ impl Listed {
 }
 
 /// The photographs of the input: a file, those of a folder by name, or those of a dataset.
-pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
+pub(super) fn listed(args: &ApplyArgs, balance: Option<&WhiteBalance>) -> Result<Vec<Listed>> {
     let input = &args.input;
     let unreadable =
         |error: std::io::Error| Error::input(input, format!("cannot be read: {error}"));
@@ -102,7 +102,6 @@ pub(super) fn listed(args: &ApplyArgs) -> Result<Vec<Listed>> {
         return Err(Error::input(input, "contains no PNG, JPEG, WebP, TIFF or EXR image"));
     }
     let named = || photographs.iter().map(|one| (one.name.as_str(), one.input.as_path()));
-    let balance = args.white_balance.as_ref();
     let gains = balance.map(|balance| balance.gains(input, named())).transpose()?;
     photographs.iter_mut().for_each(|photograph| photograph.gains = gains);
     if let Some(out) = &args.out {

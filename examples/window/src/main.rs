@@ -1,23 +1,16 @@
 //! A host application with a window: its own geometry and splats in one picture, each in front of the other.
 //!
-//! `cargo run --release --example window -- MODEL.ply`; drag to turn, scroll to approach. The options `--frames N` and
-//! `--screenshot FILE.ppm` end by themselves; `usage` below has the others.
+//! In its folder, `cargo run --release -- MODEL.ply`; drag to turn, scroll to approach. The options `--frames N` and
+//! `--screenshot FILE.ppm` end by themselves; `USAGE` below has the others.
 //!
 //! What the host does for the library, in each frame, is [`Splats::record`]. The rest is what any Vulkan application
-//! does: `window/device.rs` has device and queue, `window/swapchain.rs` the images, `window/geometry.rs` the host's own
-//! pipeline, `window/scene.rs` boxes and camera.
+//! does: `device.rs` has device and queue, `swapchain.rs` the images, `geometry.rs` the host's own pipeline, `scene.rs`
+//! boxes and camera.
 
-#![expect(unsafe_code, reason = "plays a host application, which calls Vulkan itself")]
-
-#[path = "window/device.rs"]
 mod device;
-#[path = "window/geometry.rs"]
 mod geometry;
-#[path = "window/scene.rs"]
 mod scene;
-#[path = "window/shot.rs"]
 mod shot;
-#[path = "window/swapchain.rs"]
 mod swapchain;
 
 use std::error::Error;

@@ -1,25 +1,16 @@
-//! The pictures of `examples/window.rs` and `view --window`, on an X server without a screen, beside our own.
+//! The window's pictures on an X server without a screen, beside what the library renders by itself.
 
-#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
-
-#[path = "../common/mod.rs"]
-#[macro_use]
-mod common;
 #[allow(dead_code, reason = "the near plane is that of the depth image alone")]
-#[path = "../../examples/window/scene.rs"]
+#[path = "../src/scene.rs"]
 mod scene;
-mod view;
 
 use std::path::Path;
 use std::process::Command;
 
-use common::{Random, not_run};
-use glam::{DVec2, DVec3, Vec3};
-use nightsplat::camera::Camera;
-use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
-use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
-use nightsplat::splats::scene::{Gaussians, ply};
+use nightsplat::glam::{DVec2, DVec3, Vec3};
+use nightsplat::{
+    Camera, DeviceChoice, Gaussians, Gpu, Image, RenderOptions, RenderSettings, Renderer,
+};
 use scene::{Block, Orbit, Scene};
 
 const SKY: [f64; 3] = [0.06, 0.07, 0.23];
@@ -30,9 +21,13 @@ const COUNT: usize = 600;
 /// Two layers of splats, one before and one beyond the middle of the scene.
 fn gaussians() -> Gaussians {
     let mut gaussians = Gaussians::zeros(COUNT, 0);
-    let mut random = Random::new(7);
+    let mut state = 7_u32;
     for i in 0..COUNT {
-        let mut uniform = |from, to| random.between(from, to) as f32;
+        let mut uniform = |from: f32, to: f32| {
+            // The generator of Numerical Recipes.
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            from + (to - from) * (state >> 8) as f32 / 16_777_216.0
+        };
         let y = if i < BEFORE { uniform(-1.1, -1.0) } else { uniform(1.0, 1.1) };
         gaussians.means_mut()[i] = Vec3::new(uniform(-0.7, 0.7), y, uniform(-0.4, 0.4));
         gaussians.quats_mut()[i] = [0, 1, 2, 3].map(|_| uniform(-1.0, 1.0));
@@ -43,15 +38,33 @@ fn gaussians() -> Gaussians {
     gaussians
 }
 
+/// A PLY file of Gaussians, in INRIA's layout.
+fn ply(gaussians: &Gaussians) -> Vec<u8> {
+    let mut file = b"ply\nformat binary_little_endian 1.0\n".to_vec();
+    file.extend(format!("element vertex {COUNT}\n").bytes());
+    for name in "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+        .split(' ')
+    {
+        file.extend(format!("property float {name}\n").bytes());
+    }
+    file.extend(b"end_header\n");
+    for i in 0..COUNT {
+        let (mean, dc) = (gaussians.means()[i], gaussians.dc()[i]);
+        let (opacity, scale) = (gaussians.raw_opacities()[i], gaussians.log_scales()[i]);
+        let row = mean.to_array().into_iter().chain(dc.to_array()).chain([opacity]);
+        let row = row.chain(scale.to_array()).chain(gaussians.quats()[i]);
+        file.extend(row.flat_map(f32::to_le_bytes));
+    }
+    file
+}
+
 /// The example's picture of `model` with these options.
 fn shot(model: &Path, options: &str) -> Image {
-    // Beside the folder of this test.
-    let tests = std::env::current_exe().unwrap();
-    let program = tests.parent().unwrap().with_file_name("examples").join("window");
+    let program = env!("CARGO_BIN_EXE_window");
     let picture = model.with_file_name("window.ppm");
     let run = Command::new("xvfb-run")
         .args(["--auto-servernum", "--server-args", "-screen 0 1280x1024x24"])
-        .arg(&program)
+        .arg(program)
         .arg(model)
         .args(options.split_whitespace())
         .args(["--frames", "8", "--validate", "--screenshot"])
@@ -60,7 +73,7 @@ fn shot(model: &Path, options: &str) -> Image {
         .output()
         .unwrap();
     let errors = String::from_utf8_lossy(&run.stderr);
-    assert!(run.status.success(), "{}: {errors}", program.display());
+    assert!(run.status.success(), "{program}: {errors}");
     let bytes = std::fs::read(picture).unwrap();
     let mut parts = bytes.splitn(4, |byte| *byte == b'\n');
     let mut line = || String::from_utf8(parts.next().unwrap().to_vec()).unwrap();
@@ -73,12 +86,11 @@ fn shot(model: &Path, options: &str) -> Image {
     Image::from_fn(width, height, |x, y| [0, 1, 2].map(|i| f32::from(pixels[at(x, y) + i])))
 }
 
-/// What our own renderer sees of some Gaussians: colour before black, and transmittance.
-fn render(gaussians: &Gaussians, camera: &Camera) -> [Image; 2] {
-    let gpu = gpu();
-    let on_device = gaussians.upload(&gpu).unwrap();
+/// What the library renders of some Gaussians: colour before black, and transmittance.
+fn render(gpu: &Gpu, gaussians: &Gaussians, camera: &Camera) -> [Image; 2] {
+    let on_device = gaussians.upload(gpu).unwrap();
     let settings = RenderSettings { shape: gaussians.shape, ..RenderSettings::default() };
-    let mut renderer = Renderer::new(&gpu, settings).unwrap();
+    let mut renderer = Renderer::new(gpu, settings).unwrap();
     renderer.reserve(COUNT, [camera]).unwrap();
     let [black, white] = [0.0, 1.0].map(|background| {
         let options = RenderOptions { sh_degree: 0, background: [background; 3] };
@@ -111,14 +123,18 @@ fn hit(blocks: &[Block], camera: &Camera, x: u32, y: u32) -> Option<(f64, DVec3)
     blocks.iter().filter_map(hit).min_by(|a, b| a.0.total_cmp(&b.0))
 }
 
-/// What a byte of an sRGB image stands for, and the byte that stands for light.
-fn eotf(c: f64) -> f64 {
-    linear_from_srgb(c as f32).into()
+/// The light that a value of an sRGB image stands for, and the value that stands for light.
+fn linear_from_srgb(srgb: f64) -> f64 {
+    if srgb <= 0.040_45 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) }
+}
+
+fn srgb_from_linear(linear: f64) -> f64 {
+    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
 fn to_level(value: f64, is_srgb: bool) -> f64 {
     let value = value.clamp(0.0, 1.0);
-    255.0 * if is_srgb { f64::from(srgb_from_linear(value as f32)) } else { value }
+    255.0 * if is_srgb { srgb_from_linear(value) } else { value }
 }
 
 /// The fraction of the picture's values that are further than one level from the composite in f64.
@@ -126,10 +142,11 @@ fn off(picture: &Image, has_geometry: bool, is_srgb: bool) -> f64 {
     let gaussians = gaussians();
     let scene = Scene::around(gaussians.means(), false);
     let camera = Orbit::default().camera(&scene, [picture.width, picture.height]);
-    let all = render(&gaussians, &camera);
+    let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
+    let all = render(&gpu, &gaussians, &camera);
     let mut front = gaussians.clone();
     front.raw_opacities_mut()[BEFORE..].fill(-20.0);
-    let front = render(&front, &camera);
+    let front = render(&gpu, &front, &camera);
     let depths = |range: std::ops::Range<usize>| {
         let means = gaussians.means()[range].iter().map(|mean| DVec3::from(*mean));
         means.map(|mean| camera.view_from_world.transform_point3(mean).z).collect::<Vec<_>>()
@@ -152,8 +169,10 @@ fn off(picture: &Image, has_geometry: bool, is_srgb: bool) -> f64 {
             // As the host's image holds it.
             let under = (to_level(under[i], is_srgb).round() / 255.0).clamp(0.0, 1.0);
             let value = match is_srgb {
-                true if alpha > 0.0 => eotf(color / alpha) * alpha + through * eotf(under),
-                true => eotf(under),
+                true if alpha > 0.0 => {
+                    linear_from_srgb(color / alpha) * alpha + through * linear_from_srgb(under)
+                }
+                true => linear_from_srgb(under),
                 false => color + through * under,
             };
             let level = to_level(value, is_srgb);
@@ -166,12 +185,8 @@ fn off(picture: &Image, has_geometry: bool, is_srgb: bool) -> f64 {
 
 #[test]
 fn a_window_shows_splats_before_and_beyond_the_geometry_of_its_host() {
-    if Command::new("xvfb-run").arg("--help").output().is_err() {
-        return not_run("xvfb", "there is no xvfb-run (on Debian `apt install xvfb xauth`)");
-    }
-    let folder = tempfile::tempdir().unwrap();
-    let model = folder.path().join("model.ply");
-    ply::save(&gaussians(), &model).unwrap();
+    let model = Path::new(env!("CARGO_TARGET_TMPDIR")).join("model.ply");
+    std::fs::write(&model, ply(&gaussians())).unwrap();
     for (options, size, has_geometry, is_srgb) in [
         ("--size 400x300 --resize 500x376", [500, 376], true, false),
         ("--size 500x375 --srgb", [500, 375], true, true),

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use nightsplat::ash::vk::Handle as _;
 use nightsplat::ash::{self, ext, khr, vk};
 use nightsplat::{HostDevice, required_device_features};
-use raw_window_handle::{HasDisplayHandle as _, HasWindowHandle as _};
+use winit::raw_window_handle::{HasDisplayHandle as _, HasWindowHandle as _};
 use winit::window::Window;
 
 /// The messages of the validation layers so far.
