@@ -97,6 +97,7 @@ impl CheckReport {
         }));
     }
 
+    /// The first difference as an error.
     pub fn agree(&self) -> Result<()> {
         match self.first_difference() {
             Some(difference) => Err(Error::Disagrees { what: difference.to_string() }),
