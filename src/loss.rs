@@ -22,12 +22,12 @@ use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::splats::scene::{Feature, Features};
 use crate::{Error, Result};
 
-pub use denoising::{DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights};
-pub use depth::{DepthBoxes, DepthInputs, DepthLoss, DepthSettings};
-pub use image::{Loss, LossInputs, LossSettings};
+pub use denoising::DenoisingLoss;
+pub use depth::{DepthBoxes, DepthLoss};
+pub use image::{Loss, LossInputs};
 pub use log::{LogSlot, LossLog, LossLogDownload, StepLosses};
-pub use parameters::{ParameterInputs, ParameterTerms, ParameterWeights};
-pub use structure::{StructureInputs, StructureLoss};
+pub use parameters::{ParameterTerms, ParameterWeights};
+pub use structure::StructureLoss;
 
 /// All terms, in the order of the columns.
 pub const TERMS: [LossSpec; 6] =
@@ -105,6 +105,24 @@ pub struct Term {
 }
 
 impl Term {
+    /// A term that enters the loss as it is.
+    const fn distance(
+        column: &'static str,
+        name: &'static str,
+        weight: fn(&LossConfig) -> f64,
+    ) -> Self {
+        Self { column, name, is_likeness: false, weight }
+    }
+
+    /// A term that enters the loss as 1 - value.
+    const fn likeness(
+        column: &'static str,
+        name: &'static str,
+        weight: fn(&LossConfig) -> f64,
+    ) -> Self {
+        Self { column, name, is_likeness: true, weight }
+    }
+
     /// All terms, in the order of the columns.
     pub fn all() -> impl Iterator<Item = Self> {
         TERMS.iter().flat_map(|spec| spec.terms).copied()
@@ -336,29 +354,4 @@ fn check_weight(of: &str, weight: f64) -> Result<()> {
         return Ok(());
     }
     Err(Error::Usage(format!("the weight of {of} is {weight}; it must be 0 or more")))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::gpu::testing::gpu;
-
-    /// With another plane, training would still proceed, but on the wrong feature.
-    #[test]
-    fn a_term_reads_the_first_channel_of_its_feature() {
-        let gpu = gpu();
-        let image = gpu.zeros("image", 1).unwrap();
-        let features = Features { depth: true, structure: true, noise: true, illumination: true };
-        let inputs = TermInputs {
-            step: 1,
-            view: 0,
-            size: UVec2::ONE,
-            features,
-            render: &image,
-            colors: &image,
-            target: &image,
-        };
-        let all = [Feature::Depth, Feature::Structure, Feature::Noise, Feature::Illumination];
-        assert_eq!(all.map(|feature| inputs.plane(feature)), [3, 4, 5, 8]);
-    }
 }

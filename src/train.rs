@@ -47,7 +47,7 @@ use crate::gpu::{Gpu, PassTime, Recorder};
 use crate::loss::Term;
 use crate::photographs::dataset::{Dataset, Fingerprint};
 use crate::photographs::tone::SceneLaw;
-use crate::splats::optimizer::{Adam, FiniteCheck, GaussianStep, LearningRates};
+use crate::splats::optimizer::{Adam, AdamStep, FiniteCheck, GaussianStep, LearningRates};
 use crate::splats::render::{Damping, Gradients, RenderOptions, Renderer};
 use crate::splats::scene::{ATTRIBUTES, Facts, Gaussians};
 use crate::splats::smoothing::SmoothingFloor;
@@ -352,7 +352,7 @@ impl Trainer {
         let Self { gpu, supervision, model, renderer, optimizer, .. } = self;
 
         renderer.forward(pass, &model.gaussians, supervision.views.viewpoint(view), &options)?;
-        supervision.compare(pass, (step, view), model.shape().features, renderer, slot)?;
+        supervision.compare(pass, step, view, model.shape().features, renderer, slot)?;
         renderer.backward(
             pass,
             &model.gaussians,
@@ -366,21 +366,19 @@ impl Trainer {
                 visit_counts: &mut model.visit_counts,
             },
         )?;
-        supervision.regularise((gpu, pass), model, renderer, slot)?;
+        supervision.regularise(pass, model, renderer, slot)?;
         let status = renderer.status();
-        let own = GaussianStep {
-            step,
-            rates: &rates,
+        let gaussian_step = GaussianStep {
+            adam: AdamStep { step, rates: &rates, status },
             sh_degrees: [model.shape().sh_degree, options.sh_degree],
             camera: renderer.camera_of(&supervision.views.viewpoint(view)),
-            status,
         };
-        model.update((gpu, pass), &optimizer.adam, own, renderer.gradient_kind())?;
+        model.update(gpu, pass, &optimizer.adam, gaussian_step, renderer.gradient_kind())?;
         if let Some(floor) = optimizer.floor.as_ref().filter(|_| is_floored) {
             floor.record(pass, &mut model.gaussians, status)?;
         }
         supervision.update(pass, &optimizer.adam, step, cooldown_factor, status)?;
-        optimizer.update_lamp(pass, renderer, (step, cooldown_factor))
+        optimizer.update_lamp(pass, renderer, step, cooldown_factor)
     }
 
     /// The networks, if the model has any.

@@ -124,7 +124,7 @@ pub fn spread(centers: &[DVec3]) -> (DVec3, f64) {
 }
 
 /// Whether [`spread`] excludes a camera.
-pub fn stands_elsewhere(center: DVec3, (mean, extent): (DVec3, f64)) -> bool {
+pub fn stands_elsewhere(center: DVec3, mean: DVec3, extent: f64) -> bool {
     // All inliers are closer than the extent.
     extent > 0.0 && center.distance(mean) > extent
 }
@@ -211,9 +211,9 @@ mod tests {
             let mut with_one = ring.clone();
             with_one.push(DVec3::splat(far));
             assert_eq!(spread(&with_one), alone, "{far}");
-            assert!(stands_elsewhere(DVec3::splat(far), alone));
+            assert!(stands_elsewhere(DVec3::splat(far), alone.0, alone.1));
         }
-        assert!(ring.iter().all(|&center| !stands_elsewhere(center, alone)));
+        assert!(ring.iter().all(|&center| !stands_elsewhere(center, alone.0, alone.1)));
         assert_eq!(spread(&[DVec3::ONE; 3]), (DVec3::ONE, 0.0));
         assert_eq!(spread(&[]), (DVec3::ZERO, 0.0));
     }

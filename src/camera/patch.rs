@@ -91,7 +91,7 @@ impl Patch {
     }
 
     /// Copies it from the planes of one enclosing patch to those of another, (planes, h, w) each.
-    pub fn paste(&self, (from, source): (&Self, &[f32]), (into, target): (&Self, &mut [f32])) {
+    pub fn paste(&self, from: &Self, source: &[f32], into: &Self, target: &mut [f32]) {
         let targets = target.chunks_exact_mut(into.pixel_count());
         for (target, source) in targets.zip(source.chunks_exact(from.pixel_count())) {
             for (to, row) in self.rows_in(into).zip(self.rows_in(from)) {
@@ -258,7 +258,7 @@ mod tests {
             let UVec2 { x, y } = patch.origin;
             assert_eq!(own[0], (y * 13 + x) as f32);
             let whole = Patch::from(&camera);
-            patch.paste((&around, &around.cut(&view)), (&whole, &mut pasted));
+            patch.paste(&around, &around.cut(&view), &whole, &mut pasted);
             for half in patch.halves().unwrap() {
                 let at = half.cut(&view)[0];
                 assert_eq!(at, (half.origin.y * 13 + half.origin.x) as f32);

@@ -97,8 +97,7 @@ impl CheckReport {
         }));
     }
 
-    /// # Errors
-    /// [`Error::Disagrees`] with the first difference, if there is one.
+    /// The first difference as an error.
     pub fn agree(&self) -> Result<()> {
         match self.first_difference() {
             Some(difference) => Err(Error::Disagrees { what: difference.to_string() }),

@@ -4,7 +4,9 @@
 use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
-use super::{LossRegion, LossSpec, Term, TermOn, check_weight, holds, no_scratch, value_count};
+use super::{
+    LossInputs, LossSpec, Term, TermOn, Weights, check_weight, holds, no_scratch, value_count,
+};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::denoising;
@@ -14,57 +16,21 @@ pub(super) const SPEC: LossSpec =
 
 impl Term {
     /// Mean squared difference between the denoised image and its target.
-    pub const DENOISING: Self = Self {
-        column: "denoising",
-        name: "denoising",
-        is_likeness: false,
-        weight: |config| config.weights.denoising,
-    };
+    pub const DENOISING: Self =
+        Self::distance("denoising", "denoising", |config| config.weights.denoising);
     /// Total variation of the denoised image.
-    pub const TOTAL_VARIATION: Self = Self {
-        column: "total_variation",
-        name: "total variation",
-        weight: |config| config.weights.total_variation,
-        ..Self::DENOISING
-    };
+    pub const TOTAL_VARIATION: Self =
+        Self::distance("total_variation", "total variation", |config| {
+            config.weights.total_variation
+        });
 }
 
-/// The weights of the terms.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct DenoisingWeights {
-    /// Of the mean squared difference between the denoised image and its target.
-    pub mse: f64,
-    /// Of the total variation of the denoised image.
-    pub total_variation: f64,
-}
-
-/// The inputs of one step.
-#[derive(Clone, Copy, Debug)]
-pub struct DenoisingInputs<'a> {
-    /// Width and height in pixels.
-    pub size: UVec2,
-    /// The pixels that count.
-    pub loss_region: LossRegion,
-    /// (3, H, W)
-    pub denoised: &'a Buffer<f32>,
-    /// Its target, (3, H, W).
-    pub render: &'a Buffer<f32>,
-}
-
-/// The outputs, (3, H, W) each; both gradients are written, not added to.
-#[derive(Debug)]
-pub struct DenoisingGradients<'a> {
-    /// With respect to the denoised image.
-    pub d_denoised: &'a mut Buffer<f32>,
-    /// With respect to the render.
-    pub d_render: &'a mut Buffer<f32>,
-}
-
-/// mse * mean (denoised - render)^2 + `total_variation` * TV(denoised).
+/// `denoising` * mean (denoised - target)^2 + `total_variation` * TV(denoised), with the weights of these names.
 #[derive(Debug)]
 pub struct DenoisingLoss {
     gpu: Gpu,
-    weights: DenoisingWeights,
+    mse_weight: f64,
+    tv_weight: f64,
     pipeline: Pipeline<denoising::Kernel>,
     subgroup_size: u32,
     rows: u32,
@@ -74,13 +40,15 @@ pub struct DenoisingLoss {
 
 impl DenoisingLoss {
     /// Builds the kernel; [`DenoisingLoss::reserve`] allocates.
-    pub fn new(gpu: &Gpu, weights: DenoisingWeights) -> Result<Self> {
-        check_weight("the denoising", weights.mse)?;
-        check_weight("the total variation", weights.total_variation)?;
+    pub fn new(gpu: &Gpu, weights: &Weights) -> Result<Self> {
+        let Weights { denoising: mse_weight, total_variation: tv_weight, .. } = *weights;
+        check_weight("the denoising", mse_weight)?;
+        check_weight("the total variation", tv_weight)?;
         let constants = denoising::Constants::default();
         Ok(Self {
             gpu: gpu.clone(),
-            weights,
+            mse_weight,
+            tv_weight,
             pipeline: gpu.pipeline(&constants)?,
             subgroup_size: gpu.properties().subgroup_size,
             rows: constants.rows,
@@ -91,7 +59,7 @@ impl DenoisingLoss {
 
     /// Whether a weight is above 0.
     pub fn is_on(&self) -> bool {
-        self.weights.mse > 0.0 || self.weights.total_variation > 0.0
+        self.mse_weight > 0.0 || self.tv_weight > 0.0
     }
 
     /// Allocates scratch memory for views up to `size`; it never shrinks.
@@ -104,12 +72,14 @@ impl DenoisingLoss {
         Ok(())
     }
 
-    /// Writes both gradients for the whole view, 0 outside the loss region, and both terms to the log.
+    /// Writes the gradients of the denoised image and of its target for the whole view, 0 outside the loss region, and
+    /// both terms to the log.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,
-        DenoisingInputs { size, loss_region, denoised, render }: DenoisingInputs<'_>,
-        DenoisingGradients { d_denoised, d_render }: DenoisingGradients<'_>,
+        LossInputs { size, loss_region, render: denoised, target }: LossInputs<'_>,
+        d_denoised: &mut Buffer<f32>,
+        d_target: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
         let workgroups = self.workgroups(size);
@@ -117,7 +87,7 @@ impl DenoisingLoss {
             return Err(no_scratch("denoising term", size));
         }
         loss_region.check(size)?;
-        for buffer in [denoised, render, &*d_denoised, &*d_render] {
+        for buffer in [denoised, target, &*d_denoised, &*d_target] {
             holds(buffer, value_count(size) as usize)?;
         }
         log.check()?;
@@ -132,17 +102,17 @@ impl DenoisingLoss {
                 height: size.y,
                 loss_begin: loss_region.origin,
                 loss_end: loss_region.end(),
-                mse_weight: self.weights.mse as f32,
-                tv_weight: self.weights.total_variation as f32,
+                mse_weight: self.mse_weight as f32,
+                tv_weight: self.tv_weight as f32,
                 mean_scale,
                 x_scale: pair_scale((columns - 1) * rows),
                 y_scale: pair_scale(columns * (rows - 1)),
             },
             denoising::Buffers {
                 denoised: denoised.slice(),
-                render: render.slice(),
+                render: target.slice(),
                 d_denoised: d_denoised.slice_mut(),
-                d_render: d_render.slice_mut(),
+                d_render: d_target.slice_mut(),
                 mse_partials: self.mse_partials.slice_mut(),
                 tv_partials: self.tv_partials.slice_mut(),
             },

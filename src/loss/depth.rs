@@ -3,6 +3,8 @@
 //! P(a, b) = 1 - mean(a^ b^), a^ = (a - mean a) / (s + 1e-6), s^2 the unbiased variance of a: the estimate's scale
 //! and offset do not matter.
 
+use std::sync::Arc;
+
 use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
@@ -21,73 +23,17 @@ use crate::{Error, Result};
 pub(super) const SPEC: LossSpec = LossSpec {
     terms: &[Term::DEPTH, Term::DEPTH_LOCAL],
     on: TermOn::Feature(Feature::Depth, |gpu, config| {
-        let settings = DepthSettings { weight: config.weights.depth, box_side: config.depth_box };
-        let loss = DepthLoss::new(gpu, settings)?;
-        Ok(Box::new(DepthTerm { loss, boxes: config.boxes, depths: vec![] }))
+        let weight = config.weights.depth;
+        Ok(Box::new(DepthLoss::new(gpu, weight, config.depth_box, config.boxes)?))
     }),
 };
 
 impl Term {
     /// 1 - correlation of depths over the view.
-    pub const DEPTH: Self = Self {
-        column: "depth",
-        name: "depth",
-        is_likeness: false,
-        weight: |config| config.weights.depth,
-    };
+    pub const DEPTH: Self = Self::distance("depth", "depth", |config| config.weights.depth);
     /// Mean 1 - correlation of depths over boxes.
     pub const DEPTH_LOCAL: Self =
         Self { column: "depth_local", name: "local depth", ..Self::DEPTH };
-}
-
-/// Builds the term with the depth of every view that has one, (H, W) each.
-#[derive(Debug)]
-struct DepthTerm {
-    loss: DepthLoss,
-    boxes: Stream,
-    depths: Vec<Option<Buffer<f32>>>,
-}
-
-impl LossTerm for DepthTerm {
-    fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()> {
-        let gpu = self.loss.gpu.clone();
-        for view in views {
-            self.loss.reserve(view.size)?;
-            let depth = view.depth.map(|depth| gpu.buffer("depth", depth));
-            self.depths.push(depth.transpose()?);
-        }
-        Ok(())
-    }
-
-    fn record_step(
-        &mut self,
-        pass: &mut Recorder<'_>,
-        inputs: &TermInputs<'_>,
-        d_render: &mut Buffer<f32>,
-        log: &mut LogSlot<'_>,
-    ) -> Result<()> {
-        let &TermInputs { size, render, view, step, .. } = inputs;
-        let Some(Some(depth)) = self.depths.get(view) else { return Ok(()) };
-        let plane = inputs.plane(Feature::Depth);
-        let inputs = DepthInputs { size, render, plane, depth, stream: self.boxes, step };
-        self.loss.record(pass, inputs, d_render, log)
-    }
-}
-
-/// The weight of the depth term, and its boxes.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct DepthSettings {
-    /// The weight of P over the view, and of the mean of P over the boxes.
-    pub weight: f64,
-    /// The side of a box in pixels, where the view is large enough for it.
-    pub box_side: u32,
-}
-
-impl Default for DepthSettings {
-    /// As LITA-GS: weight 0.1, boxes of 128 x 128.
-    fn default() -> Self {
-        Self { weight: 0.1, box_side: 128 }
-    }
 }
 
 /// The boxes of a view.
@@ -112,28 +58,14 @@ impl DepthBoxes {
     }
 }
 
-/// The inputs of one step.
-#[derive(Clone, Copy, Debug)]
-pub struct DepthInputs<'a> {
-    /// Width and height in pixels.
-    pub size: UVec2,
-    /// (channels, H, W)
-    pub render: &'a Buffer<f32>,
-    /// The depth channel.
-    pub plane: u32,
-    /// (H, W), larger is farther.
-    pub depth: &'a Buffer<f32>,
-    /// The random numbers that place the boxes.
-    pub stream: Stream,
-    /// The draw of the stream; the same draw gives the same boxes.
-    pub step: u64,
-}
-
 /// weight * (P over the view + mean of P over boxes).
 #[derive(Debug)]
 pub struct DepthLoss {
     gpu: Gpu,
-    settings: DepthSettings,
+    weight: f64,
+    box_side: u32,
+    /// Draws the positions of the boxes; the draw is that of the step.
+    stream: Stream,
     chunk_size: u32,
     boxes: Pipeline<depth_boxes::Kernel>,
     moments: Pipeline<depth_moments::Kernel>,
@@ -144,6 +76,8 @@ pub struct DepthLoss {
     gradients: Buffer<DepthGradient>,
     view_value: Buffer<f32>,
     box_values: Buffer<f32>,
+    /// The estimated depth of every view that has one, (H, W) each.
+    depths: Vec<Option<Arc<Buffer<f32>>>>,
 }
 
 /// How the regions of a view are split into chunks.
@@ -161,19 +95,21 @@ impl Chunks {
 }
 
 impl DepthLoss {
-    /// Builds the kernels; [`DepthLoss::reserve`] allocates.
-    pub fn new(gpu: &Gpu, settings: DepthSettings) -> Result<Self> {
-        check_weight("the depth", settings.weight)?;
-        if !(2..=4096).contains(&settings.box_side) {
+    /// Builds the kernels; [`DepthLoss::reserve`] allocates. A box has a side of `box_side` pixels where the view is
+    /// large enough for it, at a position drawn from `stream`.
+    pub fn new(gpu: &Gpu, weight: f64, box_side: u32, stream: Stream) -> Result<Self> {
+        check_weight("the depth", weight)?;
+        if !(2..=4096).contains(&box_side) {
             return Err(Error::Usage(format!(
-                "the side of the depth boxes is {}; it must be within 2 and 4096",
-                settings.box_side
+                "the side of the depth boxes is {box_side}; it must be within 2 and 4096"
             )));
         }
         let constants = depth_moments::Constants::default();
         Ok(Self {
             gpu: gpu.clone(),
-            settings,
+            weight,
+            box_side,
+            stream,
             chunk_size: gpu.properties().subgroup_size * constants.values_per_thread,
             boxes: gpu.pipeline(&depth_boxes::Constants {})?,
             moments: gpu.pipeline(&constants)?,
@@ -184,12 +120,15 @@ impl DepthLoss {
             gradients: gpu.uninit("depth_gradients", 0)?,
             view_value: gpu.uninit("depth_view_value", 1)?,
             box_values: gpu.uninit("depth_box_values", 0)?,
+            depths: vec![],
         })
     }
 
-    /// The boxes of a view of `size`.
-    pub fn boxes(&self, size: UVec2) -> DepthBoxes {
-        DepthBoxes::new(size, self.settings.box_side)
+    /// Adds a view by its estimated depth, (H, W), larger is farther.
+    pub fn add(&mut self, depth: Option<&[f32]>) -> Result<()> {
+        let depth = depth.map(|depth| self.gpu.buffer("depth", depth).map(Arc::new));
+        self.depths.push(depth.transpose()?);
+        Ok(())
     }
 
     /// Allocates scratch memory for views up to `size`; it never shrinks.
@@ -207,74 +146,16 @@ impl DepthLoss {
         Ok(())
     }
 
-    /// Writes the plane of `d_render`, (channels, H, W), and both values to the log; without boxes, the global one
-    /// only.
-    pub fn record(
-        &mut self,
-        pass: &mut Recorder<'_>,
-        inputs: DepthInputs<'_>,
-        d_render: &mut Buffer<f32>,
-        log: &mut LogSlot<'_>,
-    ) -> Result<()> {
-        let DepthInputs { size, render, plane, depth, stream, step } = inputs;
-        let (pixels, chunks) = (pixel_count(size), self.chunks(size));
-        let region_count = chunks.boxes.count + 1;
-        let fits = region_count as usize <= self.regions.len()
-            && chunks.total() as usize <= self.chunk_moments.len();
-        if pixels == 0 || !fits {
-            return Err(no_scratch("depth term", size));
-        }
-        holds(depth, pixels as usize)?;
-        for buffer in [render, &*d_render] {
-            holds(buffer, (plane as usize + 1) * pixels as usize)?;
-        }
-        log.check()?;
-        pass.dispatch(
-            &self.boxes,
-            &depth_boxes::Params {
-                size,
-                side: chunks.boxes.side,
-                box_count: chunks.boxes.count,
-                key: (stream.bits(step) >> 32) as u32,
-            },
-            depth_boxes::Buffers { regions: self.regions.slice_mut() },
-            Threads::Exactly([region_count, 1, 1]),
-        )?;
-        self.correlate(pass, inputs, chunks)?;
-        pass.dispatch(
-            &self.gradient,
-            &depth_gradient::Params { size, first: plane * pixels, region_count },
-            depth_gradient::Buffers {
-                render: render.slice(),
-                depth: depth.slice(),
-                regions: self.regions.slice(),
-                gradients: self.gradients.slice(),
-                d_render: d_render.slice_mut(),
-            },
-            Threads::Exactly([pixels, 1, 1]),
-        )?;
-        let boxes = chunks.boxes.count;
-        let sums = |term, partials, count: u32| {
-            let scale = 1.0 / count.max(1) as f32;
-            PartialSums { term, partials, count, scale }
-        };
-        log.record(
-            pass,
-            [
-                sums(Term::DEPTH, &self.view_value, 1),
-                sums(Term::DEPTH_LOCAL, &self.box_values, boxes),
-            ],
-        )
-    }
-
     /// P of every region and its gradient, from the moments of its chunks.
     fn correlate(
         &mut self,
         pass: &mut Recorder<'_>,
-        DepthInputs { size, render, plane, depth, .. }: DepthInputs<'_>,
+        inputs: &TermInputs<'_>,
+        depth: &Buffer<f32>,
         chunks: Chunks,
     ) -> Result<()> {
-        let (width, first) = (size.x, plane * pixel_count(size));
+        let &TermInputs { size, render, .. } = inputs;
+        let (width, first) = (size.x, inputs.plane(Feature::Depth) * pixel_count(size));
         let (view_chunks, box_chunks) = (chunks.of_view, chunks.of_box);
         pass.dispatch(
             &self.moments,
@@ -294,7 +175,7 @@ impl DepthLoss {
             },
             Threads::Workgroups([chunks.total(), 1, 1]),
         )?;
-        let (weight, boxes) = (self.settings.weight, chunks.boxes.count);
+        let (weight, boxes) = (self.weight, chunks.boxes.count);
         pass.dispatch(
             &self.correlation,
             &depth_correlation::Params {
@@ -321,11 +202,82 @@ impl DepthLoss {
     }
 
     fn chunks(&self, size: UVec2) -> Chunks {
-        let boxes = self.boxes(size);
+        let boxes = DepthBoxes::new(size, self.box_side);
         Chunks {
             boxes,
             of_view: pixel_count(size).div_ceil(self.chunk_size),
             of_box: (boxes.side * boxes.side).div_ceil(self.chunk_size),
         }
+    }
+}
+
+impl LossTerm for DepthLoss {
+    fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()> {
+        for view in views {
+            self.reserve(view.size)?;
+            self.add(view.depth)?;
+        }
+        Ok(())
+    }
+
+    /// Writes the plane of `d_render` and both values; without boxes, that of the view only.
+    fn record_step(
+        &mut self,
+        pass: &mut Recorder<'_>,
+        inputs: &TermInputs<'_>,
+        d_render: &mut Buffer<f32>,
+        log: &mut LogSlot<'_>,
+    ) -> Result<()> {
+        let &TermInputs { size, render, view, step, .. } = inputs;
+        let Some(Some(depth)) = self.depths.get(view).cloned() else { return Ok(()) };
+        let plane = inputs.plane(Feature::Depth);
+        let (pixels, chunks) = (pixel_count(size), self.chunks(size));
+        let region_count = chunks.boxes.count + 1;
+        let fits = region_count as usize <= self.regions.len()
+            && chunks.total() as usize <= self.chunk_moments.len();
+        if pixels == 0 || !fits {
+            return Err(no_scratch("depth term", size));
+        }
+        holds(&depth, pixels as usize)?;
+        for buffer in [render, &*d_render] {
+            holds(buffer, (plane as usize + 1) * pixels as usize)?;
+        }
+        log.check()?;
+        pass.dispatch(
+            &self.boxes,
+            &depth_boxes::Params {
+                size,
+                side: chunks.boxes.side,
+                box_count: chunks.boxes.count,
+                key: (self.stream.bits(step) >> 32) as u32,
+            },
+            depth_boxes::Buffers { regions: self.regions.slice_mut() },
+            Threads::Exactly([region_count, 1, 1]),
+        )?;
+        self.correlate(pass, inputs, &depth, chunks)?;
+        pass.dispatch(
+            &self.gradient,
+            &depth_gradient::Params { size, first: plane * pixels, region_count },
+            depth_gradient::Buffers {
+                render: render.slice(),
+                depth: depth.slice(),
+                regions: self.regions.slice(),
+                gradients: self.gradients.slice(),
+                d_render: d_render.slice_mut(),
+            },
+            Threads::Exactly([pixels, 1, 1]),
+        )?;
+        let boxes = chunks.boxes.count;
+        let sums = |term, partials, count: u32| {
+            let scale = 1.0 / count.max(1) as f32;
+            PartialSums { term, partials, count, scale }
+        };
+        log.record(
+            pass,
+            [
+                sums(Term::DEPTH, &self.view_value, 1),
+                sums(Term::DEPTH_LOCAL, &self.box_values, boxes),
+            ],
+        )
     }
 }

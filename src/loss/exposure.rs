@@ -12,6 +12,7 @@ use glam::{UVec2, Vec2};
 
 pub use affine::Affine;
 
+use super::{holds, no_scratch, pixel_count};
 use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
@@ -109,7 +110,7 @@ impl Exposures {
 
     /// Allocates for views up to `size`; it never shrinks.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
-        let values = COLOR_CHANNELS * pixels(size) as usize;
+        let values = COLOR_CHANNELS * pixel_count(size) as usize;
         if values > self.exposed.len() {
             self.exposed = self.gpu.uninit("exposed", values)?;
         }
@@ -155,7 +156,7 @@ impl Exposures {
         self.check(view, size, render)?;
         pass.dispatch(
             if inverse { &self.neutralize } else { &self.expose },
-            &expose::Params { pixel_count: pixels(size), view: view as u32 },
+            &expose::Params { pixel_count: pixel_count(size), view: view as u32 },
             expose::Buffers {
                 exposures: self.parameters.slice(),
                 whites: self.whites.slice(),
@@ -163,7 +164,7 @@ impl Exposures {
                 target: target.slice(),
                 exposed: self.exposed.slice_mut(),
             },
-            Threads::Exactly([COLOR_CHANNELS as u32 * pixels(size), 1, 1]),
+            Threads::Exactly([COLOR_CHANNELS as u32 * pixel_count(size), 1, 1]),
         )
     }
 
@@ -185,10 +186,10 @@ impl Exposures {
         for planes in [render, target, &*d_render] {
             self.check(view, size, planes)?;
         }
-        let (pixel_count, view, chunk_count) = (pixels(size), view as u32, self.chunks(size));
+        let (view, chunk_count) = (view as u32, self.chunks(size));
         pass.dispatch(
             &self.backward,
-            &expose_backward::Params { pixel_count, view },
+            &expose_backward::Params { pixel_count: pixel_count(size), view },
             expose_backward::Buffers {
                 exposures: self.parameters.slice(),
                 whites: self.whites.slice(),
@@ -234,12 +235,12 @@ impl Exposures {
     }
 
     fn chunks(&self, size: UVec2) -> u32 {
-        pixels(size).div_ceil(self.chunk)
+        pixel_count(size).div_ceil(self.chunk)
     }
 
     /// A kernel that exceeds a buffer corrupts other data, so lengths are checked before anything is recorded.
     fn check(&self, view: usize, size: UVec2, planes: &Buffer<f32>) -> Result<()> {
-        let values = COLOR_CHANNELS * pixels(size) as usize;
+        let values = COLOR_CHANNELS * pixel_count(size) as usize;
         if view >= self.view_count as usize {
             let count = self.view_count;
             return Err(Error::Usage(format!("there is no exposure {view} of {count}")));
@@ -247,16 +248,9 @@ impl Exposures {
         let fits = (1..=self.exposed.len()).contains(&values)
             && COLOR_CHANNELS * self.chunks(size) as usize <= self.partials.len();
         if !fits {
-            let UVec2 { x, y } = size;
-            let problem = format!("exposures have no scratch memory for a view of {x} x {y}");
-            return Err(Error::Usage(problem));
+            return Err(no_scratch("exposure", size));
         }
-        if planes.len() < values {
-            let (name, len) = (planes.name(), planes.len());
-            let problem = format!("buffer `{name}` holds {len} values, the view has {values}");
-            return Err(Error::Usage(problem));
-        }
-        Ok(())
+        holds(planes, values)
     }
 }
 
@@ -277,10 +271,6 @@ impl Learnable for Exposures {
             moments: moments.slice_mut(),
         }
     }
-}
-
-fn pixels(size: UVec2) -> u32 {
-    size.x.saturating_mul(size.y)
 }
 
 impl Affine {

@@ -23,9 +23,8 @@ use crate::{Error, Result};
 pub(super) const TARGET: LossSpec = LossSpec {
     terms: &[Term::L1, Term::SSIM],
     on: TermOn::Colors(|gpu, config, gradient| {
-        let ssim_weight = config.ssim_weight;
         let terms = [Term::L1, Term::SSIM];
-        Ok(Box::new(Loss::new(gpu, LossSettings { ssim_weight, terms, gradient })?))
+        Ok(Box::new(Loss::new(gpu, config.ssim_weight, terms, gradient)?))
     }),
 };
 
@@ -35,49 +34,21 @@ pub(super) const DARK: LossSpec =
 
 impl Term {
     /// Mean |render - target|.
-    pub const L1: Self = Self {
-        column: "l1",
-        name: "L1",
-        is_likeness: false,
-        weight: |config| 1.0 - config.ssim_weight,
-    };
+    pub const L1: Self = Self::distance("l1", "L1", |config| 1.0 - config.ssim_weight);
     /// Mean SSIM of render and target.
-    pub const SSIM: Self = Self {
-        column: "ssim",
-        name: "SSIM",
-        is_likeness: true,
-        weight: |config| config.ssim_weight,
-        ..Self::L1
-    };
+    pub const SSIM: Self = Self::likeness("ssim", "SSIM", |config| config.ssim_weight);
     /// Mean |render - photograph| of the dark reconstruction.
-    pub const LOW_L1: Self = Self {
-        column: "low_l1",
-        name: "L1 of the dark reconstruction",
-        is_likeness: false,
-        weight: |config| config.low * (1.0 - config.weights.low_ssim),
-    };
+    pub const LOW_L1: Self = Self::distance("low_l1", "L1 of the dark reconstruction", |config| {
+        config.low * (1.0 - config.weights.low_ssim)
+    });
     /// Mean SSIM of the dark reconstruction and the photograph.
-    pub const LOW_SSIM: Self = Self {
-        column: "low_ssim",
-        name: "SSIM of the dark reconstruction",
-        is_likeness: true,
-        weight: |config| config.low * config.weights.low_ssim,
-        ..Self::LOW_L1
-    };
+    pub const LOW_SSIM: Self =
+        Self::likeness("low_ssim", "SSIM of the dark reconstruction", |config| {
+            config.low * config.weights.low_ssim
+        });
 }
 
-/// The settings of a loss between images.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct LossSettings {
-    /// w, in [0, 1].
-    pub ssim_weight: f64,
-    /// The columns of the log for mean|a - b| and for mean SSIM.
-    pub terms: [Term; 2],
-    /// How it updates the gradient.
-    pub gradient: Gradient,
-}
-
-/// The inputs of one step.
+/// An image and the image that it is compared with.
 #[derive(Clone, Copy, Debug)]
 pub struct LossInputs<'a> {
     /// Width and height in pixels.
@@ -113,9 +84,9 @@ enum Kernels {
 }
 
 impl Loss {
-    /// Builds the kernels; [`Loss::reserve`] allocates.
-    pub fn new(gpu: &Gpu, settings: LossSettings) -> Result<Self> {
-        let LossSettings { ssim_weight, terms, gradient } = settings;
+    /// Builds the kernels; [`Loss::reserve`] allocates. `ssim_weight` is w; `terms` are the columns of mean|a - b| and
+    /// of mean SSIM.
+    pub fn new(gpu: &Gpu, ssim_weight: f64, terms: [Term; 2], gradient: Gradient) -> Result<Self> {
         let adds = gradient == Gradient::Added;
         if !(0.0..=1.0).contains(&ssim_weight) {
             return Err(Error::Usage(format!(
@@ -197,7 +168,7 @@ impl Loss {
             Kernels::Ssim(ssim) => {
                 ssim_count = workgroups;
                 let partials = [l1_partials, ssim_partials];
-                if ssim.record(pass, inputs, d_render, partials, (self.terms, log))? {
+                if ssim.record(pass, inputs, d_render, partials, self.terms, log)? {
                     return Ok(());
                 }
             }

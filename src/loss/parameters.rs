@@ -13,33 +13,22 @@ use crate::Result;
 use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::parameter_terms;
-use crate::splats::batches::{Batch, Batches};
+use crate::splats::batches::Batch;
+use crate::splats::scene::GaussianSlice;
 
 pub(super) const SPEC: LossSpec =
     LossSpec { terms: &[Term::OPACITY, Term::SCALE, Term::ANISOTROPY], on: TermOn::Parameters };
 
 impl Term {
     /// Mean opacity.
-    pub const OPACITY: Self = Self {
-        column: "opacity",
-        name: "opacity",
-        is_likeness: false,
-        weight: |config| config.parameters.opacity_weight,
-    };
+    pub const OPACITY: Self =
+        Self::distance("opacity", "opacity", |config| config.parameters.opacity_weight);
     /// Mean standard deviation, in units of the frame.
-    pub const SCALE: Self = Self {
-        column: "scale",
-        name: "scale",
-        weight: |config| config.parameters.scale_weight,
-        ..Self::OPACITY
-    };
+    pub const SCALE: Self =
+        Self::distance("scale", "scale", |config| config.parameters.scale_weight);
     /// Mean excess of the logarithm of longest over shortest standard deviation.
-    pub const ANISOTROPY: Self = Self {
-        column: "anisotropy",
-        name: "anisotropy",
-        weight: |config| config.parameters.anisotropy_weight,
-        ..Self::OPACITY
-    };
+    pub const ANISOTROPY: Self =
+        Self::distance("anisotropy", "anisotropy", |config| config.parameters.anisotropy_weight);
 }
 
 settings! {
@@ -64,17 +53,6 @@ impl ParameterWeights {
     }
 }
 
-/// The inputs of the terms in a step.
-#[derive(Clone, Copy, Debug)]
-pub struct ParameterInputs<'a> {
-    /// The layout of the planes of gradients.
-    pub batches: &'a Batches,
-    /// Words per Gaussian in `parameters`.
-    pub words: usize,
-    /// The planes; the columns of opacities and scales are those of include/gaussian.glsl.
-    pub parameters: &'a Buffer<f32>,
-}
-
 /// A part begins at a multiple of this many floats, which is aligned for bindings on every device.
 const PART: usize = 64;
 
@@ -83,6 +61,7 @@ const PART: usize = 64;
 pub struct ParameterTerms {
     gpu: Gpu,
     weights: ParameterWeights,
+    frozen_columns: u32,
     pipeline: Pipeline<parameter_terms::Kernel>,
     gaussians_per_workgroup: u32,
     /// One per workgroup, of all batches in order.
@@ -99,6 +78,7 @@ impl ParameterTerms {
             Ok(Self {
                 gpu: gpu.clone(),
                 weights,
+                frozen_columns,
                 pipeline: gpu.pipeline(&constants)?,
                 gaussians_per_workgroup: gpu.properties().subgroup_size
                     * constants.gaussians_per_thread,
@@ -110,16 +90,17 @@ impl ParameterTerms {
         weights.is_on().then(new).transpose()
     }
 
-    /// Records the terms of a step: adds to the gradients, planes of floats in the same batches, and writes the means
-    /// to the log.
+    /// Records the terms of a step: adds to the gradients, planes of the trained columns, and writes the means to the
+    /// log.
     pub fn record(
         &mut self,
         pass: &mut Recorder<'_>,
-        ParameterInputs { batches, words, parameters }: ParameterInputs<'_>,
+        GaussianSlice { layout, parameters }: GaussianSlice<'_>,
         gradients: &mut Buffer<f32>,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
         log.check()?;
+        let batches = layout.batches(&self.gpu).without(self.frozen_columns);
         let each = self.gaussians_per_workgroup;
         let workgroups = |batch: &Batch| batch.gaussian_count().div_ceil(each);
         // Batches bind parts of the partial sums; padding between them counts as 0.
@@ -149,7 +130,7 @@ impl ParameterTerms {
                     log_ratio: self.weights.anisotropy_limit.ln() as f32,
                 },
                 parameter_terms::Buffers {
-                    parameters: batch.rows(parameters, words)?,
+                    parameters: batch.rows(parameters, layout.words())?,
                     gradients: batch.planes_mut(&mut *gradients)?,
                     opacity_partials: self.opacity_partials.slice_mut().range(part.clone())?,
                     scale_partials: self.scale_partials.slice_mut().range(part.clone())?,

@@ -16,40 +16,65 @@ use crate::splats::scene::Feature;
 pub(super) const SPEC: LossSpec = LossSpec {
     terms: &[Term::STRUCTURE],
     on: TermOn::Feature(Feature::Structure, |gpu, config| {
-        let loss = StructureLoss::new(gpu, config.weights.structure)?;
-        Ok(Box::new(StructureTerm { loss, structures: vec![] }))
+        Ok(Box::new(StructureLoss::new(gpu, config.weights.structure)?))
     }),
 };
 
 impl Term {
     /// Mean |structure - structure of the target|.
-    pub const STRUCTURE: Self = Self {
-        column: "structure",
-        name: "structure",
-        is_likeness: false,
-        weight: |config| config.weights.structure,
-    };
+    pub const STRUCTURE: Self =
+        Self::distance("structure", "structure", |config| config.weights.structure);
 }
 
-/// Builds the term with the structure of every view's target, (H, W) each.
+/// weight * mean |clamp(p, 0, 1) - structure|, p the structure channel of the render.
 #[derive(Debug)]
-struct StructureTerm {
-    loss: StructureLoss,
+pub struct StructureLoss {
+    gpu: Gpu,
+    weight: f64,
+    pipeline: Pipeline<structure_l1::Kernel>,
+    values_per_workgroup: u32,
+    partials: Buffer<f32>,
+    /// The structure of every view's target, (H, W) each.
     structures: Vec<Buffer<f32>>,
 }
 
-impl LossTerm for StructureTerm {
+impl StructureLoss {
+    /// Builds the kernel; [`StructureLoss::add`] and [`LossTerm::prepare`] add views.
+    pub fn new(gpu: &Gpu, weight: f64) -> Result<Self> {
+        check_weight("the structure", weight)?;
+        let constants = structure_l1::Constants::default();
+        Ok(Self {
+            gpu: gpu.clone(),
+            weight,
+            pipeline: gpu.pipeline(&constants)?,
+            values_per_workgroup: gpu.properties().subgroup_size * constants.values_per_thread,
+            partials: gpu.uninit("structure_partials", 0)?,
+            structures: vec![],
+        })
+    }
+
+    /// Adds a view of this size by the structure of its target, (H, W), and allocates scratch memory for it.
+    pub fn add(&mut self, size: UVec2, structure: Buffer<f32>) -> Result<()> {
+        let workgroups = pixel_count(size).div_ceil(self.values_per_workgroup) as usize;
+        if workgroups > self.partials.len() {
+            self.partials = self.gpu.uninit("structure_partials", workgroups)?;
+        }
+        self.structures.push(structure);
+        Ok(())
+    }
+}
+
+impl LossTerm for StructureLoss {
     fn prepare(&mut self, views: &[ViewSource<'_>]) -> Result<()> {
-        let gpu = self.loss.gpu.clone();
-        let mut structures = StructureTarget::new(&gpu)?;
+        let mut structures = StructureTarget::new(&self.gpu)?;
         for view in views {
-            self.loss.reserve(view.size)?;
             let target = (view.target)()?;
-            let mut structure = gpu.uninit("structure", pixel_count(view.size) as usize)?;
-            gpu.run("structure", |pass| {
+            let pixels = pixel_count(view.size) as usize;
+            let mut structure = self.gpu.uninit("structure", pixels)?;
+            self.gpu.run("structure", |pass| {
                 structures.record(pass, &target, view.size, &mut structure)
             })?;
-            self.structures.push(structure);
+            self.add(view.size, structure)?;
         }
         Ok(())
     }
@@ -63,67 +88,7 @@ impl LossTerm for StructureTerm {
     ) -> Result<()> {
         let &TermInputs { size, render, view, .. } = inputs;
         let Some(structure) = self.structures.get(view) else { return Ok(()) };
-        let plane = inputs.plane(Feature::Structure);
-        let inputs = StructureInputs { size, render, plane, structure };
-        self.loss.record(pass, inputs, d_render, log)
-    }
-}
-
-/// The inputs of one step.
-#[derive(Clone, Copy, Debug)]
-pub struct StructureInputs<'a> {
-    /// Width and height in pixels.
-    pub size: UVec2,
-    /// (channels, H, W), not clamped.
-    pub render: &'a Buffer<f32>,
-    /// The structure channel.
-    pub plane: u32,
-    /// (H, W), from [`crate::photographs::structure::StructureTarget`].
-    pub structure: &'a Buffer<f32>,
-}
-
-/// weight * mean |clamp(p, 0, 1) - structure|.
-#[derive(Debug)]
-pub struct StructureLoss {
-    gpu: Gpu,
-    weight: f64,
-    pipeline: Pipeline<structure_l1::Kernel>,
-    values_per_workgroup: u32,
-    partials: Buffer<f32>,
-}
-
-impl StructureLoss {
-    /// Builds the kernel; [`StructureLoss::reserve`] allocates.
-    pub fn new(gpu: &Gpu, weight: f64) -> Result<Self> {
-        check_weight("the structure", weight)?;
-        let constants = structure_l1::Constants::default();
-        Ok(Self {
-            gpu: gpu.clone(),
-            weight,
-            pipeline: gpu.pipeline(&constants)?,
-            values_per_workgroup: gpu.properties().subgroup_size * constants.values_per_thread,
-            partials: gpu.uninit("structure_partials", 0)?,
-        })
-    }
-
-    /// Allocates scratch memory for views up to `size`; it never shrinks.
-    pub fn reserve(&mut self, size: UVec2) -> Result<()> {
-        let workgroups = pixel_count(size).div_ceil(self.values_per_workgroup) as usize;
-        if workgroups > self.partials.len() {
-            self.partials = self.gpu.uninit("structure_partials", workgroups)?;
-        }
-        Ok(())
-    }
-
-    /// Writes the plane of `d_render`, (channels, H, W), and the mean to the log.
-    pub fn record(
-        &mut self,
-        pass: &mut Recorder<'_>,
-        StructureInputs { size, render, plane, structure }: StructureInputs<'_>,
-        d_render: &mut Buffer<f32>,
-        log: &mut LogSlot<'_>,
-    ) -> Result<()> {
-        let pixels = pixel_count(size);
+        let (plane, pixels) = (inputs.plane(Feature::Structure), pixel_count(size));
         let workgroups = pixels.div_ceil(self.values_per_workgroup);
         if pixels == 0 || workgroups as usize > self.partials.len() {
             return Err(no_scratch("structure term", size));

@@ -52,7 +52,7 @@ pub(super) fn in_halves([m, v]: [f32; 2], chance: u32) -> u32 {
 /// The parameter and both moments after the step.
 fn updated<T: Real>(params: &Params, column: usize, before: [f32; 4]) -> [T; 3] {
     let planes = planes(params.feature_count as usize, params.column_count as usize);
-    let plane = planes.iter().rposition(|(first, width)| *width > 0 && column >= *first);
+    let plane = planes.iter().rposition(|plane| plane.width > 0 && column >= plane.column);
     let plane = plane.unwrap_or_default();
     bounded(plane, stepped::<T>([params.rates[plane], params.second_correction], before))
 }

@@ -35,14 +35,14 @@ fn updates(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<U
     let of_gaussian = |i: usize| {
         let places: Vec<usize> = own.places(i).collect();
         let planes = planes(own.feature_count, places.len());
-        let before_rest = planes[Attribute::Rest as usize].0;
+        let before_rest = planes[Attribute::Rest as usize].column;
         let mean = DVec3::from_array([0, 1, 2].map(|axis| parameters[places[axis]].into()));
         let offset = mean - camera.center();
         let basis = sh_basis(params.sh_degree, offset.normalize_or_zero());
         // The direction has the error of the difference.
         let far = (mean.length() + camera.center().length()) / offset.length().max(1e-12);
         let update = |column: usize| {
-            let plane = planes.iter().rposition(|(first, width)| *width > 0 && column >= *first);
+            let plane = planes.iter().rposition(|plane| plane.width > 0 && column >= plane.column);
             let (at, plane) = (places[column], plane.unwrap_or_default());
             let own = at - left_out;
             if column < before_rest {

@@ -2,7 +2,7 @@ use super::adam::{from_halves, in_halves, moments_after, stepped};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::adam_rest::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::half::{LARGEST_HALF, SMALLEST_HALF};
-use crate::splats::attributes::word_of;
+use crate::splats::attributes::{Attribute, AttributePlane};
 use crate::splats::batches::frozen_floats;
 use crate::splats::packed_sh::value;
 
@@ -26,8 +26,10 @@ impl Reference for Kernel {
         }
         let (count, own) = (params.gaussian_count as usize, params.coefficient_count as usize);
         let left_out = frozen_floats(constants.frozen_columns, count);
+        let (attribute, column) = (Attribute::Rest, params.first_column as usize);
         let rest = |width, i, k| {
-            word_of((params.first_column as usize, width), constants.rest_by_column, count, i, k)
+            let plane = AttributePlane { attribute, column, width };
+            plane.index(constants.rest_by_column, count, i, k)
         };
         for (i, k) in (0..count).flat_map(|i| (0..own).map(move |k| (i, k))) {
             let (at, word) = (rest(own, i, k) - left_out, rest(own.div_ceil(2), i, k / 2));

@@ -4,7 +4,7 @@ use std::f32::consts::TAU;
 
 use glam::{Quat, Vec3};
 
-use super::gaussian::{sigmoid, word_of_plane};
+use super::gaussian::sigmoid;
 use super::random::random_bits;
 use super::rounding::{TRIGONOMETRIC, UNIT};
 use crate::gpu::{Reference, Tolerance};
@@ -122,9 +122,9 @@ impl Reference for Kernel {
         let step_key = random_bits(random_bits(params.seed).wrapping_add(params.step));
         let new = [params.first_new_gaussian, params.new_gaussian_count];
         for Child { of: i, index, to, is_new } in copies(n, slices.actions, slices.offsets, new) {
-            for plane in planes(features, columns).into_iter().enumerate() {
-                let word = |n, i, k| word_of_plane(plane, constants.rest_by_column, n, i, k);
-                for k in 0..plane.1.1 {
+            for plane in planes(features, columns) {
+                let word = |n, i, k| plane.index(constants.rest_by_column, n, i, k);
+                for k in 0..plane.width {
                     slices.new_parameters[word(new_n, to, k)] = slices.parameters[word(n, i, k)];
                 }
             }

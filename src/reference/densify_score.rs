@@ -3,7 +3,7 @@
 use glam::{DMat3, DVec2, DVec3, DVec4};
 
 use super::camera::Camera;
-use super::gaussian::{Gaussian, sigmoid, word_of_plane};
+use super::gaussian::{Gaussian, sigmoid};
 use super::rotation::{rotation, unit_quat};
 use super::rounding::UNIT;
 use crate::gpu::{Reference, Tolerance};
@@ -84,9 +84,9 @@ impl Reference for Kernel {
         let opacities = Attribute::RawOpacities.column(0) * n;
         let [features, columns] = [params.feature_count, params.column_count].map(|n| n as usize);
         for i in 0..n {
-            let is_finite = planes(features, columns).into_iter().enumerate().all(|plane| {
-                let word = |k| word_of_plane(plane, constants.rest_by_column, n, i, k);
-                (0..plane.1.1).all(|k| slices.parameters[word(k)].abs() < 3e38)
+            let is_finite = planes(features, columns).iter().all(|plane| {
+                let word = |k| plane.index(constants.rest_by_column, n, i, k);
+                (0..plane.width).all(|k| slices.parameters[word(k)].abs() < 3e38)
             });
             let is_visible = slices.parameters[opacities + i] >= params.min_raw_opacity;
             let mean_gradient = mean_gradient(&slices, i);

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use glam::{DVec3, DVec4};
 
-use crate::splats::attributes::{Attribute, PlaneCounts, column_count, planes, word_of};
+use crate::splats::attributes::{Attribute, AttributePlane, PlaneCounts, column_count, planes};
 use crate::splats::packed_sh::PackedSh;
 
 /// A Gaussian, or the gradient of one, in f64.
@@ -38,17 +38,6 @@ pub struct Planes {
     pub rest_by_column: bool,
 }
 
-/// The index of word `k` of Gaussian `i` of `count` in a plane: its number, first column and width.
-pub(super) fn word_of_plane(
-    (number, plane): (usize, (usize, usize)),
-    rest_by_column: bool,
-    count: usize,
-    i: usize,
-    k: usize,
-) -> usize {
-    word_of(plane, rest_by_column && number == Attribute::Rest as usize, count, i, k)
-}
-
 impl Planes {
     /// The planes of this many Gaussians whose splats have this many channels: colour, and the features after it.
     pub(super) fn of(
@@ -70,8 +59,8 @@ impl Planes {
     pub(super) fn places(self, i: usize) -> impl Iterator<Item = usize> {
         let columns = column_count(self.feature_count, self.sh_degree);
         let planes = planes(self.feature_count, columns);
-        planes.into_iter().enumerate().flat_map(move |plane| {
-            (0..plane.1.1).map(move |k| word_of_plane(plane, self.rest_by_column, self.count, i, k))
+        planes.into_iter().flat_map(move |plane| {
+            (0..plane.width).map(move |k| plane.index(self.rest_by_column, self.count, i, k))
         })
     }
 
@@ -84,10 +73,11 @@ impl Planes {
         let words = if half_rest { packed.columns() } else { planes.columns };
         let mut by_gaussian = Cow::from(parameters);
         if rest_by_column {
-            let rest = (planes.before_rest(), words - planes.before_rest());
-            for (i, k) in (0..count).flat_map(|i| (0..rest.1).map(move |k| (i, k))) {
-                by_gaussian.to_mut()[word_of(rest, false, count, i, k)] =
-                    parameters[word_of(rest, true, count, i, k)];
+            let column = planes.before_rest();
+            let rest = AttributePlane { attribute: Attribute::Rest, column, width: words - column };
+            for (i, k) in (0..count).flat_map(|i| (0..rest.width).map(move |k| (i, k))) {
+                by_gaussian.to_mut()[rest.index(false, count, i, k)] =
+                    parameters[rest.index(true, count, i, k)];
             }
         }
         let floats = if half_rest { packed.unpack(&by_gaussian).into() } else { by_gaussian };
@@ -99,7 +89,7 @@ impl Planes {
         let v: Vec<f64> = self.places(i).map(|at| parameters[at].into()).collect();
         let planes = planes(self.feature_count, v.len());
         let of = |attribute: Attribute| {
-            let (column, width) = planes[attribute as usize];
+            let AttributePlane { column, width, .. } = planes[attribute as usize];
             &v[column..column + width]
         };
         Gaussian {

@@ -169,29 +169,40 @@ impl PlaneCounts {
     }
 }
 
-/// The index of word `k` of Gaussian `i` of `count` in the plane with this first column and width: Gaussian by
-/// Gaussian, or word by word, each for all Gaussians.
-pub fn word_of(
-    (column, width): (usize, usize),
-    is_by_column: bool,
-    count: usize,
-    i: usize,
-    k: usize,
-) -> usize {
-    if is_by_column { (column + k) * count + i } else { column * count + width * i + k }
+/// The values of an attribute of all Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct AttributePlane {
+    /// The attribute.
+    pub attribute: Attribute,
+    /// Floats per Gaussian before it.
+    pub column: usize,
+    /// Its words per Gaussian.
+    pub width: usize,
 }
 
-/// First column and width of every plane, for `column_count` floats per Gaussian, of which `feature_count` are
-/// features.
-pub fn planes(feature_count: usize, column_count: usize) -> [(usize, usize); ATTRIBUTES.len()] {
+impl AttributePlane {
+    /// The index of word `k` of Gaussian `i` of `count`: Gaussian by Gaussian or, where that is so for SH coefficients
+    /// above degree 0, word by word, each for all Gaussians.
+    pub fn index(self, rest_by_column: bool, count: usize, i: usize, k: usize) -> usize {
+        let Self { attribute, column, width } = self;
+        match rest_by_column && attribute == Attribute::Rest {
+            true => (column + k) * count + i,
+            false => column * count + width * i + k,
+        }
+    }
+}
+
+/// Every plane, for `column_count` floats per Gaussian, of which `feature_count` are features.
+pub fn planes(feature_count: usize, column_count: usize) -> [AttributePlane; ATTRIBUTES.len()] {
     ATTRIBUTES.each_ref().map(|spec| {
-        let column = spec.attribute.column(feature_count);
+        let attribute = spec.attribute;
+        let column = attribute.column(feature_count);
         let width = match spec.width {
             Width::Fixed(width) => width,
             Width::Features => feature_count,
             Width::Rest => column_count.saturating_sub(column),
         };
-        (column, width)
+        AttributePlane { attribute, column, width }
     })
 }
 

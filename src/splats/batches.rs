@@ -7,7 +7,7 @@ use std::ops::Range;
 
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Slice, SliceMut};
-use crate::splats::attributes::{Attribute, PlaneCounts, planes};
+use crate::splats::attributes::{Attribute, AttributePlane, PlaneCounts, planes};
 use crate::splats::packed_sh::StorageFormat;
 
 /// The layout of planes in a buffer.
@@ -166,7 +166,7 @@ impl Batches {
     }
 
     /// The index of a float of a buffer in the planes of all Gaussians.
-    pub fn place_of(&self, float: usize) -> usize {
+    pub fn index_of(&self, float: usize) -> usize {
         let mut before = 0;
         for Part { range, columns } in self.parts() {
             let (own, count) = (float - before, range.len() / columns);
@@ -190,15 +190,15 @@ impl Batches {
         let rest_by_column = self.rest_by_column;
         self.iter().flat_map(move |batch| {
             let frozen = frozen_floats(batch.frozen, batch.count);
-            planes(features, columns).into_iter().enumerate().map(
-                move |(plane, (column, width))| {
-                    let (begin, own) = (column * count + width * batch.first, width * batch.count);
-                    let is_by_column = rest_by_column && plane == Attribute::Rest as usize;
-                    let columns = if is_by_column { width.max(1) } else { 1 };
-                    let left_out = frozen.saturating_sub(column * batch.count).min(own);
-                    Part { range: begin + left_out..begin + own, columns }
-                },
-            )
+            planes(features, columns).into_iter().map(move |plane| {
+                let AttributePlane { attribute, column, width } = plane;
+                let begin = column * count + width * batch.first;
+                let end = begin + width * batch.count;
+                let is_by_column = rest_by_column && attribute == Attribute::Rest;
+                let columns = if is_by_column { width.max(1) } else { 1 };
+                let left_out = frozen.saturating_sub(column * batch.count).min(end - begin);
+                Part { range: begin + left_out..end, columns }
+            })
         })
     }
 }

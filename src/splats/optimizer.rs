@@ -13,7 +13,7 @@ use std::sync::OnceLock;
 use crate::gpu::{Buffer, Gpu, Kernel, Pipeline, Recorder, Slice, SliceMut, Threads};
 use crate::kernels::sh::MAX_SH_DEGREE;
 use crate::kernels::{self, adam, adam_gaussian, adam_rest};
-use crate::splats::attributes::PlaneCounts;
+use crate::splats::attributes::{Attribute, PlaneCounts};
 use crate::splats::batches::{Batch, frozen_floats, rest_by_column};
 use crate::splats::packed_sh::StorageFormat;
 use crate::{Error, Result};
@@ -54,12 +54,7 @@ impl Moments {
 
     /// Borrows all of them for a step of Adam.
     pub fn slice_mut(&mut self) -> Moments<SliceMut<'_, f32>> {
-        match self {
-            Self::Single { first, second } => {
-                Moments::Single { first: first.slice_mut(), second: second.slice_mut() }
-            }
-            Self::Half(both) => Moments::Half(both.slice_mut()),
-        }
+        self.as_mut().map(Buffer::slice_mut)
     }
 
     /// Borrows those of a batch of Gaussians.
@@ -75,6 +70,22 @@ impl Moments {
 }
 
 impl<P> Moments<P> {
+    fn as_mut(&mut self) -> Moments<&mut P> {
+        match self {
+            Self::Single { first, second } => Moments::Single { first, second },
+            Self::Half(both) => Moments::Half(both),
+        }
+    }
+
+    fn map<'a, Q>(self, mut plane: impl FnMut(P) -> Q + 'a) -> Moments<Q> {
+        match self {
+            Self::Single { first, second } => {
+                Moments::Single { first: plane(first), second: plane(second) }
+            }
+            Self::Half(both) => Moments::Half(plane(both)),
+        }
+    }
+
     /// Their planes, by name.
     pub(crate) fn planes(&self) -> Vec<(&'static str, &P)> {
         match self {
@@ -87,12 +98,7 @@ impl<P> Moments<P> {
 
     /// Their planes, by name.
     pub(crate) fn planes_mut(&mut self) -> Vec<(&'static str, &mut P)> {
-        match self {
-            Self::Single { first, second } => {
-                vec![("first_moments", first), ("second_moments", second)]
-            }
-            Self::Half(both) => vec![("moments", both)],
-        }
+        self.as_mut().into_planes()
     }
 
     /// Their planes, by name.
@@ -118,12 +124,7 @@ impl<'a> Moments<SliceMut<'a, f32>> {
     /// Reborrows them.
     #[cfg(feature = "io")]
     fn reborrow(&mut self) -> Moments<SliceMut<'_, f32>> {
-        match self {
-            Self::Single { first, second } => {
-                Moments::Single { first: first.reborrow(), second: second.reborrow() }
-            }
-            Self::Half(both) => Moments::Half(both.reborrow()),
-        }
+        self.as_mut().map(SliceMut::reborrow)
     }
 
     /// The bindings of a kernel: first moments, second moments, packed moments; those that do not apply are empty.
@@ -185,19 +186,25 @@ pub struct Adam {
 
 const DEGREES: usize = MAX_SH_DEGREE as usize + 1;
 
-/// A step of Adam over whole Gaussians, whose gradients above SH degree 0 are those of colours.
+/// A step of [`Adam`].
+#[derive(Clone, Copy, Debug)]
+pub struct AdamStep<'a> {
+    /// Its number, from 1.
+    pub step: u64,
+    /// The learning rates.
+    pub rates: &'a LearningRates,
+    /// Nothing changes while its first word is nonzero.
+    pub status: &'a Buffer<u32>,
+}
+
+/// A step over whole Gaussians, whose gradients above SH degree 0 are those of colours.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct GaussianStep<'a> {
-    /// The step, from 1.
-    pub(crate) step: u64,
-    /// The learning rates.
-    pub(crate) rates: &'a LearningRates,
+    pub(crate) adam: AdamStep<'a>,
     /// The SH degrees that are stored and in use.
     pub(crate) sh_degrees: [u32; 2],
     /// The camera of the step: its buffer and index.
     pub(crate) camera: (&'a Buffer<kernels::Camera>, u32),
-    /// Nothing changes while its first word is nonzero.
-    pub(crate) status: &'a Buffer<u32>,
 }
 
 impl Adam {
@@ -224,18 +231,15 @@ impl Adam {
         Ok(adam)
     }
 
-    /// Records step number `step`, from 1, over `planes`, which may be a part of all. Nothing changes while the first
-    /// word of `status` is nonzero.
+    /// Records a step over `planes`, which may be a part of all.
     pub fn record(
         &self,
         pass: &mut Recorder<'_>,
-        step: u64,
-        rates: &LearningRates,
+        step: AdamStep<'_>,
         planes: PlaneCounts,
         buffers: AdamBuffers<'_>,
-        status: &Buffer<u32>,
     ) -> Result<()> {
-        self.record_from(0, pass, (step, rates), planes, buffers, status)
+        self.record_from(0, pass, step, planes, buffers)
     }
 
     /// [`Adam::record`] for Gaussians, whose frozen columns have neither gradients nor moments.
@@ -243,23 +247,20 @@ impl Adam {
     pub(crate) fn record_trained(
         &self,
         pass: &mut Recorder<'_>,
-        step: u64,
-        rates: &LearningRates,
+        step: AdamStep<'_>,
         planes: PlaneCounts,
         buffers: AdamBuffers<'_>,
-        status: &Buffer<u32>,
     ) -> Result<()> {
-        self.record_from(self.frozen_columns, pass, (step, rates), planes, buffers, status)
+        self.record_from(self.frozen_columns, pass, step, planes, buffers)
     }
 
     fn record_from(
         &self,
         frozen_columns: u32,
         pass: &mut Recorder<'_>,
-        (step, rates): (u64, &LearningRates),
+        AdamStep { step, rates, status }: AdamStep<'_>,
         planes: PlaneCounts,
         AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
-        status: &Buffer<u32>,
     ) -> Result<()> {
         let len = planes.total();
         let left = frozen_floats(frozen_columns, planes.gaussians);
@@ -296,11 +297,9 @@ impl Adam {
     pub fn record_halves(
         &self,
         pass: &mut Recorder<'_>,
-        step: u64,
-        rate: f64,
+        AdamStep { step, rates, status }: AdamStep<'_>,
         planes: PlaneCounts,
         AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
-        status: &Buffer<u32>,
     ) -> Result<()> {
         let words = planes.gaussians * StorageFormat::Half.words(planes);
         let frozen_columns = self.frozen_columns;
@@ -320,7 +319,7 @@ impl Adam {
                 gaussian_count,
                 first_column,
                 coefficient_count,
-                rate: (rate / uncorrected) as f32,
+                rate: (rates[Attribute::Rest] / uncorrected) as f32,
                 second_correction,
                 step: step as u32,
             },
@@ -340,10 +339,11 @@ impl Adam {
     pub(crate) fn record_gaussians(
         &self,
         pass: &mut Recorder<'_>,
-        GaussianStep { step, rates, sh_degrees, camera, status }: GaussianStep<'_>,
+        GaussianStep { adam, sh_degrees, camera }: GaussianStep<'_>,
         planes: PlaneCounts,
         AdamBuffers { parameters, gradients, moments }: AdamBuffers<'_>,
     ) -> Result<()> {
+        let AdamStep { step, rates, status } = adam;
         let (len, frozen_columns) = (planes.total(), self.frozen_columns);
         let floats = len - frozen_floats(frozen_columns, planes.gaussians);
         check(step, status, [(parameters.as_slice(), len), (gradients, floats)], &moments)?;
@@ -383,12 +383,12 @@ impl Adam {
         which: usize,
         constants: &K::Constants,
     ) -> Result<&'a Pipeline<K>> {
-        let place = &pipelines[which];
-        if let Some(pipeline) = place.get() {
+        let built = &pipelines[which];
+        if let Some(pipeline) = built.get() {
             return Ok(pipeline);
         }
         let pipeline = self.gpu.pipeline(constants)?;
-        Ok(place.get_or_init(|| pipeline))
+        Ok(built.get_or_init(|| pipeline))
     }
 }
 

@@ -49,7 +49,7 @@ use draw::HostTargets;
 #[cfg(feature = "io")]
 pub(crate) use gradients::ViewGradients;
 pub(crate) use lamp::DeviceLamp;
-use pipelines::Projections;
+use pipelines::{ProjectionKind, Projections, WrittenGradients};
 pub use settings::{Purpose, RenderSettings};
 pub use target::{DepthConvention, DepthKind, SceneDepth, Target};
 
@@ -87,15 +87,13 @@ pub struct Gradients<'a> {
 pub struct Renderer {
     gpu: Gpu,
     settings: RenderSettings,
-    gradients: GradientKind,
-    /// The columns of the parameters, from the first, whose gradients are not written.
-    frozen_columns: u32,
+    gradients: WrittenGradients,
     tile: Tile,
     /// The most splats of one tile that the blending kernels can process.
     longest_run: u32,
     /// By camera model and whether the last channel is the depth; those of the pinhole without depth are built at once,
     /// others on first use.
-    projections: BTreeMap<(u32, bool), Projections>,
+    projections: BTreeMap<ProjectionKind, Projections>,
     order_counts: Pipeline<order_counts::Kernel>,
     emit: Pipeline<emit::Kernel>,
     blend_forward: Pipeline<blend_forward::Kernel>,
@@ -183,7 +181,7 @@ impl Renderer {
 
     /// What the backward pass writes.
     pub(crate) fn gradient_kind(&self) -> GradientKind {
-        self.gradients
+        self.gradients.kind
     }
 
     /// The camera of a recorded viewpoint: its buffer and index.
@@ -287,7 +285,7 @@ impl Renderer {
     ) -> Result<()> {
         let (gaussians, view) = (gaussians.into(), self.view(&viewpoint.into(), false)?);
         self.check(&gaussians.layout)?;
-        let project_backward = self.projections[&(view.model, false)].backward.as_ref();
+        let project_backward = self.projections[&view.kind].backward.as_ref();
         let (Some(blend_backward), Some(project_backward)) =
             (&self.blend_backward, project_backward)
         else {
@@ -318,7 +316,7 @@ impl Renderer {
             Threads::Workgroups([tile_count.saturating_add(further_segments), 1, 1]),
         )?;
         let GaussianSlice { layout, parameters } = gaussians;
-        for batch in layout.batches(&self.gpu).without(self.frozen_columns).iter() {
+        for batch in layout.batches(&self.gpu).without(self.gradients.frozen_columns).iter() {
             let (gaussian_count, rendered) = (batch.gaussian_count(), batch.after(first));
             pass.dispatch(
                 project_backward,
@@ -360,7 +358,7 @@ impl Renderer {
     ) -> Result<()> {
         let Self { gpu, settings, projections, frame, context, lamp, .. } = self;
         let color_floats = color_floats(view.channels);
-        let project = &projections[&(view.model, view.view_depths)].forward;
+        let project = &projections[&view.kind].forward;
         let context = context.as_ref().map(DeviceGaussians::slice);
         let own = (gaussians, context.map_or(0, |context| context.layout.count));
         let all = context.into_iter().map(|context| (context, 0)).chain([own]);
@@ -502,19 +500,18 @@ impl Renderer {
             let what = format!("a {width}x{height} image exceeds what the renderer reserved");
             return Err(Error::Usage(what));
         }
-        let model = patch.camera.model.number();
-        self.build_projections(model, view_depths)?;
+        let kind = ProjectionKind { camera_model: patch.camera.model.number(), view_depths };
+        self.build_projections(kind)?;
         let (cameras, camera_index) = on_device.unzip();
         let camera_index = camera_index.unwrap_or_default();
         let (size, half_view) = (patch.size, patch.half_view());
-        Ok(View { model, view_depths, channels, cameras, camera_index, size, half_view, tiles })
+        Ok(View { kind, channels, cameras, camera_index, size, half_view, tiles })
     }
 }
 
 /// A viewpoint as the kernels take it, and the columns and rows of tiles of its image.
 struct View<'a> {
-    model: u32,
-    view_depths: bool,
+    kind: ProjectionKind,
     /// Values per pixel.
     channels: usize,
     /// `None`: the renderer's own.

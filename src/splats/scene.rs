@@ -18,7 +18,7 @@ pub mod ply;
 #[cfg(feature = "io")]
 use crate::camera::TrainingFrame;
 pub use crate::splats::attributes::{ATTRIBUTES, Attribute, PlaneCounts, rest_coefficients};
-use crate::splats::attributes::{column_count, planes};
+use crate::splats::attributes::{AttributePlane, column_count, planes};
 #[cfg(feature = "io")]
 pub(crate) use change::{Lengths, is_far};
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
@@ -92,12 +92,12 @@ impl Gaussians {
     /// The range of an attribute in [`Gaussians::parameters`].
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn plane(&self, attribute: Attribute) -> Range<usize> {
-        let (column, width) = self.columns(attribute);
+        let AttributePlane { column, width, .. } = self.columns(attribute);
         column * self.count..(column + width) * self.count
     }
 
-    /// First column and width of an attribute.
-    fn columns(&self, attribute: Attribute) -> (usize, usize) {
+    /// The columns of an attribute.
+    fn columns(&self, attribute: Attribute) -> AttributePlane {
         planes(self.shape.features.width(), width(self.shape))[attribute as usize]
     }
 

@@ -15,7 +15,7 @@ use crate::base::random::Stream;
 use crate::camera::{Camera, Patch};
 use crate::loss::exposure::{Affine, Exposures};
 use crate::photographs::image::Image;
-use crate::splats::attributes::planes;
+use crate::splats::attributes::{AttributePlane, planes};
 use crate::splats::packed_sh::StorageFormat;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::init::Initialization;
@@ -203,7 +203,7 @@ fn joined(old: &Gaussians, new: &[DepthSample], start: &Initialization) -> Resul
         colors.chain(new.iter().map(|depth_sample| depth_sample.color)).collect();
     let mut all = Gaussians::from_points(&positions, &colors, old.shape, start, 0)?;
     let features = old.shape.features.width();
-    for (column, width) in planes(features, width(old.shape)) {
+    for AttributePlane { column, width, .. } in planes(features, width(old.shape)) {
         let (from, to) = (column * old.count, column * all.count);
         let own = &old.parameters[from..from + width * old.count];
         all.parameters[to..to + own.len()].copy_from_slice(own);

@@ -261,8 +261,8 @@ fn read(
     let mut photographs = vec![];
     for files in files.chunks(Image::decoded_at_once(largest)) {
         let read = files.par_iter().map(|file| {
-            let hidden = (options.invert_masks, &borders);
-            let photograph = Photograph::load(file, hidden, gains, &colours)?;
+            let photograph =
+                Photograph::load(file, options.invert_masks, &borders, gains, &colours)?;
             Ok((file.name.clone(), photograph))
         });
         photographs.extend(read.collect::<Result<Vec<_>>>()?);
@@ -282,7 +282,8 @@ struct Photograph {
 impl Photograph {
     fn load(
         file: &dataset::Photograph,
-        (invert_masks, borders): (bool, &Borders),
+        invert_masks: bool,
+        borders: &Borders,
         gains: Option<WhiteBalanceGains>,
         colours: &ColourCounts,
     ) -> Result<Self> {

@@ -72,7 +72,8 @@ impl Optimizer {
         &mut self,
         pass: &mut Recorder<'_>,
         renderer: &mut Renderer,
-        (step, factor): (u64, f64),
+        step: u64,
+        factor: f64,
     ) -> Result<()> {
         let Some((learning, (lamp, status))) = self.lamp.as_mut().zip(renderer.lamp_and_status())
         else {

@@ -67,11 +67,12 @@ impl Masks {
         &self,
         pass: &mut Recorder<'_>,
         view: usize,
-        (size, channels): (UVec2, usize),
+        size: UVec2,
+        channels: usize,
         d_render: &mut Buffer<f32>,
     ) -> Result<()> {
         match self.of_view(view).zip(self.masking.as_ref()) {
-            Some((weights, masking)) => masking.hide(pass, weights, (size, channels), d_render),
+            Some((weights, masking)) => masking.hide(pass, weights, size, channels, d_render),
             None => Ok(()),
         }
     }
@@ -125,7 +126,8 @@ impl Masking {
         &self,
         pass: &mut Recorder<'_>,
         weights: &Buffer<f32>,
-        (size, channels): (UVec2, usize),
+        size: UVec2,
+        channels: usize,
         d_render: &mut Buffer<f32>,
     ) -> Result<()> {
         let pixel_count = size.x * size.y;

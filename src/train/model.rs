@@ -3,15 +3,13 @@
 use super::{PrecisionConfig, Trainer};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
-use crate::loss::{LogSlot, ParameterInputs, ParameterTerms};
-use crate::splats::attributes::{PlaneCounts, planes};
+use crate::loss::{LogSlot, ParameterTerms};
+use crate::splats::attributes::{AttributePlane, PlaneCounts, planes};
 use crate::splats::batches::{Batches, GradientKind};
 use crate::splats::densify::{Densifier, DensifyInputs, DensifyReport, Round};
 use crate::splats::optimizer::{Adam, AdamBuffers, FiniteCheck, GaussianStep, Moments};
 use crate::splats::packed_sh::StorageFormat;
-use crate::splats::scene::{
-    ATTRIBUTES, Attribute, DeviceGaussians, GaussianSlice, Gaussians, Layout, Shape,
-};
+use crate::splats::scene::{DeviceGaussians, GaussianSlice, Gaussians, Layout, Shape};
 
 impl Trainer {
     /// The gradients of all parameters in the last step, in the frame.
@@ -154,12 +152,13 @@ impl Model {
     /// gradients of this kind. Nothing changes while the first element of its status is not zero.
     pub(super) fn update(
         &mut self,
-        (gpu, pass): (&Gpu, &mut Recorder<'_>),
+        gpu: &Gpu,
+        pass: &mut Recorder<'_>,
         adam: &Adam,
-        own: GaussianStep<'_>,
+        step: GaussianStep<'_>,
         kind: GradientKind,
     ) -> Result<()> {
-        let GaussianStep { step, rates, sh_degrees: [_, sh_degree], status, .. } = own;
+        let [_, sh_degree] = step.sh_degrees;
         let Self { gaussians, moments, .. } = self;
         let layout = gaussians.layout;
         let is_half = layout.sh_rest == StorageFormat::Half;
@@ -171,34 +170,27 @@ impl Model {
                 moments: moments.of_batch(&batch)?,
             };
             if kind == GradientKind::Colors {
-                return adam.record_gaussians(pass, own, planes, buffers);
+                return adam.record_gaussians(pass, step, planes, buffers);
             }
             let columns =
                 if sh_degree == 0 || is_half { planes.before_rest() } else { planes.columns };
             let floats = PlaneCounts { columns, ..planes };
-            adam.record_trained(pass, step, rates, floats, buffers.reborrow(), status)?;
+            adam.record_trained(pass, step.adam, floats, buffers.reborrow())?;
             if sh_degree == 0 || !is_half {
                 return Ok(());
             }
-            adam.record_halves(pass, step, rates[Attribute::Rest], planes, buffers, status)
+            adam.record_halves(pass, step.adam, planes, buffers)
         })
     }
 
     /// Records the terms on parameters, which add to the gradients.
     pub(super) fn record_terms(
         &mut self,
-        (gpu, pass): (&Gpu, &mut Recorder<'_>),
+        pass: &mut Recorder<'_>,
         terms: &mut ParameterTerms,
         log: &mut LogSlot<'_>,
     ) -> Result<()> {
-        let batches = &self.trained_planes(gpu);
-        let Self { gaussians, gradients, .. } = self;
-        let inputs = ParameterInputs {
-            batches,
-            words: gaussians.layout.words(),
-            parameters: &gaussians.parameters,
-        };
-        terms.record(pass, inputs, gradients, log)
+        terms.record(pass, self.gaussians.slice(), &mut self.gradients, log)
     }
 
     /// One round of density control, if `keeps` accepts the new parameters ([`Densifier::densify`]); the statistics are
@@ -237,7 +229,7 @@ impl Model {
         for batch in batches.iter() {
             let planes = batch.rows(&self.gaussians.parameters, words)?;
             if let Some(at) = finite.first(gpu, planes, planes.len())? {
-                return Ok(Some(batches.place_of(before + at)));
+                return Ok(Some(batches.index_of(before + at)));
             }
             before += planes.len();
         }
@@ -247,14 +239,15 @@ impl Model {
     /// The attribute and the Gaussian at an index of planes with `columns` columns.
     pub(super) fn place_of(&self, index: usize, columns: usize) -> (String, usize) {
         let (count, features) = (self.count().max(1), self.shape().features.width());
-        let mut planes = ATTRIBUTES.iter().zip(planes(features, columns));
-        let within = |(column, width): (usize, usize)| {
+        let is_within = |AttributePlane { column, width, .. }: &AttributePlane| {
             (column * count..(column + width) * count).contains(&index)
         };
-        planes.find(|(_, plane)| within(*plane)).map_or_else(
-            || ("parameters".to_owned(), index),
-            |(spec, (column, width))| (spec.name.to_owned(), (index - column * count) / width),
-        )
+        match planes(features, columns).into_iter().find(is_within) {
+            Some(AttributePlane { attribute, column, width }) => {
+                (attribute.spec().name.to_owned(), (index - column * count) / width)
+            }
+            None => ("parameters".to_owned(), index),
+        }
     }
 
     pub(super) fn download(&self, gpu: &Gpu) -> Result<Gaussians> {

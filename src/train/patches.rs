@@ -112,7 +112,7 @@ pub(super) fn put_together(views: &[TrainView], parts: Vec<Vec<f32>>) -> Vec<Ima
             images.push(Image::filled(width, height, [0.0; 3]));
         }
         if let Some(image) = images.last_mut() {
-            patch.paste((patch, &data), (&Patch::from(&patch.camera), &mut image.data));
+            patch.paste(patch, &data, &Patch::from(&patch.camera), &mut image.data);
         }
     }
     images

@@ -45,10 +45,10 @@ impl Rendered {
             renderer.reserve_sizes(count, capacity, [around.size])?;
             let own = renderer.render_patch(gaussians, &around, options)?;
             planes.resize(own.len() / around.pixel_count() * whole.pixel_count(), 0.0);
-            patch.paste((&around, &own), (&whole, &mut planes));
+            patch.paste(&around, &own, &whole, &mut planes);
             let channels = &own[..own.len() - around.pixel_count()];
             let own = networks.denoised_image(channels, around.size)?;
-            patch.paste((&around, &own.data), (&whole, &mut denoised.data));
+            patch.paste(&around, &own.data, &whole, &mut denoised.data);
         }
         Ok(Self { denoised: Some(denoised), ..Self::of_planes(camera, planes) })
     }

@@ -13,7 +13,7 @@ use super::networks::Networks;
 use super::terms::{NetworkTerms, Photographs};
 use super::views::{ViewId, Views};
 use crate::Result;
-use crate::gpu::{Buffer, Gpu, Recorder};
+use crate::gpu::{Buffer, Recorder};
 use crate::loss::exposure::Exposures;
 use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, TermInputs};
 use crate::photographs::pseudo_gt::PseudoGt;
@@ -54,7 +54,8 @@ impl Supervision {
     pub(super) fn compare(
         &mut self,
         pass: &mut Recorder<'_>,
-        (step, view): (u64, ViewId),
+        step: u64,
+        view: ViewId,
         features: Features,
         renderer: &mut Renderer,
         slot: u32,
@@ -77,7 +78,7 @@ impl Supervision {
         };
         let colors = masks.shown(pass, number, size, exposed, target)?;
         losses.record(pass, &TermInputs { colors, ..*inputs }, d_render, log)?;
-        masks.hide(pass, number, (size, channels), d_render)?;
+        masks.hide(pass, number, size, channels, d_render)?;
         if let Some(exposures) = &mut self.exposures {
             exposures.backward(pass, view.place, size, [render, target], d_render)?;
         }
@@ -93,20 +94,20 @@ impl Supervision {
         };
         let photographs = Photographs { mask: masks.of_view(number), low, target };
         networks.record(pass, inputs, photographs, d_render, log)?;
-        masks.hide(pass, number, (size, channels), d_render)
+        masks.hide(pass, number, size, channels, d_render)
     }
 
     /// Records the terms on parameters, which add to the gradients of the model.
     pub(super) fn regularise(
         &mut self,
-        (gpu, pass): (&Gpu, &mut Recorder<'_>),
+        pass: &mut Recorder<'_>,
         model: &mut Model,
         renderer: &mut Renderer,
         slot: u32,
     ) -> Result<()> {
         let Some(terms) = &mut self.parameter_terms else { return Ok(()) };
         let (_, status) = renderer.render_and_status();
-        model.record_terms((gpu, pass), terms, &mut LogSlot { log: &mut self.log, slot, status })
+        model.record_terms(pass, terms, &mut LogSlot { log: &mut self.log, slot, status })
     }
 
     /// Records Adam's step of the learned parameters other than the Gaussians.

@@ -9,8 +9,7 @@ use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Recorder};
 use crate::kernels::ssim_window::RADIUS;
 use crate::loss::{
-    DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, Gradient, LogSlot, Loss,
-    LossInputs, LossRegion, LossSettings, Term, TermInputs,
+    DenoisingLoss, Gradient, LogSlot, Loss, LossInputs, LossRegion, Term, TermInputs,
 };
 use crate::networks::crop::PaddedCrop;
 use crate::networks::{Denoiser, NetworkVariant};
@@ -74,7 +73,7 @@ impl CropMask {
 
     /// [`Masking::hide`] for the colours of a crop.
     fn hide(&self, pass: &mut Recorder<'_>, size: UVec2, d_output: &mut Buffer<f32>) -> Result<()> {
-        self.masking.hide(pass, &self.weights, (size, COLOR_CHANNELS), d_output)
+        self.masking.hide(pass, &self.weights, size, COLOR_CHANNELS, d_output)
     }
 }
 
@@ -98,20 +97,12 @@ impl NetworkTerms {
             variant: config.model.network.variant,
             crop: *denoiser_crop,
             crops: Stream::new(config.seed, streams::CROPS),
-            denoising: DenoisingLoss::new(
-                gpu,
-                DenoisingWeights {
-                    mse: weights.denoising,
-                    total_variation: weights.total_variation,
-                },
-            )?,
+            denoising: DenoisingLoss::new(gpu, weights)?,
             low: Loss::new(
                 gpu,
-                LossSettings {
-                    ssim_weight: weights.low_ssim,
-                    terms: [Term::LOW_L1, Term::LOW_SSIM],
-                    gradient: Gradient::Written,
-                },
+                weights.low_ssim,
+                [Term::LOW_L1, Term::LOW_SSIM],
+                Gradient::Written,
             )?,
             masking: None,
             illumination: empty("crop_illumination")?,
@@ -261,13 +252,14 @@ impl NetworkTerms {
         };
         self.denoising.record(
             pass,
-            DenoisingInputs {
+            LossInputs {
                 size: padded_crop.size,
                 loss_region: loss_region(padded_crop),
-                denoised,
-                render: held_to,
+                render: denoised,
+                target: held_to,
             },
-            DenoisingGradients { d_denoised: &mut self.d_denoised, d_render: &mut self.d_colors },
+            &mut self.d_denoised,
+            &mut self.d_colors,
             log,
         )?;
         let Some(mask) = mask else { return Ok(()) };

@@ -1,19 +1,23 @@
 //! The denoising terms.
 
 use glam::UVec2;
+use nightsplat::Result;
 use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::denoising;
-use nightsplat::loss::{
-    DenoisingGradients, DenoisingInputs, DenoisingLoss, DenoisingWeights, LossRegion, Term,
-};
+use nightsplat::loss::{DenoisingLoss, LossInputs, LossRegion, Term, Weights};
 
 use super::{
     Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,
     log_step, noise, widen,
 };
 
-const WEIGHTS: DenoisingWeights = DenoisingWeights { mse: 0.7, total_variation: 1.3 };
+/// Of the mean squared difference and the total variation.
+const WEIGHTS: [f64; 2] = [0.7, 1.3];
+
+fn term(gpu: &Gpu, [denoising, total_variation]: [f64; 2]) -> Result<DenoisingLoss> {
+    DenoisingLoss::new(gpu, &Weights { denoising, total_variation, ..Weights::default() })
+}
 
 /// Views and their loss regions.
 fn cases() -> Vec<(UVec2, LossRegion)> {
@@ -57,7 +61,7 @@ fn loss_of(size: UVec2, LossRegion { origin, size: own }: LossRegion, a: &[f64],
     }
     let mean = |sum: f64, count: u32| if count == 0 { 0.0 } else { sum / f64::from(3 * count) };
     let tv = 2.0 * (mean(vertical, own.x * (own.y - 1)) + mean(horizontal, (own.x - 1) * own.y));
-    WEIGHTS.mse * mean(squares, own.x * own.y) + WEIGHTS.total_variation * tv
+    WEIGHTS[0] * mean(squares, own.x * own.y) + WEIGHTS[1] * tv
 }
 
 struct Outcome {
@@ -68,7 +72,7 @@ struct Outcome {
 
 fn evaluate(
     gpu: &Gpu,
-    weights: DenoisingWeights,
+    weights: [f64; 2],
     (size, loss_region): (UVec2, LossRegion),
     [denoised, render]: [&[f32]; 2],
 ) -> Outcome {
@@ -76,12 +80,11 @@ fn evaluate(
         ["d_denoised", "d_render"].map(|d| gpu.buffer(d, &vec![f32::NAN; render.len()]).unwrap());
     let [denoised, render] =
         [("denoised", denoised), ("render", render)].map(|(n, x)| gpu.buffer(n, x).unwrap());
-    let mut loss = DenoisingLoss::new(gpu, weights).unwrap();
+    let mut loss = term(gpu, weights).unwrap();
     loss.reserve(size).unwrap();
     let logged = log_step(gpu, |pass, log| {
-        let inputs = DenoisingInputs { size, loss_region, denoised: &denoised, render: &render };
-        let gradients = DenoisingGradients { d_denoised: &mut d_denoised, d_render: &mut d_render };
-        loss.record(pass, inputs, gradients, log)
+        let inputs = LossInputs { size, loss_region, render: &denoised, target: &render };
+        loss.record(pass, inputs, &mut d_denoised, &mut d_render, log)
     })
     .unwrap();
     let [d_denoised, d_render] = [d_denoised, d_render].map(|d| gpu.read(&d).unwrap());
@@ -101,8 +104,8 @@ fn the_terms_match_their_reference_and_finite_differences() {
             height: size.y,
             loss_begin: loss_region.origin,
             loss_end: loss_region.origin + own,
-            mse_weight: WEIGHTS.mse as f32,
-            tv_weight: WEIGHTS.total_variation as f32,
+            mse_weight: WEIGHTS[0] as f32,
+            tv_weight: WEIGHTS[1] as f32,
             mean_scale: 1.0 / (3 * own.element_product()) as f32,
             x_scale: pair_scale((own.x - 1) * own.y),
             y_scale: pair_scale(own.x * (own.y - 1)),
@@ -143,8 +146,7 @@ fn the_terms_agree_with_pytorch() {
     let size = UVec2::new(17, 13);
     let images = [torch.get("denoising.denoised"), torch.get("denoising.rendered")];
     let evaluate = |mse: f64, total_variation: f64| {
-        let weights = DenoisingWeights { mse, total_variation };
-        evaluate(&gpu, weights, (size, LossRegion::whole(size)), images)
+        evaluate(&gpu, [mse, total_variation], (size, LossRegion::whole(size)), images)
     };
     let (mse, tv) = (evaluate(1.0, 0.0), evaluate(0.0, 1.0));
     torch.assert_agrees("denoising.mse.value", &[mse.logged.losses.get(Term::DENOISING)]);
@@ -207,10 +209,10 @@ fn the_same_step_leaves_the_same_bits() {
 #[test]
 fn buffers_and_views_that_do_not_fit_are_refused() {
     let gpu = gpu();
-    for (mse, total_variation) in [(-1.0, 0.0), (0.0, f64::INFINITY)] {
-        assert!(DenoisingLoss::new(&gpu, DenoisingWeights { mse, total_variation }).is_err());
+    for weights in [[-1.0, 0.0], [0.0, f64::INFINITY]] {
+        assert!(term(&gpu, weights).is_err());
     }
-    let mut loss = DenoisingLoss::new(&gpu, WEIGHTS).unwrap();
+    let mut loss = term(&gpu, WEIGHTS).unwrap();
     loss.reserve(UVec2::splat(8)).unwrap();
     let whole = |size: [u32; 2]| (size.into(), LossRegion::whole(size.into()));
     let is_narrow = gpu.properties().subgroup_size <= 8;
@@ -226,10 +228,8 @@ fn buffers_and_views_that_do_not_fit_are_refused() {
         let image = gpu.zeros("image", len).unwrap();
         let [mut d_denoised, mut d_render] = [0; 2].map(|_| gpu.zeros("d", len).unwrap());
         let logged = log_step(&gpu, |pass, log| {
-            let inputs = DenoisingInputs { size, loss_region, denoised: &image, render: &image };
-            let gradients =
-                DenoisingGradients { d_denoised: &mut d_denoised, d_render: &mut d_render };
-            loss.record(pass, inputs, gradients, log)
+            let inputs = LossInputs { size, loss_region, render: &image, target: &image };
+            loss.record(pass, inputs, &mut d_denoised, &mut d_render, log)
         });
         let refused = logged.err().unwrap().to_string();
         assert!(refused.contains(why), "{size} {loss_region:?}: {refused}");

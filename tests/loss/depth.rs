@@ -7,12 +7,15 @@ use nightsplat::gpu::{Gpu, Threads};
 use nightsplat::kernels::{
     DepthGradient, DepthMoments, depth_boxes, depth_correlation, depth_gradient, depth_moments,
 };
-use nightsplat::loss::{DepthBoxes, DepthInputs, DepthLoss, DepthSettings, Term};
+use nightsplat::loss::{DepthBoxes, DepthLoss, LossTerm as _, Term};
+use nightsplat::splats::scene::Features;
 
 use super::{
     Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,
-    log_step, noise, widen,
+    log_step, noise, term_inputs, widen,
 };
+
+const FEATURES: Features = Features { depth: true, ..Features::NONE };
 
 /// Views and the side of their boxes.
 const CASES: [([u32; 2], u32); 7] = [
@@ -119,8 +122,7 @@ fn chunk_size() -> u32 {
 fn the_kernels_match_their_references() {
     let gpu = gpu();
     for (size, side) in CASES {
-        let settings = DepthSettings { weight: 0.1, box_side: side };
-        let (_, report) = gpu.checked(|| evaluate(&gpu, settings, size, &depths(size), 11));
+        let (_, report) = gpu.checked(|| evaluate(&gpu, 0.1, side, size, &depths(size), 11));
         report.agree().unwrap();
         assert_eq!(report.passes.len(), 5, "boxes, moments, correlation, gradient, log");
     }
@@ -203,32 +205,25 @@ fn a_view_smaller_than_a_box_has_smaller_boxes_and_a_tiny_view_none() {
     assert_eq!(boxes(1, 1, 128), (0, 0));
 }
 
-/// The whole term on a render of one plane.
+/// The whole term on the last plane of a render; returns that plane of the gradient.
 fn evaluate(
     gpu: &Gpu,
-    settings: DepthSettings,
+    weight: f64,
+    box_side: u32,
     size: [u32; 2],
-    [render, depth]: &[Vec<f32>; 2],
+    [plane, depth]: &[Vec<f32>; 2],
     step: u64,
 ) -> (Logged, Vec<f32>) {
-    let [render, depth] =
-        [("render", render), ("depth", depth)].map(|(name, x)| gpu.buffer(name, x).unwrap());
+    let colors = 3 * plane.len();
+    let render = gpu.buffer("render", &[&vec![9.0; colors], &**plane].concat()).unwrap();
     let mut d_render = gpu.buffer("d_render", &vec![f32::NAN; render.len()]).unwrap();
-    let mut loss = DepthLoss::new(gpu, settings).unwrap();
+    let mut loss = DepthLoss::new(gpu, weight, box_side, Stream::new(10, 5)).unwrap();
     loss.reserve(size.into()).unwrap();
-    let logged = log_step(gpu, |pass, log| {
-        let inputs = DepthInputs {
-            size: size.into(),
-            render: &render,
-            plane: 0,
-            depth: &depth,
-            stream: Stream::new(10, 5),
-            step,
-        };
-        loss.record(pass, inputs, &mut d_render, log)
-    })
-    .unwrap();
-    (logged, gpu.read(&d_render).unwrap())
+    loss.add(Some(depth)).unwrap();
+    let inputs = term_inputs(size.into(), FEATURES, &render, step);
+    let logged =
+        log_step(gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log)).unwrap();
+    (logged, gpu.read(&d_render).unwrap().split_off(colors))
 }
 
 #[test]
@@ -236,8 +231,7 @@ fn the_term_is_the_mean_over_the_view_and_over_its_boxes() {
     let gpu = gpu();
     for (size, box_side) in CASES {
         let images = depths(size);
-        let settings = DepthSettings { weight: 0.3, box_side };
-        let (logged, d_render) = evaluate(&gpu, settings, size, &images, 4);
+        let (logged, d_render) = evaluate(&gpu, 0.3, box_side, size, &images, 4);
         let key = (Stream::new(10, 5).bits(4) >> 32) as u32;
         let regions = regions_of(size.into(), box_side, key);
         let [a, b] = [widen(&images[0]), widen(&images[1])];
@@ -269,8 +263,7 @@ fn a_constant_depth_has_no_correlation_and_no_gradient() {
         [constant(0.0), constant(0.0)],
         [constant(12345.678), constant(0.1)],
     ] {
-        let settings = DepthSettings { weight: 1.0, box_side: 20 };
-        let (logged, d_render) = evaluate(&gpu, settings, size, &images, 0);
+        let (logged, d_render) = evaluate(&gpu, 1.0, 20, size, &images, 0);
         assert_eq!(logged.losses.get(Term::DEPTH), 1.0);
         assert_eq!(logged.losses.get(Term::DEPTH_LOCAL), 1.0);
         assert!(d_render.iter().all(|&d| d == 0.0));
@@ -283,9 +276,8 @@ fn scale_and_offset_of_the_estimate_do_not_matter() {
     let size = [77, 50];
     let [render, depth] = depths(size);
     let farther: Vec<f32> = depth.iter().map(|d| 5.0 * d + 7.0).collect();
-    let settings = DepthSettings { weight: 1.0, box_side: 20 };
     let [(near, d_near), (far, d_far)] =
-        [depth, farther].map(|depth| evaluate(&gpu, settings, size, &[render.clone(), depth], 0));
+        [depth, farther].map(|depth| evaluate(&gpu, 1.0, 20, size, &[render.clone(), depth], 0));
     for term in [Term::DEPTH, Term::DEPTH_LOCAL] {
         assert!((near.losses.get(term) - far.losses.get(term)).abs() < 1e-5);
     }
@@ -299,7 +291,7 @@ fn a_value_that_is_not_finite_reaches_the_log() {
         let [mut render, depth] = depths([77, 50]);
         render[at] = value;
         let images = [render, depth];
-        let (logged, _) = evaluate(&gpu, DepthSettings::default(), [77, 50], &images, 0);
+        let (logged, _) = evaluate(&gpu, 0.1, 128, [77, 50], &images, 0);
         assert_eq!(logged.losses.first_not_finite(), Some(Term::DEPTH), "{value} at {at}");
         assert_eq!(logged.status, NOT_FINITE);
     }
@@ -311,8 +303,7 @@ fn the_same_step_leaves_the_same_bits_and_another_step_other_boxes() {
     let size = [131, 97];
     let images = depths(size);
     let step = |step: u64| {
-        let settings = DepthSettings { weight: 1.0, box_side: 24 };
-        let (logged, d_render) = evaluate(&gpu, settings, size, &images, step);
+        let (logged, d_render) = evaluate(&gpu, 1.0, 24, size, &images, step);
         let values = [Term::DEPTH, Term::DEPTH_LOCAL].map(|term| logged.losses.get(term));
         (bits(&values), bits(&d_render))
     };
@@ -327,57 +318,44 @@ fn the_same_step_leaves_the_same_bits_and_another_step_other_boxes() {
 fn buffers_and_views_that_do_not_fit_are_refused() {
     let gpu = gpu();
     for (weight, box_side) in [(-0.1, 128), (f64::NAN, 128), (0.1, 1), (0.1, 0)] {
-        assert!(DepthLoss::new(&gpu, DepthSettings { weight, box_side }).is_err());
+        assert!(DepthLoss::new(&gpu, weight, box_side, Stream::new(0, 0)).is_err());
     }
-    let mut loss = DepthLoss::new(&gpu, DepthSettings { weight: 0.1, box_side: 4 }).unwrap();
+    let mut loss = DepthLoss::new(&gpu, 0.1, 4, Stream::new(0, 0)).unwrap();
     loss.reserve(UVec2::splat(16)).unwrap();
     // Wide subgroups need less scratch memory.
     let is_narrow = gpu.properties().subgroup_size <= 8;
     // Narrower than any box, with more chunks than all boxes of the view reserved for.
     let strip = [3, 16 * chunk_size()];
     let long = 3 * strip[1] as usize;
-    let mut refuses = |len: usize, size: [u32; 2], plane_index, why: &str| {
-        let plane = gpu.buffer("plane", &vec![0.5f32; len]).unwrap();
-        let mut d_render = gpu.zeros("d_render", len).unwrap();
-        let inputs = DepthInputs {
-            size: size.into(),
-            render: &plane,
-            plane: plane_index,
-            depth: &plane,
-            stream: Stream::new(0, 0),
-            step: 0,
-        };
-        let logged = log_step(&gpu, |pass, log| loss.record(pass, inputs, &mut d_render, log));
+    loss.add(Some(&vec![0.5; long])).unwrap();
+    let mut refuses = |len: usize, size: [u32; 2], why: &str| {
+        let [render, mut d_render] = [0; 2].map(|_| gpu.zeros("render", len).unwrap());
+        let inputs = term_inputs(size.into(), FEATURES, &render, 0);
+        let logged =
+            log_step(&gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log));
         let refused = logged.err().unwrap().to_string();
-        assert!(refused.contains(why), "{size:?} {plane_index}: {refused}");
+        assert!(refused.contains(why), "{size:?}: {refused}");
     };
-    refuses(256, [0, 8], 0, "no scratch memory for a view of 0 x 8");
-    refuses(256, [16, 16], 1, "holds 256 values, the view has 512");
-    let wide = if is_narrow { "no scratch memory for a view of 17 x 16" } else { "has 272" };
-    refuses(256, [17, 16], 0, wide);
-    refuses(long, [256, 256], 0, "no scratch memory for a view of 256 x 256");
-    refuses(long, strip, 0, "no scratch memory for a view of 3 x");
+    refuses(4 * 256, [0, 8], "no scratch memory for a view of 0 x 8");
+    refuses(3 * 256, [16, 16], "holds 768 values, the view has 1024");
+    let wide = if is_narrow { "no scratch memory for a view of 17 x 16" } else { "has 1088" };
+    refuses(4 * 256, [17, 16], wide);
+    refuses(long, [256, 256], "no scratch memory for a view of 256 x 256");
+    refuses(long, strip, "no scratch memory for a view of 3 x");
 }
 
 /// There are enough chunks, but not enough regions.
 #[test]
 fn more_boxes_than_were_reserved_for_are_refused() {
     let gpu = gpu();
-    let mut loss = DepthLoss::new(&gpu, DepthSettings { weight: 0.1, box_side: 4 }).unwrap();
+    let mut loss = DepthLoss::new(&gpu, 0.1, 4, Stream::new(0, 0)).unwrap();
     for size in [[16, 16], [3, 64 * chunk_size()]] {
         loss.reserve(size.into()).unwrap();
     }
-    let plane = gpu.buffer("plane", &[0.5f32; 512]).unwrap();
-    let mut d_render = gpu.zeros("d_render", 512).unwrap();
-    let inputs = DepthInputs {
-        size: [32, 16].into(),
-        render: &plane,
-        plane: 0,
-        depth: &plane,
-        stream: Stream::new(0, 0),
-        step: 0,
-    };
-    let logged = log_step(&gpu, |pass, log| loss.record(pass, inputs, &mut d_render, log));
+    loss.add(Some(&[0.5; 512])).unwrap();
+    let [render, mut d_render] = [0; 2].map(|_| gpu.zeros("render", 4 * 512).unwrap());
+    let inputs = term_inputs([32, 16].into(), FEATURES, &render, 0);
+    let logged = log_step(&gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log));
     let refused = logged.err().unwrap().to_string();
     assert!(refused.contains("no scratch memory for a view of 32 x 16"), "{refused}");
 }

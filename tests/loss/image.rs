@@ -3,10 +3,11 @@
 use std::sync::OnceLock;
 
 use glam::UVec2;
+use nightsplat::Result;
 use nightsplat::gpu::testing::{gpu, gpu_with};
 use nightsplat::gpu::{Gpu, Reference, Threads};
 use nightsplat::kernels::{l1, ssim};
-use nightsplat::loss::{Gradient, Loss, LossInputs, LossRegion, LossSettings, Term};
+use nightsplat::loss::{Gradient, Loss, LossInputs, LossRegion, Term};
 use nightsplat::reference::ssim::{gradient, ssim};
 
 use super::{NOT_FINITE, Torch, assert_close, bits, central_differences, largest, log_step};
@@ -36,8 +37,8 @@ struct Outcome {
     status: u32,
 }
 
-fn settings(ssim_weight: f64) -> LossSettings {
-    LossSettings { ssim_weight, terms: [Term::L1, Term::SSIM], gradient: Gradient::Written }
+fn loss(gpu: &Gpu, ssim_weight: f64) -> Result<Loss> {
+    Loss::new(gpu, ssim_weight, [Term::L1, Term::SSIM], Gradient::Written)
 }
 
 fn evaluate(gpu: &Gpu, weight: f64, size: [u32; 2], images: &[Vec<f32>; 2]) -> Outcome {
@@ -52,7 +53,7 @@ fn evaluate_loss_region(
     [render, target]: &[Vec<f32>; 2],
 ) -> Outcome {
     let size = UVec2::from_array(size);
-    let mut loss = Loss::new(gpu, settings(weight)).unwrap();
+    let mut loss = loss(gpu, weight).unwrap();
     loss.reserve(size).unwrap();
     let [render, target] = [("render", render), ("target", target)]
         .map(|(name, data)| gpu.buffer(name, data).unwrap());
@@ -333,7 +334,7 @@ fn a_nan_beyond_every_window_of_the_loss_region_changes_nothing() {
 fn a_loss_region_outside_the_view_is_refused() {
     let gpu = gpu();
     let size = UVec2::splat(8);
-    let mut loss = Loss::new(&gpu, settings(0.2)).unwrap();
+    let mut loss = loss(&gpu, 0.2).unwrap();
     loss.reserve(size).unwrap();
     let image = gpu.zeros("image", 3 * 64).unwrap();
     for (origin, own) in [([0, 0], [0, 8]), ([1, 0], [8, 8]), ([9, 0], [1, 1]), ([0, 0], [8, 9])] {
@@ -466,7 +467,7 @@ fn the_same_step_leaves_the_same_bits() {
 fn a_weight_outside_its_range_is_refused() {
     let gpu = gpu();
     for weight in [-0.1, 1.1, f64::NAN] {
-        assert!(Loss::new(&gpu, settings(weight)).is_err());
+        assert!(loss(&gpu, weight).is_err());
     }
 }
 
@@ -482,7 +483,7 @@ fn a_view_that_does_not_fit_is_refused() {
             (0.2, [16, 16], 3),
             (0.2, [u32::MAX, u32::MAX], 0),
         ] {
-            let mut loss = Loss::new(gpu, settings(weight)).unwrap();
+            let mut loss = loss(gpu, weight).unwrap();
             loss.reserve(UVec2::splat(16)).unwrap();
             let mut d_render = gpu.zeros("d_render", 3 * 256).unwrap();
             let result = log_step(gpu, |pass, log| {
@@ -495,7 +496,7 @@ fn a_view_that_does_not_fit_is_refused() {
             assert!(result.is_err(), "{weight} {size:?} {slot}");
         }
         // As many values, but more subgroups than there are partial sums, if subgroups are narrow.
-        let mut loss = Loss::new(gpu, settings(0.2)).unwrap();
+        let mut loss = loss(gpu, 0.2).unwrap();
         loss.reserve(UVec2::splat(16)).unwrap();
         let mut d_render = gpu.zeros("d_render", 3 * 256).unwrap();
         let result = log_step(gpu, |pass, log| {
@@ -516,9 +517,7 @@ fn a_second_term_adds_to_the_gradient_of_the_first() {
             let first: Vec<f32> = (0..images[0].len()).map(|i| (i as f32 * 0.1).sin()).collect();
             let own = evaluate(gpu, weight, size, &images).d_render;
             let size = UVec2::from_array(size);
-            let mut loss =
-                Loss::new(gpu, LossSettings { gradient: Gradient::Added, ..settings(weight) })
-                    .unwrap();
+            let mut loss = Loss::new(gpu, weight, [Term::L1, Term::SSIM], Gradient::Added).unwrap();
             loss.reserve(size).unwrap();
             let [render, target] = images.map(|image| gpu.buffer("image", &image).unwrap());
             let mut d_render = gpu.buffer("d_render", &first).unwrap();

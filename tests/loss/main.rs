@@ -20,10 +20,12 @@ mod view_exposures;
 use std::collections::BTreeMap;
 
 use common::{largest, widen};
+use glam::UVec2;
 use nightsplat::Result;
-use nightsplat::gpu::{Gpu, Recorder};
+use nightsplat::gpu::{Buffer, Gpu, Recorder};
 use nightsplat::kernels::status::{STATUS_NOT_FINITE as NOT_FINITE, STATUS_WORDS};
-use nightsplat::loss::{LogSlot, LossLog, StepLosses, Term};
+use nightsplat::loss::{LogSlot, LossLog, StepLosses, Term, TermInputs};
+use nightsplat::splats::scene::Features;
 
 /// The terms of one step in the log.
 struct Logged {
@@ -53,6 +55,11 @@ fn log_step(
     let status = gpu.read(&status)?[0];
     assert_eq!(steps[1].status, status);
     Ok(Logged { losses: steps[1].clone(), status })
+}
+
+/// A step of a term on the first view and a render with these features.
+fn term_inputs(size: UVec2, features: Features, render: &Buffer<f32>, step: u64) -> TermInputs<'_> {
+    TermInputs { step, view: 0, size, features, render, colors: render, target: render }
 }
 
 /// Prints the first mismatches, so that a failure shows its pattern.

@@ -1,13 +1,15 @@
 //! The terms on parameters.
 
 use nightsplat::base::random::Stream;
-use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;
+use nightsplat::gpu::{Buffer, Threads};
 use nightsplat::kernels::parameter_terms;
-use nightsplat::loss::{ParameterInputs, ParameterTerms, ParameterWeights, Term};
+use nightsplat::loss::{ParameterTerms, ParameterWeights, Term};
 use nightsplat::reference::parameter_terms::parameter_terms;
 use nightsplat::splats::attributes::{Attribute, PlaneCounts, column_count};
 use nightsplat::splats::batches::Batches;
+use nightsplat::splats::packed_sh::StorageFormat;
+use nightsplat::splats::scene::{GaussianSlice, Layout};
 
 use super::{assert_close, central_differences, log_step};
 
@@ -16,6 +18,11 @@ fn planes(count: usize) -> Vec<f32> {
     let stream = Stream::new(3, 1);
     let value = |i: usize| 4.0 * stream.uniform(i as u64) as f32 - 2.0;
     (0..count * column_count(0, 0)).map(value).collect()
+}
+
+fn gaussians(count: usize, parameters: &Buffer<f32>) -> GaussianSlice<'_> {
+    let layout = Layout::new(count, 0, StorageFormat::Single);
+    GaussianSlice { layout, parameters: parameters.slice() }
 }
 
 #[test]
@@ -89,8 +96,7 @@ fn the_means_over_the_gaussians_reach_the_log_and_their_gradients_the_planes() {
     let parameters = batches.upload(&gpu, "parameters", &planes).unwrap();
     let mut gradients = batches.zeros(&gpu, "gradients").unwrap();
     let logged = log_step(&gpu, |pass, log| {
-        let inputs = ParameterInputs { batches: &batches, words, parameters: &parameters };
-        terms.record(pass, inputs, &mut gradients, log)
+        terms.record(pass, gaussians(count, &parameters), &mut gradients, log)
     })
     .unwrap();
     let planes: Vec<f64> = planes.into_iter().map(f64::from).collect();
@@ -125,8 +131,7 @@ fn frozen_attributes_have_no_gradient() {
         let mut gradients = batches.zeros(&gpu, "gradients").unwrap();
         let (logged, report) = gpu.checked(|| {
             log_step(&gpu, |pass, log| {
-                let inputs = ParameterInputs { batches, words, parameters: &parameters };
-                terms.record(pass, inputs, &mut gradients, log)
+                terms.record(pass, gaussians(count, &parameters), &mut gradients, log)
             })
         });
         report.agree().unwrap();

@@ -4,13 +4,16 @@ use glam::UVec2;
 use nightsplat::gpu::Gpu;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::structure_l1;
-use nightsplat::loss::{StructureInputs, StructureLoss, Term};
+use nightsplat::loss::{LossTerm as _, StructureLoss, Term};
 use nightsplat::photographs::structure::StructureTarget;
+use nightsplat::splats::scene::Features;
 
 use super::{
     Logged, NOT_FINITE, Torch, assert_close, assert_gradient, bits, central_differences, largest,
-    log_step, noise, widen,
+    log_step, noise, term_inputs, widen,
 };
+
+const FEATURES: Features = Features { structure: true, ..Features::NONE };
 
 const SIZES: [[u32; 2]; 7] = [[1, 1], [3, 1], [1, 40], [5, 7], [33, 17], [16, 64], [131, 97]];
 
@@ -99,7 +102,7 @@ fn a_view_without_pixels_or_with_a_short_buffer_is_refused() {
     }
 }
 
-/// The term on plane 1 of a render of two planes; returns that plane of the gradient.
+/// The term on the last plane of a render; returns that plane of the gradient.
 fn evaluate(
     gpu: &Gpu,
     weight: f64,
@@ -108,19 +111,16 @@ fn evaluate(
     structure: &[f32],
 ) -> (Logged, Vec<f32>) {
     let pixels = plane.len();
-    let render = gpu.buffer("render", &[vec![9.0; pixels], plane.to_vec()].concat()).unwrap();
-    let structure = gpu.buffer("structure", structure).unwrap();
-    let mut d_render = gpu.buffer("d_render", &vec![5.0f32; 2 * pixels]).unwrap();
+    let render = gpu.buffer("render", &[vec![9.0; 3 * pixels], plane.to_vec()].concat()).unwrap();
+    let mut d_render = gpu.buffer("d_render", &vec![5.0f32; 4 * pixels]).unwrap();
     let mut loss = StructureLoss::new(gpu, weight).unwrap();
-    loss.reserve(size).unwrap();
-    let logged = log_step(gpu, |pass, log| {
-        let inputs = StructureInputs { size, render: &render, plane: 1, structure: &structure };
-        loss.record(pass, inputs, &mut d_render, log)
-    })
-    .unwrap();
+    loss.add(size, gpu.buffer("structure", structure).unwrap()).unwrap();
+    let inputs = term_inputs(size, FEATURES, &render, 1);
+    let logged =
+        log_step(gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log)).unwrap();
     let d_render = gpu.read(&d_render).unwrap();
-    assert!(d_render[..pixels].iter().all(|&d| d == 5.0), "another plane was written");
-    (logged, d_render[pixels..].to_vec())
+    assert!(d_render[..3 * pixels].iter().all(|&d| d == 5.0), "another plane was written");
+    (logged, d_render[3 * pixels..].to_vec())
 }
 
 #[test]
@@ -188,14 +188,16 @@ fn buffers_and_views_that_do_not_fit_are_refused() {
     let gpu = gpu();
     assert!(StructureLoss::new(&gpu, -1.0).is_err() && StructureLoss::new(&gpu, f64::NAN).is_err());
     let mut loss = StructureLoss::new(&gpu, 1.0).unwrap();
-    loss.reserve(UVec2::splat(8)).unwrap();
-    let render = gpu.zeros("render", 128).unwrap();
-    let structure = gpu.zeros("structure", 64).unwrap();
-    for (size, plane) in [([0, 8], 0), ([8, 8], 2), ([9, 8], 0), ([64, 64], 0)] {
-        let mut d_render = gpu.zeros("d_render", 128).unwrap();
-        let inputs =
-            StructureInputs { size: size.into(), render: &render, plane, structure: &structure };
-        let logged = log_step(&gpu, |pass, log| loss.record(pass, inputs, &mut d_render, log));
-        assert!(logged.is_err(), "{size:?} {plane}");
+    loss.add(UVec2::splat(8), gpu.zeros("structure", 64).unwrap()).unwrap();
+    let render = gpu.zeros("render", 4 * 64).unwrap();
+    let with_depth = Features { depth: true, ..FEATURES };
+    for (size, features) in
+        [([0, 8], FEATURES), ([8, 8], with_depth), ([9, 8], FEATURES), ([64, 64], FEATURES)]
+    {
+        let mut d_render = gpu.zeros("d_render", 4 * 64).unwrap();
+        let inputs = term_inputs(size.into(), features, &render, 1);
+        let logged =
+            log_step(&gpu, |pass, log| loss.record_step(pass, &inputs, &mut d_render, log));
+        assert!(logged.is_err(), "{size:?} {features:?}");
     }
 }

@@ -37,7 +37,7 @@ fn the_planes_of_a_gpu_are_written_column_by_column_and_read_back_whole() {
         assert_eq!(all.read(&gpu, &buffer).unwrap(), planes);
         let stored = gpu.read(&buffer).unwrap();
         for (float, value) in stored.iter().take(count * columns).enumerate() {
-            assert_eq!(all.place_of(float) as f32, *value);
+            assert_eq!(all.index_of(float) as f32, *value);
         }
         // Neighbouring Gaussians of a batch have neighbouring words.
         for batch in all.iter().filter(|batch| batch.count > 1) {
@@ -75,7 +75,7 @@ fn written_and_read_back(gpu: &Gpu) {
                 .all(|x| *x == 0.0)
         );
         for (float, value) in gpu.read(&buffer).unwrap().into_iter().enumerate() {
-            assert_eq!(all.place_of(float) as f32, value);
+            assert_eq!(all.index_of(float) as f32, value);
         }
         // The scales of each batch's last Gaussian are at the addresses that its kernels read.
         if let Some(batch) = all.iter().filter(|batch| batch.count > 0).last() {

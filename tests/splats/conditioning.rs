@@ -15,9 +15,8 @@ use nightsplat::reference::blend_forward::blend_pixel;
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::reference::rounding::UNIT;
 use nightsplat::reference::splat::Splat;
-use nightsplat::splats::attributes::PlaneCounts;
-use nightsplat::splats::attributes::planes;
-use nightsplat::splats::optimizer::{Adam, AdamBuffers, LearningRates, Moments};
+use nightsplat::splats::attributes::{AttributePlane, PlaneCounts, planes};
+use nightsplat::splats::optimizer::{Adam, AdamBuffers, AdamStep, LearningRates, Moments};
 
 use crate::common::setup::Setup;
 use crate::common::{Random, widen};
@@ -145,8 +144,7 @@ fn adam_in_f64(steps: u64, start: &[f32]) -> Vec<f64> {
     let planes = planes(0, COLUMNS);
     let plane_of = |at: usize| {
         let column = at / GAUSSIANS;
-        let own = |&(begin, width): &(usize, usize)| (begin..begin + width).contains(&column);
-        planes.iter().position(own).unwrap()
+        planes.iter().rposition(|plane| plane.width > 0 && column >= plane.column).unwrap()
     };
     let in_f64 = |at: usize| {
         let (mut value, mut m, mut v) = (f64::from(start[at]), 0.0, 0.0);
@@ -189,7 +187,8 @@ fn adam_on_device(steps: u64, start: &[f32]) -> Vec<f32> {
                     moments: moments.slice_mut(),
                 };
                 let planes = PlaneCounts { gaussians: GAUSSIANS, columns: COLUMNS, features: 0 };
-                adam.record(pass, step, &RATES, planes, buffers, &status)?;
+                let step = AdamStep { step, rates: &RATES, status: &status };
+                adam.record(pass, step, planes, buffers)?;
             }
             Ok(())
         })
@@ -215,8 +214,8 @@ fn adam_errors(steps: u64) -> Vec<PlaneError> {
     let start: Vec<f32> =
         (0..GAUSSIANS * COLUMNS).map(|at| 1.5 * (at as f32 * 0.7).sin()).collect();
     let (actual, expected) = (adam_on_device(steps, &start), adam_in_f64(steps, &start));
-    let of_plane = |(begin, width): (usize, usize)| {
-        let own = GAUSSIANS * begin..GAUSSIANS * (begin + width);
+    let of_plane = |AttributePlane { column, width, .. }| {
+        let own = GAUSSIANS * column..GAUSSIANS * (column + width);
         let most = |of: &dyn Fn(usize) -> f64| own.clone().map(of).fold(0.0, f64::max);
         let largest = most(&|at| expected[at].abs().max(f64::from(start[at]).abs()));
         PlaneError {

@@ -8,7 +8,7 @@ use nightsplat::kernels::adam;
 use nightsplat::splats::attributes::Attribute;
 use nightsplat::splats::attributes::PlaneCounts;
 use nightsplat::splats::optimizer::{
-    Adam, AdamBuffers, FiniteCheck, LearningRates, Moments, Schedule,
+    Adam, AdamBuffers, AdamStep, FiniteCheck, LearningRates, Moments, Schedule,
 };
 
 /// Two features and SH of degree 1.
@@ -67,18 +67,13 @@ impl Planes {
                 gradients: gradients.slice(),
                 moments: moments.slice_mut(),
             };
-            adam.record(
-                pass,
-                step,
-                &RATES,
-                PlaneCounts {
-                    gaussians: gaussian_count as usize,
-                    columns: column_count as usize,
-                    features: FEATURES as usize,
-                },
-                buffers,
-                &status,
-            )
+            let planes = PlaneCounts {
+                gaussians: gaussian_count as usize,
+                columns: column_count as usize,
+                features: FEATURES as usize,
+            };
+            let step = AdamStep { step, rates: &RATES, status: &status };
+            adam.record(pass, step, planes, buffers)
         })
         .unwrap();
         self.parameters = gpu.read(&parameters).unwrap();
@@ -175,7 +170,8 @@ fn frozen_columns_have_no_moments_and_keep_their_parameters() {
                     gradients: gradients.slice(),
                     moments: moments.slice_mut(),
                 };
-                adam.record_trained(pass, 3, &RATES, planes, buffers, &status)
+                let step = AdamStep { step: 3, rates: &RATES, status: &status };
+                adam.record_trained(pass, step, planes, buffers)
             })
         });
         done.unwrap();
@@ -326,7 +322,8 @@ fn a_buffer_that_is_too_short_is_refused() {
                 gradients: gradients.slice(),
                 moments: moments.slice_mut(),
             };
-            adam.record(pass, step, &rates, PLANES, buffers, &status)
+            let step = AdamStep { step, rates: &rates, status: &status };
+            adam.record(pass, step, PLANES, buffers)
         });
         assert!(result.is_err(), "{lengths:?} {status_len} {step}");
     }
@@ -352,14 +349,8 @@ fn coefficients_in_halves_are_refused_if_a_buffer_is_too_short() {
                 gradients: gradients.slice(),
                 moments: moments.slice_mut(),
             };
-            adam.record_halves(
-                pass,
-                1,
-                1e-3,
-                PlaneCounts { columns: 23, ..PLANES },
-                buffers,
-                &status,
-            )
+            let step = AdamStep { step: 1, rates: &RATES, status: &status };
+            adam.record_halves(pass, step, PlaneCounts { columns: 23, ..PLANES }, buffers)
         });
         assert_eq!(result.is_ok(), fits, "{short:?}");
     }

@@ -7,7 +7,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat::gpu::{Buffer, Gpu};
 use nightsplat::splats::attributes::PlaneCounts;
-use nightsplat::splats::optimizer::{Adam, AdamBuffers, LearningRates, Moments};
+use nightsplat::splats::optimizer::{Adam, AdamBuffers, AdamStep, LearningRates, Moments};
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer};
 use nightsplat::splats::scene::{DeviceGaussians, Layout, Shape, width};
@@ -63,8 +63,7 @@ impl Learned {
             StorageFormat::Single => planes.columns,
         };
         let floats = PlaneCounts { columns, ..planes };
-        let rate = self.rate;
-        let rates = LearningRates::uniform(rate);
+        let rates = LearningRates::uniform(self.rate);
         gpu.run("adam", |pass| {
             let Self { gaussians, moments, gradients, adam, status, .. } = self;
             let buffers = AdamBuffers {
@@ -72,7 +71,8 @@ impl Learned {
                 gradients: gradients.slice(),
                 moments: moments.slice_mut(),
             };
-            adam.record(pass, step, &rates, floats, buffers, status)?;
+            let step = AdamStep { step, rates: &rates, status };
+            adam.record(pass, step, floats, buffers)?;
             if rest == StorageFormat::Single {
                 return Ok(());
             }
@@ -81,7 +81,7 @@ impl Learned {
                 gradients: gradients.slice(),
                 moments: moments.slice_mut(),
             };
-            adam.record_halves(pass, step, rate, planes, buffers, status)
+            adam.record_halves(pass, step, planes, buffers)
         })
         .unwrap();
     }

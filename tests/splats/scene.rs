@@ -73,7 +73,7 @@ mod table {
             gaussians.dc_mut().fill(Vec3::splat(5.0));
             gaussians.features_mut().fill(6.0);
             gaussians.rest_mut().fill(Vec3::splat(7.0));
-            let widths = planes(features.width(), width(shape)).map(|(_, width)| 5 * width);
+            let widths = planes(features.width(), width(shape)).map(|plane| 5 * plane.width);
             let expected = (1..=7).zip(widths).flat_map(|(value, len)| vec![value as f32; len]);
             assert_eq!(gaussians.parameters, expected.collect::<Vec<_>>());
             assert_eq!(
@@ -83,12 +83,6 @@ mod table {
             assert_eq!((gaussians.raw_opacities().len(), gaussians.dc().len()), (5, 5));
             assert_eq!(gaussians.rest().len(), 5 * rest_coefficients(sh_degree));
         }
-    }
-
-    #[test]
-    fn zero_gaussians_are_valid() {
-        let none = Gaussians::zeros(0, 3);
-        assert!(none.means().is_empty() && none.rest().is_empty());
     }
 }
 

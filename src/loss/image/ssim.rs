@@ -132,7 +132,8 @@ impl Ssim {
         LossInputs { size, loss_region, render, target }: LossInputs<'_>,
         d_render: &mut Buffer<f32>,
         [l1_partials, ssim_partials]: [&mut Buffer<f32>; 2],
-        (terms, log): ([Term; 2], &mut LogSlot<'_>),
+        terms: [Term; 2],
+        log: &mut LogSlot<'_>,
     ) -> Result<bool> {
         let strips = self.workgroups(size);
         let threads = Threads::Workgroups([strips, 1, 1]);

@@ -71,7 +71,7 @@ impl Dataset {
         let (center, extent) = self.place();
         for view in self.train_views() {
             let own = view.camera.center();
-            if frame::stands_elsewhere(own, (center, extent)) {
+            if frame::stands_elsewhere(own, center, extent) {
                 tracing::warn!(
                     "view {} stands {:.0e} extents of the other cameras away from them; check its pose",
                     view.name,

@@ -127,9 +127,7 @@ impl Content {
     /// Writes a PLY.
     pub(super) fn save_ply(&self, provenance: &Provenance, out: &Path) -> Result<()> {
         let comments = provenance.ply_comments(&self.none);
-        save_parts(out, (&self.none, self.count), &comments, |take| {
-            self.each_part(|part| take(part))
-        })
+        save_parts(out, &self.none, self.count, &comments, |take| self.each_part(|part| take(part)))
     }
 
     fn each_part(&self, mut take: impl FnMut(&Gaussians) -> Result<()>) -> Result<()> {

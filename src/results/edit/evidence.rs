@@ -84,7 +84,7 @@ impl<'a> Measured<'a> {
         let mut white = self.gaussians.with_sh_degree(0);
         white.dc_mut().fill(Vec3::ZERO);
         let (gaussians, mut renderer) = self.renderer(white)?;
-        let mut gradients = ViewGradients::new(&self.capture.gpu, &gaussians)?;
+        let mut gradients = ViewGradients::new(&self.capture.gpu, &gaussians, Attribute::Dc)?;
         let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
         for view in self.capture.views() {
             let mut weights = vec![0.0; self.gaussians.count];
@@ -94,7 +94,7 @@ impl<'a> Measured<'a> {
                 &gaussians,
                 &self.camera(&view.camera),
                 &options,
-                (&mut gradients, Attribute::Dc),
+                &mut gradients,
                 |patch, _| {
                     let mut d_render = vec![0.0; COLOR_CHANNELS * patch.pixel_count()];
                     match &mask {
@@ -122,7 +122,8 @@ impl<'a> Measured<'a> {
         let (mut errors, mut values) = (0.0, 0);
         let adjusts = self.capture.adjusts;
         let (gaussians, mut renderer) = self.renderer(self.gaussians.clone())?;
-        let mut gradients = ViewGradients::new(&self.capture.gpu, &gaussians)?;
+        let mut gradients =
+            ViewGradients::new(&self.capture.gpu, &gaussians, Attribute::RawOpacities)?;
         let options =
             RenderOptions { sh_degree: self.gaussians.shape.sh_degree, background: [0.0; 3] };
         // From the gradient of the raw opacity to that of its logarithm.
@@ -136,7 +137,7 @@ impl<'a> Measured<'a> {
                 &gaussians,
                 &self.camera(&view.camera),
                 &options,
-                (&mut gradients, Attribute::RawOpacities),
+                &mut gradients,
                 |patch, planes| {
                     let d_renders = d_renders((view, target), patch, planes, signs, adjusts);
                     let squares = d_renders[0].iter().map(|d| f64::from(d / 2.0).powi(2));

@@ -1,6 +1,6 @@
 //! Learned parameters other than the Gaussians.
 
-use super::{Adam, AdamBuffers, LearningRates};
+use super::{Adam, AdamBuffers, AdamStep, LearningRates};
 use crate::Result;
 use crate::gpu::{Buffer, Recorder};
 use crate::splats::attributes::PlaneCounts;
@@ -32,6 +32,6 @@ impl Adam {
         let buffers = learnable.buffers();
         // One column of planes.
         let planes = PlaneCounts { gaussians: buffers.parameters.len(), columns: 1, features: 0 };
-        self.record(pass, step, &rates, planes, buffers, status)
+        self.record(pass, AdamStep { step, rates: &rates, status }, planes, buffers)
     }
 }

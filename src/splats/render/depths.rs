@@ -1,6 +1,6 @@
 //! The depth of a view, to the host.
 
-use super::{DepthChannel, RenderOptions, Renderer};
+use super::{DepthChannel, ProjectionKind, RenderOptions, Renderer};
 use crate::Result;
 use crate::camera::{Camera, Patch};
 use crate::kernels::pack_pixels::NOTHING_SEEN;
@@ -20,7 +20,8 @@ impl Renderer {
     ) -> Result<Vec<f32>> {
         self.frame.set_channels(&self.gpu, self.settings.channels() + 1)?;
         self.reserve(gaussians.layout.count, [camera])?;
-        self.build_projections(camera.model.number(), true)?;
+        let camera_model = camera.model.number();
+        self.build_projections(ProjectionKind { camera_model, view_depths: true })?;
         self.build_blending(true)?;
         let whole = Patch::from(camera);
         let mut depths = vec![f32::INFINITY; whole.pixel_count()];
@@ -38,7 +39,7 @@ impl Renderer {
                 .iter()
                 .map(|&depth| if is_seen(depth) { depth } else { f32::INFINITY })
                 .collect();
-            patch.paste((&patch, &own), (&whole, &mut depths));
+            patch.paste(&patch, &own, &whole, &mut depths);
         }
         Ok(depths)
     }

@@ -4,7 +4,7 @@
 //! soon as the frame that overflowed is done.
 
 use super::target::Target;
-use super::{DepthChannel, RenderOptions, Renderer};
+use super::{DepthChannel, ProjectionKind, RenderOptions, Renderer};
 use crate::Result;
 use crate::camera::{Camera, Patch};
 use crate::gpu::{Buffer, Gpu, HostImage, ImageState, Pipeline, Recorder, Ring, Threads};
@@ -145,7 +145,9 @@ impl Renderer {
         let size = |camera: &Camera| Patch::from(camera).size;
         self.reserve_sizes(layout.count, layout.capacity, cameras.iter().map(size))?;
         for camera in cameras {
-            self.build_projections(camera.model.number(), target.needs_depths())?;
+            let camera_model = camera.model.number();
+            let view_depths = target.needs_depths();
+            self.build_projections(ProjectionKind { camera_model, view_depths })?;
         }
         self.build_blending(target.needs_depths())?;
         if target.scene.is_some() && self.limits.len() < pixels {
@@ -221,7 +223,7 @@ impl Renderer {
             .map(|image| image.map(|image| HostImage { layer: image.layer + layer, ..*image }));
         if let Some(scene) = target.scene {
             let image = HostImage { layer: scene.image.layer + layer, ..*scene.image };
-            self.record_limits(pass, &image, scene.code(), size)?;
+            self.record_limits(pass, &image, scene.limits(pixel_count), size)?;
         }
         let depths = target.needs_depths().then_some(DepthChannel {
             takes_median: target.depth_kind == super::DepthKind::Median,
@@ -298,25 +300,17 @@ impl Renderer {
         &mut self,
         pass: &mut Recorder<'_>,
         image: &HostImage,
-        (format, is_reversed, is_linear, near, far): (u32, bool, bool, f32, f32),
+        params: depth_limits::Params,
         size: [u32; 2],
     ) -> Result<()> {
         let Self { limits, host_targets, .. } = self;
         let Some(own) = host_targets else { return Ok(()) };
         pass.take_image(image, size, &mut own.scene_words);
-        let pixel_count = size[0] * size[1];
         pass.dispatch(
             &own.limits,
-            &depth_limits::Params {
-                pixel_count,
-                format,
-                is_reversed: is_reversed.into(),
-                is_linear: is_linear.into(),
-                near,
-                far,
-            },
+            &params,
             depth_limits::Buffers { words: own.scene_words.slice(), limits: limits.slice_mut() },
-            Threads::Exactly([pixel_count, 1, 1]),
+            Threads::Exactly([params.pixel_count, 1, 1]),
         )
     }
 }

@@ -10,6 +10,8 @@ use crate::splats::scene::{Attribute, DeviceGaussians, Gaussians};
 /// Memory for the gradients of a set of Gaussians, and the host's sums of them.
 #[derive(Debug)]
 pub(crate) struct ViewGradients {
+    /// The attribute whose gradients are read back.
+    attribute: Attribute,
     batches: Batches,
     parameters: Buffer<f32>,
     grad_norm_sums: Buffer<f32>,
@@ -20,10 +22,15 @@ pub(crate) struct ViewGradients {
 }
 
 impl ViewGradients {
-    pub(crate) fn new(gpu: &Gpu, gaussians: &DeviceGaussians) -> Result<Self> {
+    pub(crate) fn new(
+        gpu: &Gpu,
+        gaussians: &DeviceGaussians,
+        attribute: Attribute,
+    ) -> Result<Self> {
         let layout = gaussians.layout;
         let batches = layout.batches(gpu);
         Ok(Self {
+            attribute,
             parameters: batches.zeros(gpu, "gradients")?,
             grad_norm_sums: gpu.zeros("grad_norm_sums", layout.count)?,
             visit_counts: gpu.zeros("visit_counts", layout.count)?,
@@ -37,13 +44,13 @@ impl ViewGradients {
 impl Renderer {
     /// Renders the view patch by patch. `d_renders` returns one or more gradients with respect to the patch's render,
     /// (channels, h, w), from its channels and transmittance; `take` gets, for each of them in order, the gradients of
-    /// an attribute, (count, width), which add up over patches.
+    /// the attribute, (count, width), which add up over patches.
     pub(crate) fn view_gradients(
         &mut self,
         gaussians: &DeviceGaussians,
         camera: &Camera,
         options: &RenderOptions,
-        (gradients, attribute): (&mut ViewGradients, Attribute),
+        gradients: &mut ViewGradients,
         mut d_renders: impl FnMut(&Patch, &[f32]) -> Vec<Vec<f32>>,
         mut take: impl FnMut(usize, &[f32]),
     ) -> Result<()> {
@@ -60,7 +67,8 @@ impl Renderer {
                 self.record_gradients(gaussians, &patch, options, gradients)?;
                 gradients.planes.parameters =
                     gradients.batches.read(&self.gpu, &gradients.parameters)?;
-                take(index, &gradients.planes.parameters[gradients.planes.plane(attribute)]);
+                let plane = gradients.planes.plane(gradients.attribute);
+                take(index, &gradients.planes.parameters[plane]);
             }
         }
         Ok(())

@@ -89,7 +89,7 @@ impl Renderer {
         let mut data = vec![0.0; (self.settings.channels() + 1) * whole.pixel_count()];
         for part in parts {
             let own = self.render_patch(gaussians, part, options)?;
-            part.paste((part, &own), (whole, &mut data));
+            part.paste(part, &own, whole, &mut data);
         }
         Ok(data)
     }

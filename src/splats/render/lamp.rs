@@ -135,11 +135,11 @@ impl Renderer {
         gradients: &Buffer<f32>,
     ) -> Result<()> {
         let (first, channels) = (self.context_count(), self.settings.channels());
-        let Self { gpu, frame, lamp, frozen_columns, .. } = self;
+        let Self { gpu, frame, lamp, gradients: written, .. } = self;
         let Some(DeviceLamp { numbers, gradients: to, backward: Some(own), .. }) = lamp else {
             return Ok(());
         };
-        let batches = layout.batches(gpu).without(*frozen_columns);
+        let batches = layout.batches(gpu).without(written.frozen_columns);
         let chunk_count = own.chunks(batches);
         let mut first_chunk = 0;
         for batch in batches.iter() {

@@ -36,30 +36,33 @@ impl Renderer {
     ) -> Result<Self> {
         let tile = settings.tile_on(gpu)?;
         let segment = segment_length(gpu.properties(), settings.purpose, tile);
-        Self::build(gpu, settings, (gradients, frozen_columns), tile, segment)
+        let gradients = WrittenGradients { kind: gradients, frozen_columns };
+        Self::build(gpu, settings, gradients, tile, segment)
     }
 
     /// [`Renderer::new`] with segments of `segment` splats, a multiple of the subgroup size; 0: a run has one segment.
     #[cfg(feature = "testing")]
     pub fn with_segments(gpu: &Gpu, settings: RenderSettings, segment: u32) -> Result<Self> {
-        Self::build(gpu, settings, (GradientKind::All, 0), settings.tile_on(gpu)?, segment)
+        let gradients = WrittenGradients { kind: GradientKind::All, frozen_columns: 0 };
+        Self::build(gpu, settings, gradients, settings.tile_on(gpu)?, segment)
     }
 
     fn build(
         gpu: &Gpu,
         settings: RenderSettings,
-        (gradients, frozen_columns): (GradientKind, u32),
+        gradients: WrittenGradients,
         tile: Tile,
         segment: u32,
     ) -> Result<Self> {
         let Tile { size: [tile_width, tile_height], subgroups: subgroups_per_tile } = tile;
         let channels = settings.channels() as u32;
         let (alpha_max, partition_size) = (settings.max_alpha, RANKS_PER_PARTITION);
-        let pinhole = (CameraModel::Pinhole.number(), false);
+        let pinhole =
+            ProjectionKind { camera_model: CameraModel::Pinhole.number(), view_depths: false };
+        let frozen_columns = gradients.frozen_columns;
         let lamp = settings.lamp;
         let lamp = lamp.map(|lamp| DeviceLamp::new(gpu, &settings, tile, frozen_columns, &lamp));
-        let written = (gradients, frozen_columns);
-        let projections = Projections::new(gpu, &settings, tile.size, pinhole, written)?;
+        let projections = Projections::new(gpu, &settings, tile.size, pinhole, gradients)?;
         let shaping_channels = settings.shaping_channels();
         let (skips_groups, splats_per_turn) = (!gpu.properties().is_cpu, splats_per_turn(gpu));
         let blend_backward = match settings.purpose {
@@ -84,7 +87,6 @@ impl Renderer {
             gpu: gpu.clone(),
             settings,
             gradients,
-            frozen_columns,
             tile,
             longest_run: longest_run(gpu),
             projections: BTreeMap::from([(pinhole, projections)]),
@@ -110,13 +112,11 @@ impl Renderer {
     }
 
     /// Builds the kernels for a camera model where they are not there yet.
-    pub(super) fn build_projections(&mut self, model: u32, view_depths: bool) -> Result<()> {
-        let key = (model, view_depths);
-        if !self.projections.contains_key(&key) {
-            let (settings, tile) = (&self.settings, self.tile.size);
-            let written = (self.gradients, self.frozen_columns);
-            let own = Projections::new(&self.gpu, settings, tile, key, written)?;
-            self.projections.insert(key, own);
+    pub(super) fn build_projections(&mut self, kind: ProjectionKind) -> Result<()> {
+        if !self.projections.contains_key(&kind) {
+            let Self { gpu, settings, tile, gradients, .. } = self;
+            let projections = Projections::new(gpu, settings, tile.size, kind, *gradients)?;
+            self.projections.insert(kind, projections);
         }
         Ok(())
     }
@@ -133,23 +133,26 @@ impl Renderer {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn set_lamp(&mut self, lamp: Option<Lamp>) -> Result<()> {
         let settings = RenderSettings { lamp, ..self.settings };
-        let (tile, frozen_columns) = (self.tile, self.frozen_columns);
-        let new = |lamp| DeviceLamp::new(&self.gpu, &settings, tile, frozen_columns, &lamp);
-        let own = lamp.map(new).transpose()?;
+        let frozen_columns = self.gradients.frozen_columns;
+        let new = |lamp| DeviceLamp::new(&self.gpu, &settings, self.tile, frozen_columns, &lamp);
+        let on_device = lamp.map(new).transpose()?;
         if lamp.is_some() != self.settings.lamp.is_some() {
             self.projections = self.built_with(&settings)?;
         }
-        (self.settings, self.lamp) = (settings, own);
+        (self.settings, self.lamp) = (settings, on_device);
         self.reserve_lamp()
     }
 
     /// The kernels that read Gaussians, for other settings.
-    fn built_with(&self, settings: &RenderSettings) -> Result<BTreeMap<(u32, bool), Projections>> {
-        let own = |&key: &(u32, bool)| {
-            let (tile, written) = (self.tile.size, (self.gradients, self.frozen_columns));
-            Ok((key, Projections::new(&self.gpu, settings, tile, key, written)?))
+    fn built_with(
+        &self,
+        settings: &RenderSettings,
+    ) -> Result<BTreeMap<ProjectionKind, Projections>> {
+        let Self { gpu, tile, gradients, .. } = self;
+        let built = |&kind: &ProjectionKind| {
+            Ok((kind, Projections::new(gpu, settings, tile.size, kind, *gradients)?))
         };
-        self.projections.keys().map(own).collect()
+        self.projections.keys().map(built).collect()
     }
 
     /// Switches to another SH degree.
@@ -168,6 +171,23 @@ impl Renderer {
     }
 }
 
+/// What the kernels of a view are specialised for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct ProjectionKind {
+    /// The number of the camera model in kernels.
+    pub(super) camera_model: u32,
+    /// Whether the last channel is the depth in the view.
+    pub(super) view_depths: bool,
+}
+
+/// The gradients that the backward pass writes.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct WrittenGradients {
+    pub(super) kind: GradientKind,
+    /// The columns of the parameters, from the first, whose gradients are not written.
+    pub(super) frozen_columns: u32,
+}
+
 /// The kernels that read Gaussians and cameras, the only ones that depend on the SH degree and the camera model.
 #[derive(Debug)]
 pub(super) struct Projections {
@@ -181,10 +201,10 @@ impl Projections {
         gpu: &Gpu,
         settings: &RenderSettings,
         [tile_width, tile_height]: [u32; 2],
-        (camera_model, has_depths): (u32, bool),
-        (gradients, frozen_columns): (GradientKind, u32),
+        ProjectionKind { camera_model, view_depths: has_depths }: ProjectionKind,
+        WrittenGradients { kind, frozen_columns }: WrittenGradients,
     ) -> Result<Self> {
-        let color_gradients = gradients == GradientKind::Colors;
+        let color_gradients = kind == GradientKind::Colors;
         let (view_depths, alpha_max) = (u32::from(has_depths), settings.max_alpha);
         let channels = settings.channels() as u32 + view_depths;
         let RenderSettings { raw_colors, antialiased, .. } = *settings;

@@ -6,6 +6,7 @@ use glam::Vec3;
 
 use crate::camera::{Camera, deviation_from_rigid};
 use crate::gpu::{HostImage, ImageFormat};
+use crate::kernels::depth_limits;
 use crate::kernels::pixels::{
     DEPTH_16, DEPTH_24, DEPTH_FLOAT, PIXELS_DISPLAY_HALF, PIXELS_LINEAR_HALF, PIXELS_SRGB,
     PIXELS_UNORM,
@@ -222,21 +223,26 @@ impl SceneDepth<'_> {
         }
     }
 
-    /// How the kernel reads it: format, reversed, linear, near, far.
-    pub(super) fn code(&self) -> (u32, bool, bool, f32, f32) {
+    /// How the kernel reads it.
+    pub(super) fn limits(&self, pixel_count: u32) -> depth_limits::Params {
         let format = match self.image.format {
             ImageFormat::D16Unorm => DEPTH_16,
             ImageFormat::D24UnormX8 | ImageFormat::D24UnormS8 => DEPTH_24,
             _ => DEPTH_FLOAT,
         };
-        match self.convention {
-            DepthConvention::Linear => (format, false, true, 1.0, 0.0),
-            DepthConvention::Forward { near, far } => {
-                (format, false, false, near, far.unwrap_or_default())
+        let (near, far) = match self.convention {
+            DepthConvention::Linear => (1.0, None),
+            DepthConvention::Forward { near, far } | DepthConvention::Reversed { near, far } => {
+                (near, far)
             }
-            DepthConvention::Reversed { near, far } => {
-                (format, true, false, near, far.unwrap_or_default())
-            }
+        };
+        depth_limits::Params {
+            pixel_count,
+            format,
+            is_reversed: matches!(self.convention, DepthConvention::Reversed { .. }).into(),
+            is_linear: (self.convention == DepthConvention::Linear).into(),
+            near,
+            far: far.unwrap_or_default(),
         }
     }
 }

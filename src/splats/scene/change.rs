@@ -5,11 +5,11 @@ use glam::DVec3;
 use glam::{DMat3, DQuat};
 use rayon::prelude::*;
 
-#[cfg(feature = "io")]
-use super::ATTRIBUTES;
 use super::Gaussians;
 #[cfg(feature = "io")]
 use super::neighbours::Neighbours;
+#[cfg(feature = "io")]
+use super::{ATTRIBUTES, AttributePlane};
 use crate::splats::harmonics::HarmonicRotation;
 use crate::splats::scene::rest_coefficients;
 
@@ -71,7 +71,7 @@ impl Gaussians {
         }
         let mut to = 0;
         for spec in &ATTRIBUTES {
-            let (column, width) = self.columns(spec.attribute);
+            let AttributePlane { column, width, .. } = self.columns(spec.attribute);
             for (index, _) in keep.iter().enumerate().filter(|(_, keep)| **keep) {
                 let from = column * self.count + index * width;
                 self.parameters.copy_within(from..from + width, to);
@@ -140,7 +140,7 @@ impl Gaussians {
     #[cfg(feature = "io")]
     pub(crate) fn replace(&mut self, first: usize, by: &Self) {
         for spec in &ATTRIBUTES {
-            let (_, width) = self.columns(spec.attribute);
+            let width = self.columns(spec.attribute).width;
             let start = self.plane(spec.attribute).start + first * width;
             self.parameters[start..start + by.count * width]
                 .copy_from_slice(&by.parameters[by.plane(spec.attribute)]);
@@ -151,7 +151,7 @@ impl Gaussians {
     #[cfg(feature = "io")]
     pub(crate) fn row(&self, index: usize) -> impl Iterator<Item = &[f32]> {
         ATTRIBUTES.iter().map(move |spec| {
-            let (column, width) = self.columns(spec.attribute);
+            let AttributePlane { column, width, .. } = self.columns(spec.attribute);
             &self.parameters[column * self.count + index * width..][..width]
         })
     }

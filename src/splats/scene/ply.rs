@@ -19,7 +19,7 @@ use crate::base::input;
 use crate::base::output::write_whole_with;
 use crate::base::ply::{Encoding, Header, Kind};
 use crate::splats::attributes::{
-    ATTRIBUTES, Attribute, AttributeSpec, Ply, planes, rest_coefficients,
+    ATTRIBUTES, Attribute, AttributePlane, AttributeSpec, Ply, planes, rest_coefficients,
 };
 use crate::{Error, Result};
 
@@ -40,7 +40,7 @@ struct Property {
 impl Property {
     /// The property's value is at `begin + stride * gaussian` in [`Gaussians::parameters`].
     fn address(&self, gaussians: &Gaussians) -> (usize, usize) {
-        let (column, width) = gaussians.columns(self.attribute);
+        let AttributePlane { column, width, .. } = gaussians.columns(self.attribute);
         (column * gaussians.count + self.component, width)
     }
 }
@@ -51,7 +51,7 @@ fn properties(shape: Shape) -> Vec<Property> {
     specs.sort_by_key(|spec| spec.ply_place);
     let planes = planes(shape.features.width(), width(shape));
     let of_attribute = |spec: &'static AttributeSpec| {
-        (0..planes[spec.attribute as usize].1).map(move |position| {
+        (0..planes[spec.attribute as usize].width).map(move |position| {
             // The file is channel-major, the scene coefficient-major.
             let component = match spec.attribute {
                 Attribute::Rest => {
@@ -99,8 +99,8 @@ pub fn save_with_comments(
 
 fn write(gaussians: &Gaussians, path: &Path, comments: &[impl AsRef<str>]) -> std::io::Result<()> {
     let lines = comment_lines(gaussians.origin, comments);
-    let kind = (gaussians.shape, gaussians.count);
-    let mut writer = Writer::new(fs::File::create(path)?, &lines, kind)?;
+    let Gaussians { shape, count, .. } = *gaussians;
+    let mut writer = Writer::new(fs::File::create(path)?, &lines, shape, count)?;
     writer.add(gaussians)?;
     writer.finish()
 }
@@ -124,7 +124,8 @@ impl Writer {
     fn new(
         file: fs::File,
         comments: &[String],
-        (shape, count): (Shape, usize),
+        shape: Shape,
+        count: usize,
     ) -> std::io::Result<Self> {
         let mut file = BufWriter::new(file);
         writeln!(file, "ply\nformat binary_little_endian 1.0")?;

@@ -88,14 +88,15 @@ impl PartFile {
 /// bytes as of [`super::save_with_comments`].
 pub(crate) fn save_parts(
     path: &Path,
-    (of, count): (&Gaussians, usize),
+    of: &Gaussians,
+    count: usize,
     comments: &[String],
     parts: impl FnOnce(&mut dyn FnMut(&Gaussians) -> Result<()>) -> Result<()>,
 ) -> Result<()> {
     let mut failed = None;
     let written = write_whole_with(path, |partial| {
         let lines = comment_lines(of.origin, comments);
-        let mut writer = Writer::new(File::create(partial)?, &lines, (of.shape, count))?;
+        let mut writer = Writer::new(File::create(partial)?, &lines, of.shape, count)?;
         let mut unwritten = None;
         let handed = parts(&mut |part| {
             writer.add(part).map_err(|error| {
@@ -135,7 +136,7 @@ mod tests {
         let file = PartFile::open(&path("a.ply"), 5).unwrap().unwrap();
         assert_eq!((file.count(), file.shape(), file.facts().near), (23, 2.into(), Some(0.1)));
         let mut sizes = vec![];
-        save_parts(&path("b.ply"), (&model, 23), &comments, |take| {
+        save_parts(&path("b.ply"), &model, 23, &comments, |take| {
             file.read(|part| {
                 sizes.push(part.count);
                 take(&part)
@@ -152,7 +153,7 @@ mod tests {
         std::fs::write(path("c.ply"), broken).unwrap();
         let file = PartFile::open(&path("c.ply"), 5).unwrap().unwrap();
         let copy = |take: &mut dyn FnMut(&Gaussians) -> Result<()>| file.read(|part| take(&part));
-        let refused = save_parts(&path("d.ply"), (&model, 23), &comments, copy).unwrap_err();
+        let refused = save_parts(&path("d.ply"), &model, 23, &comments, copy).unwrap_err();
         assert!(refused.to_string().contains("vertex 22: `rot_3` is inf"), "{refused}");
         std::fs::write(path("c.ply"), &a[..end - 1]).unwrap();
         let refused = PartFile::open(&path("c.ply"), 5).unwrap_err().to_string();
