@@ -38,15 +38,36 @@ pub struct Planes {
     pub rest_by_column: bool,
 }
 
-/// The index of word `k` of Gaussian `i` of `count` in a plane: its number, first column and width.
-pub(super) fn word_of_plane(
-    (number, plane): (usize, (usize, usize)),
-    rest_by_column: bool,
-    count: usize,
-    i: usize,
-    k: usize,
-) -> usize {
-    word_of(plane, rest_by_column && number == Attribute::Rest as usize, count, i, k)
+/// The layout of an array of words, of which the last attribute may be in halves.
+#[derive(Clone, Copy)]
+pub(super) struct Words {
+    /// Gaussians in the array.
+    pub(super) count: usize,
+    pub(super) feature_count: usize,
+    /// Words per Gaussian.
+    pub(super) columns: usize,
+    pub(super) rest_by_column: bool,
+}
+
+impl Words {
+    /// The layout of `count` Gaussians.
+    pub(super) fn new(
+        count: usize,
+        [feature_count, columns]: [u32; 2],
+        rest_by_column: bool,
+    ) -> Self {
+        let [feature_count, columns] = [feature_count, columns].map(|n| n as usize);
+        Self { count, feature_count, columns, rest_by_column }
+    }
+
+    /// The indices of the words of Gaussian `i`.
+    pub(super) fn of_gaussian(self, i: usize) -> impl Iterator<Item = usize> {
+        let planes = planes(self.feature_count, self.columns).into_iter().enumerate();
+        planes.flat_map(move |(number, plane)| {
+            let is_by_column = self.rest_by_column && number == Attribute::Rest as usize;
+            (0..plane.1).map(move |k| word_of(plane, is_by_column, self.count, i, k))
+        })
+    }
 }
 
 impl Planes {
@@ -68,11 +89,9 @@ impl Planes {
 
     /// The indices of the floats of Gaussian `i`, in the order of [`Gaussian`].
     pub(super) fn places(self, i: usize) -> impl Iterator<Item = usize> {
-        let columns = column_count(self.feature_count, self.sh_degree);
-        let planes = planes(self.feature_count, columns);
-        planes.into_iter().enumerate().flat_map(move |plane| {
-            (0..plane.1.1).map(move |k| word_of_plane(plane, self.rest_by_column, self.count, i, k))
-        })
+        let Self { count, feature_count, sh_degree, rest_by_column } = self;
+        let columns = column_count(feature_count, sh_degree);
+        Words { count, feature_count, columns, rest_by_column }.of_gaussian(i)
     }
 
     /// The array as floats, Gaussian by Gaussian, and its planes; the last one may be in halves.

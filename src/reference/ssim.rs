@@ -3,8 +3,8 @@
 use glam::UVec2;
 
 use super::inside;
-use super::rounding::{Rounded, UNIT, chain};
-use crate::gpu::{Reference, Tolerance};
+use super::rounding::{Rounded, UNIT, chain, sum_tolerance, write, write_sum};
+use crate::gpu::Reference;
 use crate::kernels::ssim::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::ssim_window::{C1, C2};
 use crate::photographs::tone::Real;
@@ -91,8 +91,8 @@ pub fn gradient(
 
 /// dSSIM/da at one pixel, from the blurred derivatives. A value outside all windows has no gradient, even if it is NaN.
 fn d_ssim<T: Real>(a: T, b: T, [mean, square, product]: [T; 3]) -> T {
-    let own = if square == T::of(0.0) { square } else { T::of(2.0) * a * square };
-    mean + own + b * product
+    let of_square = if square == T::of(0.0) { square } else { T::of(2.0) * a * square };
+    mean + of_square + b * product
 }
 
 /// The gradient at one pixel, from the blurred derivatives, and |a - b| where it counts.
@@ -104,8 +104,8 @@ pub(super) fn rounded_gradient(
     counts: bool,
 ) -> [Rounded; 2] {
     let difference = if counts { a - b } else { Rounded::default() };
-    let own = difference.value;
-    let sign = Rounded::of(if own == 0.0 { 0.0 } else { own.signum() });
+    let value = difference.value;
+    let sign = Rounded::of(if value == 0.0 { 0.0 } else { value.signum() });
     let gradient = l1_scale * sign - ssim_scale * d_ssim(a, b, d_moments);
     [gradient, difference.abs()]
 }
@@ -131,9 +131,8 @@ fn outcomes(params: &Params, slices: &Slices<'_>) -> Vec<Outcome> {
     let pixels = params.width as usize * params.height as usize;
     let channel = |channel: usize| {
         let plane = channel * pixels..(channel + 1) * pixels;
-        let exact = |&x: &f32| Rounded::exact(x);
-        let a: Vec<_> = slices.render[plane.clone()].iter().map(exact).collect();
-        let b: Vec<_> = slices.target[plane].iter().map(exact).collect();
+        let [a, b] =
+            [slices.render, slices.target].map(|image| Rounded::all(&image[plane.clone()]));
         outcomes_of_channel(params, &a, &b)
     };
     (0..3).flat_map(channel).collect()
@@ -190,32 +189,20 @@ fn accumulated<'a>(
 }
 
 impl Reference for Kernel {
-    /// The whole sums go into the first partials: the number of partials is chosen by the device.
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let (outcomes, before) = (outcomes(params, &slices), slices.d_render.to_vec());
-        for (to, d) in slices.d_render.iter_mut().zip(accumulated(&outcomes, constants, &before)) {
-            *to = d.value as f32;
-        }
-        let sum = |of: fn(&Outcome) -> f64| outcomes.iter().map(of).sum::<f64>() as f32;
-        for (partials, sum) in [
-            (slices.l1_partials, sum(|of| of.difference.value)),
-            (slices.ssim_partials, sum(|of| of.ssim.value)),
-        ] {
-            partials.fill(0.0);
-            partials[0] = sum;
-        }
+        write(accumulated(&outcomes, constants, &before), slices.d_render);
+        write_sum(outcomes.iter().map(|of| of.difference.value), slices.l1_partials);
+        write_sum(outcomes.iter().map(|of| of.ssim.value), slices.ssim_partials);
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let outcomes = outcomes(params, &slices);
         let chain = chain(0) + f64::from(constants.columns * constants.rows);
-        let sum = |of: fn(&Outcome) -> Rounded| {
-            Tolerance::Sum(Rounded::sum(chain, outcomes.iter().map(of)).bound())
-        };
         Tolerances {
             d_render: accumulated(&outcomes, constants, slices.d_render).collect(),
-            l1_partials: sum(|of| of.difference),
-            ssim_partials: sum(|of| of.ssim),
+            l1_partials: sum_tolerance(chain, outcomes.iter().map(|of| of.difference)),
+            ssim_partials: sum_tolerance(chain, outcomes.iter().map(|of| of.ssim)),
         }
     }
 }
