@@ -16,6 +16,7 @@ pub mod lpips;
 mod norm;
 mod parameters;
 mod relu;
+mod reserved;
 mod tonemapper;
 mod trunk;
 
@@ -62,8 +63,8 @@ const NARROW_SUBGROUP: u32 = 8;
 /// The columns and rows of pixels for this device.
 pub(crate) fn conv_shape(gpu: &Gpu) -> [u32; 2] {
     match gpu.properties() {
-        own if own.is_cpu => CPU_SHAPE,
-        own if own.subgroup_size <= NARROW_SUBGROUP => NARROW_GPU_SHAPE,
+        device if device.is_cpu => CPU_SHAPE,
+        device if device.subgroup_size <= NARROW_SUBGROUP => NARROW_GPU_SHAPE,
         _ => GPU_SHAPE,
     }
 }

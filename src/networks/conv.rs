@@ -77,15 +77,26 @@ pub(super) struct Conv {
     outputs: u32,
     forward: Product,
     data_gradient: Product,
-    weight_gradient: WeightGradient,
+    weight_gradient: Pipeline<conv3x3_weight_gradient::Kernel>,
     reduce: Reduce,
 }
 
-/// The input of a convolution and the gradient of its output before the activation.
+/// A layer: the parameters of its network, and the offset of its weights and biases.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct WeightGradientInputs<'a> {
+pub(super) struct Layer<'a> {
+    pub(super) offset: u32,
+    pub(super) values: &'a Buffer<f32>,
+}
+
+/// The images of a layer's backward pass, each (C, H, W).
+#[derive(Debug)]
+pub(super) struct Backward<'a> {
+    /// The input of the layer.
     pub(super) source: &'a Buffer<f32>,
+    /// The gradient of its output, before the activation of a convolution.
     pub(super) d_target: &'a Buffer<f32>,
+    /// The gradient of its input.
+    pub(super) d_source: &'a mut Buffer<f32>,
 }
 
 impl Conv {
@@ -106,7 +117,10 @@ impl Conv {
             outputs,
             forward: Product::new(gpu, outputs, forward)?,
             data_gradient: Product::new(gpu, inputs, backward)?,
-            weight_gradient: WeightGradient::new(gpu, outputs)?,
+            weight_gradient: gpu.pipeline(&conv3x3_weight_gradient::Constants {
+                rows: STRIP_ROWS,
+                out_block: outputs.min(OUT_BLOCK),
+            })?,
             reduce: Reduce::new(gpu)?,
         })
     }
@@ -116,43 +130,37 @@ impl Conv {
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
-        offset: u32,
-        values: &Buffer<f32>,
+        layer: Layer<'_>,
         source: &Buffer<f32>,
         target: &mut Buffer<f32>,
     ) -> Result<()> {
-        let channels = [self.inputs, self.outputs];
-        self.forward.record(pass, size, channels, offset, values, source, target)
+        self.forward.record(pass, size, [self.inputs, self.outputs], layer, source, target)
     }
 
-    /// Writes or adds the gradient of the input, given that of the output before the activation.
-    pub(super) fn data_gradient(
+    /// Adds the gradients of weights and biases, and writes or adds that of the input.
+    pub(super) fn backward(
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
-        offset: u32,
-        values: &Buffer<f32>,
-        d_target: &Buffer<f32>,
-        d_source: &mut Buffer<f32>,
+        layer: Layer<'_>,
+        images: Backward<'_>,
+        strips: &mut Strips<'_>,
     ) -> Result<()> {
-        let channels = [self.outputs, self.inputs];
-        self.data_gradient.record(pass, size, channels, offset, values, d_target, d_source)
-    }
-
-    /// Adds the gradients of weights and biases; `partials` has [`partial_count`] values.
-    pub(super) fn weight_gradient(
-        &self,
-        pass: &mut Recorder<'_>,
-        size: UVec2,
-        offset: u32,
-        seen: WeightGradientInputs<'_>,
-        partials: &mut Buffer<f32>,
-        gradients: &mut Buffer<f32>,
-    ) -> Result<()> {
-        let channels = [self.inputs, self.outputs];
-        self.weight_gradient.record(pass, size, channels, seen, partials)?;
+        let Backward { source, d_target, d_source } = images;
+        let (inputs, outputs) = (self.inputs, self.outputs);
         let strip_count = size.y.div_ceil(STRIP_ROWS);
-        self.reduce.record(pass, channels, strip_count, offset, Strips { partials, gradients })
+        pass.dispatch(
+            &self.weight_gradient,
+            &conv3x3_weight_gradient::Params { size, in_channels: inputs, out_channels: outputs },
+            conv3x3_weight_gradient::Buffers {
+                source: source.slice(),
+                d_target: d_target.slice(),
+                partials: strips.partials.slice_mut(),
+            },
+            Threads::Workgroups([inputs, outputs.div_ceil(outputs.min(OUT_BLOCK)), strip_count]),
+        )?;
+        self.reduce.record(pass, [inputs, outputs], strip_count, layer.offset, strips)?;
+        self.data_gradient.record(pass, size, [outputs, inputs], layer, d_target, d_source)
     }
 }
 
@@ -190,14 +198,12 @@ impl Product {
         Ok(Self { kernel, columns, rows, channels })
     }
 
-    #[expect(clippy::too_many_arguments, reason = "a layer, its place and its images")]
     pub(super) fn record(
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
         [in_channels, out_channels]: [u32; 2],
-        offset: u32,
-        values: &Buffer<f32>,
+        Layer { offset, values }: Layer<'_>,
         source: &Buffer<f32>,
         target: &mut Buffer<f32>,
     ) -> Result<()> {
@@ -213,45 +219,6 @@ impl Product {
                 out_channels.div_ceil(self.channels),
                 size.x.div_ceil(self.columns),
                 size.y.div_ceil(self.rows),
-            ]),
-        )
-    }
-}
-
-/// The kernel that sums the weight gradient over strips, and the output channels per subgroup.
-#[derive(Debug)]
-struct WeightGradient {
-    kernel: Pipeline<conv3x3_weight_gradient::Kernel>,
-    outputs: u32,
-}
-
-impl WeightGradient {
-    fn new(gpu: &Gpu, outputs: u32) -> Result<Self> {
-        let outputs = outputs.min(OUT_BLOCK);
-        let constants = conv3x3_weight_gradient::Constants { rows: STRIP_ROWS, out_block: outputs };
-        Ok(Self { kernel: gpu.pipeline(&constants)?, outputs })
-    }
-
-    fn record(
-        &self,
-        pass: &mut Recorder<'_>,
-        size: UVec2,
-        [in_channels, out_channels]: [u32; 2],
-        WeightGradientInputs { source, d_target }: WeightGradientInputs<'_>,
-        partials: &mut Buffer<f32>,
-    ) -> Result<()> {
-        pass.dispatch(
-            &self.kernel,
-            &conv3x3_weight_gradient::Params { size, in_channels, out_channels },
-            conv3x3_weight_gradient::Buffers {
-                source: source.slice(),
-                d_target: d_target.slice(),
-                partials: partials.slice_mut(),
-            },
-            Threads::Workgroups([
-                in_channels,
-                out_channels.div_ceil(self.outputs),
-                size.y.div_ceil(STRIP_ROWS),
             ]),
         )
     }
@@ -280,7 +247,7 @@ impl Reduce {
         [inputs, outputs]: [u32; 2],
         strip_count: u32,
         offset: u32,
-        Strips { partials, gradients }: Strips<'_>,
+        Strips { partials, gradients }: &mut Strips<'_>,
     ) -> Result<()> {
         let parameter_count = layer_len(inputs, outputs);
         pass.dispatch(

@@ -16,14 +16,15 @@ mod memory;
 
 use glam::UVec2;
 
-use self::memory::{Activations, DenoiserExtent, DenoiserMemory, EarlierStages, Repeat};
-use super::conv::{AccumulateInto, Activation, Conv, Precision, Strips, WeightGradientInputs};
+use self::memory::{Activations, DenoiserMemory, EarlierStages, Repeat};
+use super::conv::{AccumulateInto, Activation, Backward, Conv, Layer, Precision, Strips};
 use super::half::{Direction, PackedMap};
-use super::inner::{Inner, InnerLayer, Map};
-use super::norm::{Backward, Forward, Norm, NormUse};
+use super::inner::{Inner, InnerLayer, PackedBackward};
+use super::norm::{Forward, Norm, NormUse};
 use super::parameters::{Layout, Parameters};
 use super::relu::ReluBackward;
-use super::{NetworkVariant, RGB, check_images, out_of_turn, pixel_count};
+use super::reserved::Reserved;
+use super::{NetworkVariant, RGB};
 use crate::base::random::Stream;
 use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Properties, Recorder, Threads};
@@ -90,11 +91,8 @@ pub struct Denoiser {
     parameters: Parameters,
     stages: Vec<Stage>,
     kernels: Kernels,
-    reserved: DenoiserExtent,
-    memory: DenoiserMemory,
+    reserved: Reserved<DenoiserMemory>,
     earlier: EarlierStages,
-    /// The size of the last forward pass.
-    recorded: Option<UVec2>,
 }
 
 /// The offsets of a stage's layers in the parameters.
@@ -134,15 +132,9 @@ impl Denoiser {
             conv_in: layout.conv(&format!("{k}.conv_in"), RGB, channels),
             conv: layout.conv(&format!("{k}.conv"), channels, channels),
             norm: layout.norm(&format!("{k}.norm"), channels),
-            conv_out: match settings.variant {
-                NetworkVariant::Identity => {
-                    layout.zero_conv(&format!("{k}.conv_out"), channels, RGB)
-                }
-                NetworkVariant::Paper => layout.conv(&format!("{k}.conv_out"), channels, RGB),
-            },
+            conv_out: layout.last_conv(&format!("{k}.conv_out"), channels, settings.variant),
         };
         let stages = (0..settings.stages).map(stage).collect();
-        let reserved = DenoiserExtent::default();
         let held = settings.held_on(gpu);
         Ok(Self {
             gpu: gpu.clone(),
@@ -150,15 +142,14 @@ impl Denoiser {
             held,
             parameters: layout.upload(
                 gpu,
-                ("denoiser", Self::LEARNING_RATE),
+                "denoiser",
+                Self::LEARNING_RATE,
                 serde_json::json!(settings).to_string(),
             )?,
             stages,
             kernels: Kernels::new(gpu, settings)?,
-            reserved,
-            memory: DenoiserMemory::new(gpu, held, reserved)?,
+            reserved: Reserved::new("denoiser", |extent| DenoiserMemory::new(gpu, held, extent))?,
             earlier: EarlierStages::default(),
-            recorded: None,
         })
     }
 
@@ -194,42 +185,33 @@ impl Denoiser {
     /// The memory of [`Denoiser::reserve`] for a view.
     #[cfg(feature = "testing")]
     pub fn bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
-        DenoiserExtent::of(settings, size).bytes(settings)
+        memory::bytes(settings, memory::extent(settings, size))
     }
 
     /// The additional memory of [`Denoiser::keep_activations`] for a view.
     #[cfg(feature = "testing")]
     pub fn kept_bytes(settings: DenoiserSettings, size: UVec2) -> u64 {
-        EarlierStages::bytes(settings, DenoiserExtent::of(settings, size))
+        EarlierStages::bytes(settings, memory::extent(settings, size))
     }
 
     /// Whether the device can bind every map of a view of `size`.
     pub fn fits_on(gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> bool {
         let held = settings.held_on(gpu);
-        DenoiserExtent::of(held, size).check(gpu, held, size).is_ok()
+        memory::check(gpu, held, size).is_ok()
     }
 
     /// Allocates for views up to `size`; it never shrinks.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
-        let needed = DenoiserExtent::of(self.held, size);
-        if needed.fits(self.reserved) {
-            return Ok(());
-        }
-        let gpu = &self.gpu;
-        needed.check(gpu, self.held, size)?;
-        // The old memory is freed first: both together may not fit.
-        self.recorded = None;
-        let extent = needed.max(std::mem::take(&mut self.reserved));
-        self.memory = DenoiserMemory::new(gpu, self.held, DenoiserExtent::default())?;
-        self.memory = DenoiserMemory::new(gpu, self.held, extent)?;
-        self.reserved = extent;
-        Ok(())
+        let (gpu, held) = (&self.gpu, self.held);
+        memory::check(gpu, held, size)?;
+        let allocate = |extent| DenoiserMemory::new(gpu, held, extent);
+        self.reserved.grow(memory::extent(held, size), allocate)
     }
 
     /// Keeps the activations of every stage in views up to `size` from now on, if that takes at most `most` bytes and
     /// the device has them; returns whether it does. Results are bit-identical either way.
     pub fn keep_activations(&mut self, size: UVec2, most: u64) -> Result<bool> {
-        let (settings, needed) = (self.held, DenoiserExtent::of(self.held, size));
+        let (settings, needed) = (self.held, memory::extent(self.held, size));
         if needed.fits(self.earlier.extent()) {
             return Ok(true);
         }
@@ -237,7 +219,7 @@ impl Denoiser {
         if EarlierStages::bytes(settings, extent) > most {
             return Ok(false);
         }
-        (self.recorded, self.earlier) = (None, EarlierStages::default());
+        (self.reserved.recorded, self.earlier) = (None, EarlierStages::default());
         match EarlierStages::new(&self.gpu, settings, extent) {
             Ok(earlier) => self.earlier = earlier,
             Err(Error::OutOfMemory { .. } | Error::BufferTooLarge { .. }) => return Ok(false),
@@ -248,7 +230,8 @@ impl Denoiser {
 
     /// `R_K` of the last forward pass, (3, H, W), at the start of a buffer of the reserved length.
     pub fn denoised(&self) -> &Buffer<f32> {
-        &self.memory.denoised[self.memory.denoised.len() - 1]
+        let denoised = &self.reserved.memory.denoised;
+        &denoised[denoised.len() - 1]
     }
 
     /// Records the forward pass from `I_0`, the noise map or in the identity variant the render, and the render, each
@@ -260,33 +243,30 @@ impl Denoiser {
         input: &Buffer<f32>,
         render: &Buffer<f32>,
     ) -> Result<()> {
-        let (pixels, extent) = (pixel_count(size)?, DenoiserExtent::of(self.held, size));
-        if !extent.fits(self.reserved) {
-            return Err(out_of_turn("denoiser", size, "reserve memory for that size first"));
-        }
-        check_images(pixels, [input, render])?;
+        let extent = memory::extent(self.held, size);
+        let value_count = RGB * self.reserved.check_forward(size, extent, [input, render])?;
         let Self { kernels, parameters, earlier, .. } = self;
-        let DenoiserMemory { activations: shared, denoised, .. } = &mut self.memory;
+        let DenoiserMemory { activations: shared, denoised, .. } = &mut self.reserved.memory;
         for (k, stage) in self.stages.iter().enumerate() {
             let (before, from_here) = denoised.split_at_mut(k);
             let stage_input = before.last().unwrap_or(input);
-            let own = earlier.of(k, extent, shared);
+            let activations = earlier.of(k, extent, shared);
             kernels.conv.prepare(pass, Direction::Forward, stage.inner(&parameters.values))?;
-            kernels.stage_forward(pass, size, stage, &parameters.values, stage_input, own)?;
-            let value_count = RGB * pixels as u32;
+            let values = &parameters.values;
+            kernels.stage_forward(pass, size, stage, values, stage_input, activations)?;
             pass.dispatch(
                 &kernels.residual,
                 &residual::Params { value_count },
                 residual::Buffers {
                     render: render.slice(),
                     stage_input: stage_input.slice(),
-                    update: own.update.slice(),
+                    update: activations.update.slice(),
                     denoised: from_here[0].slice_mut(),
                 },
                 Threads::Exactly([value_count, 1, 1]),
             )?;
         }
-        self.recorded = Some(size);
+        self.reserved.recorded = Some(size);
         Ok(())
     }
 
@@ -304,14 +284,10 @@ impl Denoiser {
         d_input: &mut Buffer<f32>,
         d_render: &mut Buffer<f32>,
     ) -> Result<()> {
-        let pixels = pixel_count(size)?;
-        check_images(pixels, [input, render, d_denoised, d_input, d_render])?;
-        if self.recorded.take() != Some(size) {
-            let remedy = "each backward pass needs its own preceding forward pass";
-            return Err(out_of_turn("denoiser", size, remedy));
-        }
-        let Self { kernels, memory, earlier, parameters, stages, held, .. } = self;
-        let extent = DenoiserExtent::of(*held, size);
+        let images = [input, render, d_denoised, d_input, d_render];
+        let value_count = RGB * self.reserved.check_backward(size, images)?;
+        let Self { kernels, earlier, parameters, stages, held, .. } = self;
+        let (memory, extent) = (&mut self.reserved.memory, memory::extent(*held, size));
         let are_kept = extent.fits(earlier.extent());
         pass.fill(&mut parameters.gradients, 0);
         for stage in stages.iter() {
@@ -327,10 +303,9 @@ impl Denoiser {
             }
             // Two images alternate, so that a stage never reads what it writes.
             let [even, odd] = &mut memory.d_denoised;
-            let (own, other) = if k % 2 == 0 { (even, odd) } else { (odd, even) };
-            let d_output = if k == last { d_denoised } else { &*other };
-            let d_stage_input = if k == 0 { &mut *d_input } else { own };
-            let value_count = RGB * pixels as u32;
+            let (written, read) = if k % 2 == 0 { (even, odd) } else { (odd, even) };
+            let d_output = if k == last { d_denoised } else { &*read };
+            let d_stage_input = if k == 0 { &mut *d_input } else { written };
             pass.dispatch(
                 &kernels.residual_backward,
                 &residual_backward::Params { value_count },
@@ -410,16 +385,15 @@ impl Kernels {
         activations: &mut Activations,
     ) -> Result<()> {
         let first = activations.first_features();
-        self.conv_in.forward(pass, size, stage.conv_in, values, input, first)?;
+        self.conv_in.forward(pass, size, Layer { offset: stage.conv_in, values }, input, first)?;
         for repeat in 0..self.repeats {
             let Repeat { shortcut, packed, convolved, norm, target } = activations.repeat(repeat);
-            let map = Map { single: shortcut, packed };
-            self.conv.forward(pass, size, stage.inner(values), map, convolved)?;
+            self.conv.forward(pass, size, stage.inner(values), shortcut, packed, convolved)?;
             let images = Forward { source: convolved, shortcut, target };
             self.norm.forward(pass, stage.norm_use(size, repeat), values, norm, images)?;
         }
         let (last, update) = activations.ends(self.repeats);
-        self.conv_out.forward(pass, size, stage.conv_out, values, last, update)
+        self.conv_out.forward(pass, size, Layer { offset: stage.conv_out, values }, last, update)
     }
 
     /// From the gradient of the last layer's sum to that of the stage's input; adds those of the stage's parameters.
@@ -434,44 +408,41 @@ impl Kernels {
     ) -> Result<()> {
         let Parameters { values, gradients, .. } = parameters;
         let Maps { activations, d_features, d_convolved, d_packed, partials } = maps;
-        let last = activations.features(self.repeats);
-        let seen = WeightGradientInputs { source: last, d_target: ends.d_update };
-        self.conv_out.weight_gradient(pass, size, stage.conv_out, seen, partials, gradients)?;
-        self.conv_out.data_gradient(
-            pass,
-            size,
-            stage.conv_out,
-            values,
-            ends.d_update,
-            d_features,
-        )?;
+        let mut strips = Strips { partials, gradients };
+        let images = Backward {
+            source: activations.features(self.repeats),
+            d_target: ends.d_update,
+            d_source: &mut *d_features,
+        };
+        let layer = Layer { offset: stage.conv_out, values };
+        self.conv_out.backward(pass, size, layer, images, &mut strips)?;
         for repeat in (0..self.repeats).rev() {
-            let (of, Activations { convolved, norm, .. }) =
-                (stage.norm_use(size, repeat), &mut *activations);
+            let Activations { convolved, norm, .. } = &mut *activations;
             let (d_target, d_source) = (&*d_features, &mut *d_convolved);
             let images = Backward { source: &convolved[repeat], d_target, d_source };
-            self.norm.backward(pass, of, values, gradients, norm, images)?;
-            let source = (activations.features(repeat), &activations.packed[repeat]);
-            let d_target = Map { single: &*d_convolved, packed: &mut *d_packed };
-            let strips = Strips { partials: &mut *partials, gradients: &mut *gradients };
+            let norm_use = stage.norm_use(size, repeat);
+            self.norm.backward(pass, norm_use, values, strips.gradients, norm, images)?;
             // The shortcut passes the gradient through: that of the convolution is added to it.
-            let layer = stage.inner(values);
-            self.conv.backward(pass, size, layer, source, d_target, d_features, strips)?;
+            let (source, d_source) = (activations.features(repeat), &mut *d_features);
+            let images = Backward { source, d_target: &*d_convolved, d_source };
+            let source = &activations.packed[repeat];
+            let packed = PackedBackward { source, d_target: &mut *d_packed };
+            self.conv.backward(pass, size, stage.inner(values), images, packed, &mut strips)?;
         }
         let value_count = self.channels * size.element_product();
         let first = activations.features(0);
         self.relu_backward.record(pass, value_count, first, d_features)?;
-        let seen = WeightGradientInputs { source: ends.stage_input, d_target: &*d_features };
-        self.conv_in.weight_gradient(pass, size, stage.conv_in, seen, partials, gradients)?;
-        let d_input = ends.d_stage_input;
-        self.conv_in.data_gradient(pass, size, stage.conv_in, values, d_features, d_input)
+        let StageMaps { stage_input: source, d_stage_input: d_source, .. } = ends;
+        let images = Backward { source, d_target: &*d_features, d_source };
+        let layer = Layer { offset: stage.conv_in, values };
+        self.conv_in.backward(pass, size, layer, images, &mut strips)
     }
 }
 
 impl Stage {
     /// The repeated layer.
     fn inner(self, values: &Buffer<f32>) -> InnerLayer<'_> {
-        InnerLayer { number: self.number, offset: self.conv, values }
+        InnerLayer { number: self.number, layer: Layer { offset: self.conv, values } }
     }
 
     fn norm_use(&self, size: UVec2, repeat: usize) -> NormUse {

@@ -2,7 +2,7 @@
 
 use glam::UVec2;
 
-use super::conv::{AccumulateInto, HALF_STRIP_ROWS, Reduce, Strips};
+use super::conv::{AccumulateInto, HALF_STRIP_ROWS, Layer, Reduce, Strips};
 use crate::Result;
 use crate::gpu::{Buffer, CooperativeMatrix, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::packed::{PACKED_CHANNELS, PACKED_COLUMNS, PACKED_ROWS};
@@ -87,8 +87,8 @@ impl HalfConv {
         let [blocks, strip_blocks] =
             [BLOCKS, STRIP_BLOCKS].map(|most| channels.div_ceil(m).min(most));
         let pack_weights = |transposed| gpu.pipeline(&pack_weights::Constants { transposed });
-        let product = |biased, own| {
-            let accumulate = adds == own;
+        let product = |biased, target| {
+            let accumulate = adds == target;
             gpu.pipeline(&conv3x3_half::Constants { m, n, k, blocks, biased, accumulate })
         };
         let (blocks_of_strip, rows) = (strip_blocks, HALF_STRIP_ROWS);
@@ -126,13 +126,12 @@ impl HalfConv {
         9 * self.channels.next_multiple_of(PACKED_CHANNELS).pow(2) / 8
     }
 
-    /// Packs the weights of the layer at `offset`; for the backward direction after the forward one.
+    /// Packs the weights of a layer; for the backward direction after the forward one.
     pub(super) fn pack_weights(
         &self,
         pass: &mut Recorder<'_>,
         way: Direction,
-        offset: u32,
-        values: &Buffer<f32>,
+        Layer { offset, values }: Layer<'_>,
         packed: &mut PackedWeights,
     ) -> Result<()> {
         let PackedWeights { largest, halves } = packed;
@@ -193,13 +192,13 @@ impl HalfConv {
     }
 
     /// Writes or adds the convolution of the packed `source` in a direction, (C, H, W), with the weights packed for it.
-    #[expect(clippy::too_many_arguments, reason = "a layer, its place and its images")]
+    #[expect(clippy::too_many_arguments, reason = "a layer and its packed images")]
     pub(super) fn product(
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
         way: Direction,
-        (offset, values): (u32, &Buffer<f32>),
+        Layer { offset, values }: Layer<'_>,
         weights: &PackedWeights,
         source: &PackedMap,
         target: &mut Buffer<f32>,
@@ -235,7 +234,7 @@ impl HalfConv {
         offset: u32,
         [source, d_target]: [&PackedMap; 2],
         d_target_single: &Buffer<f32>,
-        Strips { partials, gradients }: Strips<'_>,
+        strips: &mut Strips<'_>,
     ) -> Result<()> {
         let (in_channels, out_channels) = (self.channels, self.channels);
         let CooperativeMatrix { m, n, .. } = self.matrix;
@@ -249,7 +248,7 @@ impl HalfConv {
                 source: source.halves.slice(),
                 d_target: d_target.halves.slice(),
                 d_target_single: d_target_single.slice(),
-                partials: partials.slice_mut(),
+                partials: strips.partials.slice_mut(),
             },
             Threads::Workgroups([
                 in_channels.div_ceil(n),
@@ -257,7 +256,6 @@ impl HalfConv {
                 strip_count,
             ]),
         )?;
-        let channels = [in_channels, out_channels];
-        self.reduce.record(pass, channels, strip_count, offset, Strips { partials, gradients })
+        self.reduce.record(pass, [in_channels, out_channels], strip_count, offset, strips)
     }
 }

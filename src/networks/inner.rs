@@ -2,7 +2,7 @@
 
 use glam::UVec2;
 
-use super::conv::{AccumulateInto, Activation, Conv, Precision, Strips, WeightGradientInputs};
+use super::conv::{AccumulateInto, Activation, Backward, Conv, Layer, Precision, Strips};
 use super::half::{Direction, HalfConv, PackedMap, PackedWeights};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Recorder};
@@ -14,19 +14,18 @@ pub(super) enum Inner {
     Half { conv: HalfConv, layers: Vec<PackedWeights> },
 }
 
-/// A layer: its number, and its offset in the values.
+/// A layer and its number.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct InnerLayer<'a> {
     pub(super) number: usize,
-    pub(super) offset: u32,
-    pub(super) values: &'a Buffer<f32>,
+    pub(super) layer: Layer<'a>,
 }
 
-/// A map, and its packed form.
+/// The packed forms of a layer's input, as its forward pass left it, and of the gradient of its output.
 #[derive(Debug)]
-pub(super) struct Map<'a> {
-    pub(super) single: &'a Buffer<f32>,
-    pub(super) packed: &'a mut PackedMap,
+pub(super) struct PackedBackward<'a> {
+    pub(super) source: &'a PackedMap,
+    pub(super) d_target: &'a mut PackedMap,
 }
 
 impl Inner {
@@ -50,14 +49,11 @@ impl Inner {
         &mut self,
         pass: &mut Recorder<'_>,
         way: Direction,
-        layer: InnerLayer<'_>,
+        InnerLayer { number, layer }: InnerLayer<'_>,
     ) -> Result<()> {
-        let InnerLayer { number, offset, values } = layer;
         match self {
             Self::Single(_) => Ok(()),
-            Self::Half { conv, layers } => {
-                conv.pack_weights(pass, way, offset, values, &mut layers[number])
-            }
+            Self::Half { conv, layers } => conv.pack_weights(pass, way, layer, &mut layers[number]),
         }
     }
 
@@ -66,49 +62,40 @@ impl Inner {
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
-        layer: InnerLayer<'_>,
-        source: Map<'_>,
+        InnerLayer { number, layer }: InnerLayer<'_>,
+        source: &Buffer<f32>,
+        packed: &mut PackedMap,
         target: &mut Buffer<f32>,
     ) -> Result<()> {
-        let (InnerLayer { number, offset, values }, Map { single, packed }) = (layer, source);
         match self {
-            Self::Single(conv) => conv.forward(pass, size, offset, values, single, target),
+            Self::Single(conv) => conv.forward(pass, size, layer, source, target),
             Self::Half { conv, layers } => {
-                conv.pack_map(pass, size, single, packed)?;
-                let (own, weights) = ((offset, values), &layers[number]);
-                conv.product(pass, size, Direction::Forward, own, weights, packed, target)
+                conv.pack_map(pass, size, source, packed)?;
+                let (way, weights) = (Direction::Forward, &layers[number]);
+                conv.product(pass, size, way, layer, weights, packed, target)
             }
         }
     }
 
-    /// Adds the gradients of weights and biases, and writes or adds that of the input, `d_source`, from that of the
-    /// output, `d_target`. The input must be that of the forward pass, in single precision, and packed as the forward
-    /// pass left it.
-    #[expect(clippy::too_many_arguments, reason = "a layer, its place, two maps and two gradients")]
+    /// Adds the gradients of weights and biases, and writes or adds that of the input.
     pub(super) fn backward(
         &self,
         pass: &mut Recorder<'_>,
         size: UVec2,
-        layer: InnerLayer<'_>,
-        source: (&Buffer<f32>, &PackedMap),
-        d_target: Map<'_>,
-        d_source: &mut Buffer<f32>,
-        strips: Strips<'_>,
+        InnerLayer { number, layer }: InnerLayer<'_>,
+        images: Backward<'_>,
+        packed: PackedBackward<'_>,
+        strips: &mut Strips<'_>,
     ) -> Result<()> {
-        let (InnerLayer { number, offset, values }, Map { single, packed }) = (layer, d_target);
         match self {
-            Self::Single(conv) => {
-                let seen = WeightGradientInputs { source: source.0, d_target: single };
-                let Strips { partials, gradients } = strips;
-                conv.weight_gradient(pass, size, offset, seen, partials, gradients)?;
-                conv.data_gradient(pass, size, offset, values, single, d_source)
-            }
+            Self::Single(conv) => conv.backward(pass, size, layer, images, strips),
             Self::Half { conv, layers } => {
-                conv.pack_map(pass, size, single, packed)?;
-                let factors = [source.1, &*packed];
-                conv.weight_gradient(pass, size, offset, factors, single, strips)?;
-                let (own, weights) = ((offset, values), &layers[number]);
-                conv.product(pass, size, Direction::Backward, own, weights, packed, d_source)
+                let PackedBackward { source, d_target } = packed;
+                conv.pack_map(pass, size, images.d_target, d_target)?;
+                let (offset, factors) = (layer.offset, [source, &*d_target]);
+                conv.weight_gradient(pass, size, offset, factors, images.d_target, strips)?;
+                let (way, weights) = (Direction::Backward, &layers[number]);
+                conv.product(pass, size, way, layer, weights, d_target, images.d_source)
             }
         }
     }

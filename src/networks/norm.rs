@@ -3,6 +3,7 @@
 
 use glam::Vec2;
 
+use super::conv::Backward;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{
@@ -53,17 +54,6 @@ pub(super) struct Forward<'a> {
     pub(super) shortcut: &'a Buffer<f32>,
     /// f'
     pub(super) target: &'a mut Buffer<f32>,
-}
-
-/// The images of the backward pass, each (C, H, W).
-#[derive(Debug)]
-pub(super) struct Backward<'a> {
-    /// z
-    pub(super) source: &'a Buffer<f32>,
-    /// dL/df'
-    pub(super) d_target: &'a Buffer<f32>,
-    /// dL/dz
-    pub(super) d_source: &'a mut Buffer<f32>,
 }
 
 /// The push constants of all six kernels.
@@ -129,7 +119,7 @@ impl Norm {
         )
     }
 
-    /// Writes dL/dz and adds the gradients of gamma and beta.
+    /// Writes dL/dz from z and dL/df', and adds the gradients of gamma and beta.
     pub(super) fn backward(
         &self,
         pass: &mut Recorder<'_>,

@@ -1,5 +1,6 @@
 //! The parameters of a network: one flat array on the device, and the table of the tensors in it.
 
+use super::{NetworkVariant, RGB};
 use crate::Result;
 use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu};
@@ -96,11 +97,14 @@ impl Layout {
         offset
     }
 
-    /// [`Layout::conv`] with zeros: the output is zero, and still learns.
-    pub(super) fn zero_conv(&mut self, name: &str, inputs: u32, outputs: u32) -> u32 {
-        let (inputs, outputs) = (inputs as usize, outputs as usize);
-        let offset = self.tensor(format!("{name}.weight"), vec![outputs, inputs, 3, 3], |_| 0.0);
-        self.tensor(format!("{name}.bias"), vec![outputs], |_| 0.0);
+    /// The last layer, to RGB: [`Layout::conv`], or zeros in the identity variant, which still learn.
+    pub(super) fn last_conv(&mut self, name: &str, inputs: u32, variant: NetworkVariant) -> u32 {
+        if variant == NetworkVariant::Paper {
+            return self.conv(name, inputs, RGB);
+        }
+        let shape = vec![RGB as usize, inputs as usize, 3, 3];
+        let offset = self.tensor(format!("{name}.weight"), shape, |_| 0.0);
+        self.tensor(format!("{name}.bias"), vec![RGB as usize], |_| 0.0);
         offset
     }
 
@@ -123,7 +127,8 @@ impl Layout {
     pub(super) fn upload(
         self,
         gpu: &Gpu,
-        (name, learning_rate): (&'static str, f64),
+        name: &'static str,
+        learning_rate: f64,
         settings: String,
     ) -> Result<Parameters> {
         Ok(Parameters {

@@ -3,11 +3,12 @@
 use glam::UVec2;
 
 use super::conv::{
-    AccumulateInto, Activation, Conv, Precision, WeightGradientInputs, partial_count,
+    AccumulateInto, Activation, Backward, Conv, Layer, Precision, Strips, partial_count,
 };
 use super::parameters::{Layout, Parameters};
 use super::relu::ReluBackward;
-use super::{NetworkVariant, RGB, check_binding, check_images, out_of_turn, pixel_count};
+use super::reserved::{Extent, Reserved};
+use super::{NetworkVariant, RGB, check_binding};
 use crate::Result;
 use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -32,10 +33,7 @@ pub struct Tonemapper {
     product: Pipeline<product::Kernel>,
     product_backward: Pipeline<product_backward::Kernel>,
     relu_backward: ReluBackward,
-    reserved: [usize; 2],
-    memory: TonemapperMemory,
-    /// The size of the last forward pass.
-    recorded: Option<UVec2>,
+    reserved: Reserved<TonemapperMemory>,
 }
 
 #[derive(Debug)]
@@ -63,10 +61,7 @@ impl Tonemapper {
         let offsets = [
             layout.conv("conv1", RGB, CHANNELS),
             layout.conv("conv2", CHANNELS, CHANNELS),
-            match variant {
-                NetworkVariant::Identity => layout.zero_conv("conv3", CHANNELS, RGB),
-                NetworkVariant::Paper => layout.conv("conv3", CHANNELS, RGB),
-            },
+            layout.last_conv("conv3", CHANNELS, variant),
         ];
         let (relu, none) = (Activation::Relu, Activation::None);
         let [adds_input, adds_output] = match variant {
@@ -76,7 +71,7 @@ impl Tonemapper {
         Ok(Self {
             gpu: gpu.clone(),
             variant,
-            parameters: layout.upload(gpu, ("tonemapper", Self::LEARNING_RATE), "{}".to_owned())?,
+            parameters: layout.upload(gpu, "tonemapper", Self::LEARNING_RATE, "{}".to_owned())?,
             offsets,
             convs: [
                 Conv::new(gpu, [RGB, CHANNELS], relu, adds_input)?,
@@ -86,9 +81,7 @@ impl Tonemapper {
             product: gpu.pipeline(&product::Constants::default())?,
             product_backward: gpu.pipeline(&product_backward::Constants::default())?,
             relu_backward: ReluBackward::new(gpu)?,
-            reserved: [0; 2],
-            memory: TonemapperMemory::new(gpu, [0; 2])?,
-            recorded: None,
+            reserved: Reserved::new("tonemapper", |extent| TonemapperMemory::new(gpu, extent))?,
         })
     }
 
@@ -114,27 +107,13 @@ impl Tonemapper {
 
     /// Allocates for views up to `size`; it never shrinks.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
-        if self.fits(size) {
-            return Ok(());
-        }
-        let [pixels, partials] = lengths(size);
         check_maps(&self.gpu, size)?;
-        let extent = [pixels.max(self.reserved[0]), partials.max(self.reserved[1])];
-        // The old memory is freed first: both together may not fit.
-        (self.recorded, self.reserved) = (None, [0; 2]);
-        self.memory = TonemapperMemory::new(&self.gpu, [0; 2])?;
-        self.memory = TonemapperMemory::new(&self.gpu, extent)?;
-        self.reserved = extent;
-        Ok(())
-    }
-
-    fn fits(&self, size: UVec2) -> bool {
-        lengths(size).into_iter().zip(self.reserved).all(|(needed, held)| needed <= held)
+        self.reserved.grow(extent(size), |extent| TonemapperMemory::new(&self.gpu, extent))
     }
 
     /// The output of the last forward pass, (3, H, W), not clamped, at the start of a buffer of the reserved length.
     pub fn output(&self) -> &Buffer<f32> {
-        &self.memory.output
+        &self.reserved.memory.output
     }
 
     /// Records the forward pass from illumination and denoised image, each (3, H, W), to [`Tonemapper::output`].
@@ -145,13 +124,10 @@ impl Tonemapper {
         illumination: &Buffer<f32>,
         denoised: &Buffer<f32>,
     ) -> Result<()> {
-        let pixels = pixel_count(size)?;
-        if !self.fits(size) {
-            return Err(out_of_turn("tonemapper", size, "reserve memory for that size first"));
-        }
-        check_images(pixels, [illumination, denoised])?;
-        let TonemapperMemory { product, features: [first, second], output, .. } = &mut self.memory;
-        let value_count = RGB * pixels as u32;
+        let images = [illumination, denoised];
+        let value_count = RGB * self.reserved.check_forward(size, extent(size), images)?;
+        let TonemapperMemory { product, features: [first, second], output, .. } =
+            &mut self.reserved.memory;
         pass.dispatch(
             &self.product,
             &product::Params { value_count },
@@ -162,15 +138,15 @@ impl Tonemapper {
             },
             Threads::Exactly([value_count, 1, 1]),
         )?;
-        let ([conv_in, conv, conv_out], [at_in, at, at_out]) = (&self.convs, self.offsets);
-        let values = &self.parameters.values;
-        conv_in.forward(pass, size, at_in, values, product, first)?;
-        conv.forward(pass, size, at, values, first, second)?;
+        let ([conv_in, conv, conv_out], values) = (&self.convs, &self.parameters.values);
+        let [layer_in, layer, layer_out] = self.offsets.map(|offset| Layer { offset, values });
+        conv_in.forward(pass, size, layer_in, product, first)?;
+        conv.forward(pass, size, layer, first, second)?;
         if self.variant == NetworkVariant::Identity {
             pass.copy(product, output);
         }
-        conv_out.forward(pass, size, at_out, values, second, output)?;
-        self.recorded = Some(size);
+        conv_out.forward(pass, size, layer_out, second, output)?;
+        self.reserved.recorded = Some(size);
         Ok(())
     }
 
@@ -187,36 +163,30 @@ impl Tonemapper {
         d_illumination: &mut Buffer<f32>,
         d_denoised: &mut Buffer<f32>,
     ) -> Result<()> {
-        let pixels = pixel_count(size)?;
-        check_images(pixels, [illumination, denoised, d_output, d_illumination, d_denoised])?;
-        if self.recorded.take() != Some(size) {
-            let remedy = "each backward pass needs its own preceding forward pass";
-            return Err(out_of_turn("tonemapper", size, remedy));
-        }
+        let images = [illumination, denoised, d_output, d_illumination, d_denoised];
+        let pixel_count = self.reserved.check_backward(size, images)?;
         let TonemapperMemory { product, features, d_features, d_product, partials, .. } =
-            &mut self.memory;
+            &mut self.reserved.memory;
         let Parameters { values, gradients, .. } = &mut self.parameters;
-        let ([conv_in, conv, conv_out], [at_in, at, at_out]) = (&self.convs, self.offsets);
+        let [conv_in, conv, conv_out] = &self.convs;
+        let [layer_in, layer, layer_out] = self.offsets.map(|offset| Layer { offset, values });
         let ([first, second], [d_first, d_second]) = (features, d_features);
-        let threads = |value_count| Threads::Exactly([value_count, 1, 1]);
         pass.fill(gradients, 0);
 
-        let seen = WeightGradientInputs { source: second, d_target: d_output };
-        conv_out.weight_gradient(pass, size, at_out, seen, partials, gradients)?;
-        conv_out.data_gradient(pass, size, at_out, values, d_output, d_second)?;
-        let value_count = CHANNELS * pixels as u32;
+        let mut strips = Strips { partials, gradients };
+        let images = Backward { source: second, d_target: d_output, d_source: d_second };
+        conv_out.backward(pass, size, layer_out, images, &mut strips)?;
+        let value_count = CHANNELS * pixel_count;
         self.relu_backward.record(pass, value_count, second, d_second)?;
-        let seen = WeightGradientInputs { source: first, d_target: d_second };
-        conv.weight_gradient(pass, size, at, seen, partials, gradients)?;
-        conv.data_gradient(pass, size, at, values, d_second, d_first)?;
+        let images = Backward { source: first, d_target: d_second, d_source: d_first };
+        conv.backward(pass, size, layer, images, &mut strips)?;
         self.relu_backward.record(pass, value_count, first, d_first)?;
         if self.variant == NetworkVariant::Identity {
             pass.copy(d_output, d_product);
         }
-        let seen = WeightGradientInputs { source: product, d_target: d_first };
-        conv_in.weight_gradient(pass, size, at_in, seen, partials, gradients)?;
-        conv_in.data_gradient(pass, size, at_in, values, d_first, d_product)?;
-        let value_count = RGB * pixels as u32;
+        let images = Backward { source: product, d_target: d_first, d_source: d_product };
+        conv_in.backward(pass, size, layer_in, images, &mut strips)?;
+        let value_count = RGB * pixel_count;
         pass.dispatch(
             &self.product_backward,
             &product_backward::Params { value_count },
@@ -227,26 +197,26 @@ impl Tonemapper {
                 d_illumination: d_illumination.slice_mut(),
                 d_denoised: d_denoised.slice_mut(),
             },
-            threads(value_count),
+            Threads::Exactly([value_count, 1, 1]),
         )
     }
 }
 
-/// Pixels, and partial sums of the largest layer's gradient.
-fn lengths(size: UVec2) -> [usize; 2] {
-    [
-        size.x as usize * size.y as usize,
-        partial_count(size, [CHANNELS, CHANNELS], Precision::Single),
-    ]
+fn extent(size: UVec2) -> Extent {
+    Extent {
+        pixels: size.x as usize * size.y as usize,
+        partials: partial_count(size, [CHANNELS, CHANNELS], Precision::Single),
+        packed: 0,
+    }
 }
 
 fn check_maps(gpu: &Gpu, size: UVec2) -> Result<()> {
-    let [pixels, _] = lengths(size);
-    check_binding(gpu, "the tonemapper's feature maps", size, CHANNELS as usize * pixels)
+    let map = CHANNELS as usize * extent(size).pixels;
+    check_binding(gpu, "the tonemapper's feature maps", size, map)
 }
 
 impl TonemapperMemory {
-    fn new(gpu: &Gpu, [pixels, partials]: [usize; 2]) -> Result<Self> {
+    fn new(gpu: &Gpu, Extent { pixels, partials, .. }: Extent) -> Result<Self> {
         let map = |name| gpu.uninit(name, CHANNELS as usize * pixels);
         let image = |name| gpu.uninit(name, RGB as usize * pixels);
         Ok(Self {

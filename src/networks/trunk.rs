@@ -5,7 +5,7 @@ use std::path::Path;
 
 use glam::UVec2;
 
-use super::conv::{Activation, ConvVariant, Product};
+use super::conv::{Activation, ConvVariant, Layer, Product};
 use super::file::TensorFile;
 use super::{RGB, float_bytes};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -270,7 +270,8 @@ impl Trunk {
         let (values, channels) = (&self.values, layer.channels);
         let TrunkLayer { window, stride, padding, .. } = *layer;
         if window == 3 {
-            return self.product.record(pass, size, channels, offset, values, source, target);
+            let layer = Layer { offset, values };
+            return self.product.record(pass, size, channels, layer, source, target);
         }
         let [in_channels, out_channels] = channels;
         let blocks = out_channels.div_ceil(conv_strided::Constants::default().out_block);

@@ -13,7 +13,6 @@ mod depth;
 pub(crate) mod exclude;
 mod fingerprint;
 mod layout;
-mod listed;
 mod listing;
 mod loaded;
 mod locate;
@@ -54,8 +53,7 @@ use crate::{Error, Result};
 pub(crate) use borders::Borders;
 pub use fingerprint::Fingerprint;
 use layout::Layout;
-use listed::{ListedView, Listing};
-use listing::{select, warn};
+use listing::{ListedView, Listing, select, warn};
 pub(crate) use masks::is_beside as is_mask;
 use members::with_held_out;
 pub use options::{DOWNSCALE, DepthOptions, LoadOptions, MeasuredSize};
@@ -154,7 +152,7 @@ impl Dataset {
         log_split(&layout.root, has_split, options);
         let sources = sources(&layout.root, &frames, options, &files, &mut skipped);
         let gains = white_balance_gains(&layout.root, &sources, options)?;
-        let views = pixels::load(sources, &layout, options, (look, gains), &mut skipped)?;
+        let views = pixels::load(sources, &layout, options, look, gains, &mut skipped)?;
         if !views.iter().any(|view| view.split == Split::Train) {
             let first = skipped.first().map(|line| format!(" ({line})")).unwrap_or_default();
             let problem = format!(
@@ -319,10 +317,18 @@ fn sources(
             let depth = (options.depth.load && split == Split::Train)
                 .then(|| frame.depth_file(root, options.depth.folder.as_deref(), files))
                 .flatten();
-            let mask = masks::find(root, frame, files);
-            let ListedView { name, lens, view_from_world, .. } = frame.clone();
-            let camera = (lens, view_from_world);
-            sources.push(Source::new((name, split), camera, [input, reference, depth], mask));
+            sources.push(Source {
+                name: frame.name.clone(),
+                split,
+                lens: frame.lens,
+                view_from_world: frame.view_from_world,
+                input,
+                reference,
+                mask: masks::find(root, frame, files),
+                depth,
+                read: [None, None],
+                turns: Default::default(),
+            });
         }
     }
     if let Some(folder) = &options.reference

@@ -30,7 +30,7 @@ use serde::Serialize;
 pub use self::histogram::{Cell, Column, Histogram};
 use self::model::Model;
 pub use self::model::psnr;
-pub use self::pairs::{FitScene, Pair};
+pub use self::pairs::{FitScene, Pair, Scene};
 pub use self::profile::{
     ColourPair, ColourScene, ProfileFold, ProfileScores, cross_validate_profile, fit_profile,
     profile_scores,
@@ -212,10 +212,8 @@ pub fn fit(family: &'static Family, pairs: &[&Pair], options: &FitOptions) -> Re
         return Err(Error::Usage("there are no pairs to fit to".to_owned()));
     };
     let mut solver = Solver::new(&model, pairs, options);
-    let (columns, needed) = (
-        solver.groups.iter().map(|group| group.histogram.columns.len()).sum::<usize>(),
-        model.free.len(),
-    );
+    let columns: usize = solver.groups.iter().map(|group| group.histogram.columns.len()).sum();
+    let needed = model.free.len();
     if columns < needed {
         let problem = format!(
             "all pairs together have {columns} different values of t, too few for the {needed} constants of `{}`; \

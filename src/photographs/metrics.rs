@@ -27,12 +27,7 @@ impl Scores {
     /// # Errors
     /// [`Error::Usage`] if the images differ in size.
     pub fn of(render: &Image, reference: &Image) -> Result<Self> {
-        Ok(Self {
-            psnr: psnr(render, reference)?,
-            psnr_channel_mean: psnr_channel_mean(render, reference)?,
-            ssim: ssim(render, reference)?,
-            lpips: None,
-        })
+        Self::of_counted(render, reference, None)
     }
 
     /// Every score of the unmasked pixels; see [`counted`].
@@ -42,19 +37,13 @@ impl Scores {
         reference: &Image,
         mask: Option<&Mask>,
     ) -> Result<Self> {
-        let Some(mask) = mask else { return Self::of(render, reference) };
-        let mask = mask.resized(render.width, render.height);
-        let errors = weighted_errors(render, reference, &mask)?;
-        let shown = counted(render, reference, Some(&mask));
-        let width = render.width as usize;
-        let ssim = channels(&shown, reference)?
-            .into_par_iter()
-            .map(|(a, b)| weighted_mean(ssim_map(a, b, width), &mask));
-        let ssim: Vec<f64> = ssim.collect();
+        let mask = mask.map(|mask| mask.resized(render.width, render.height));
+        let mask = mask.as_deref();
+        let errors = errors(render, reference, mask)?;
         Ok(Self {
             psnr: decibels(mean(&errors)),
             psnr_channel_mean: mean(&errors.map(decibels)),
-            ssim: mean(&ssim),
+            ssim: mean_ssim(&counted(render, reference, mask), reference, mask)?,
             lpips: None,
         })
     }
@@ -88,32 +77,31 @@ pub fn counted<'a>(render: &'a Image, reference: &Image, mask: Option<&Mask>) ->
 
 /// Peak signal-to-noise ratio over all pixels and channels, dB; infinite for equal images.
 pub fn psnr(render: &Image, reference: &Image) -> Result<f64> {
-    let errors = channel_mean_squared_errors(render, reference)?;
-    Ok(decibels(mean(&errors)))
+    psnr_of_counted(render, reference, None)
 }
 
 /// [`psnr`] of the unmasked pixels.
 pub fn psnr_of_counted(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<f64> {
-    let Some(mask) = mask else { return psnr(render, reference) };
-    Ok(decibels(mean(&weighted_errors(
-        render,
-        reference,
-        &mask.resized(render.width, render.height),
-    )?)))
+    let mask = mask.map(|mask| mask.resized(render.width, render.height));
+    Ok(decibels(mean(&errors(render, reference, mask.as_deref())?)))
 }
 
 /// The mean of the PSNRs of the three channels, dB: as the paper's code computes it, never below [`psnr`].
 pub fn psnr_channel_mean(render: &Image, reference: &Image) -> Result<f64> {
-    Ok(mean(&channel_mean_squared_errors(render, reference)?.map(decibels)))
+    Ok(mean(&errors(render, reference, None)?.map(decibels)))
 }
 
 /// Mean structural similarity over all pixels and channels (Wang et al. 2004): an 11x11 Gaussian window with sigma 1.5
 /// and zero padding, C1 = 0.01^2, C2 = 0.03^2, as in 3DGS.
 pub fn ssim(render: &Image, reference: &Image) -> Result<f64> {
-    let pairs = channels(render, reference)?;
-    let width = render.width as usize;
-    let ssim: Vec<f64> = pairs.into_par_iter().map(|(a, b)| ssim_of_channel(a, b, width)).collect();
-    Ok(mean(&ssim))
+    mean_ssim(render, reference, None)
+}
+
+/// The mean over the channels of that over the unmasked pixels.
+fn mean_ssim(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<f64> {
+    let (pairs, width) = (channels(render, reference)?, render.width as usize);
+    let ssim = pairs.into_par_iter().map(|(a, b)| mean_of_counted(&ssim_map(a, b, width), mask));
+    Ok(mean(&ssim.collect::<Vec<f64>>()))
 }
 
 /// The three pairs of planes, (H, W) each.
@@ -134,30 +122,26 @@ fn channels<'a>(render: &'a Image, reference: &'a Image) -> Result<[(&'a [f32], 
     Ok([0, 1, 2].map(|channel| (&render.data[plane(channel)], &reference.data[plane(channel)])))
 }
 
-fn channel_mean_squared_errors(render: &Image, reference: &Image) -> Result<[f64; 3]> {
-    let mean_squared_error = |(a, b): (&[f32], &[f32])| {
-        let squared = a.iter().zip(b).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2));
-        squared.sum::<f64>() / a.len() as f64
-    };
-    Ok(channels(render, reference)?.map(mean_squared_error))
-}
-
 /// The mean squared error of each channel over the unmasked pixels.
-fn weighted_errors(render: &Image, reference: &Image, mask: &Mask) -> Result<[f64; 3]> {
-    if mask.hides_all() {
-        return Err(Error::Usage(
-            "a mask that hides every pixel leaves none to compare".to_owned(),
-        ));
+fn errors(render: &Image, reference: &Image, mask: Option<&Mask>) -> Result<[f64; 3]> {
+    if mask.is_some_and(Mask::hides_all) {
+        let problem = "a mask that hides every pixel leaves none to compare";
+        return Err(Error::Usage(problem.to_owned()));
     }
     let squared = |(&a, &b): (&f32, &f32)| (f64::from(a) - f64::from(b)).powi(2);
-    let of_channel = |(a, b): (&[f32], &[f32])| weighted_mean(a.iter().zip(b).map(squared), mask);
+    let of_channel = |(a, b): (&[f32], &[f32])| {
+        let squares: Vec<f64> = a.iter().zip(b).map(squared).collect();
+        mean_of_counted(&squares, mask)
+    };
     Ok(channels(render, reference)?.map(of_channel))
 }
 
-fn weighted_mean(values: impl IntoIterator<Item = f64>, mask: &Mask) -> f64 {
+/// The mean over the unmasked pixels.
+fn mean_of_counted(values: &[f64], mask: Option<&Mask>) -> f64 {
+    let Some(mask) = mask else { return mean(values) };
     let weights = || mask.weights.iter().copied().map(f64::from);
-    let pairs = values.into_iter().zip(weights());
-    pairs.map(|(value, weight)| value * weight).sum::<f64>() / weights().sum::<f64>()
+    let weighted = values.iter().zip(weights()).map(|(value, weight)| value * weight);
+    weighted.sum::<f64>() / weights().sum::<f64>()
 }
 
 fn decibels(mean_squared_error: f64) -> f64 {
@@ -166,10 +150,6 @@ fn decibels(mean_squared_error: f64) -> f64 {
 
 fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
-}
-
-fn ssim_of_channel(a: &[f32], b: &[f32], width: usize) -> f64 {
-    ssim_map(a, b, width).iter().sum::<f64>() / a.len() as f64
 }
 
 /// SSIM of every pixel.

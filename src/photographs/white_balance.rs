@@ -227,10 +227,8 @@ fn parsed(text: &str) -> Option<WhiteBalance> {
         }
         Some(&[red, green, blue]) => {
             let gains = [red, green, blue];
-            return gains
-                .iter()
-                .all(|gain| GAINS.contains(gain))
-                .then_some(WhiteBalance::Gains(gains));
+            let are_plausible = gains.iter().all(|gain| GAINS.contains(gain));
+            return are_plausible.then_some(WhiteBalance::Gains(gains));
         }
         _ => {}
     }
@@ -381,14 +379,8 @@ mod tests {
 
     #[test]
     fn a_written_white_balance_is_read_back() {
-        for text in [
-            "1.5,1,0.8",
-            "5200",
-            "v1,1,2,30,40",
-            "a,b,1,2,3,4",
-            "007,1,2,3,4",
-            "v1,1,2,30.5,2,31,40,0,39",
-        ] {
+        let all = "1.5,1,0.8 5200 v1,1,2,30,40 a,b,1,2,3,4 007,1,2,3,4 v1,1,2,30.5,2,31,40,0,39";
+        for text in all.split(' ') {
             let balance: WhiteBalance = text.parse().unwrap();
             assert_eq!(balance.to_string(), text);
         }
@@ -396,23 +388,9 @@ mod tests {
 
     #[test]
     fn an_invalid_white_balance_is_refused_in_a_line() {
-        for text in [
-            "",
-            "1,2",
-            "0,1,1",
-            "-1,1,1",
-            "NaN,1,1",
-            "inf,1,1",
-            "1500",
-            "40000",
-            "1e5,1,1",
-            "v1,1,2,0,4",
-            "v1,-1,2,3,4",
-            "v1,1.5,2,3,4",
-            "v1,1,1,1,1,1,1,1,1",
-            ",1,2,3,4",
-            "warm",
-        ] {
+        let all = " 1,2 0,1,1 -1,1,1 NaN,1,1 inf,1,1 1500 40000 1e5,1,1 v1,1,2,0,4 v1,-1,2,3,4 v1,1.5,2,3,4 \
+                   v1,1,1,1,1,1,1,1,1 ,1,2,3,4 warm";
+        for text in all.split(' ') {
             let message = text.parse::<WhiteBalance>().unwrap_err().to_string();
             assert!(
                 message.starts_with("white_balance is ") && message.lines().count() == 1,

@@ -1,6 +1,6 @@
 use super::random::random_bits;
 use super::rounding::Rounded;
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::Reference;
 use crate::kernels::adam::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::adam_step::{BETA1, BETA2, EPSILON, GRADIENT_BOUND};
 use crate::kernels::log_scale::{LOG_SCALE_MAX, LOG_SCALE_MIN};
@@ -69,49 +69,41 @@ pub(super) fn bounded<T: Real>(plane: usize, [p, m, v]: [T; 3]) -> [T; 3] {
     [bounded, m, v]
 }
 
-/// Parameter `i`, and at `own` its gradient and both moments.
-fn before(
-    constants: &Constants,
-    [i, own]: [usize; 2],
-    parameters: &[f32],
-    gradients: &[f32],
-    [first, second]: [&[f32]; 2],
-    both: &[u32],
-) -> [f32; 4] {
-    let [m, v] =
-        if constants.half_moments { from_halves(both[own]) } else { [first[own], second[own]] };
-    [parameters[i], gradients[own], m, v]
+/// Parameter `i`, its gradient and both moments; `trained` is its index among the trained ones.
+fn before(constants: &Constants, slices: &Slices<'_>, i: usize, trained: usize) -> [f32; 4] {
+    let [m, v] = match constants.half_moments {
+        true => from_halves(slices.both_moments[trained]),
+        false => [slices.first_moments[trained], slices.second_moments[trained]],
+    };
+    [slices.parameters[i], slices.gradients[trained], m, v]
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices { parameters, gradients, first_moments, second_moments, both_moments, status } =
-            slices;
-        if status[0] != 0 {
+        if slices.status[0] != 0 {
             return;
         }
         let gaussian_count = params.gaussian_count as usize;
         let frozen = constants.frozen_columns as usize * gaussian_count;
         let left_out = frozen_floats(constants.frozen_columns, gaussian_count);
         for i in frozen..params.column_count as usize * gaussian_count {
-            let (own, moments) = (i - left_out, [&*first_moments, &*second_moments]);
-            let before = before(constants, [i, own], parameters, gradients, moments, both_moments);
+            let trained = i - left_out;
+            let before = before(constants, &slices, i, trained);
             let [parameter, first, second] = updated(params, i / gaussian_count, before);
-            parameters[i] = parameter;
+            slices.parameters[i] = parameter;
             if constants.half_moments {
                 let (moments, chance) = moments_after(params.step, before);
-                both_moments[own] = in_halves(moments, chance);
+                slices.both_moments[trained] = in_halves(moments, chance);
             } else {
-                (first_moments[own], second_moments[own]) = (first, second);
+                (slices.first_moments[trained], slices.second_moments[trained]) = (first, second);
             }
         }
     }
 
     /// Twice the running error, since the reference rounds too. Half moments are rounded identically.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let Slices { parameters, gradients, first_moments, second_moments, both_moments, status } =
-            slices;
-        let count = if status[0] == 0 { params.column_count * params.gaussian_count } else { 0 };
+        let count =
+            if slices.status[0] == 0 { params.column_count * params.gaussian_count } else { 0 };
         let frozen = (constants.frozen_columns * params.gaussian_count) as usize;
         let left_out = frozen_floats(constants.frozen_columns, params.gaussian_count as usize);
         let bounds = |which: usize| {
@@ -119,14 +111,12 @@ impl Reference for Kernel {
                 if i < frozen {
                     return 0.0;
                 }
-                let (own, moments) = (i - left_out, [&*first_moments, &*second_moments]);
-                let before =
-                    before(constants, [i, own], parameters, gradients, moments, both_moments);
+                let before = before(constants, &slices, i, i - left_out);
                 let column = i / params.gaussian_count as usize;
                 2.0 * updated::<Rounded>(params, column, before)[which].error
             };
             let first = if which == 0 { 0 } else { left_out };
-            Tolerance::Each((first..count as usize).map(of).collect())
+            (first..count as usize).map(of).collect()
         };
         let parameters = bounds(0);
         if constants.half_moments {

@@ -83,62 +83,74 @@ fn tile_runs(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec
     tiles.map(run).collect()
 }
 
-/// Calls `visit` with the list of every tile of the image and its pixels.
+/// Calls `visit` with the number of every tile of the image and its list.
 fn for_each_tile(
     params: &Params,
     constants: &Constants,
     slices: &Slices<'_>,
-    mut visit: impl FnMut(&TileList, &mut dyn Iterator<Item = UVec2>),
+    mut visit: impl FnMut(u32, &TileList),
 ) {
     let Slices { sorted_intersections, gaussian_ids, splats, colors, .. } = slices;
-    let tile = UVec2::new(constants.tile_width, constants.tile_height);
     for (index, (range, count)) in (0..).zip(tile_runs(params, constants, slices)) {
         let shown = if count > params.longest_run { 0 } else { count };
         let intersection_ids = &sorted_intersections[range.x as usize..][..shown as usize];
         let list =
             TileList::new(constants.channels, intersection_ids, gaussian_ids, splats, colors);
-        visit(&list, &mut tile_pixels(index, params.tile_columns, tile, params.size));
+        visit(index, &list);
     }
 }
 
-/// The depths of a pixel, where the last channel is the depth in the view.
-struct Depths<'a> {
-    params: &'a Params,
-    limits: &'a [f32],
+/// Calls `visit` for every pixel: the list of its tile, the splats that are seen, its centre and its index.
+fn for_each_pixel(
+    params: &Params,
+    constants: &Constants,
+    slices: &Slices<'_>,
+    mut visit: impl FnMut(&TileList, &[Splat], DVec2, usize),
+) {
+    let tile = UVec2::new(constants.tile_width, constants.tile_height);
+    for_each_tile(params, constants, slices, |index, list| {
+        for pixel in tile_pixels(index, params.tile_columns, tile, params.size) {
+            let at = (pixel.y * params.size.x + pixel.x) as usize;
+            let seen = seen(params, constants, slices.limits, list, at);
+            visit(list, &list.splats[..seen], pixel.as_dvec2() + 0.5, at);
+        }
+    });
 }
 
-impl<'a> Depths<'a> {
-    fn of(params: &'a Params, constants: &Constants, limits: &'a [f32]) -> Option<Self> {
-        (constants.view_depths != 0).then_some(Self { params, limits })
+/// The splats of a list that are seen at pixel `at`: with depths, those before the first beyond its limit.
+fn seen(
+    params: &Params,
+    constants: &Constants,
+    limits: &[f32],
+    list: &TileList,
+    at: usize,
+) -> usize {
+    let all = list.splats.len();
+    if constants.view_depths == 0 {
+        return all;
     }
-
-    fn takes_median(&self) -> bool {
-        self.params.takes_median != 0
-    }
-
-    /// The splats of a list that are seen at pixel `at`: those before the first beyond its limit.
-    fn seen(&self, list: &TileList, at: usize) -> usize {
-        let limit = match self.params.has_limits != 0 {
-            true => f64::from(self.limits[at]),
-            false => NO_DEPTH,
-        };
-        (0..list.splats.len()).take_while(|&i| list.depth(i) <= limit || limit.is_nan()).count()
-    }
-
-    /// The depth at which the transmittance passes 1/2, and whether a rounding of it decides.
-    fn median(&self, list: &TileList, fragments: &[Fragment], error: f64) -> (f64, bool) {
-        let after = |fragment: &Fragment| fragment.before * (1.0 - fragment.alpha);
-        let passing = fragments.iter().find(|&fragment| after(fragment) <= 0.5);
-        let is_fragile = fragments.iter().any(|own| (after(own) - 0.5).abs() <= error);
-        (passing.map_or(NO_DEPTH, |fragment| list.depth(fragment.index)), is_fragile)
-    }
+    let limit = if params.has_limits != 0 { f64::from(limits[at]) } else { NO_DEPTH };
+    (0..all).take_while(|&i| list.depth(i) <= limit || limit.is_nan()).count()
 }
 
-/// The splats of a list before which segments start, except for the first, with their places in memory.
+/// Whether the last channel is the median depth instead of the mean one.
+fn takes_median(params: &Params, constants: &Constants) -> bool {
+    constants.view_depths != 0 && params.takes_median != 0
+}
+
+/// The depth at which the transmittance passes 1/2, and whether a rounding of it decides.
+fn median(list: &TileList, fragments: &[Fragment], error: f64) -> (f64, bool) {
+    let after = |fragment: &Fragment| fragment.before * (1.0 - fragment.alpha);
+    let passing = fragments.iter().find(|&fragment| after(fragment) <= 0.5);
+    let is_fragile = fragments.iter().any(|fragment| (after(fragment) - 0.5).abs() <= error);
+    (passing.map_or(NO_DEPTH, |fragment| list.depth(fragment.index)), is_fragile)
+}
+
+/// The splats of a list before which segments start, except for the first, with the numbers of their states.
 fn segment_starts(run: UVec2, count: u32, segment: u32) -> Vec<(usize, usize)> {
     let starts = (0..count).step_by(segment.max(1) as usize).skip(1);
-    let place = |start: u32| (start as usize, ((run.x + start) / segment) as usize);
-    if segment == 0 { vec![] } else { starts.map(place).collect() }
+    let state = |start: u32| (start as usize, ((run.x + start) / segment) as usize);
+    if segment == 0 { vec![] } else { starts.map(state).collect() }
 }
 
 /// Visits the state of every pixel of a tile before every segment: the list, the number of its splats before the
@@ -152,8 +164,7 @@ fn for_each_state(
 ) {
     let tile = UVec2::new(constants.tile_width, constants.tile_height);
     let runs = tile_runs(params, constants, slices);
-    let mut index = 0;
-    for_each_tile(params, constants, slices, |list, _| {
+    for_each_tile(params, constants, slices, |index, list| {
         let (run, _) = runs[index as usize];
         let origin = UVec2::new(index % params.tile_columns, index / params.tile_columns) * tile;
         let starts = segment_starts(run, list.splats.len() as u32, constants.segment);
@@ -166,13 +177,11 @@ fn for_each_state(
                 visit(list, start, center, (constants.channels as usize + 1) * pixels * block + at);
             }
         }
-        index += 1;
     });
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, mut slices: Slices<'_>) {
-        let depths = Depths::of(params, constants, slices.limits);
         let background = background(params, constants);
         let pixels = params.size.element_product() as usize;
         for (tile, (run, count)) in tile_runs(params, constants, &slices).into_iter().enumerate() {
@@ -201,23 +210,16 @@ impl Reference for Kernel {
         });
         let (render, transmittances) =
             (std::mem::take(&mut slices.render), std::mem::take(&mut slices.transmittances));
-        for_each_tile(params, constants, &slices, |list, tile| {
-            for pixel in tile {
-                let (center, alpha_max) = (pixel.as_dvec2() + 0.5, constants.alpha_max.into());
-                let at = (pixel.y * params.size.x + pixel.x) as usize;
-                let all = list.splats.len();
-                let seen = &list.splats[..depths.as_ref().map_or(all, |own| own.seen(list, at))];
-                let (mut values, transmittance) =
-                    blend_pixel(seen, &list.colors, &background, center, alpha_max);
-                if let Some(depths) = depths.as_ref().filter(|depths| depths.takes_median()) {
-                    let (fragments, _) = fragments(seen, center, alpha_max);
-                    let last = values.len() - 1;
-                    values[last] = depths.median(list, &fragments, 0.0).0;
-                }
-                transmittances[at] = transmittance as f32;
-                for (c, value) in values.into_iter().enumerate() {
-                    render[c * pixels + at] = value as f32;
-                }
+        for_each_pixel(params, constants, &slices, |list, seen, center, at| {
+            let (mut values, transmittance) =
+                blend_pixel(seen, &list.colors, &background, center, alpha_max);
+            if takes_median(params, constants) {
+                let last = values.len() - 1;
+                values[last] = median(list, &fragments(seen, center, alpha_max).0, 0.0).0;
+            }
+            transmittances[at] = transmittance as f32;
+            for (c, value) in values.into_iter().enumerate() {
+                render[c * pixels + at] = value as f32;
             }
         });
     }
@@ -225,37 +227,27 @@ impl Reference for Kernel {
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let background = background(params, constants);
         let pixels = params.size.element_product() as usize;
-        let depths = Depths::of(params, constants, slices.limits);
+        let alpha_max = constants.alpha_max.into();
         let mut errors = vec![0.0; pixels];
         let mut largest_colors = vec![0.0; pixels];
         let mut medians = vec![0.0; pixels];
         let tile_size = UVec2::new(constants.tile_width, constants.tile_height);
-        for_each_tile(params, constants, &slices, |list, tile| {
-            let largest = list.largest_color(&background);
-            for pixel in tile {
-                let (center, alpha_max) = (pixel.as_dvec2() + 0.5, constants.alpha_max.into());
-                let at = (pixel.y * params.size.x + pixel.x) as usize;
-                let all = list.splats.len();
-                let seen = &list.splats[..depths.as_ref().map_or(all, |own| own.seen(list, at))];
-                errors[at] = PixelModel::new(seen, center, alpha_max, tile_size).error;
-                largest_colors[at] = largest;
-                if let Some(depths) = depths.as_ref().filter(|depths| depths.takes_median()) {
-                    let (fragments, _) = fragments(seen, center, alpha_max);
-                    let (_, is_fragile) = depths.median(list, &fragments, errors[at]);
-                    medians[at] = if is_fragile { f64::INFINITY } else { 0.0 };
-                }
-            }
+        for_each_pixel(params, constants, &slices, |list, seen, center, at| {
+            errors[at] = PixelModel::new(seen, center, alpha_max, tile_size).error;
+            largest_colors[at] = list.largest_color(&background);
+            let (_, is_fragile) = median(list, &fragments(seen, center, alpha_max).0, errors[at]);
+            medians[at] = if is_fragile { f64::INFINITY } else { 0.0 };
         });
         let of_channel = errors.iter().zip(largest_colors).map(|(error, color)| error * color);
         let mut render: Vec<f64> =
             of_channel.cycle().take(constants.channels as usize * pixels).collect();
-        if depths.is_some_and(|depths| depths.takes_median()) {
+        if takes_median(params, constants) {
             render.splice(render.len() - pixels.., medians);
         }
         let stride = (constants.tile_width * constants.tile_height) as usize;
         let mut states = vec![0.0; slices.segment_states.len()];
         for_each_state(params, constants, &slices, |list, start, center, at| {
-            let (seen, alpha_max) = (&list.splats[..start], constants.alpha_max.into());
+            let seen = &list.splats[..start];
             let model = center.map(|center| PixelModel::new(seen, center, alpha_max, tile_size));
             let is_done = center.is_none_or(|center| is_done(seen, center, alpha_max));
             states[at] = model.as_ref().map_or(0.0, |model| model.error);

@@ -1,10 +1,9 @@
 //! `CIConv`: the columns pass and the invariant.
 
-use glam::{Vec2, Vec3};
+use glam::Vec3;
 
 use super::ciconv_rows::taps;
-use super::rounding::{Rounded, chain};
-use crate::gpu::Reference;
+use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::ciconv_columns::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
 use crate::photographs::tone::Real;
 
@@ -43,21 +42,11 @@ fn moments(params: &Params, logs: &[Rounded]) -> impl Iterator<Item = [Rounded; 
     })
 }
 
-impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let logs = log_invariants(params, slices.smooth_rows, slices.slope_rows);
-        slices.logs.iter_mut().zip(&logs).for_each(|(log, of)| *log = of.value as f32);
-        for (moment, of) in slices.moments.iter_mut().zip(moments(params, &logs)) {
-            *moment = Vec2::from_array(of.map(|of| of.value as f32));
-        }
-    }
-
-    /// A derivative that almost vanishes has lost its digits to cancellation; W is floored at 1e-5.
-    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
-        let logs = log_invariants(params, slices.smooth_rows, slices.slope_rows);
-        Tolerances {
-            moments: moments(params, &logs).flatten().collect(),
-            logs: logs.into_iter().collect(),
-        }
-    }
+fn numbers(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 2] {
+    let logs = log_invariants(params, slices.smooth_rows, slices.slope_rows);
+    let moments = moments(params, &logs).flatten().collect();
+    [logs, moments]
 }
+
+// A derivative that almost vanishes has lost its digits to cancellation; W is floored at 1e-5.
+bounded_reference!(numbers: logs, moments);

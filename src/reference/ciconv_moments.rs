@@ -1,12 +1,12 @@
 use glam::Vec2;
 
-use super::rounding::{Rounded, chain};
-use crate::gpu::Reference;
+use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::ciconv_moments::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
 use crate::photographs::tone::Real;
 
 /// Mean and 1 / standard deviation, from the moments of the workgroups.
-fn norm(params: &Params, moments: &[Vec2]) -> [Rounded; 2] {
+fn norm(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {
+    let moments = slices.moments;
     let (pixels, size) = (params.pixel_count as usize, params.pixels_per_moment as usize);
     let workgroups = pixels.div_ceil(size);
     let chain = chain(workgroups);
@@ -23,15 +23,7 @@ fn norm(params: &Params, moments: &[Vec2]) -> [Rounded; 2] {
         Rounded::exact(of.y) + count * deviation * deviation
     });
     let variance = Rounded::sum(chain, squares) / all;
-    [pivot + shift, Rounded::of(1.0) / (variance + Rounded::of(EPSILON)).sqrt()]
+    [vec![pivot + shift, Rounded::of(1.0) / (variance + Rounded::of(EPSILON)).sqrt()]]
 }
 
-impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        slices.norm[0] = Vec2::from_array(norm(params, slices.moments).map(|of| of.value as f32));
-    }
-
-    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
-        Tolerances { norm: norm(params, slices.moments).into_iter().collect() }
-    }
-}
+bounded_reference!(norm: norm);

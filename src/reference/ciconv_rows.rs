@@ -1,7 +1,7 @@
 //! `CIConv` in double precision: the rows pass and its taps.
 
 use super::rounding::UNIT;
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::Reference;
 use crate::kernels::ciconv_rows::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// The weights of R, G and B in E, `E_lambda` and `E_lambda_lambda` (Geusebroek et al. 2001).
@@ -62,7 +62,8 @@ impl Reference for Kernel {
         let bounds =
             |at| filtered(params, slices.image, &taps, at, f64::abs).map(|sum| 20.0 * UNIT * sum);
         let numbers = (0..3 * (params.width * params.height) as usize).map(|at| [at / 3, at % 3]);
-        let (smooth, slope) = numbers.map(|at| bounds(at).into()).unzip();
-        Tolerances { smooth_rows: Tolerance::Each(smooth), slope_rows: Tolerance::Each(slope) }
+        let numbers: Vec<_> = numbers.map(bounds).collect();
+        let [smooth_rows, slope_rows] = [0, 1].map(|row| numbers.iter().map(|n| n[row]).collect());
+        Tolerances { smooth_rows, slope_rows }
     }
 }

@@ -2,7 +2,7 @@
 
 use super::rounding::UNIT;
 use super::widen;
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::Reference;
 use crate::kernels::conv3x3::{Constants, Kernel, Params, RELU, SIGMOID, Slices, Tolerances};
 
 /// Calls `visit(pixel, tap, neighbour)` for each of the nine neighbours of each pixel that lie in the image.
@@ -119,8 +119,6 @@ impl Reference for Kernel {
             let kept = if constants.accumulate { f64::from(target.abs()) } else { 0.0 };
             sum_error(params, magnitude) + sigmoid + 2.0 * UNIT * (magnitude + kept)
         };
-        Tolerances {
-            target: Tolerance::Each(magnitudes.into_iter().zip(target.iter()).map(bound).collect()),
-        }
+        Tolerances { target: magnitudes.into_iter().zip(target.iter()).map(bound).collect() }
     }
 }

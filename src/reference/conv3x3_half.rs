@@ -3,7 +3,7 @@
 use super::conv3x3::sums;
 use super::packed::{self, largest, scale, sum_error};
 use super::rounding::UNIT;
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::Reference;
 use crate::kernels::conv3x3;
 use crate::kernels::conv3x3_half::{Constants, Kernel, Params, Slices, Tolerances};
 
@@ -57,8 +57,6 @@ impl Reference for Kernel {
             let of_sum = sum_error(9 * params.in_channels, magnitude, scaled.largest);
             of_sum / unit + 4.0 * UNIT * (magnitude / unit + beside)
         };
-        Tolerances {
-            target: Tolerance::Each(scaled.magnitudes.iter().enumerate().map(bound).collect()),
-        }
+        Tolerances { target: scaled.magnitudes.iter().enumerate().map(bound).collect() }
     }
 }

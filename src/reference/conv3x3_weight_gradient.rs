@@ -3,7 +3,7 @@
 use super::conv3x3::for_each_tap;
 use super::rounding::UNIT;
 use super::widen;
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::Reference;
 use crate::kernels::conv3x3_weight_gradient::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// The gradients of the weights (out, in, 3, 3), then of the biases (out), over the pixels for which `counts` is true.
@@ -67,6 +67,6 @@ impl Reference for Kernel {
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let magnitudes = strips(params, constants.rows, slices.source, slices.d_target, f64::abs);
         let error = f64::from(constants.rows * params.size.x + 2) * UNIT;
-        Tolerances { partials: Tolerance::Each(magnitudes.iter().map(|m| error * m).collect()) }
+        Tolerances { partials: magnitudes.iter().map(|m| error * m).collect() }
     }
 }

@@ -3,7 +3,7 @@
 use super::conv3x3_weight_gradient::strips;
 use super::packed::{self, largest, scale, sum_error};
 use super::rounding::UNIT;
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::Reference;
 use crate::kernels::conv3x3_weight_gradient;
 use crate::kernels::conv3x3_weight_gradient_half::{Constants, Kernel, Params, Slices, Tolerances};
 
@@ -22,8 +22,8 @@ fn sums(
     let biases = strips(&single, constants.rows, &[], d_single, term);
     let of_strip = (out_channels * (9 * in_channels + 1)) as usize;
     let biases = biases.chunks(out_channels as usize);
-    for (strip, own) in sums.chunks_mut(of_strip).zip(biases) {
-        strip[of_strip - own.len()..].copy_from_slice(own);
+    for (strip, biases) in sums.chunks_mut(of_strip).zip(biases) {
+        strip[of_strip - biases.len()..].copy_from_slice(biases);
     }
     sums
 }
@@ -71,6 +71,6 @@ impl Reference for Kernel {
             }
             (f64::from(pixels) + 2.0) * UNIT * magnitude
         };
-        Tolerances { partials: Tolerance::Each(magnitudes.iter().enumerate().map(bound).collect()) }
+        Tolerances { partials: magnitudes.iter().enumerate().map(bound).collect() }
     }
 }

@@ -1,7 +1,7 @@
 //! A strided convolution with a ReLU in double precision; the kernel's reference rounds the results.
 
 use super::rounding::UNIT;
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::Reference;
 use crate::kernels::conv_strided::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// The sums before the ReLU, or sums of the terms' magnitudes if `term` returns those of the factors.
@@ -49,6 +49,6 @@ impl Reference for Kernel {
         let terms = params.window * params.window * params.in_channels + 2;
         let bound = |magnitude| f64::from(terms) * UNIT * magnitude;
         let magnitudes = sums(params, values, source, f64::abs);
-        Tolerances { target: Tolerance::Each(magnitudes.into_iter().map(bound).collect()) }
+        Tolerances { target: magnitudes.into_iter().map(bound).collect() }
     }
 }

@@ -1,5 +1,5 @@
 use super::inside;
-use super::rounding::{UNIT, chain};
+use super::rounding::{UNIT, chain, write_sum};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::denoising::{Constants, Kernel, Params, Slices, Tolerances};
 
@@ -44,22 +44,19 @@ impl Terms {
 }
 
 impl Reference for Kernel {
-    /// The whole sums go into the first partials: the number of partials is chosen by the device.
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let terms = Terms::new(params, &slices, |x| x);
         let Slices { d_denoised, d_render, mse_partials, tv_partials, .. } = slices;
         d_denoised.iter_mut().zip(terms.d_denoised).for_each(|(to, d)| *to = d as f32);
         d_render.iter_mut().zip(terms.d_render).for_each(|(to, d)| *to = d as f32);
-        mse_partials.fill(0.0);
-        tv_partials.fill(0.0);
-        (mse_partials[0], tv_partials[0]) = (terms.squares as f32, terms.tv as f32);
+        write_sum(std::iter::once(terms.squares), mse_partials);
+        write_sum(std::iter::once(terms.tv), tv_partials);
     }
 
     /// Each term is a product of five factors, and there are five of them.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let terms = Terms::new(params, &slices, f64::abs);
-        let bounds =
-            |sums: Vec<f64>| Tolerance::Each(sums.iter().map(|m| 10.0 * UNIT * m.abs()).collect());
+        let bounds = |sums: Vec<f64>| sums.iter().map(|m| 10.0 * UNIT * m.abs()).collect();
         let sum_error = (chain(0) + f64::from(constants.rows) + 6.0) * UNIT;
         Tolerances {
             d_denoised: bounds(terms.d_denoised),

@@ -4,7 +4,7 @@ use std::f32::consts::TAU;
 
 use glam::{Quat, Vec3};
 
-use super::gaussian::sigmoid;
+use super::gaussian::{Words, sigmoid};
 use super::random::random_bits;
 use super::rounding::{TRIGONOMETRIC, UNIT};
 use crate::gpu::{Reference, Tolerance};
@@ -14,7 +14,7 @@ use crate::kernels::densify_action::{
     SPLIT_OPACITY_SLOPE,
 };
 use crate::kernels::densify_scatter::{Constants, Kernel, Params, Slices, Tolerances};
-use crate::splats::attributes::{Attribute, planes};
+use crate::splats::attributes::Attribute;
 
 fn random_uniform(key: u32) -> f32 {
     ((random_bits(key) >> 8) + 1) as f32 / 16_777_216.0
@@ -118,15 +118,13 @@ fn rotation(parameters: &[f32], count: usize, i: usize) -> Quat {
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let (n, new_n) = (params.gaussian_count as usize, params.new_gaussian_count as usize);
-        let [features, columns] = [params.feature_count, params.column_count].map(|n| n as usize);
+        let widths = [params.feature_count, params.column_count];
+        let words = |count| Words::new(count, widths, constants.rest_by_column);
         let step_key = random_bits(random_bits(params.seed).wrapping_add(params.step));
         let new = [params.first_new_gaussian, params.new_gaussian_count];
         for Child { of: i, index, to, is_new } in copies(n, slices.actions, slices.offsets, new) {
-            for plane in planes(features, columns) {
-                let word = |n, i, k| plane.index(constants.rest_by_column, n, i, k);
-                for k in 0..plane.width {
-                    slices.new_parameters[word(new_n, to, k)] = slices.parameters[word(n, i, k)];
-                }
+            for (to, from) in words(new_n).of_gaussian(to).zip(words(n).of_gaussian(i)) {
+                slices.new_parameters[to] = slices.parameters[from];
             }
             if !is_new {
                 continue;

@@ -1,9 +1,9 @@
 //! The score of each Gaussian for densification, and the estimated change of the cameras' views by a split.
 
-use glam::{DMat3, DVec2, DVec3, DVec4};
+use glam::{DMat3, DVec2};
 
 use super::camera::Camera;
-use super::gaussian::{Gaussian, sigmoid};
+use super::gaussian::{Gaussian, Planes, Words, sigmoid};
 use super::rotation::{rotation, unit_quat};
 use super::rounding::UNIT;
 use crate::gpu::{Reference, Tolerance};
@@ -13,7 +13,7 @@ use crate::kernels::densify_action::{
 };
 use crate::kernels::densify_score::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::splat::DILATION;
-use crate::splats::attributes::{Attribute, planes};
+use crate::splats::attributes::Attribute;
 
 fn mean_gradient(slices: &Slices<'_>, i: usize) -> f32 {
     match slices.visit_counts[i] {
@@ -54,24 +54,9 @@ pub(super) fn view_change(near: f64, camera: &Camera, gaussian: &Gaussian) -> f6
 
 /// The largest change of a camera's view by a split of Gaussian `i`; NaN if any is.
 fn largest_change(params: &Params, slices: &Slices<'_>, i: usize) -> f64 {
-    let n = params.gaussian_count as usize;
-    fn of<const WIDTH: usize>(
-        slices: &Slices<'_>,
-        n: usize,
-        i: usize,
-        own: Attribute,
-    ) -> [f64; WIDTH] {
-        let first = own.column(0) * n + WIDTH * i;
-        std::array::from_fn(|k| f64::from(slices.parameters[first + k]))
-    }
-    let gaussian = Gaussian {
-        mean: DVec3::from_array(of(slices, n, i, Attribute::Means)),
-        quat: DVec4::from_array(of(slices, n, i, Attribute::Quats)),
-        log_scale: DVec3::from_array(of(slices, n, i, Attribute::LogScales)),
-        raw_opacity: of::<1>(slices, n, i, Attribute::RawOpacities)[0],
-        features: vec![],
-        sh: vec![],
-    };
+    let count = params.gaussian_count as usize;
+    let planes = Planes { count, feature_count: 0, sh_degree: 0, rest_by_column: false };
+    let gaussian = planes.load(slices.parameters, i);
     let cameras = slices.cameras.iter().take(params.camera_count as usize);
     let change = |camera| view_change(params.near.into(), &Camera::from(camera), &gaussian);
     let most = |most: f64, one: f64| if most >= one { most } else { one };
@@ -82,12 +67,10 @@ impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let n = params.gaussian_count as usize;
         let opacities = Attribute::RawOpacities.column(0) * n;
-        let [features, columns] = [params.feature_count, params.column_count].map(|n| n as usize);
+        let widths = [params.feature_count, params.column_count];
+        let words = Words::new(n, widths, constants.rest_by_column);
         for i in 0..n {
-            let is_finite = planes(features, columns).iter().all(|plane| {
-                let word = |k| plane.index(constants.rest_by_column, n, i, k);
-                (0..plane.width).all(|k| slices.parameters[word(k)].abs() < 3e38)
-            });
+            let is_finite = words.of_gaussian(i).all(|at| slices.parameters[at].abs() < 3e38);
             let is_visible = slices.parameters[opacities + i] >= params.min_raw_opacity;
             let mean_gradient = mean_gradient(&slices, i);
             let key = if !is_finite || !is_visible {
@@ -122,10 +105,10 @@ impl Reference for Kernel {
                     && is_near(largest_change(params, &slices, i), bound, 1e-3))
         };
         let n = params.gaussian_count as usize;
-        let keys = (0..n).map(|i| if is_close(i) { f64::from(u32::MAX) } else { ROUNDINGS });
+        let key_bound = |i| if is_close(i) { f64::from(u32::MAX) } else { ROUNDINGS };
         let close = (0..n).filter(|&i| is_close(i)).count();
         Tolerances {
-            keys: Tolerance::Each(keys.collect()),
+            keys: (0..n).map(key_bound).collect(),
             counters: Tolerance::Each(vec![close as f64]),
             ..Tolerances::default()
         }

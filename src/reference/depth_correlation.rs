@@ -1,10 +1,6 @@
 //! The Pearson loss, in any number type.
 
-use glam::Vec2;
-
-use super::rounding::{Rounded, chain};
-use crate::gpu::Reference;
-use crate::kernels::DepthGradient;
+use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::depth_correlation::{Constants, EPSILON, Kernel, Params, Slices, Tolerances};
 use crate::photographs::tone::Real;
 
@@ -72,29 +68,13 @@ fn correlation(params: &Params, slices: &Slices<'_>, region: usize) -> [Rounded;
     [mean[0], mean[1], weight * a_scale, weight * b_scale, value]
 }
 
-/// The correlations of all regions, the view first.
-fn correlations(params: &Params, slices: &Slices<'_>) -> Vec<[Rounded; 5]> {
-    (0..params.region_count as usize).map(|region| correlation(params, slices, region)).collect()
+/// The gradients of all regions, the view first, then the values of the view and of the boxes.
+fn correlations(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 3] {
+    let regions = 0..params.region_count as usize;
+    let regions: Vec<_> = regions.map(|region| correlation(params, slices, region)).collect();
+    let values = |regions: &[[Rounded; 5]]| regions.iter().map(|of| of[4]).collect();
+    let gradients = regions.iter().flat_map(|of| of[..4].iter().copied()).collect();
+    [gradients, values(&regions[..1]), values(&regions[1..])]
 }
 
-impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        for (region, of) in correlations(params, &slices).into_iter().enumerate() {
-            let [a, b, a_scale, b_scale, value] = of.map(|of| of.value as f32);
-            slices.gradients[region] = DepthGradient { mean: Vec2::new(a, b), a_scale, b_scale };
-            match region {
-                0 => slices.view_values[0] = value,
-                _ => slices.box_values[region - 1] = value,
-            }
-        }
-    }
-
-    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
-        let regions = correlations(params, &slices);
-        Tolerances {
-            gradients: regions.iter().flat_map(|of| of[..4].iter().copied()).collect(),
-            view_values: regions[..1].iter().map(|of| of[4]).collect(),
-            box_values: regions[1..].iter().map(|of| of[4]).collect(),
-        }
-    }
-}
+bounded_reference!(correlations: gradients, view_values, box_values);

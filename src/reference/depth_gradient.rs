@@ -1,5 +1,5 @@
-use super::rounding::{Rounded, values};
-use crate::gpu::{Reference, Tolerance};
+use super::rounding::{Rounded, bounds_from, write};
+use crate::gpu::Reference;
 use crate::kernels::depth_gradient::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// The gradient of every pixel: the sum over the regions that contain it.
@@ -23,14 +23,11 @@ fn d_depths(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let gradients = values(d_depths(params, &slices));
-        let plane = &mut slices.d_render[params.first as usize..];
-        plane.iter_mut().zip(gradients).for_each(|(to, d)| *to = d);
+        let gradients = d_depths(params, &slices);
+        write(gradients, &mut slices.d_render[params.first as usize..]);
     }
 
     fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
-        let mut bounds = vec![0.0; params.first as usize];
-        bounds.extend(d_depths(params, &slices).into_iter().map(Rounded::bound));
-        Tolerances { d_render: Tolerance::Each(bounds) }
+        Tolerances { d_render: bounds_from(params.first as usize, d_depths(params, &slices)) }
     }
 }

@@ -1,4 +1,4 @@
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::Reference;
 use crate::kernels::depth_limits::{Constants, Kernel, NO_DEPTH, Params, Slices, Tolerances};
 use crate::kernels::pixels::{DEPTH_16, DEPTH_24};
 
@@ -12,20 +12,24 @@ fn stored_depth(params: &Params, words: &[u32], at: usize) -> f32 {
 }
 
 /// 1 at the near plane, 0 at the far one.
-fn nearness(params: &Params, depth: f32) -> f32 {
-    if params.is_reversed != 0 { depth } else { 1.0 - depth }
+fn nearness(params: &Params, depth: f32) -> f64 {
+    f64::from(if params.is_reversed != 0 { depth } else { 1.0 - depth })
+}
+
+/// The depth in the view of this nearness.
+fn view_depth(params: &Params, nearness: f64) -> f64 {
+    let (near, far) = (f64::from(params.near), f64::from(params.far));
+    if far > 0.0 { near * far / (near + nearness * (far - near)) } else { near / nearness }
 }
 
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let (near, far) = (f64::from(params.near), f64::from(params.far));
         for at in 0..params.pixel_count as usize {
             let depth = stored_depth(params, slices.words, at);
-            let e = f64::from(nearness(params, depth));
-            let z = if far > 0.0 { near * far / (near + e * (far - near)) } else { near / e };
+            let e = nearness(params, depth);
             slices.limits[at] = match (params.is_linear != 0, e > 0.0) {
                 (true, _) => depth,
-                (false, true) => z as f32,
+                (false, true) => view_depth(params, e) as f32,
                 (false, false) => NO_DEPTH as f32,
             };
         }
@@ -40,8 +44,7 @@ impl Reference for Kernel {
         let unit = f64::from(f32::EPSILON);
         let bound = |at: usize| {
             let depth = stored_depth(params, slices.words, at);
-            let e = f64::from(nearness(params, depth));
-            let (near, far) = (f64::from(params.near), f64::from(params.far));
+            let e = nearness(params, depth);
             let error = if is_float { 0.0 } else { 4.0 * unit * f64::from(depth) };
             if e <= 0.0 || e.is_nan() {
                 return if error > 0.0 && e > -error { f64::INFINITY } else { 0.0 };
@@ -49,12 +52,9 @@ impl Reference for Kernel {
             if error >= e {
                 return f64::INFINITY;
             }
-            let z = |e: f64| {
-                if far > 0.0 { near * far / (near + e * (far - near)) } else { near / e }
-            };
+            let z = |e: f64| view_depth(params, e);
             (z(e - error) - z(e + error)).abs() + 12.0 * unit * z(e).abs()
         };
-        let limits = (0..params.pixel_count as usize).map(bound).collect();
-        Tolerances { limits: Tolerance::Each(limits) }
+        Tolerances { limits: (0..params.pixel_count as usize).map(bound).collect() }
     }
 }

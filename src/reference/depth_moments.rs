@@ -1,14 +1,10 @@
-use glam::{Vec2, Vec3};
-
-use super::rounding::{Rounded, chain};
-use crate::gpu::Reference;
-use crate::kernels::DepthMoments;
+use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::depth_moments::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::photographs::tone::Real;
 
 /// Means of a and b, then the sums of aa, ab and bb about them, of every chunk.
-fn moments(params: &Params, slices: &Slices<'_>) -> impl Iterator<Item = [Rounded; 5]> {
-    (0..params.chunk_count).map(|workgroup| {
+fn moments(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {
+    let of_chunk = |workgroup| {
         let (mut region, mut chunk) = (0, workgroup);
         if workgroup >= params.view_chunks {
             let beyond = workgroup - params.view_chunks;
@@ -31,19 +27,8 @@ fn moments(params: &Params, slices: &Slices<'_>) -> impl Iterator<Item = [Rounde
             Rounded::sum(chain, products)
         });
         [mean[0], mean[1], aa, ab, bb]
-    })
+    };
+    [(0..params.chunk_count).flat_map(of_chunk).collect()]
 }
 
-impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let all: Vec<_> = moments(params, &slices).collect();
-        for (moments, of) in slices.moments.iter_mut().zip(all) {
-            let [a, b, aa, ab, bb] = of.map(|of| of.value as f32);
-            *moments = DepthMoments { mean: Vec2::new(a, b), products: Vec3::new(aa, ab, bb) };
-        }
-    }
-
-    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
-        Tolerances { moments: moments(params, &slices).flatten().collect() }
-    }
-}
+bounded_reference!(moments: moments);

@@ -1,7 +1,6 @@
 //! Application of an exposure, in any number type.
 
-use super::rounding::{Rounded, values};
-use crate::gpu::Reference;
+use super::rounding::{Rounded, bounded_reference};
 use crate::kernels::expose::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::exposure::{BIAS_SCALE, CLIPPED_REACH, EXPOSURE_WIDTH};
 use crate::photographs::tone::Real;
@@ -18,14 +17,14 @@ pub(super) fn is_clipped(target: f32, white: f32) -> bool {
 }
 
 /// Every value written.
-fn exposed<'a>(
+fn exposed(
     params: &Params,
     &Constants { inverse }: &Constants,
-    slices: &'a Slices<'_>,
-) -> impl Iterator<Item = Rounded> + 'a {
+    slices: &Slices<'_>,
+) -> [Vec<Rounded>; 1] {
     let (pixels, view) = (params.pixel_count as usize, params.view as usize);
-    let exposures: Vec<Rounded> = slices.exposures.iter().copied().map(Rounded::exact).collect();
-    slices.render[..3 * pixels].iter().enumerate().map(move |(i, &value)| {
+    let exposures = Rounded::all(slices.exposures);
+    let value = |(i, &value): (usize, &f32)| {
         let channel = i / pixels;
         let [gain, bias] = gain_and_bias(&exposures, view, channel);
         let value = Rounded::exact(value);
@@ -38,16 +37,8 @@ fn exposed<'a>(
             true => exposed.at_most(Rounded::exact(target)),
             false => exposed,
         }
-    })
+    };
+    [slices.render[..3 * pixels].iter().enumerate().map(value).collect()]
 }
 
-impl Reference for Kernel {
-    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let exposed: Vec<f32> = values(exposed(params, constants, &slices)).collect();
-        slices.exposed[..exposed.len()].copy_from_slice(&exposed);
-    }
-
-    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        Tolerances { exposed: exposed(params, constants, &slices).collect() }
-    }
-}
+bounded_reference!(exposed: exposed);

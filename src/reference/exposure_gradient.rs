@@ -1,11 +1,10 @@
-use super::rounding::{Rounded, chain, values};
-use crate::gpu::Reference;
+use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
 use crate::kernels::exposure_gradient::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::photographs::tone::Real;
 
 /// The gradient of every number of every view.
-fn gradients(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
+fn gradients(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {
     let (chunks, view) = (params.chunk_count as usize, params.view as usize);
     let width = EXPOSURE_WIDTH as usize;
     let mut gradients = vec![Rounded::default(); params.view_count as usize * width];
@@ -18,16 +17,7 @@ fn gradients(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
         gradients[view * width + channel] = sum(0);
         gradients[view * width + channel + 3] = Rounded::of(BIAS_SCALE) * sum(1);
     }
-    gradients
+    [gradients]
 }
 
-impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let gradients = values(gradients(params, &slices));
-        slices.gradients.iter_mut().zip(gradients).for_each(|(to, gradient)| *to = gradient);
-    }
-
-    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
-        Tolerances { gradients: gradients(params, &slices).into_iter().collect() }
-    }
-}
+bounded_reference!(gradients: gradients);

@@ -38,6 +38,36 @@ pub struct Planes {
     pub rest_by_column: bool,
 }
 
+/// The layout of an array of words, of which the last attribute may be in halves.
+#[derive(Clone, Copy)]
+pub(super) struct Words {
+    /// Gaussians in the array.
+    pub(super) count: usize,
+    pub(super) feature_count: usize,
+    /// Words per Gaussian.
+    pub(super) columns: usize,
+    pub(super) rest_by_column: bool,
+}
+
+impl Words {
+    /// The layout of `count` Gaussians.
+    pub(super) fn new(
+        count: usize,
+        [feature_count, columns]: [u32; 2],
+        rest_by_column: bool,
+    ) -> Self {
+        let [feature_count, columns] = [feature_count, columns].map(|n| n as usize);
+        Self { count, feature_count, columns, rest_by_column }
+    }
+
+    /// The indices of the words of Gaussian `i`.
+    pub(super) fn of_gaussian(self, i: usize) -> impl Iterator<Item = usize> {
+        planes(self.feature_count, self.columns).into_iter().flat_map(move |plane| {
+            (0..plane.width).map(move |k| plane.index(self.rest_by_column, self.count, i, k))
+        })
+    }
+}
+
 impl Planes {
     /// The planes of this many Gaussians whose splats have this many channels: colour, and the features after it.
     pub(super) fn of(
@@ -57,11 +87,9 @@ impl Planes {
 
     /// The indices of the floats of Gaussian `i`, in the order of [`Gaussian`].
     pub(super) fn places(self, i: usize) -> impl Iterator<Item = usize> {
-        let columns = column_count(self.feature_count, self.sh_degree);
-        let planes = planes(self.feature_count, columns);
-        planes.into_iter().flat_map(move |plane| {
-            (0..plane.width).map(move |k| plane.index(self.rest_by_column, self.count, i, k))
-        })
+        let Self { count, feature_count, sh_degree, rest_by_column } = self;
+        let columns = column_count(feature_count, sh_degree);
+        Words { count, feature_count, columns, rest_by_column }.of_gaussian(i)
     }
 
     /// The array as floats, Gaussian by Gaussian, and its planes; the last one may be in halves.

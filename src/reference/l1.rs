@@ -1,5 +1,5 @@
 use super::inside;
-use super::rounding::{Rounded, chain};
+use super::rounding::{Rounded, chain, sum_tolerance, write_sum};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::l1::{Constants, Kernel, Params, Slices, Tolerances};
 
@@ -19,7 +19,6 @@ fn differences(
 }
 
 impl Reference for Kernel {
-    /// The whole sum goes into the first partial: the number of partials is chosen by the device.
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let differences: Vec<Rounded> = differences(params, constants, &slices).collect();
         for (d, difference) in slices.d_render.iter_mut().zip(&differences) {
@@ -28,14 +27,13 @@ impl Reference for Kernel {
             let gradient = params.l1_scale * sign as f32;
             *d = if constants.adds { *d + gradient } else { gradient };
         }
-        slices.partials.fill(0.0);
-        slices.partials[0] = differences.iter().map(|d| d.value.abs()).sum::<f64>() as f32;
+        write_sum(differences.iter().map(|d| d.value.abs()), slices.partials);
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let differences = differences(params, constants, &slices);
         let chain = chain(0) + f64::from(constants.values_per_thread);
-        let sum = Rounded::sum(chain, differences.map(|d| d.abs()));
-        Tolerances { d_render: Tolerance::Exact, partials: Tolerance::Sum(sum.bound()) }
+        let partials = sum_tolerance(chain, differences.map(Rounded::abs));
+        Tolerances { d_render: Tolerance::Exact, partials }
     }
 }

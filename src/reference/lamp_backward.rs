@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use super::camera::Camera;
 use super::lamp::{Lamp, WIDTH};
-use super::rounding::{Rounded, UNIT, chain, sensitivity, values};
+use super::rounding::{Rounded, UNIT, bounds_from, chain, sensitivity, write};
 use super::splat::stored_color;
 use crate::gpu::Reference;
 use crate::kernels::lamp::LAMP_NUMBERS;
@@ -76,15 +76,12 @@ fn sums(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Roun
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let sums = values(sums(params, constants, &slices));
-        let to = &mut slices.partials[WIDTH * params.first_chunk as usize..];
-        to.iter_mut().zip(sums).for_each(|(to, sum)| *to = sum);
+        let sums = sums(params, constants, &slices);
+        write(sums, &mut slices.partials[WIDTH * params.first_chunk as usize..]);
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let mut all = vec![Rounded::default(); WIDTH * params.first_chunk as usize];
-        all.extend(sums(params, constants, &slices));
-        all.resize(slices.partials.len(), Rounded::default());
-        Tolerances { partials: all.into_iter().collect() }
+        let sums = sums(params, constants, &slices);
+        Tolerances { partials: bounds_from(WIDTH * params.first_chunk as usize, sums) }
     }
 }

@@ -124,5 +124,5 @@ pub(super) fn affine(
 /// Channel `channel` of an image.
 pub(super) fn plane(image: &[f32], pixels: u32, channel: usize) -> Vec<Rounded> {
     let pixels = pixels as usize;
-    image[channel * pixels..][..pixels].iter().copied().map(Rounded::exact).collect()
+    Rounded::all(&image[channel * pixels..][..pixels])
 }

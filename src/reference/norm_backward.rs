@@ -1,11 +1,10 @@
 use super::norm::{affine, backward, plane};
-use super::rounding::{Rounded, values};
-use crate::gpu::Reference;
+use super::rounding::{Rounded, bounded_reference};
 use crate::kernels::norm_backward::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::photographs::tone::Real;
 
 /// The gradient of every value of every channel.
-fn d_source(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
+fn d_source(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {
     let &Params { pixel_count, channel_count, offset, slot } = params;
     let channel = |channel| {
         let affine = affine(slices.values, offset, channel_count, channel);
@@ -16,16 +15,7 @@ fn d_source(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
             [slices.source, slices.d_target].map(|image| plane(image, pixel_count, channel));
         backward(statistics, affine, means, &z, &d)
     };
-    (0..channel_count as usize).flat_map(channel).collect()
+    [(0..channel_count as usize).flat_map(channel).collect()]
 }
 
-impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let d_source = values(d_source(params, &slices));
-        slices.d_source.iter_mut().zip(d_source).for_each(|(to, value)| *to = value);
-    }
-
-    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
-        Tolerances { d_source: d_source(params, &slices).into_iter().collect() }
-    }
-}
+bounded_reference!(d_source: d_source);

@@ -1,6 +1,6 @@
 use glam::Vec2;
 
-use super::rounding::{Rounded, chain};
+use super::rounding::{Rounded, chain, write};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::norm_backward_merge::{Constants, Kernel, Params, Slices, Tolerances};
 
@@ -24,8 +24,8 @@ fn added(params: &Params, channel: usize, sums: [Rounded; 2]) -> [(usize, Rounde
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let sums = sums(params, constants, slices.partials);
+        write(sums.iter().flatten().copied(), slices.sums);
         for (channel, sums) in sums.into_iter().enumerate() {
-            slices.sums[channel] = Vec2::from_array(sums.map(|sum| sum.value as f32));
             for (at, sum) in added(params, channel, sums) {
                 slices.gradients[at] = (f64::from(slices.gradients[at]) + sum.value) as f32;
             }

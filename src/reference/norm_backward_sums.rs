@@ -1,12 +1,9 @@
-use glam::Vec2;
-
 use super::norm::{affine, backward_terms, plane};
-use super::rounding::{Rounded, chain};
-use crate::gpu::Reference;
+use super::rounding::{Rounded, bounded_reference, chain};
 use crate::kernels::norm_backward_sums::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// Both sums of every chunk of every channel.
-fn partials(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<[Rounded; 2]> {
+fn partials(params: &Params, constants: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {
     let &Params { pixel_count, channel_count, offset, slot } = params;
     let chunk = constants.chunk as usize;
     let channel = |channel| {
@@ -14,25 +11,13 @@ fn partials(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<
         let statistics = slices.statistics[slot as usize + channel].into();
         let [z, d] =
             [slices.source, slices.d_target].map(|image| plane(image, pixel_count, channel));
-        let sums = z.chunks(chunk).zip(d.chunks(chunk)).map(|(z, d)| {
+        let sums = z.chunks(chunk).zip(d.chunks(chunk)).flat_map(|(z, d)| {
             let terms: Vec<_> = backward_terms(statistics, affine, z, d).collect();
             [0, 1].map(|which| Rounded::sum(chain(chunk), terms.iter().map(|of| of[which])))
         });
         sums.collect::<Vec<_>>()
     };
-    (0..channel_count as usize).flat_map(channel).collect()
+    [(0..channel_count as usize).flat_map(channel).collect()]
 }
 
-impl Reference for Kernel {
-    fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let partials = partials(params, constants, &slices);
-        for (partial, sums) in slices.partials.iter_mut().zip(partials) {
-            *partial = Vec2::from_array(sums.map(|sum| sum.value as f32));
-        }
-    }
-
-    fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let partials = partials(params, constants, &slices);
-        Tolerances { partials: partials.into_iter().flatten().collect() }
-    }
-}
+bounded_reference!(partials: partials);

@@ -1,10 +1,9 @@
 use super::norm::{affine, forward, plane};
-use super::rounding::{Rounded, values};
-use crate::gpu::Reference;
+use super::rounding::{Rounded, bounded_reference};
 use crate::kernels::norm_forward::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// Every value of every channel.
-fn target(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
+fn target(params: &Params, _: &Constants, slices: &Slices<'_>) -> [Vec<Rounded>; 1] {
     let &Params { pixel_count, channel_count, offset, slot } = params;
     let channel = |channel| {
         let affine = affine(slices.values, offset, channel_count, channel);
@@ -13,16 +12,7 @@ fn target(params: &Params, slices: &Slices<'_>) -> Vec<Rounded> {
         let shortcut = plane(slices.shortcut, pixel_count, channel);
         shortcut.into_iter().zip(added).map(|(shortcut, added)| shortcut + added)
     };
-    (0..channel_count as usize).flat_map(channel).collect()
+    [(0..channel_count as usize).flat_map(channel).collect()]
 }
 
-impl Reference for Kernel {
-    fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
-        let target = values(target(params, &slices));
-        slices.target.iter_mut().zip(target).for_each(|(to, value)| *to = value);
-    }
-
-    fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
-        Tolerances { target: target(params, &slices).into_iter().collect() }
-    }
-}
+bounded_reference!(target: target);

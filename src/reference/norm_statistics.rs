@@ -2,7 +2,7 @@ use glam::Vec2;
 
 use super::rounding::{UNIT, chain};
 use super::widen;
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::Reference;
 use crate::kernels::norm_statistics::{Constants, Kernel, Params, Slices, Tolerances};
 
 /// Every chunk of every channel.
@@ -29,14 +29,15 @@ impl Reference for Kernel {
     /// The first mean has the rounding error of a sum. The sum of the deviations corrects it: the second mean has its
     /// own rounding and that of the deviations' sum.
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
-        let bounds = chunks(params, constants, slices.source).into_iter().flat_map(|chunk| {
+        let bounds = |chunk: Vec<f64>| {
             let ([mean, squares], n) = (moments(&chunk), chunk.len() as f64);
             let error = (chain(chunk.len()) + 6.0) * UNIT;
             let first = error * chunk.iter().map(|z| z.abs()).sum::<f64>() / n;
             let deviation = chunk.iter().map(|z| (z - mean).abs()).sum::<f64>() / n + first;
             let about_first = squares + n * first * first;
             [error * deviation + 2.0 * UNIT * mean.abs(), 2.0 * error * about_first]
-        });
-        Tolerances { partials: Tolerance::Each(bounds.collect()) }
+        };
+        let chunks = chunks(params, constants, slices.source).into_iter();
+        Tolerances { partials: chunks.flat_map(bounds).collect() }
     }
 }

@@ -2,8 +2,8 @@
 
 use std::ops::Range;
 
-use super::rounding::{Rounded, chain};
-use crate::gpu::{Reference, Tolerance};
+use super::rounding::{Rounded, chain, sum_tolerance, write, write_sum};
+use crate::gpu::Reference;
 use crate::kernels::parameter_terms::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::photographs::tone::Real;
 use crate::splats::attributes::Attribute;
@@ -44,8 +44,8 @@ pub fn parameter_terms(
     {
         let weight = weights[term] / range.len() as f64;
         for at in range {
-            let [own, derivative] = [opacity, scale][term](planes[at]);
-            value += weight * own;
+            let [summed, derivative] = [opacity, scale][term](planes[at]);
+            value += weight * summed;
             gradient[at] = weight * derivative;
         }
     }
@@ -86,14 +86,13 @@ fn outcome(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Outco
     let frozen = constants.frozen_columns as usize * count;
     let left_out = frozen_floats(constants.frozen_columns, count);
     let parameter = |at: usize| Rounded::exact(slices.parameters[at]);
-    let mut gradients: Vec<Rounded> =
-        slices.gradients.iter().map(|&gradient| Rounded::exact(gradient)).collect();
+    let mut gradients = Rounded::all(slices.gradients);
     let mut of = |range: Range<usize>, term: fn(Rounded) -> [Rounded; 2], weight: f32| {
         let value = |at: usize| {
             let [value, derivative] = term(parameter(at));
             if weight > 0.0 && at >= frozen {
-                let own = at - left_out;
-                gradients[own] = gradients[own] + Rounded::exact(weight) * derivative;
+                let at = at - left_out;
+                gradients[at] = gradients[at] + Rounded::exact(weight) * derivative;
             }
             value
         };
@@ -122,19 +121,12 @@ fn outcome(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Outco
 }
 
 impl Reference for Kernel {
-    /// The whole sums go into the first partials: the number of partials is chosen by the device.
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let Outcome { opacities, scales, ratios, gradients } = outcome(params, constants, &slices);
-        for (own, gradient) in slices.gradients.iter_mut().zip(gradients) {
-            *own = gradient.value as f32;
-        }
-        for (partials, values) in [
-            (slices.opacity_partials, opacities),
-            (slices.scale_partials, scales),
-            (slices.ratio_partials, ratios),
-        ] {
-            partials.fill(0.0);
-            partials[0] = values.iter().map(|value| value.value).sum::<f64>() as f32;
+        write(gradients, slices.gradients);
+        let partials = [slices.opacity_partials, slices.scale_partials, slices.ratio_partials];
+        for (partials, values) in partials.into_iter().zip([opacities, scales, ratios]) {
+            write_sum(values.iter().map(|value| value.value), partials);
         }
     }
 
@@ -144,12 +136,11 @@ impl Reference for Kernel {
         let bound = |(gradient, &before): (&Rounded, &f32)| {
             if gradient.value == f64::from(before) { 0.0 } else { gradient.bound() }
         };
-        let bounds = gradients.iter().zip(slices.gradients.iter()).map(bound).collect();
         let chain = chain(0) + f64::from(3 * constants.gaussians_per_thread);
-        let [opacity_partials, scale_partials, ratio_partials] = [opacities, scales, ratios]
-            .map(|values| Tolerance::Sum(Rounded::sum(chain, values).bound()));
+        let [opacity_partials, scale_partials, ratio_partials] =
+            [opacities, scales, ratios].map(|values| sum_tolerance(chain, values));
         Tolerances {
-            gradients: Tolerance::Each(bounds),
+            gradients: gradients.iter().zip(slices.gradients.iter()).map(bound).collect(),
             opacity_partials,
             scale_partials,
             ratio_partials,

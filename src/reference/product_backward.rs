@@ -23,7 +23,7 @@ impl Reference for Kernel {
         };
         Tolerances {
             d_illumination: Tolerance::Roundings(1.0),
-            d_denoised: Tolerance::Each((0..params.value_count as usize).map(bound).collect()),
+            d_denoised: (0..params.value_count as usize).map(bound).collect(),
         }
     }
 }

@@ -201,11 +201,15 @@ impl<'a> ProjectionInputs<'a> {
     }
 
     /// `color`: of the forward pass.
-    fn backward(&self, gaussian: &Gaussian, splat: (&Splat, DVec3), d_splat: &DSplat) -> Gaussian {
+    fn backward(
+        &self,
+        gaussian: &Gaussian,
+        splat: &Splat,
+        color: DVec3,
+        d_splat: &DSplat,
+    ) -> Gaussian {
         let (degree, antialiased) = (self.params.sh_degree, self.constants.antialiased);
-        let (splat, color) = splat;
-        let lit = self.lamp.map(|lamp| Lit { lamp, color });
-        let splat = (splat, lit);
+        let splat = (splat, self.lamp.map(|lamp| Lit { lamp, color }));
         let mut gradient =
             project_gaussian_backward(&self.camera, degree, antialiased, gaussian, splat, d_splat);
         if self.constants.color_gradients {
@@ -306,32 +310,24 @@ fn values(record: &[Rounded]) -> Vec<f64> {
 
 impl Reference for Kernel {
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
-        let Slices {
-            parameters,
-            splats,
-            colors,
-            tile_counts,
-            intersection_ranges,
-            gradient_records,
-            ..
-        } = slices;
+        let Slices { splats, colors, intersection_ranges, gradient_records, .. } = slices;
         let Slices { status, gradients, grad_norm_sums, visit_counts, .. } = slices;
         // From before the pass, since the device may process Gaussians in any order.
         let before = status[3];
         let scene = ProjectionInputs::new(params, constants, slices.cameras, slices.lamp);
-        let (planes, parameters) = scene.planes.floats(parameters, constants.half_rest);
+        let (planes, parameters) = scene.planes.floats(slices.parameters, constants.half_rest);
         let written = scene.written_columns() * scene.planes.count;
         let frozen = constants.frozen_columns as usize * scene.planes.count;
         let left_out = scene.left_out();
         gradients[frozen - left_out..written - left_out].fill(0.0);
-        for i in (0..scene.planes.count).filter(|&i| tile_counts[i] > 0) {
+        for i in (0..scene.planes.count).filter(|&i| slices.tile_counts[i] > 0) {
             let record =
                 summed_record(constants.channels, intersection_ranges[i], gradient_records);
             let splat = Splat::from(&splats[i]);
             let d_splat = scene.d_splat(&splat, colors, &values(&record), i);
             let gaussian = planes.load(&parameters, i);
             let color = scene.color(colors, i);
-            let gradient = scene.backward(&gaussian, (&splat, color), &d_splat);
+            let gradient = scene.backward(&gaussian, &splat, color, &d_splat);
             let d_color = scene.d_color(&gaussian, d_splat.color, color);
             let mut is_finite = (8.0 * d_color.as_vec3()).is_finite();
             scene.planes.store(&gradient, i, |at, value| {
@@ -372,31 +368,27 @@ impl Reference for Kernel {
                 slices.gradient_records,
             );
             inputs.extend(values(&record));
-            let mut errors: Vec<f64> = (0..inputs.len())
-                .map(|at| {
-                    let beside = if at < 3 { far } else { 0.0 };
-                    OFF * (inputs[at].abs()
-                        + beside
-                        + if at < one.float_count() { 1.0 } else { 0.0 })
-                })
-                .collect();
-            errors[one.float_count() + 3..]
-                .iter_mut()
-                .zip(&record)
-                .for_each(|(e, sum)| *e += sum.error);
+            let attributes = one.float_count();
+            let of_input = |(at, input): (usize, &f64)| {
+                let beside = if at < 3 { far } else { 0.0 };
+                OFF * (input.abs() + beside + if at < attributes { 1.0 } else { 0.0 })
+            };
+            let mut errors: Vec<f64> = inputs.iter().enumerate().map(of_input).collect();
+            let of_record = errors[attributes + 3..].iter_mut().zip(&record);
+            of_record.for_each(|(error, sum)| *error += sum.error);
             let bounds = sensitivity(&inputs, &errors, |inputs| {
-                let (own, rest) = inputs.split_at(one.float_count());
+                let (own, rest) = inputs.split_at(attributes);
                 let splat = Splat { conic: DVec3::from_slice(rest), ..splat };
                 let (gaussian, d_splat) =
                     (one.load(own, 0), scene.d_splat(&splat, slices.colors, &rest[3..], i));
-                let gradient = scene.backward(&gaussian, (&splat, color), &d_splat);
-                let mut numbers = vec![0.0; one.float_count() + 1];
+                let gradient = scene.backward(&gaussian, &splat, color, &d_splat);
+                let mut numbers = vec![0.0; attributes + 1];
                 one.store(&gradient, 0, |at, value| numbers[at] = value);
-                numbers[one.float_count()] = scene.damped_norm(&gaussian, &d_splat);
+                numbers[attributes] = scene.damped_norm(&gaussian, &d_splat);
                 numbers
             });
             let d_splat = scene.d_splat(&splat, slices.colors, &values(&record), i);
-            let gradient = scene.backward(&gaussian, (&splat, color), &d_splat);
+            let gradient = scene.backward(&gaussian, &splat, color, &d_splat);
             scene.planes.store(&gradient, i, |at, value| gradients[at] = OFF * value.abs());
             let mut moved = one.load(&bounds, 0);
             // A basis is a polynomial of magnitude 3 and degree 3, which may vanish.
@@ -409,7 +401,7 @@ impl Reference for Kernel {
             scene.planes.store(&moved, i, |at, bound| gradients[at] += bound);
             let norm = scene.damped_norm(&gaussian, &d_splat);
             let sum = f64::from(slices.grad_norm_sums[i].abs()) + norm;
-            grad_norm_sums[i] = bounds[one.float_count()] + 16.0 * UNIT * norm + 2.0 * UNIT * sum;
+            grad_norm_sums[i] = bounds[attributes] + 16.0 * UNIT * norm + 2.0 * UNIT * sum;
         }
         Tolerances {
             gradients: Tolerance::Each(gradients.split_off(scene.left_out())),

@@ -4,6 +4,8 @@
 use std::cmp::Ordering;
 use std::ops::{Add, Div, Mul, Neg, Sub};
 
+use bytemuck::Pod;
+
 use crate::gpu::Tolerance;
 use crate::kernels::ToneParameters;
 use crate::photographs::tone::{Real, curve_at};
@@ -51,6 +53,11 @@ impl Rounded {
         Self { value: value.into(), error: 0.0 }
     }
 
+    /// Numbers in single precision.
+    pub(super) fn all(values: &[f32]) -> Vec<Self> {
+        values.iter().copied().map(Self::exact).collect()
+    }
+
     /// After `count` more roundings. A subnormal result may be flushed to zero: NVIDIA's devices do.
     pub(super) fn rounded(self, count: f64) -> Self {
         let magnitude = self.value.abs();
@@ -95,13 +102,10 @@ impl Rounded {
     /// ln x: three ulp, or 2^-21 between a half and two.
     pub(super) fn ln(self) -> Self {
         let (low, value) = (self.value - self.error, self.value.ln());
-        let own = if (0.5..=2.0).contains(&self.value) {
-            1.0 / 2_097_152.0
-        } else {
-            6.0 * UNIT * value.abs()
-        };
+        let is_near_one = (0.5..=2.0).contains(&self.value);
+        let logarithm = if is_near_one { 1.0 / 2_097_152.0 } else { 6.0 * UNIT * value.abs() };
         let argument = if self.error == 0.0 { 0.0 } else { (self.value / low.max(0.0)).ln() };
-        Self { value, error: own + argument }
+        Self { value, error: logarithm + argument }
     }
 
     /// The error of a reference in double precision that is rounded at its end.
@@ -117,15 +121,57 @@ pub(super) fn rounded_tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> R
     y.at_least(Rounded::of(0.0)).at_most(Rounded::of(1.0))
 }
 
-/// The values, as a reference returns them.
-pub(super) fn values(numbers: impl IntoIterator<Item = Rounded>) -> impl Iterator<Item = f32> {
-    numbers.into_iter().map(|number| number.value as f32)
+/// Writes the values to the start of a buffer of floats or of groups of floats.
+pub(super) fn write<T: Pod>(numbers: impl IntoIterator<Item = Rounded>, to: &mut [T]) {
+    let to: &mut [f32] = bytemuck::cast_slice_mut(to);
+    to.iter_mut().zip(numbers).for_each(|(to, number)| *to = number.value as f32);
+}
+
+/// The tolerance of a buffer that these numbers are written to from index `first` on.
+pub(super) fn bounds_from(first: usize, numbers: impl IntoIterator<Item = Rounded>) -> Tolerance {
+    std::iter::repeat_n(0.0, first).chain(numbers.into_iter().map(Rounded::bound)).collect()
+}
+
+/// Writes a whole sum into the first partial: the device chooses the number of partials.
+pub(super) fn write_sum(terms: impl Iterator<Item = f64>, partials: &mut [f32]) {
+    partials.fill(0.0);
+    partials[0] = terms.sum::<f64>() as f32;
+}
+
+/// The tolerance of partial sums in which a term takes part in at most `chain` additions.
+pub(super) fn sum_tolerance(chain: f64, terms: impl IntoIterator<Item = Rounded>) -> Tolerance {
+    Tolerance::Sum(Rounded::sum(chain, terms).bound())
+}
+
+/// The reference of a kernel, from a function that returns the numbers of each buffer that it writes.
+macro_rules! bounded_reference {
+    ($numbers:ident: $($buffer:ident),+) => {
+        impl crate::gpu::Reference for Kernel {
+            fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
+                let [$($buffer),+] = $numbers(params, constants, &slices);
+                $(crate::reference::rounding::write($buffer, slices.$buffer);)+
+            }
+
+            fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
+                let [$($buffer),+] = $numbers(params, constants, &slices);
+                Tolerances { $($buffer: $buffer.into_iter().collect()),+ }
+            }
+        }
+    };
+}
+pub(super) use bounded_reference;
+
+/// A bound for each element of a buffer.
+impl FromIterator<f64> for Tolerance {
+    fn from_iter<I: IntoIterator<Item = f64>>(bounds: I) -> Self {
+        Self::Each(bounds.into_iter().collect())
+    }
 }
 
 /// A bound for each element of a buffer, from a reference in double precision.
 impl FromIterator<Rounded> for Tolerance {
     fn from_iter<I: IntoIterator<Item = Rounded>>(numbers: I) -> Self {
-        Self::Each(numbers.into_iter().map(Rounded::bound).collect())
+        numbers.into_iter().map(Rounded::bound).collect()
     }
 }
 
@@ -225,8 +271,8 @@ impl Real for Rounded {
         if self.value < 0.01 {
             return argument.rounded(6.0);
         }
-        let own = UNIT * (6.0 + 4.0 * self.value.abs()) * (-self.value).exp();
-        Self { error: argument.error + own, ..argument }.rounded(1.0)
+        let exponential = UNIT * (6.0 + 4.0 * self.value.abs()) * (-self.value).exp();
+        Self { error: argument.error + exponential, ..argument }.rounded(1.0)
     }
 
     /// A series if x is small, else ln(1 + x).

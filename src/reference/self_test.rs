@@ -1,4 +1,4 @@
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::Reference;
 use crate::kernels::self_test::{
     Constants, FUNCTION_VALUES, Kernel, Params, SUBGROUPS, Slices, Tolerances,
 };
@@ -16,8 +16,8 @@ impl Reference for Kernel {
         for (value, (expected, _)) in values.iter_mut().zip(functions(numbers)) {
             *value = expected as f32;
         }
-        let own = &numbers[FUNCTION_VALUES as usize + 1..];
-        words[..2].copy_from_slice(&[own[1], own[0]]);
+        let rest = &numbers[FUNCTION_VALUES as usize + 1..];
+        words[..2].copy_from_slice(&[rest[1], rest[0]]);
         for i in 0..SUBGROUPS {
             sums[i as usize] = number_of(i + params.turn);
         }
@@ -26,6 +26,6 @@ impl Reference for Kernel {
 
     fn tolerances(_: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
         let bounds = functions(slices.numbers).into_iter().map(|(_, bound)| bound);
-        Tolerances { values: Tolerance::Each(bounds.collect()), ..Tolerances::default() }
+        Tolerances { values: bounds.collect(), ..Tolerances::default() }
     }
 }

@@ -3,23 +3,23 @@
 use glam::UVec2;
 
 use super::inside;
-use super::rounding::{Rounded, UNIT, chain};
-use crate::gpu::{Reference, Tolerance};
+use super::rounding::{Rounded, UNIT, chain, sum_tolerance, write, write_sum};
+use crate::gpu::Reference;
 use crate::kernels::ssim::{Constants, Kernel, Params, Slices, Tolerances};
 use crate::kernels::ssim_window::{C1, C2};
 use crate::photographs::tone::Real;
 
 /// SSIM at one pixel of one channel and its derivatives with respect to the blurred moments.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Ssim<T = f64> {
+pub(super) struct Ssim<T> {
     /// The index itself, at most 1.
-    pub value: T,
+    pub(super) value: T,
     /// dS/dE\[a\], dS/dE\[aa\], dS/dE\[ab\].
-    pub d_moments: [T; 3],
+    pub(super) d_moments: [T; 3],
 }
 
 /// The 11 x 11 Gaussian window (sigma 1.5) over one channel, zero outside it.
-pub fn blur(width: usize, height: usize, plane: &[f64]) -> Vec<f64> {
+fn blur(width: usize, height: usize, plane: &[f64]) -> Vec<f64> {
     let taps: Vec<f64> = (-5..=5).map(|d| (-f64::from(d * d) / 4.5).exp()).collect();
     let sum: f64 = taps.iter().sum();
     let (mut along_x, mut blurred) = (vec![0.0; plane.len()], vec![0.0; plane.len()]);
@@ -42,14 +42,15 @@ pub fn blur(width: usize, height: usize, plane: &[f64]) -> Vec<f64> {
 
 /// SSIM of every pixel of one channel, `a` against `b`.
 #[cfg(feature = "testing")]
-pub fn ssim(width: usize, height: usize, a: &[f64], b: &[f64]) -> Vec<Ssim> {
-    let moment = |of: fn(f64, f64) -> f64| {
-        let plane: Vec<f64> = a.iter().zip(b).map(|(&a, &b)| of(a, b)).collect();
-        blur(width, height, &plane)
-    };
-    let (mean_a, mean_b) = (moment(|a, _| a), moment(|_, b| b));
-    let (aa, bb, ab) = (moment(|a, _| a * a), moment(|_, b| b * b), moment(|a, b| a * b));
-    (0..a.len()).map(|i| ssim_of_moments(mean_a[i], mean_b[i], aa[i], bb[i], ab[i])).collect()
+pub fn ssim(size: [usize; 2], a: &[f64], b: &[f64]) -> Vec<f64> {
+    let [a, b] = [a, b].map(double);
+    rounded_ssim(size, &a, &b, |_| true).iter().map(|of| of.value.value).collect()
+}
+
+/// Numbers in double precision.
+#[cfg(feature = "testing")]
+fn double(plane: &[f64]) -> Vec<Rounded> {
+    plane.iter().map(|&x| Rounded::of(x)).collect()
 }
 
 fn ssim_of_moments<T: Real>(a: T, b: T, aa: T, bb: T, ab: T) -> Ssim<T> {
@@ -69,30 +70,21 @@ fn ssim_of_moments<T: Real>(a: T, b: T, aa: T, bb: T, ab: T) -> Ssim<T> {
 /// over the pixels from `begin` to before `end`.
 #[cfg(feature = "testing")]
 pub fn gradient(
-    [width, height]: [usize; 2],
+    size: [usize; 2],
     loss_region: [UVec2; 2],
-    [l1_scale, ssim_scale]: [f64; 2],
+    scales: [f64; 2],
     a: &[f64],
     b: &[f64],
 ) -> Vec<f64> {
-    let counts = |i: usize| inside(i, [width as u32, height as u32], loss_region);
-    let map = ssim(width, height, a, b);
-    let blurred = [0, 1, 2].map(|m| {
-        let derivative = |(i, of): (usize, &Ssim)| if counts(i) { of.d_moments[m] } else { 0.0 };
-        blur(width, height, &map.iter().enumerate().map(derivative).collect::<Vec<_>>())
-    });
-    let at = |i: usize| {
-        let difference = if counts(i) { a[i] - b[i] } else { 0.0 };
-        let sign = if difference == 0.0 { 0.0 } else { difference.signum() };
-        l1_scale * sign - ssim_scale * d_ssim(a[i], b[i], [0, 1, 2].map(|m| blurred[m][i]))
-    };
-    (0..a.len()).map(at).collect()
+    let (scales, [a, b]) = (scales.map(Rounded::of), [a, b].map(double));
+    let outcomes = outcomes_of_channel(size, loss_region, scales, &a, &b);
+    outcomes.iter().map(|of| of.gradient.value).collect()
 }
 
 /// dSSIM/da at one pixel, from the blurred derivatives. A value outside all windows has no gradient, even if it is NaN.
 fn d_ssim<T: Real>(a: T, b: T, [mean, square, product]: [T; 3]) -> T {
-    let own = if square == T::of(0.0) { square } else { T::of(2.0) * a * square };
-    mean + own + b * product
+    let of_square = if square == T::of(0.0) { square } else { T::of(2.0) * a * square };
+    mean + of_square + b * product
 }
 
 /// The gradient at one pixel, from the blurred derivatives, and |a - b| where it counts.
@@ -104,8 +96,8 @@ pub(super) fn rounded_gradient(
     counts: bool,
 ) -> [Rounded; 2] {
     let difference = if counts { a - b } else { Rounded::default() };
-    let own = difference.value;
-    let sign = Rounded::of(if own == 0.0 { 0.0 } else { own.signum() });
+    let value = difference.value;
+    let sign = Rounded::of(if value == 0.0 { 0.0 } else { value.signum() });
     let gradient = l1_scale * sign - ssim_scale * d_ssim(a, b, d_moments);
     [gradient, difference.abs()]
 }
@@ -128,13 +120,14 @@ struct Outcome {
 }
 
 fn outcomes(params: &Params, slices: &Slices<'_>) -> Vec<Outcome> {
-    let pixels = params.width as usize * params.height as usize;
+    let size = [params.width as usize, params.height as usize];
+    let scales = [params.l1_scale, params.ssim_scale].map(Rounded::exact);
+    let pixels = size[0] * size[1];
     let channel = |channel: usize| {
         let plane = channel * pixels..(channel + 1) * pixels;
-        let exact = |&x: &f32| Rounded::exact(x);
-        let a: Vec<_> = slices.render[plane.clone()].iter().map(exact).collect();
-        let b: Vec<_> = slices.target[plane].iter().map(exact).collect();
-        outcomes_of_channel(params, &a, &b)
+        let [a, b] =
+            [slices.render, slices.target].map(|image| Rounded::all(&image[plane.clone()]));
+        outcomes_of_channel(size, [params.loss_begin, params.loss_end], scales, &a, &b)
     };
     (0..3).flat_map(channel).collect()
 }
@@ -160,14 +153,17 @@ pub(super) fn rounded_ssim(
     (0..a.len()).map(index).collect()
 }
 
-fn outcomes_of_channel(params: &Params, a: &[Rounded], b: &[Rounded]) -> Vec<Outcome> {
-    let size = [params.width as usize, params.height as usize];
-    let loss_region = [params.loss_begin, params.loss_end];
-    let counts = |i: usize| inside(i, [params.width, params.height], loss_region);
+fn outcomes_of_channel(
+    size: [usize; 2],
+    loss_region: [UVec2; 2],
+    scales: [Rounded; 2],
+    a: &[Rounded],
+    b: &[Rounded],
+) -> Vec<Outcome> {
+    let counts = |i: usize| inside(i, size.map(|side| side as u32), loss_region);
     let map = rounded_ssim(size, a, b, counts);
     let derivatives = [0, 1, 2]
         .map(|m| rounded_blur(size, &map.iter().map(|of| of.d_moments[m]).collect::<Vec<_>>()));
-    let scales = [params.l1_scale, params.ssim_scale].map(Rounded::exact);
     let outcome = |i: usize| {
         let d = [0, 1, 2].map(|m| derivatives[m][i]);
         let [gradient, difference] = rounded_gradient(scales, a[i], b[i], d, counts(i));
@@ -190,32 +186,20 @@ fn accumulated<'a>(
 }
 
 impl Reference for Kernel {
-    /// The whole sums go into the first partials: the number of partials is chosen by the device.
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let (outcomes, before) = (outcomes(params, &slices), slices.d_render.to_vec());
-        for (to, d) in slices.d_render.iter_mut().zip(accumulated(&outcomes, constants, &before)) {
-            *to = d.value as f32;
-        }
-        let sum = |of: fn(&Outcome) -> f64| outcomes.iter().map(of).sum::<f64>() as f32;
-        for (partials, sum) in [
-            (slices.l1_partials, sum(|of| of.difference.value)),
-            (slices.ssim_partials, sum(|of| of.ssim.value)),
-        ] {
-            partials.fill(0.0);
-            partials[0] = sum;
-        }
+        write(accumulated(&outcomes, constants, &before), slices.d_render);
+        write_sum(outcomes.iter().map(|of| of.difference.value), slices.l1_partials);
+        write_sum(outcomes.iter().map(|of| of.ssim.value), slices.ssim_partials);
     }
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let outcomes = outcomes(params, &slices);
         let chain = chain(0) + f64::from(constants.columns * constants.rows);
-        let sum = |of: fn(&Outcome) -> Rounded| {
-            Tolerance::Sum(Rounded::sum(chain, outcomes.iter().map(of)).bound())
-        };
         Tolerances {
             d_render: accumulated(&outcomes, constants, slices.d_render).collect(),
-            l1_partials: sum(|of| of.difference),
-            ssim_partials: sum(|of| of.ssim),
+            l1_partials: sum_tolerance(chain, outcomes.iter().map(|of| of.difference)),
+            ssim_partials: sum_tolerance(chain, outcomes.iter().map(|of| of.ssim)),
         }
     }
 }

@@ -1,7 +1,7 @@
 //! The gradient of L1 + SSIM, from the derivatives of SSIM with respect to the blurred moments.
 
 use super::inside;
-use super::rounding::{Rounded, chain};
+use super::rounding::{Rounded, chain, sum_tolerance, write, write_sum};
 use super::ssim::{rounded_blur, rounded_gradient};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::ssim_backward::{Constants, Kernel, Params, Slices, Tolerances};
@@ -16,10 +16,7 @@ fn gradients(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec
     let derivatives = [slices.d_mean, slices.d_square, slices.d_product];
     let of_channel = |channel: usize| {
         let plane = channel * pixels..(channel + 1) * pixels;
-        let blurred = derivatives.map(|d| {
-            let own: Vec<_> = d[plane.clone()].iter().map(|&x| Rounded::exact(x)).collect();
-            rounded_blur(size, &own)
-        });
+        let blurred = derivatives.map(|d| rounded_blur(size, &Rounded::all(&d[plane.clone()])));
         let [a, b, before] =
             [slices.render, slices.target, &*slices.d_render].map(|image| &image[plane.clone()]);
         let at = move |i: usize| {
@@ -49,25 +46,21 @@ fn within(params: &Params) -> f64 {
     chain(0) + f64::from(params.rows)
 }
 
-/// The places of both terms in the log.
-fn places(params: &Params) -> [usize; 2] {
+/// The indices of both terms in the log.
+fn logged(params: &Params) -> [usize; 2] {
     [0, 1].map(|term| (params.slot * params.term_count + params.terms[term]) as usize)
 }
 
 impl Reference for Kernel {
-    /// The whole sum goes into the first partial: the number of partials is chosen by the device.
     fn run(params: &Params, constants: &Constants, slices: Slices<'_>) {
         let gradients = gradients(params, constants, &slices);
         let means = means(params, &gradients, slices.ssim_partials);
         let Slices { d_render, l1_partials, log, statuses, status, .. } = slices;
-        for (to, [d, _]) in d_render.iter_mut().zip(&gradients) {
-            *to = d.value as f32;
-        }
-        l1_partials.fill(0.0);
-        l1_partials[0] = gradients.iter().map(|[_, of]| of.value).sum::<f64>() as f32;
-        for (place, mean) in places(params).into_iter().zip(means) {
-            log[place] = mean.value as f32;
-            if !log[place].is_finite() {
+        write(gradients.iter().map(|&[d, _]| d), d_render);
+        write_sum(gradients.iter().map(|[_, of]| of.value), l1_partials);
+        for (at, mean) in logged(params).into_iter().zip(means) {
+            log[at] = mean.value as f32;
+            if !log[at].is_finite() {
                 status[0] |= STATUS_NOT_FINITE;
             }
         }
@@ -77,13 +70,12 @@ impl Reference for Kernel {
 
     fn tolerances(params: &Params, constants: &Constants, slices: Slices<'_>) -> Tolerances {
         let gradients = gradients(params, constants, &slices);
-        let sum = Rounded::sum(within(params), gradients.iter().map(|&[_, of]| of));
         let mut log = vec![0.0; slices.log.len()];
         let means = means(params, &gradients, slices.ssim_partials);
-        places(params).into_iter().zip(means).for_each(|(place, mean)| log[place] = mean.bound());
+        logged(params).into_iter().zip(means).for_each(|(at, mean)| log[at] = mean.bound());
         Tolerances {
             d_render: gradients.iter().map(|&[d, _]| d).collect(),
-            l1_partials: Tolerance::Sum(sum.bound()),
+            l1_partials: sum_tolerance(within(params), gradients.iter().map(|&[_, of]| of)),
             log: Tolerance::Each(log),
             ..Tolerances::default()
         }

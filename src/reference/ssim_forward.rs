@@ -1,9 +1,9 @@
 //! SSIM and its derivatives with respect to the blurred moments.
 
 use super::inside;
-use super::rounding::{Rounded, chain};
+use super::rounding::{Rounded, chain, sum_tolerance, write, write_sum};
 use super::ssim::{Ssim, rounded_ssim};
-use crate::gpu::{Reference, Tolerance};
+use crate::gpu::Reference;
 use crate::kernels::ssim_forward::{Constants, Kernel, Params, Slices, Tolerances};
 
 fn indices(params: &Params, slices: &Slices<'_>) -> Vec<Ssim<Rounded>> {
@@ -11,24 +11,20 @@ fn indices(params: &Params, slices: &Slices<'_>) -> Vec<Ssim<Rounded>> {
     let counts = |i| inside(i, [params.width, params.height], [params.loss_begin, params.loss_end]);
     let pixels = size[0] * size[1];
     let of_channel = |channel: usize| {
-        let plane = |image: &[f32]| -> Vec<_> {
-            image[channel * pixels..][..pixels].iter().map(|&x| Rounded::exact(x)).collect()
-        };
+        let plane = |image: &[f32]| Rounded::all(&image[channel * pixels..][..pixels]);
         rounded_ssim(size, &plane(slices.render), &plane(slices.target), counts)
     };
     (0..3).flat_map(of_channel).collect()
 }
 
 impl Reference for Kernel {
-    /// The whole sum goes into the first partial: the number of partials is chosen by the device.
     fn run(params: &Params, _: &Constants, slices: Slices<'_>) {
         let indices = indices(params, &slices);
         let planes = [slices.d_mean, slices.d_square, slices.d_product];
         for (m, plane) in planes.into_iter().enumerate() {
-            plane.iter_mut().zip(&indices).for_each(|(d, of)| *d = of.d_moments[m].value as f32);
+            write(indices.iter().map(|of| of.d_moments[m]), plane);
         }
-        slices.partials.fill(0.0);
-        slices.partials[0] = indices.iter().map(|of| of.value.value).sum::<f64>() as f32;
+        write_sum(indices.iter().map(|of| of.value.value), slices.partials);
     }
 
     fn tolerances(params: &Params, _: &Constants, slices: Slices<'_>) -> Tolerances {
@@ -39,9 +35,7 @@ impl Reference for Kernel {
             d_mean: derivative(0),
             d_square: derivative(1),
             d_product: derivative(2),
-            partials: Tolerance::Sum(
-                Rounded::sum(chain, indices.iter().map(|of| of.value)).bound(),
-            ),
+            partials: sum_tolerance(chain, indices.iter().map(|of| of.value)),
         }
     }
 }

@@ -1,9 +1,8 @@
-use super::rounding::{UNIT, chain};
+use super::rounding::{UNIT, chain, write_sum};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::structure_l1::{Constants, Kernel, Params, Slices, Tolerances};
 
 impl Reference for Kernel {
-    /// The whole sum goes into the first partial: the number of partials is chosen by the device.
     fn run(
         params: &Params,
         _: &Constants,
@@ -18,8 +17,7 @@ impl Reference for Kernel {
             d_render[params.first as usize + i] = params.scale * sign;
             sum += f64::from(difference.abs());
         }
-        partials.fill(0.0);
-        partials[0] = sum as f32;
+        write_sum(std::iter::once(sum), partials);
     }
 
     /// The gradient is a sign; each difference rounds once, then in the sum.

@@ -343,10 +343,8 @@ impl TrainConfig {
             );
             self.model.depth = false;
         } else {
-            tracing::info!(
-                "{count} of {} training views have a depth map",
-                dataset.train_views().count()
-            );
+            let all = dataset.train_views().count();
+            tracing::info!("{count} of {all} training views have a depth map");
         }
     }
 
@@ -360,8 +358,8 @@ impl TrainConfig {
             &mut self.exposure.start,
         ];
         for folder in inside.into_iter().flatten() {
-            if let Ok(place) = folder.strip_prefix(&from) {
-                *folder = dataset.join(place);
+            if let Ok(below) = folder.strip_prefix(&from) {
+                *folder = dataset.join(below);
             }
         }
     }
@@ -455,32 +453,26 @@ impl TrainConfig {
         if let Some(frame) = self.frame {
             frame.check_rows()?;
         }
+        let refused = |key: &str, value: &str, rule: &str| {
+            let [key, value, rule] = [key, value, rule].map(str::to_owned);
+            Err(Error::Setting { key, value, rule })
+        };
         if self.up.is_some_and(|up| DVec3::from_array(up).try_normalize().is_none()) {
-            let rule = "a direction: three numbers that are not all 0".to_owned();
-            return Err(Error::Setting {
-                key: "up".to_owned(),
-                value: "no direction".to_owned(),
-                rule,
-            });
+            let rule = "a direction: three numbers that are not all 0";
+            return refused("up", "no direction", rule);
         }
         if let Some(freeze) = self.freeze.as_ref().filter(|_| self.init.is_none()) {
-            let rule = "of a given model: name one with init".to_owned();
-            return Err(Error::Setting {
-                key: "freeze".to_owned(),
-                value: freeze.to_string(),
-                rule,
-            });
+            let rule = "of a given model: name one with init";
+            return refused("freeze", &freeze.to_string(), rule);
         }
         if self.model.lamp && self.learns_no_colour() {
             let rule = "off where the colours are frozen, whose gradients it learns from";
-            let (key, value) = ("model.lamp".to_owned(), "true".to_owned());
-            return Err(Error::Setting { key, value, rule: rule.to_owned() });
+            return refused("model.lamp", "true", rule);
         }
         if self.exposure.learn && self.model.tonemapper {
             let rule = "off with a tonemapper, which fits the dark photographs: a gain of the targets does not \
                         describe their exposures";
-            let (key, value) = ("exposure.learn".to_owned(), "true".to_owned());
-            return Err(Error::Setting { key, value, rule: rule.to_owned() });
+            return refused("exposure.learn", "true", rule);
         }
         Ok(())
     }
@@ -491,21 +483,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_configuration_is_read_back_from_its_toml() {
-        let config = TrainConfig { seed: 3, background: Background::Random, ..Default::default() };
-        let text = config.to_toml().unwrap();
-        assert_eq!(toml::from_str::<TrainConfig>(&text).unwrap(), config);
-    }
-
-    #[test]
     fn settings_that_exclude_each_other_are_named_by_key() {
         let mut config = TrainConfig::default();
         (config.exposure.learn, config.model.tonemapper) = (true, true);
         let message = config.check().unwrap_err().to_string();
-        assert!(
-            message.starts_with("exposure.learn is true; it must be off with a tonemapper"),
-            "{message}"
-        );
+        assert!(message.starts_with("exposure.learn is true; it must be off with"), "{message}");
     }
 
     #[test]
@@ -521,10 +503,7 @@ mod tests {
         let all = "means,quats,scales,opacities,dc".parse().unwrap();
         let frozen = TrainConfig { freeze: Some(all), ..config.clone() };
         let refused = frozen.check().unwrap_err().to_string();
-        assert!(
-            refused.contains("model.lamp is true; it must be off where the colours"),
-            "{refused}"
-        );
+        assert!(refused.contains("model.lamp is true; it must be off where"), "{refused}");
         assert_eq!(toml::from_str::<TrainConfig>(&config.to_toml().unwrap()).unwrap(), config);
     }
 
@@ -532,13 +511,10 @@ mod tests {
     fn invalid_values_are_refused_by_key() {
         let refused = |config: TrainConfig| config.check().unwrap_err().to_string();
         assert!(refused(TrainConfig { steps: 0, ..Default::default() }).contains("steps is 0"));
-        assert!(
-            refused(TrainConfig { ssim_weight: f64::NAN, ..Default::default() }).contains("ssim")
-        );
-        assert!(
-            refused(TrainConfig { sh_degree: 4, ..Default::default() })
-                .contains("sh_degree is 4; it must be a whole number, 0 to 3")
-        );
+        let nan = TrainConfig { ssim_weight: f64::NAN, ..Default::default() };
+        assert!(refused(nan).contains("ssim"));
+        let high = TrainConfig { sh_degree: 4, ..Default::default() };
+        assert!(refused(high).contains("sh_degree is 4; it must be a whole number, 0 to 3"));
         for rate in [f64::NAN, f64::INFINITY, -1e-3, 0.0, 1e9] {
             let mut config = TrainConfig::default();
             config.schedule.initial_rates[Attribute::Means] = rate;

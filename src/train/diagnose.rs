@@ -26,7 +26,7 @@ use serde::Serialize;
 use crate::camera::Camera;
 use crate::photographs::dataset::{self, Borders, Dataset, LoadOptions, View};
 use crate::photographs::image::{ColourCounts, Image, MIDDLE_GREY, Mask, PictureFile, files};
-use crate::photographs::tone::{Exposure, LuminanceHistogram, is_black};
+use crate::photographs::tone::{Exposure, is_black};
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 use geometry::Shared;
@@ -160,7 +160,7 @@ impl Diagnosis {
     pub fn load(root: &Path, options: &LoadOptions) -> Result<(Dataset, Self)> {
         let looked_at = Mutex::new(HashMap::new());
         let look = |name: &str, image: &Image, mask: Option<&Mask>| {
-            let photograph = Photograph::of(image, mask);
+            let photograph = PhotographStatistics::of(image, mask);
             let mut looked_at = looked_at.lock().unwrap_or_else(PoisonError::into_inner);
             looked_at.insert(name.to_owned(), photograph);
         };
@@ -179,7 +179,7 @@ impl Diagnosis {
     fn with_photographs(
         dataset: &Dataset,
         options: &LoadOptions,
-        mut known: HashMap<String, Photograph>,
+        mut known: HashMap<String, PhotographStatistics>,
     ) -> Result<Self> {
         let views: Vec<(usize, &View)> =
             dataset.views.iter().enumerate().filter(|(_, view)| view.is_for_training()).collect();
@@ -196,7 +196,7 @@ impl Diagnosis {
         let unknown = paths.iter().copied().filter(|file| !known.contains_key(&file.name));
         known.extend(read(&dataset.root, &files, unknown.collect(), options)?);
         let photographs = views.iter().filter_map(|(_, view)| known.remove(&view.name));
-        let photographs: Vec<Photograph> = photographs.collect();
+        let photographs: Vec<PhotographStatistics> = photographs.collect();
         let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);
         let Some(exposure) = exposure else {
             let problem = "every training photograph is almost black (99 % of its pixels are below 2 of 255); \
@@ -205,16 +205,16 @@ impl Diagnosis {
         };
         let cameras = views.iter().map(|(_, view)| view.camera);
         let exposure = exposure.seen_by(photographs.iter().map(|one| &one.histogram).zip(cameras));
-        let of_view = |(place, photograph): (usize, &Photograph)| {
-            photograph.diagnosis(&views[place].1.name, &shared, place)
+        let of_view = |(index, photograph): (usize, &PhotographStatistics)| {
+            photograph.diagnosis(&views[index].1.name, &shared, index)
         };
-        let own: Vec<ViewDiagnosis> = photographs.iter().enumerate().map(of_view).collect();
+        let diagnosed: Vec<ViewDiagnosis> = photographs.iter().enumerate().map(of_view).collect();
         let without_pose = without_pose(&paths, &files, dataset)?;
-        let remarks = remarks(&own, &photographs, &views, &without_pose);
+        let remarks = remarks(&diagnosed, &photographs, &views, &without_pose);
         let mut scene =
-            SceneDiagnosis::of(&own, photographs, &shared, &exposure, dataset.points.len());
+            SceneDiagnosis::of(&diagnosed, photographs, &shared, &exposure, dataset.points.len());
         // A pixel of a resized target averages this many pixels in each direction.
-        let shrink = own.iter().map(|view| options.shrink(view.size[0], view.size[1]));
+        let shrink = diagnosed.iter().map(|view| options.shrink(view.size[0], view.size[1]));
         scene.target_noise /= shrink.fold(1.0, f64::max);
         Ok(Self {
             dataset: dataset.root.clone(),
@@ -223,7 +223,7 @@ impl Diagnosis {
             remarks,
             without_pose,
             scene,
-            views: own,
+            views: diagnosed,
             depth_maps: views.iter().filter(|(_, view)| view.depth.is_some()).count(),
             fingerprint: PlannedViews::of(dataset),
         })
@@ -245,7 +245,7 @@ fn read(
     all: &[dataset::Photograph],
     files: Vec<&dataset::Photograph>,
     options: &LoadOptions,
-) -> Result<Vec<(String, Photograph)>> {
+) -> Result<Vec<(String, PhotographStatistics)>> {
     let area = |file: &&dataset::Photograph| {
         Image::size_of(&file.input).map(|(w, h)| u64::from(w) * u64::from(h))
     };
@@ -261,9 +261,8 @@ fn read(
     let mut photographs = vec![];
     for files in files.chunks(Image::decoded_at_once(largest)) {
         let read = files.par_iter().map(|file| {
-            let photograph =
-                Photograph::load(file, options.invert_masks, &borders, gains, &colours)?;
-            Ok((file.name.clone(), photograph))
+            let (invert_masks, name) = (options.invert_masks, file.name.clone());
+            Ok((name, PhotographStatistics::load(file, invert_masks, &borders, gains, &colours)?))
         });
         photographs.extend(read.collect::<Result<Vec<_>>>()?);
     }
@@ -271,15 +270,7 @@ fn read(
     Ok(photographs)
 }
 
-/// A photograph with its measurements.
-struct Photograph {
-    size: [u32; 2],
-    measured: PhotographStatistics,
-    histogram: LuminanceHistogram,
-    noise_in_target: Option<TargetNoise>,
-}
-
-impl Photograph {
+impl PhotographStatistics {
     fn load(
         file: &dataset::Photograph,
         invert_masks: bool,
@@ -297,43 +288,29 @@ impl Photograph {
         Ok(Self::of(&image, mask.as_ref()))
     }
 
-    fn of(image: &Image, mask: Option<&Mask>) -> Self {
-        let counted = mask.map(|mask| mask.counted(image));
-        let counted = counted.as_deref().unwrap_or(&image.data);
-        let histogram = LuminanceHistogram::of(counted);
-        let exposure = Exposure::of([&histogram], None);
-        Self {
-            size: [image.width, image.height],
-            measured: PhotographStatistics::of(image, counted),
-            noise_in_target: exposure.and_then(|own| target_noise::target_noise(image, &own)),
-            histogram,
-        }
-    }
-
-    fn diagnosis(&self, name: &str, shared: &Shared, place: usize) -> ViewDiagnosis {
-        let Self { size, measured, histogram, noise_in_target } = self;
-        let [p10, p90] = measured.statistics.percentiles();
+    fn diagnosis(&self, name: &str, shared: &Shared, index: usize) -> ViewDiagnosis {
+        let [p10, p90] = self.statistics.percentiles();
         ViewDiagnosis {
             name: name.to_owned(),
-            size: *size,
+            size: self.size,
             p10,
             p90,
-            r: measured.statistics.printed_ratio(),
-            mean_luminance: measured.statistics.mean_luminance.into(),
-            cubic_mean: histogram.cubic_mean(),
-            light: measured.light,
-            darkening: darkening(measured.light),
-            exposure: shared.exposures[place],
-            clipped_fraction: measured.clipped_fraction,
-            zero_fraction: measured.zero_fraction,
-            code_values: measured.code_values,
-            noise: measured.noise,
-            noise_in_target: *noise_in_target,
-            blur: measured.blur,
-            unevenness: measured.unevenness,
-            points: shared.points[place],
-            overlap: shared.overlaps[place],
-            is_black: is_black(histogram),
+            r: self.statistics.printed_ratio(),
+            mean_luminance: self.statistics.mean_luminance.into(),
+            cubic_mean: self.histogram.cubic_mean(),
+            light: self.light,
+            darkening: darkening(self.light),
+            exposure: shared.exposures[index],
+            clipped_fraction: self.clipped_fraction,
+            zero_fraction: self.zero_fraction,
+            code_values: self.code_values,
+            noise: self.noise,
+            noise_in_target: self.noise_in_target,
+            blur: self.blur,
+            unevenness: self.unevenness,
+            points: shared.points[index],
+            overlap: shared.overlaps[index],
+            is_black: is_black(&self.histogram),
         }
     }
 }
@@ -341,13 +318,13 @@ impl Photograph {
 impl SceneDiagnosis {
     fn of(
         views: &[ViewDiagnosis],
-        photographs: Vec<Photograph>,
+        photographs: Vec<PhotographStatistics>,
         shared: &Shared,
         exposure: &Exposure,
         points: usize,
     ) -> Self {
         let patches = photographs.into_iter().zip(views).filter(|(_, view)| !view.is_black);
-        let noise = noise::fit(patches.flat_map(|(one, _)| one.measured.patches).collect());
+        let noise = noise::fit(patches.flat_map(|(one, _)| one.patches).collect());
         let lit: Vec<&ViewDiagnosis> = views.iter().filter(|view| !view.is_black).collect();
         let mean = |of: fn(&ViewDiagnosis) -> f64| {
             lit.iter().map(|view| of(view)).sum::<f64>() / lit.len().max(1) as f64
@@ -372,9 +349,7 @@ impl SceneDiagnosis {
             zero_fraction: mean(|view| view.zero_fraction),
             code_values: mean(|view| view.code_values as f64),
             noise,
-            noise_in_target: TargetNoise::median(
-                lit.iter().filter_map(|view| view.noise_in_target),
-            ),
+            noise_in_target: TargetNoise::median(lit.iter().filter_map(|one| one.noise_in_target)),
             target_noise: noise.map_or(0.0, |noise| target_noise(noise, light, exposure, shared)),
             blur: geometry::median(lit.iter().filter_map(|view| view.blur).collect()),
             unevenness: mean(|view| view.unevenness),
@@ -437,7 +412,7 @@ fn without_pose(
 /// Remarks that a user should read before training.
 fn remarks(
     views: &[ViewDiagnosis],
-    photographs: &[Photograph],
+    photographs: &[PhotographStatistics],
     cameras: &[(usize, &View)],
     without_pose: &[String],
 ) -> Vec<String> {
@@ -447,30 +422,24 @@ fn remarks(
         more => format!("{}, and {} more", names[..3].join(", "), more - 3),
     };
     let names = |is: &dyn Fn(usize) -> bool| -> Vec<&str> {
-        (0..views.len())
-            .filter(|&place| is(place))
-            .map(|place| views[place].name.as_str())
-            .collect()
+        let views = views.iter().enumerate().filter(|(index, _)| is(*index));
+        views.map(|(_, view)| view.name.as_str()).collect()
     };
     let mut say = |names: Vec<&str>, what: &str| {
         if !names.is_empty() {
             remarks.push(format!("{} {what}: {}", names.len(), named(names)));
         }
     };
-    say(names(&|place| views[place].is_black), "black, left out of training");
+    say(names(&|index| views[index].is_black), "black, left out of training");
     let mut checksums = HashSet::new();
-    let is_new =
-        photographs.iter().map(|photograph| checksums.insert(photograph.measured.checksum));
-    let is_new: Vec<bool> = is_new.collect();
-    say(
-        names(&|place| !is_new[place] && !views[place].is_black),
-        "identical to another photograph",
-    );
+    let is_new: Vec<bool> = photographs.iter().map(|one| checksums.insert(one.checksum)).collect();
+    let is_repeated = |index: usize| !is_new[index] && !views[index].is_black;
+    say(names(&is_repeated), "identical to another photograph");
     let blur = geometry::median(views.iter().filter_map(|view| view.blur).collect());
     let [times, more] = BLURRED;
-    let is_blurred = |place: usize| {
-        let own = views[place].blur.zip(blur);
-        own.is_some_and(|(own, median)| own > times * median && own > median + more)
+    let is_blurred = |index: usize| {
+        let blurs = views[index].blur.zip(blur);
+        blurs.is_some_and(|(blur, median)| blur > times * median && blur > median + more)
     };
     say(names(&is_blurred), "more blurred than the others");
     say(without_pose.iter().map(String::as_str).collect(), "without a pose, not used");

@@ -194,12 +194,12 @@ fn loss_of(
     a: &[f64],
     b: &[f64],
 ) -> f64 {
-    let ssim = ssim(width, height, a, b);
+    let ssim = ssim([width, height], a, b);
     let (mut l1_sum, mut ssim_sum, mut count) = (0.0, 0.0, 0.0);
     for i in 0..a.len() {
         if contains(loss_region, i % width, i / width) {
             l1_sum += (a[i] - b[i]).abs();
-            ssim_sum += ssim[i].value;
+            ssim_sum += ssim[i];
             count += 1.0;
         }
     }
@@ -399,9 +399,9 @@ fn constant_images_have_the_ssim_of_their_means_away_from_the_border() {
         // Zero padding changes the border; inside, variances vanish and (2ab + C1) / (a^2 + b^2 + C1) remains.
         let inside = f64::from((2.0 * a * b + 1e-4) / (a * a + b * b + 1e-4));
         let plane = [vec![f64::from(a); count / 3], vec![f64::from(b); count / 3]];
-        let map = ssim(size[0] as usize, size[1] as usize, &plane[0], &plane[1]);
-        assert!((map[24 * 64 + 32].value - inside).abs() < 1e-6);
-        let mean = map.iter().map(|ssim| ssim.value).sum::<f64>() / map.len() as f64;
+        let map = ssim(size.map(|side| side as usize), &plane[0], &plane[1]);
+        assert!((map[24 * 64 + 32] - inside).abs() < 1e-6);
+        let mean = map.iter().sum::<f64>() / map.len() as f64;
         // A variance is the difference of two numbers of up to 1/4, of which each may be rounded twice, over C2 = 9e-4.
         let rounding = 4.0 * 0.25 * f64::from(f32::EPSILON) / 2.0 / 9e-4;
         assert!((f64::from(outcome.ssim) - mean).abs() < rounding, "{} {mean}", outcome.ssim);

@@ -5,68 +5,45 @@ use glam::UVec2;
 use super::super::conv::{Precision, partial_count};
 use super::super::half::PackedMap;
 use super::super::norm::NormMemory;
+use super::super::reserved::Extent;
 use super::super::{RGB, check_binding, float_bytes};
 use super::DenoiserSettings;
 use crate::Result;
 use crate::gpu::{Buffer, Gpu};
 
-/// The sizes that determine the lengths of the buffers.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct DenoiserExtent {
-    pub(super) pixels: usize,
-    /// Partial sums of the gradient of the inner convolution.
-    partials: usize,
-    /// Size of a packed feature map; 0 in single precision.
-    packed: usize,
+/// The extent of a view.
+pub(super) fn extent(settings: DenoiserSettings, size: UVec2) -> Extent {
+    let DenoiserSettings { channels, precision, .. } = settings;
+    let ends = [[RGB, channels], [channels, RGB]];
+    let ends = ends.map(|layer| partial_count(size, layer, Precision::Single));
+    let inner = partial_count(size, [channels; 2], precision);
+    Extent {
+        pixels: size.x as usize * size.y as usize,
+        partials: inner.max(ends[0]).max(ends[1]),
+        packed: match precision {
+            Precision::Single => 0,
+            Precision::Half => PackedMap::packed_count(size, channels),
+        },
+    }
 }
 
-impl DenoiserExtent {
-    pub(super) fn of(settings: DenoiserSettings, size: UVec2) -> Self {
-        let DenoiserSettings { channels, precision, .. } = settings;
-        let ends = [[RGB, channels], [channels, RGB]];
-        let ends = ends.map(|layer| partial_count(size, layer, Precision::Single));
-        let inner = partial_count(size, [channels; 2], precision);
-        Self {
-            pixels: size.x as usize * size.y as usize,
-            partials: inner.max(ends[0]).max(ends[1]),
-            packed: match precision {
-                Precision::Single => 0,
-                Precision::Half => PackedMap::packed_count(size, channels),
-            },
-        }
-    }
+/// Checks that the device can bind every buffer of a view.
+pub(super) fn check(gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> Result<()> {
+    let (channels, Extent { pixels, partials, packed }) =
+        (settings.channels, extent(settings, size));
+    let map = (settings.channels().max(RGB as usize) * pixels).max(4 * packed);
+    check_binding(gpu, &format!("the denoiser's {channels} feature maps"), size, map)?;
+    let sums = format!("the sums of the gradients of the denoiser's {channels} channels");
+    check_binding(gpu, &sums, size, partials)
+}
 
-    pub(super) fn fits(self, reserved: Self) -> bool {
-        self.pixels <= reserved.pixels
-            && self.partials <= reserved.partials
-            && self.packed <= reserved.packed
-    }
-
-    pub(super) fn check(self, gpu: &Gpu, settings: DenoiserSettings, size: UVec2) -> Result<()> {
-        let channels = settings.channels;
-        let map = settings.channels().max(RGB as usize) * self.pixels;
-        let map = map.max(4 * self.packed);
-        check_binding(gpu, &format!("the denoiser's {channels} feature maps"), size, map)?;
-        let sums = format!("the sums of the gradients of the denoiser's {channels} channels");
-        check_binding(gpu, &sums, size, self.partials)
-    }
-
-    pub(super) fn max(self, other: Self) -> Self {
-        Self {
-            pixels: self.pixels.max(other.pixels),
-            partials: self.partials.max(other.partials),
-            packed: self.packed.max(other.packed),
-        }
-    }
-
-    /// The bytes that [`DenoiserMemory::new`] allocates.
-    #[cfg(feature = "testing")]
-    pub(super) fn bytes(self, settings: DenoiserSettings) -> u64 {
-        let images = settings.stages as usize + 3;
-        let per_pixel = 2 * settings.channels() + images * RGB as usize;
-        let beside = float_bytes(self.pixels * per_pixel + self.partials + 4 * self.packed);
-        beside + Activations::bytes(settings, self)
-    }
+/// The bytes that [`DenoiserMemory::new`] allocates.
+#[cfg(feature = "testing")]
+pub(super) fn bytes(settings: DenoiserSettings, extent: Extent) -> u64 {
+    let images = settings.stages as usize + 3;
+    let per_pixel = 2 * settings.channels() + images * RGB as usize;
+    let beside = float_bytes(extent.pixels * per_pixel + extent.partials + 4 * extent.packed);
+    beside + Activations::bytes(settings, extent)
 }
 
 /// State of a stage between its forward and its backward pass.
@@ -127,8 +104,8 @@ impl Activations {
         if repeat == 0 { 0 } else { 1 + (repeat - 1) % (self.features.len() - 1) }
     }
 
-    fn new(gpu: &Gpu, settings: DenoiserSettings, extent: DenoiserExtent) -> Result<Self> {
-        let DenoiserExtent { pixels, packed, .. } = extent;
+    fn new(gpu: &Gpu, settings: DenoiserSettings, extent: Extent) -> Result<Self> {
+        let Extent { pixels, packed, .. } = extent;
         let repeats = settings.repeats as usize;
         let map = |name| gpu.uninit(name, settings.channels() * pixels);
         Ok(Self {
@@ -142,8 +119,8 @@ impl Activations {
         })
     }
 
-    fn bytes(settings: DenoiserSettings, extent: DenoiserExtent) -> u64 {
-        let (DenoiserExtent { pixels, packed, .. }, repeats) = (extent, settings.repeats as usize);
+    fn bytes(settings: DenoiserSettings, extent: Extent) -> u64 {
+        let (Extent { pixels, packed, .. }, repeats) = (extent, settings.repeats as usize);
         let maps = feature_maps(settings) + repeats;
         let per_pixel = maps * settings.channels() + RGB as usize;
         let norm = NormMemory::floats(pixels, settings.channels(), repeats);
@@ -169,27 +146,23 @@ pub(super) struct Repeat<'a> {
 #[derive(Debug, Default)]
 pub(super) struct EarlierStages {
     /// The extent that they are allocated for.
-    extent: DenoiserExtent,
+    extent: Extent,
     stages: Vec<Activations>,
 }
 
 impl EarlierStages {
-    pub(super) fn new(
-        gpu: &Gpu,
-        settings: DenoiserSettings,
-        extent: DenoiserExtent,
-    ) -> Result<Self> {
+    pub(super) fn new(gpu: &Gpu, settings: DenoiserSettings, extent: Extent) -> Result<Self> {
         let stages = (1..settings.stages).map(|_| Activations::new(gpu, settings, extent));
         Ok(Self { extent, stages: stages.collect::<Result<_>>()? })
     }
 
-    pub(super) fn bytes(settings: DenoiserSettings, extent: DenoiserExtent) -> u64 {
+    pub(super) fn bytes(settings: DenoiserSettings, extent: Extent) -> u64 {
         let each = Activations::bytes(settings, extent);
         u64::from(settings.stages - 1).saturating_mul(each)
     }
 
     /// The extent that they are allocated for.
-    pub(super) fn extent(&self) -> DenoiserExtent {
+    pub(super) fn extent(&self) -> Extent {
         self.extent
     }
 
@@ -197,11 +170,11 @@ impl EarlierStages {
     pub(super) fn of<'a>(
         &'a mut self,
         k: usize,
-        extent: DenoiserExtent,
+        extent: Extent,
         shared: &'a mut Activations,
     ) -> &'a mut Activations {
-        let own = if extent.fits(self.extent) { self.stages.get_mut(k) } else { None };
-        own.unwrap_or(shared)
+        let kept = if extent.fits(self.extent) { self.stages.get_mut(k) } else { None };
+        kept.unwrap_or(shared)
     }
 }
 
@@ -223,12 +196,8 @@ pub(super) struct DenoiserMemory {
 }
 
 impl DenoiserMemory {
-    pub(super) fn new(
-        gpu: &Gpu,
-        settings: DenoiserSettings,
-        extent: DenoiserExtent,
-    ) -> Result<Self> {
-        let DenoiserExtent { pixels, partials, packed } = extent;
+    pub(super) fn new(gpu: &Gpu, settings: DenoiserSettings, extent: Extent) -> Result<Self> {
+        let Extent { pixels, partials, packed } = extent;
         let map = |name| gpu.uninit(name, settings.channels() * pixels);
         let image = |name| gpu.uninit(name, RGB as usize * pixels);
         Ok(Self {

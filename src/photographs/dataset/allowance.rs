@@ -17,18 +17,3 @@ impl Allowance {
         self.0.fetch_update(Ordering::Relaxed, Ordering::Relaxed, left_after).is_ok()
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::Allowance;
-
-    #[test]
-    fn allocations_never_exceed_the_allowance() {
-        let allowance = Allowance::new(10);
-        assert!(allowance.take(6));
-        assert!(!allowance.take(5));
-        assert!(allowance.take(4));
-        assert!(!allowance.take(1));
-        assert!(allowance.take(0));
-    }
-}

@@ -8,7 +8,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use super::Point;
-use super::listed::ListedView;
+use super::listing::ListedView;
 use crate::base::{input, output, tree};
 use crate::{Error, Result};
 

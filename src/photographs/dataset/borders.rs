@@ -56,8 +56,9 @@ impl Borders {
 
     /// Those of a dataset that is not loaded.
     pub(crate) fn of_photographs(photographs: &[Photograph]) -> Self {
-        let own = photographs.iter().filter(|own| own.split == Split::Train && own.mask.is_none());
-        Self::find(own.map(|Photograph { input, .. }| {
+        let training =
+            photographs.iter().filter(|one| one.split == Split::Train && one.mask.is_none());
+        Self::find(training.map(|Photograph { input, .. }| {
             let picture = Box::new(|| shown(PictureFile::open(input).ok()?));
             Candidate { size: Image::size_of(input).unwrap_or_default(), picture }
         }))
@@ -65,11 +66,11 @@ impl Borders {
 
     fn find<'a>(candidates: impl Iterator<Item = Candidate<'a>>) -> Self {
         let mut by_size: BTreeMap<(u32, u32), Vec<Candidate<'_>>> = BTreeMap::new();
-        candidates.for_each(|own| by_size.entry(own.size).or_default().push(own));
+        candidates.for_each(|one| by_size.entry(one.size).or_default().push(one));
         by_size.retain(|_, candidates| candidates.len() >= NEEDED);
         let found = by_size.into_iter().filter_map(|(size, candidates)| {
             let step = candidates.len().div_ceil(LOOKED_AT);
-            let images = candidates.iter().step_by(step).filter_map(|own| (own.picture)());
+            let images = candidates.iter().step_by(step).filter_map(|one| (one.picture)());
             let border = border(images, size)?;
             let (width, height) = size;
             tracing::warn!(
@@ -82,9 +83,9 @@ impl Borders {
         Self(found.collect())
     }
 
-    /// The mask of a photograph of this size as stored that hides its border beside what `own` hides; none of none.
-    pub(crate) fn hidden_too(&self, own: Option<Mask>, size: (u32, u32)) -> Option<Mask> {
-        Mask::hiding_too(own, size, self.0.get(&size).map_or(&[], Vec::as_slice))
+    /// The mask of a photograph of this size, as stored, with its border masked as well.
+    pub(crate) fn hidden_too(&self, mask: Option<Mask>, size: (u32, u32)) -> Option<Mask> {
+        Mask::masked_at(mask, size, self.0.get(&size).map_or(&[], Vec::as_slice))
     }
 }
 
@@ -202,8 +203,8 @@ impl Plane {
         let mut begin = 0;
         for _ in 0..BLOCK {
             let end = pixels.len();
-            for place in begin..end {
-                for (next, _) in self.outward(pixels[place], 1) {
+            for index in begin..end {
+                for (next, _) in self.outward(pixels[index], 1) {
                     if !is_reached[next] && is_of_kind(next) {
                         is_reached[next] = true;
                         pixels.push(next);

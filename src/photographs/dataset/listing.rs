@@ -1,16 +1,53 @@
 //! The listing of a dataset: photographs with their cameras, before any pixel is read.
 
 use std::collections::HashMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+
+use glam::DAffine3;
 
 use super::exclude::exclude;
 use super::layout::{CAMERAS, Layout};
-use super::listed::{ListedView, Listing};
 use super::locate::{self, Wanted};
+use super::ply::Cloud;
 use super::split::split;
-use super::{LoadOptions, colmap, names, transforms, unused};
+use super::{LoadOptions, Split, colmap, names, transforms, unused};
+use crate::camera::Lens;
+use crate::photographs::image::MaskFile;
 use crate::photographs::image::files::{self, Files};
 use crate::{Error, Result};
+
+/// One view as a listing describes it, before any pixel is read.
+#[derive(Clone, Debug)]
+pub(super) struct ListedView {
+    pub(super) name: String,
+    /// Path as listed, relative to the root; if the photograph was found elsewhere, that path.
+    pub(super) listed: String,
+    /// Path relative to the common folder of all photographs.
+    pub(super) below: String,
+    /// `None`: the split rule decides.
+    pub(super) split: Option<Split>,
+    /// The listed file, if it exists.
+    pub(super) file: Option<PathBuf>,
+    pub(super) lens: Lens,
+    /// A rigid transform from the listing's world.
+    pub(super) view_from_world: DAffine3,
+    /// The mask that the listing names.
+    pub(super) mask: Option<MaskFile>,
+    /// The depth map that the listing names.
+    pub(super) depth: Option<PathBuf>,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct Listing {
+    pub(super) frames: Vec<ListedView>,
+    pub(super) skipped: Vec<String>,
+    /// Choices that were made, and unused files; one line each.
+    pub(super) remarks: Vec<String>,
+    /// Points that the listing names.
+    pub(super) clouds: Vec<Cloud>,
+    /// Whether the listing itself splits the views.
+    pub(super) has_split: bool,
+}
 
 /// The views that the options select, split, by name.
 pub(super) fn select(layout: &Layout, options: &LoadOptions, files: &Files) -> Result<Listing> {
@@ -31,14 +68,12 @@ fn list(layout: &Layout, images: Option<&Path>, files: &Files) -> Result<Listing
     if listings.is_empty() {
         list_colmap(layout, images, files, &mut listing)?;
     } else {
-        transforms::read((root, images), &listings, files, &mut listing)?;
+        transforms::read(root, images, &listings, files, &mut listing)?;
     }
     if listing.frames.is_empty() {
         let first = listing.skipped.first().map_or("its listing is empty", String::as_str);
-        return Err(Error::input(
-            root,
-            format!("has no usable view ({first}); export the cameras anew"),
-        ));
+        let problem = format!("has no usable view ({first}); export the cameras anew");
+        return Err(Error::input(root, problem));
     }
     listing.has_split = listing.frames.iter().any(|frame| frame.split.is_some());
     names::disambiguate(&mut listing.frames);
@@ -88,14 +123,14 @@ fn list_colmap(
         places: folders.to_vec(),
         is_test: false,
     });
-    let found = locate::photographs((root, images), wanted.collect(), files, listing);
+    let found = locate::photographs(root, images, wanted.collect(), files, listing);
     for (image, found) in placed.into_iter().zip(found) {
         let name = image.name.replace('\\', "/");
         let lens = lenses.get(&image.camera).copied().ok_or_else(|| {
-            Error::input(
-                folder,
-                format!("{name} has camera {}, which is not listed; export it anew", image.camera),
-            )
+            let camera = image.camera;
+            let problem =
+                format!("{name} has camera {camera}, which is not listed; export it anew");
+            Error::input(folder, problem)
         })?;
         let Some(view_from_world) = image.view_from_world else {
             listing.skipped.push(format!("{name}: its pose is not finite"));

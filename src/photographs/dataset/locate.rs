@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use super::DARK_FOLDERS;
-use super::listed::Listing;
+use super::listing::Listing;
 use super::names::below_first;
 use crate::base::tree;
 use crate::photographs::image::MaskFile;
@@ -55,7 +55,8 @@ const MOST_FOLDERS: usize = 1000;
 /// Finds the photographs: in `images` if given, or at their paths; missing ones under the same names in the only folder
 /// with most of them, which is reported.
 pub(super) fn photographs(
-    (root, images): (&Path, Option<&Path>),
+    root: &Path,
+    images: Option<&Path>,
     wanted: Vec<Wanted>,
     files: &Files,
     listing: &mut Listing,

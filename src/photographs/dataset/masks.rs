@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use super::listed::ListedView;
+use super::listing::ListedView;
 use crate::photographs::image::MaskFile;
 use crate::photographs::image::files::Files;
 

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use super::listed::ListedView;
+use super::listing::ListedView;
 pub(super) use crate::photographs::image::files::normalized;
 use crate::photographs::image::files::stem;
 

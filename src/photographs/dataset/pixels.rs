@@ -42,25 +42,26 @@ pub(super) fn load(
     mut sources: Vec<Source>,
     layout: &Layout,
     options: &LoadOptions,
-    (look, gains): (Option<Look<'_>>, Option<WhiteBalanceGains>),
+    look: Option<Look<'_>>,
+    gains: Option<WhiteBalanceGains>,
     skipped: &mut Vec<String>,
 ) -> Result<Vec<View>> {
     let memory = Allowance::new(MAX_READ);
     let headers: Vec<[Option<Header>; 2]> =
         sources.par_iter_mut().map(|source| source.headers(&memory)).collect();
-    let own: Vec<Option<Header>> = headers.iter().map(|[own, _]| *own).collect();
+    let of_photographs: Vec<Option<Header>> = headers.iter().map(|[own, _]| *own).collect();
     let points = || points::of_sources(layout, &sources);
-    let pixels = tracked::pixels(&sources, &own, options.orientation, points)?;
+    let pixels = tracked::pixels(&sources, &of_photographs, options.orientation, points)?;
     let fitted = sources.into_par_iter().zip(headers).map(|(mut source, headers)| {
         source.fit(headers, pixels)?;
         Ok(source)
     });
     let mut groups: Vec<(Lens, Vec<Source>)> = Vec::new();
-    let mut places = HashMap::new();
+    let mut indices = HashMap::new();
     for source in fitted.collect::<Result<Vec<_>>>()? {
         // The Debug output distinguishes all lenses.
-        let place = *places.entry(format!("{:?}", source.lens)).or_insert(groups.len());
-        match groups.get_mut(place) {
+        let index = *indices.entry(format!("{:?}", source.lens)).or_insert(groups.len());
+        match groups.get_mut(index) {
             Some((_, group)) => group.push(source),
             None => groups.push((source.lens, vec![source])),
         }
@@ -272,23 +273,20 @@ impl ViewLoader<'_> {
         let (options, [read, read_reference]) = (loading.options, read);
         let mut problems = Vec::new();
         let [colours, reference_colours] = loading.colours;
-        let mut photograph = self.decode((input, read, turns[0]), colours, &mut problems)?;
+        let mut photograph = self.decode(input, read, turns[0], colours, &mut problems)?;
         if let (Some(gains), Some(photograph)) = (loading.gains, &mut photograph) {
             gains.apply(&mut photograph.image);
         }
         let reference =
-            self.decode((reference, read_reference, turns[1]), reference_colours, &mut problems)?;
+            self.decode(reference, read_reference, turns[1], reference_colours, &mut problems)?;
         let picture = photograph.as_ref().or(reference.as_ref());
         let orientation = picture.map(|picture| picture.turns.viewing).unwrap_or_default();
         let stored_mask = match picture {
             Some(Decoded { path, image, alpha, turns }) => {
                 let decoded = (image, alpha.as_ref());
-                let own = Mask::over(path, decoded, mask.as_ref(), options.invert_masks)?;
-                let size = (image.width, image.height);
-                self.loading
-                    .borders
-                    .hidden_too(own, size)
-                    .map(|stored| (stored, path.clone(), turns.loading))
+                let stored = Mask::over(path, decoded, mask.as_ref(), options.invert_masks)?;
+                let stored = loading.borders.hidden_too(stored, (image.width, image.height));
+                stored.map(|stored| (stored, path.clone(), turns.loading))
             }
             None => None,
         };
@@ -297,7 +295,7 @@ impl ViewLoader<'_> {
         }
         let mask = stored_mask
             .map(|(stored, path, orientation)| preparation.mask(&stored, &path, orientation));
-        let mask = Mask::hiding_too(mask.transpose()?.flatten(), preparation.size, unseen);
+        let mask = Mask::masked_at(mask.transpose()?.flatten(), preparation.size, unseen);
         let brightness = [&photograph, &reference]
             .map(|decoded| decoded.as_ref().map(|decoded| mean(&decoded.image)));
         let reference_original = reference.as_ref().map(|decoded| {
@@ -314,12 +312,9 @@ impl ViewLoader<'_> {
         let reference =
             reference.filter(|_| !is_hidden).map(|decoded| self.reference_image(decoded));
         let (reference, reference_file) = reference.transpose()?.unwrap_or_default();
+        let unused = |problem| tracing::warn!("the depth of view {name} is not used: {problem}");
         let depth = depth.and_then(|path| {
-            depth_map(&path, preparation, options.depth.is_disparity)
-                .map_err(|problem| {
-                    tracing::warn!("the depth of view {name} is not used: {problem}");
-                })
-                .ok()
+            depth_map(&path, preparation, options.depth.is_disparity).map_err(unused).ok()
         });
         let view = View::new(&name, split, Camera { view_from_world, ..*camera }, image);
         let view = View { orientation, original, reference, reference_file, mask, depth, ..view };
@@ -330,7 +325,9 @@ impl ViewLoader<'_> {
     /// Decodes a file; `None`, and a problem, where that is no picture.
     fn decode(
         &self,
-        (path, read, turns): (Option<PathBuf>, Option<Arc<PictureFile>>, Turns),
+        path: Option<PathBuf>,
+        read: Option<Arc<PictureFile>>,
+        turns: Turns,
         colours: &ColourCounts,
         problems: &mut Vec<String>,
     ) -> Result<Option<Decoded>> {

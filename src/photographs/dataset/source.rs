@@ -31,17 +31,6 @@ pub(super) struct Source {
 }
 
 impl Source {
-    /// The files of the photograph, its reference image, its mask and its depth.
-    pub(super) fn new(
-        (name, split): (String, Split),
-        (lens, view_from_world): (Lens, DAffine3),
-        [input, reference, depth]: [Option<PathBuf>; 3],
-        mask: Option<MaskFile>,
-    ) -> Self {
-        let (read, turns) = ([None, None], [Turns::default(); 2]);
-        Self { name, split, lens, view_from_world, input, reference, mask, depth, read, turns }
-    }
-
     /// Reads the files of the photograph and of the reference image; returns the header of each, if readable, and keeps
     /// the files while `memory` allows.
     pub(super) fn headers(&mut self, memory: &Allowance) -> [Option<Header>; 2] {

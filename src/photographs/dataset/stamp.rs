@@ -3,8 +3,7 @@
 use std::path::Path;
 
 use super::layout::Layout;
-use super::listed::Listing;
-use super::listing::select;
+use super::listing::{Listing, select};
 use super::{Dataset, LoadOptions, sources};
 use crate::Result;
 use crate::base::hash::{self, Hasher};

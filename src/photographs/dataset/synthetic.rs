@@ -147,39 +147,27 @@ impl SyntheticOptions {
         const PLOTS: RangeInclusive<u32> = 1..=10_000;
         const VIEWS: RangeInclusive<usize> = 2..=99_999;
         const LAMPS: RangeInclusive<f64> = 5.0..=80.0;
-        if !VIEWS.contains(&self.views) {
-            return Err(Error::Usage(format!(
-                "{} views cannot be made; ask for 2 to {}",
-                self.views,
-                VIEWS.end()
-            )));
+        let refused = |what: String, remedy: String| Err(Error::Usage(format!("{what}; {remedy}")));
+        let Self { views, width, height, street, lamp, fisheye, .. } = *self;
+        if !VIEWS.contains(&views) {
+            let remedy = format!("ask for 2 to {}", VIEWS.end());
+            return refused(format!("{views} views cannot be made"), remedy);
         }
-        if !SIDES.contains(&self.width) || !SIDES.contains(&self.height) {
-            let (width, height) = (self.width, self.height);
-            return Err(Error::Usage(format!(
-                "views of {width}x{height} cannot be made; ask for sides of 16 to 8192"
-            )));
+        if !SIDES.contains(&width) || !SIDES.contains(&height) {
+            let remedy = "ask for sides of 16 to 8192".to_owned();
+            return refused(format!("views of {width}x{height} cannot be made"), remedy);
         }
-        if let Some(plots) = self.street
-            && !PLOTS.contains(&plots)
-        {
-            return Err(Error::Usage(format!(
-                "a street of {plots} plots cannot be made; ask for 1 to {}",
-                PLOTS.end()
-            )));
+        if let Some(plots) = street.filter(|plots| !PLOTS.contains(plots)) {
+            let remedy = format!("ask for 1 to {}", PLOTS.end());
+            return refused(format!("a street of {plots} plots cannot be made"), remedy);
         }
-        if self.street.is_some() && self.fisheye {
-            let problem = "a street is not made with a fisheye; ask for one of both";
-            return Err(Error::Usage(problem.to_owned()));
+        if street.is_some() && fisheye {
+            let what = "a street is not made with a fisheye".to_owned();
+            return refused(what, "ask for one of both".to_owned());
         }
-        if let Some(degrees) = self.lamp
-            && !LAMPS.contains(&degrees)
-        {
-            return Err(Error::Usage(format!(
-                "a lamp of half its strength at {degrees} degrees cannot be made; ask for {} to {}",
-                LAMPS.start(),
-                LAMPS.end()
-            )));
+        if let Some(degrees) = lamp.filter(|degrees| !LAMPS.contains(degrees)) {
+            let what = format!("a lamp of half its strength at {degrees} degrees cannot be made");
+            return refused(what, format!("ask for {} to {}", LAMPS.start(), LAMPS.end()));
         }
         Ok(())
     }

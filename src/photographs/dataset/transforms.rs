@@ -9,14 +9,14 @@ mod matrix;
 
 use std::path::{Path, PathBuf};
 
-use glam::{DAffine3, DMat3, DVec3};
+use glam::DAffine3;
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use self::intrinsics::Intrinsics;
 use self::keys::Unsupported;
 use self::matrix::Rows;
-use super::listed::{ListedView, Listing};
+use super::listing::{ListedView, Listing};
 use super::locate::{self, Wanted};
 use super::ply::Cloud;
 use super::{Split, names};
@@ -86,7 +86,8 @@ struct Read<'a> {
 
 /// Reads the files of a listing; frames without a usable pose or size are added to `skipped`.
 pub(super) fn read(
-    (root, images): (&Path, Option<&Path>),
+    root: &Path,
+    images: Option<&Path>,
     listings: &[(PathBuf, Option<Split>)],
     files: &Files,
     listing: &mut Listing,
@@ -95,8 +96,8 @@ pub(super) fn read(
     let mut read = vec![];
     for (path, split) in listings {
         let mut transforms = parse(path)?;
-        let own = usable_frames(path, &mut transforms, *split, listing);
-        frames.extend(own.into_iter().map(|frame| (read.len(), frame)));
+        let usable = usable_frames(path, &mut transforms, *split, listing);
+        frames.extend(usable.into_iter().map(|frame| (read.len(), frame)));
         read.push(Read { path, transforms });
     }
     let wanted = frames.iter().map(|(_, frame)| Wanted {
@@ -104,7 +105,7 @@ pub(super) fn read(
         path: listed_path(&frame.listed.file_path),
         places: vec![root.to_owned()],
     });
-    let found = locate::photographs((root, images), wanted.collect(), files, listing);
+    let found = locate::photographs(root, images, wanted.collect(), files, listing);
     for ((file, frame), found) in frames.into_iter().zip(found) {
         let Read { path, transforms } = &read[file];
         let listed = frame.listed;
@@ -192,18 +193,16 @@ fn usable_frames(
             continue;
         }
         unsupported.add(&listed.others);
-        let stated = transforms.splits.of(&name, listed.split.as_deref());
-        if stated == Stated::Neither {
+        let Some(split) = transforms.splits.of(&name, listed.split.as_deref(), split) else {
             unassigned += 1;
             continue;
-        }
+        };
         match matrix::pose(&listed.transform_matrix, is_transposed) {
             Err(problem) => listing.skipped.push(format!(
                 "{name}: its transform_matrix {problem}; export it right-handed, in OpenGL axes"
             )),
             Ok(pose) => {
                 mended.add(&pose);
-                let split = stated.split().or(split);
                 let view_from_world = pose.view_from_world;
                 frames.push(TrainingFrame { listed, split, view_from_world });
             }
@@ -260,38 +259,20 @@ impl Mended {
     }
 }
 
-/// The split of a frame according to a listing.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Stated {
-    Nothing,
-    As(Split),
-    /// There are lists, but the frame is in none.
-    Neither,
-}
-
-impl Stated {
-    fn split(self) -> Option<Split> {
-        match self {
-            Self::As(split) => Some(split),
-            Self::Nothing | Self::Neither => None,
-        }
-    }
-}
-
 impl StatedSplits {
-    /// The split of a frame by its own key, else by the lists. As with files, a validation list is used only if there
-    /// is no test list.
-    fn of(&self, name: &str, own: Option<&str>) -> Stated {
-        match own {
-            Some("train") => return Stated::As(Split::Train),
-            Some("test" | "val" | "eval") => return Stated::As(Split::Test),
+    /// The split of a frame by its own key, else by the lists, else `default`; `None` if there are lists, but the frame
+    /// is in none. As with files, a validation list is used only if there is no test list.
+    fn of(&self, name: &str, key: Option<&str>, default: Option<Split>) -> Option<Option<Split>> {
+        match key {
+            Some("train") => return Some(Some(Split::Train)),
+            Some("test" | "val" | "eval") => return Some(Some(Split::Test)),
             _ => {}
         }
         let filled =
             |list: &Option<Vec<String>>| list.as_ref().is_some_and(|list| !list.is_empty());
         let lists = [&self.train_filenames, &self.val_filenames, &self.test_filenames];
         if !lists.into_iter().any(filled) {
-            return Stated::Nothing;
+            return Some(default);
         }
         let held_out =
             if filled(&self.test_filenames) { &self.test_filenames } else { &self.val_filenames };
@@ -300,11 +281,11 @@ impl StatedSplits {
         };
         let train_is_listed = filled(&self.train_filenames);
         match (holds(&self.train_filenames), holds(held_out)) {
-            (_, true) => Stated::As(Split::Test),
-            (true, false) => Stated::As(Split::Train),
-            (false, false) if train_is_listed && filled(held_out) => Stated::Neither,
-            (false, false) if train_is_listed => Stated::As(Split::Test),
-            (false, false) => Stated::As(Split::Train),
+            (_, true) => Some(Some(Split::Test)),
+            (true, false) => Some(Some(Split::Train)),
+            (false, false) if train_is_listed && filled(held_out) => None,
+            (false, false) if train_is_listed => Some(Some(Split::Test)),
+            (false, false) => Some(Some(Split::Train)),
         }
     }
 }
@@ -323,18 +304,8 @@ fn cloud(
         remarks.push(format!("{}: {named}, its ply_file_path, is absent", path.display()));
         return None;
     };
-    let applied = transforms.applied_transform.as_ref().and_then(|rows| {
-        let row = |index: usize| -> Option<[f64; 4]> {
-            let row: Option<Vec<f64>> = rows.get(index)?.iter().copied().collect();
-            row?.try_into().ok()
-        };
-        let [x, y, z] = [row(0)?, row(1)?, row(2)?];
-        let matrix3 =
-            DMat3::from_cols_array(&[x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2]]);
-        let translation = DVec3::new(x[3], y[3], z[3]);
-        Some(DAffine3 { matrix3: matrix3.transpose(), translation })
-    });
-    Some(Cloud { file, applied })
+    let applied = transforms.applied_transform.as_ref();
+    Some(Cloud { file, applied: applied.and_then(|rows| matrix::affine(rows, false)) })
 }
 
 /// Replaces the bare NaN and Infinity of Python, which are not JSON, by null, which is reported with its frame.

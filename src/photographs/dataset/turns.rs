@@ -10,12 +10,12 @@ use crate::photographs::image::Orientation;
 use crate::{Error, Result};
 
 /// Which pixels the cameras of a dataset are of, where a photograph's Exif turns or mirrors it and its size does not
-/// tell.
+/// decide it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum PixelOrientation {
-    /// As with those photographs of the dataset whose size tells; else found from the points that several photographs
-    /// show; else those that are stored, with a warning.
+    /// As for the photographs whose sizes decide it; else as the points that photographs share decide it; else those
+    /// that are stored, with a warning.
     #[default]
     Auto,
     /// Those that are stored.
@@ -59,7 +59,7 @@ pub(super) struct Header {
 }
 
 impl Header {
-    /// The pixels that a camera is of, by its size; `None` where both have it.
+    /// The pixels that a camera is of, by its size; `None` if both have this size.
     pub(super) fn by_size(self, lens: &Lens) -> Option<Pixels> {
         let fits = |(width, height): (u32, u32)| lens.fitted(width, height).is_some();
         match (fits(self.size), fits(self.orientation.size(self.size))) {

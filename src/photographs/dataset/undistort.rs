@@ -176,25 +176,17 @@ mod tests {
     use super::*;
     use crate::camera::Distortion;
 
-    const LENSES: [Distortion; 6] = [
-        Distortion { k1: 0.018, k2: -0.051, p1: 0.0087, p2: 0.0025, ..NONE },
-        Distortion { k1: -0.25, k2: 0.06, ..NONE },
-        Distortion { k1: 0.2, p1: -0.002, p2: 0.004, ..NONE },
-        Distortion { k1: 0.1, k3: 0.02, k4: 0.15, k5: -0.02, p1: 0.001, ..NONE },
-        Distortion { k1: 0.05, k2: -0.02, k3: 0.006, k4: -0.001, is_fisheye: true, ..NONE },
-        NONE,
-    ];
-    const NONE: Distortion = Distortion {
-        k1: 0.0,
-        k2: 0.0,
-        k3: 0.0,
-        k4: 0.0,
-        k5: 0.0,
-        k6: 0.0,
-        p1: 0.0,
-        p2: 0.0,
-        is_fisheye: false,
-    };
+    fn lenses() -> [Distortion; 6] {
+        let none = Distortion::default();
+        [
+            Distortion { k1: 0.018, k2: -0.051, p1: 0.0087, p2: 0.0025, ..none },
+            Distortion { k1: -0.25, k2: 0.06, ..none },
+            Distortion { k1: 0.2, p1: -0.002, p2: 0.004, ..none },
+            Distortion { k1: 0.1, k3: 0.02, k4: 0.15, k5: -0.02, p1: 0.001, ..none },
+            Distortion { k1: 0.05, k2: -0.02, k3: 0.006, k4: -0.001, is_fisheye: true, ..none },
+            none,
+        ]
+    }
 
     fn lens(distortion: Distortion) -> Lens {
         let (focal, principal_point) = (DVec2::new(105.0, 108.0), DVec2::new(52.0, 44.0));
@@ -233,7 +225,7 @@ mod tests {
 
     #[test]
     fn the_undistorted_photograph_is_that_of_a_pinhole() {
-        for distortion in LENSES {
+        for distortion in lenses() {
             let lens = lens(distortion);
             let map = Undistortion::new(&lens).unwrap();
             let ours = map.apply(&image_of(&lens, lens.focal, distortion));
@@ -247,21 +239,18 @@ mod tests {
 
     #[test]
     fn no_output_pixel_is_blank_and_the_zoom_is_the_smallest_possible() {
-        for distortion in LENSES {
+        for distortion in lenses() {
             let lens = lens(distortion);
             let factor = zoom(&lens).unwrap();
             assert!(sees_only_the_photograph(&lens, factor), "{distortion:?}");
             assert!(!sees_only_the_photograph(&lens, factor * 0.9999), "{distortion:?}: {factor}");
         }
-        assert_eq!(
-            zoom(&lens(Distortion::default())).map(|factor| (factor * 1e6).round()),
-            Some(1e6)
-        );
+        assert!((zoom(&lens(Distortion::default())).unwrap() - 1.0).abs() < 5e-7);
     }
 
     #[test]
     fn a_fisheye_is_cropped_to_its_middle_and_marked_as_cropped() {
-        let distortion = Distortion { k1: 0.02, is_fisheye: true, ..NONE };
+        let distortion = Distortion { k1: 0.02, is_fisheye: true, ..Distortion::default() };
         // 85 degrees at the corners, and 40.
         for (focal, is_cropped) in [(40.0, true), (90.0, false)] {
             let lens = Lens {
@@ -282,15 +271,13 @@ mod tests {
 
     #[test]
     fn a_lens_that_folds_over_itself_is_refused() {
-        assert!(
-            Undistortion::new(&lens(Distortion { k1: -40.0, ..Distortion::default() })).is_none()
-        );
+        let folded = lens(Distortion { k1: -40.0, ..Distortion::default() });
+        assert!(Undistortion::new(&folded).is_none());
     }
 
     #[test]
     fn interpolation_stays_within_the_range_of_its_pixels() {
-        let plane =
-            [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0];
+        let plane = [0.0, 0.0, 1.0, 1.0].repeat(4);
         for x in (0..=40).map(|step| step as f32 / 10.0) {
             let [value] = Taps::at([x, 2.0], 4, 4).sample([&plane]);
             assert!((0.0..=1.0).contains(&value), "{x}: {value}");

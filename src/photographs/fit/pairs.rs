@@ -7,8 +7,7 @@ use rayon::prelude::*;
 
 use super::Histogram;
 use crate::photographs::image::{ColourCounts, Image, files};
-use crate::photographs::tone::Statistics;
-use crate::photographs::tone::{luminance, measurable};
+use crate::photographs::tone::{Statistics, luminance, measurable};
 use crate::{Error, Result};
 
 /// Folders of the dark photographs of a scene.
@@ -18,12 +17,15 @@ const NORMAL_FOLDERS: [&str; 3] = ["high", "normal", "images"];
 
 /// Pairs of one scene.
 #[derive(Clone, Debug)]
-pub struct FitScene {
+pub struct Scene<P> {
     /// The folder's name.
     pub name: String,
     /// By name; none of them black.
-    pub pairs: Vec<Pair>,
+    pub pairs: Vec<P>,
 }
+
+/// Pairs as histograms.
+pub type FitScene = Scene<Pair>;
 
 /// A dark photograph and its reference, reduced to the data that a fit requires.
 #[derive(Clone, Debug)]
@@ -42,18 +44,8 @@ impl Pair {
     /// The pair of two images; `path` is its name.
     pub fn new(path: impl Into<PathBuf>, dark: &Image, reference: &Image) -> Result<Self> {
         let path = path.into();
-        let size = |image: &Image| (image.width, image.height);
-        if size(dark) != size(reference) {
-            let problem = format!(
-                "is {}x{} but its reference {}x{}; a pair must show the same pixels",
-                dark.width, dark.height, reference.width, reference.height
-            );
-            return Err(Error::input(path, problem));
-        }
+        check_sizes(&path, dark, reference)?;
         let pixels = dark.pixel_count();
-        if pixels == 0 {
-            return Err(Error::input(path, "has no pixels"));
-        }
         fn plane(image: &Image, channel: usize) -> &[f32] {
             &image.data[channel * image.pixel_count()..][..image.pixel_count()]
         }
@@ -74,6 +66,21 @@ impl Pair {
     pub fn is_black(&self) -> bool {
         self.statistics.p90 <= 1e-6
     }
+}
+
+/// Refuses a pair of different sizes, or without pixels.
+pub(super) fn check_sizes(path: &Path, dark: &Image, reference: &Image) -> Result<()> {
+    if (dark.width, dark.height) != (reference.width, reference.height) {
+        let problem = format!(
+            "is {}x{} but its reference {}x{}; a pair must show the same pixels",
+            dark.width, dark.height, reference.width, reference.height
+        );
+        return Err(Error::input(path, problem));
+    }
+    if dark.pixel_count() == 0 {
+        return Err(Error::input(path, "has no pixels"));
+    }
+    Ok(())
 }
 
 impl FitScene {
@@ -97,10 +104,8 @@ impl FitScene {
             !pair.is_black()
         });
         if pairs.is_empty() {
-            return Err(Error::input(
-                dark,
-                "every photograph is black (p90 is 0): there is no t = x / p90 to fit on",
-            ));
+            let problem = "every photograph is black (p90 is 0): there is no t = x / p90 to fit on";
+            return Err(Error::input(dark, problem));
         }
         Ok(Self { name: name_of(folder), pairs })
     }

@@ -18,7 +18,8 @@ use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::pairs::{files_of, name_of};
+use super::pairs::{Scene, check_sizes, files_of, name_of};
+use super::validate::{Part, all_except, split};
 use crate::kernels::pseudo_gt::SEGMENTS;
 use crate::photographs::image::{ColourCounts, Image};
 use crate::photographs::tone::{Exposure, LuminanceHistogram, Profile, measurable, soft};
@@ -43,13 +44,7 @@ const MIN_SCALE: f64 = 0.25 / 255.0;
 const UNITS: f64 = 1e4;
 
 /// The pairs of a scene as colours, normalised to one exposure.
-#[derive(Clone, Debug)]
-pub struct ColourScene {
-    /// The folder's name.
-    pub name: String,
-    /// By name; none of them black.
-    pub pairs: Vec<ColourPair>,
-}
+pub type ColourScene = Scene<ColourPair>;
 
 /// Dark colours of a photograph times its gain, and the colours of its reference.
 #[derive(Clone, Debug)]
@@ -117,14 +112,8 @@ fn sampled(
     reference: &Image,
     count: usize,
 ) -> Result<(ColourPair, LuminanceHistogram)> {
+    check_sizes(path, dark, reference)?;
     let pixels = dark.pixel_count();
-    if (dark.width, dark.height) != (reference.width, reference.height) || pixels == 0 {
-        let problem = format!(
-            "is {}x{} but its reference {}x{}; a pair must show the same pixels",
-            dark.width, dark.height, reference.width, reference.height
-        );
-        return Err(Error::input(path, problem));
-    }
     let colour = |image: &Image, i: usize| {
         [0, 1, 2].map(|channel| measurable(image.data[channel * pixels + i]))
     };
@@ -145,8 +134,7 @@ pub fn fit_profile(scenes: &[(&str, Vec<&ColourPair>)], huber: f64) -> Result<Pr
     // Written so that a NaN fails.
     let is_positive = huber > 0.0;
     if !is_positive {
-        let problem = format!("huber is {huber}; it must be above 0");
-        return Err(Error::Usage(problem));
+        return Err(Error::Usage(format!("huber is {huber}; it must be above 0")));
     }
     let colours = || pairs.iter().flat_map(|pair| &pair.colours);
     let v = |t: f32| 1.0 - (-f64::from(t)).exp();
@@ -221,15 +209,15 @@ impl Channel {
     }
 
     /// The segment of u, and the position of u within it.
-    fn place(&self, input: &SVector<f64, 4>) -> (usize, f64) {
-        let place = f64::from(SEGMENTS) * self.mix.dot(input).clamp(0.0, 1.0);
-        let segment = (place as usize).min(KNOTS - 2);
-        (segment, place - segment as f64)
+    fn segment(&self, input: &SVector<f64, 4>) -> (usize, f64) {
+        let position = f64::from(SEGMENTS) * self.mix.dot(input).clamp(0.0, 1.0);
+        let segment = (position as usize).min(KNOTS - 2);
+        (segment, position - segment as f64)
     }
 
     fn residuals(&self, inputs: &[SVector<f64, 4>], outputs: &[f64]) -> impl Iterator<Item = f64> {
         inputs.iter().zip(outputs).map(|(input, y)| {
-            let (segment, along) = self.place(input);
+            let (segment, along) = self.segment(input);
             let [low, high] = [segment, segment + 1].map(|knot| self.values[knot]);
             y - (low + along * (high - low))
         })
@@ -240,7 +228,7 @@ impl Channel {
         type Square = SMatrix<f64, KNOTS, KNOTS>;
         let (mut normal, mut right) = (Square::zeros(), SVector::<f64, KNOTS>::zeros());
         for ((input, y), weight) in inputs.iter().zip(outputs).zip(weights) {
-            let (low, along) = self.place(input);
+            let (low, along) = self.segment(input);
             let hats = [(low, 1.0 - along), (low + 1, along)];
             for (i, a) in hats {
                 right[i] += weight * a * y;
@@ -290,7 +278,7 @@ impl Channel {
             if !(0.0..=1.0).contains(&u) {
                 continue;
             }
-            let (segment, _) = self.place(input);
+            let (segment, _) = self.segment(input);
             let slope = f64::from(SEGMENTS) * (self.values[segment + 1] - self.values[segment]);
             normal += weight * slope * slope * input * input.transpose();
             right += weight * slope * residual * input;
@@ -355,34 +343,13 @@ pub fn cross_validate_profile(
     folds: usize,
     huber: f64,
 ) -> Result<Vec<ProfileFold>> {
-    let parts: Vec<(String, &str, Vec<&ColourPair>)> = match scenes {
-        [scene] => {
-            let count = scene.pairs.len().min(folds);
-            if count < 2 {
-                let pairs = scene.pairs.len();
-                return Err(Error::Usage(format!(
-                    "{pairs} pairs in {folds} folds leave none to fit to or none to validate on; use at least two \
-                     pairs in two folds"
-                )));
-            }
-            let fold = |index: usize| {
-                let pairs = scene.pairs.iter().skip(index).step_by(count).collect();
-                (format!("{} {}/{count}", scene.name, index + 1), scene.name.as_str(), pairs)
-            };
-            (0..count).map(fold).collect()
-        }
-        _ => scenes
-            .iter()
-            .map(|scene| (scene.name.clone(), scene.name.as_str(), scene.pairs.iter().collect()))
-            .collect(),
-    };
-    let held_out = |index: usize| {
-        let others = parts.iter().enumerate().filter(|(other, _)| *other != index);
-        let others: Vec<_> = others.map(|(_, (_, scene, pairs))| (*scene, pairs.clone())).collect();
+    let parts = split(scenes, folds)?;
+    let held_out = |(index, part): (usize, &Part<'_, ColourPair>)| {
+        let others = all_except(&parts, index);
+        let others: Vec<_> = others.map(|part| (part.scene, part.pairs.clone())).collect();
         let profile = fit_profile(&others, huber)?;
-        let (name, _, pairs) = &parts[index];
-        let scores = profile_scores(&profile, pairs);
-        Ok(ProfileFold { name: name.clone(), pairs: pairs.len(), scores })
+        let scores = profile_scores(&profile, &part.pairs);
+        Ok(ProfileFold { name: part.name.clone(), pairs: part.pairs.len(), scores })
     };
-    (0..parts.len()).map(held_out).collect()
+    parts.iter().enumerate().map(held_out).collect()
 }

@@ -6,7 +6,7 @@ use nalgebra::{DMatrix, DVector, Dyn, Owned};
 use super::model::{Curve, Exposure, Model, Slopes};
 use super::{Channels, FitOptions, Histogram, Pair, Weighting};
 use crate::base::random::Stream;
-use crate::photographs::tone::Statistics;
+use crate::photographs::tone::{Constant, Statistics};
 
 /// Values with the same curve of t.
 pub(super) struct Group {
@@ -218,23 +218,16 @@ impl<'a> Solver<'a> {
         for (index, group) in self.groups.iter().enumerate() {
             for column in &group.histogram.columns {
                 let t = column.x;
-                if values.is_empty() {
-                    rows.push(Row {
-                        group: index,
-                        t,
-                        weight: column.count,
-                        y: column.sum_y / column.count,
-                    });
-                    continue;
-                }
-                let model = curves[index].at(t);
-                let weighted = column
-                    .cells
-                    .iter()
-                    .map(|cell| (cell.count() * weight(cell.y() - model), cell.y()));
-                let [sum, sum_y] =
-                    weighted.fold([0.0; 2], |[sum, sum_y], (w, y)| [sum + w, sum_y + w * y]);
-                rows.push(Row { group: index, t, weight: sum, y: sum_y / sum });
+                let [weight, sum_y] = if values.is_empty() {
+                    [column.count, column.sum_y]
+                } else {
+                    let model = curves[index].at(t);
+                    column.cells.iter().fold([0.0; 2], |[sum, sum_y], cell| {
+                        let weight = cell.count() * weight(cell.y() - model);
+                        [sum + weight, sum_y + weight * cell.y()]
+                    })
+                };
+                rows.push(Row { group: index, t, weight, y: sum_y / weight });
             }
         }
         let total: f64 = rows.iter().map(|row| row.weight).sum();
@@ -322,20 +315,20 @@ impl<'a> Solver<'a> {
 }
 
 /// The start, moved into the bounds.
-fn constant_start(constant: &crate::photographs::tone::Constant) -> f64 {
+fn constant_start(constant: &Constant) -> f64 {
     let [low, high] = constant.bounds;
     constant.start.clamp(low + 0.01 * (high - low), high - 0.01 * (high - low))
 }
 
 /// The unbounded value of a constant within its bounds: the logit of its share of the range.
-fn place_of(constant: &crate::photographs::tone::Constant, value: f64) -> f64 {
+fn place_of(constant: &Constant, value: f64) -> f64 {
     let [low, high] = constant.bounds;
     let share = ((value - low) / (high - low)).clamp(1e-6, 1.0 - 1e-6);
     (share / (1.0 - share)).ln()
 }
 
 /// Inverse of [`place_of`].
-fn within(constant: &crate::photographs::tone::Constant, place: f64) -> f64 {
+fn within(constant: &Constant, place: f64) -> f64 {
     let [low, high] = constant.bounds;
     low + (high - low) / (1.0 + (-place).exp())
 }

@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::pairs::Scene;
 use super::{FitOptions, FitScene, Pair, Scores, fit, mean_psnr, mean_squared_error};
 use crate::photographs::tone::Family;
 use crate::{Error, Result};
@@ -37,16 +38,10 @@ pub fn cross_validate(
     folds: usize,
     options: &FitOptions,
 ) -> Result<HeldOut> {
-    let folds = split(scenes, folds)?;
-    let held_out = |index: usize| {
-        let (name, pairs) = &folds[index];
-        let others: Vec<&Pair> = folds
-            .iter()
-            .enumerate()
-            .filter(|(other, _)| *other != index)
-            .flat_map(|(_, (_, pairs))| pairs)
-            .copied()
-            .collect();
+    let parts = split(scenes, folds)?;
+    let held_out = |(index, Part { name, pairs, .. }): (usize, &Part<'_, Pair>)| {
+        let others = all_except(&parts, index).flat_map(|part| &part.pairs);
+        let others: Vec<&Pair> = others.copied().collect();
         let fitted = fit(family, &others, options)?;
         Ok(Fold {
             name: name.clone(),
@@ -57,27 +52,49 @@ pub fn cross_validate(
             }),
         })
     };
-    let folds = (0..folds.len()).map(held_out).collect::<Result<Vec<Fold>>>()?;
+    let folds = parts.iter().enumerate().map(held_out).collect::<Result<Vec<Fold>>>()?;
     let psnr = Scores::mean(folds.iter().map(|fold| &fold.psnr));
     let squared_error = Scores::mean(folds.iter().map(|fold| &fold.squared_error));
     Ok(HeldOut { folds, psnr, squared_error })
 }
 
-fn split(scenes: &[FitScene], folds: usize) -> Result<Vec<(String, Vec<&Pair>)>> {
-    if let [scene] = scenes {
-        let count = scene.pairs.len().min(folds);
-        if count < 2 {
-            return Err(Error::Usage(format!(
-                "{} pairs in {folds} folds leave none to fit to or none to validate on; use at least two \
-                 pairs in two folds",
-                scene.pairs.len()
-            )));
-        }
-        let fold = |index: usize| {
-            let pairs = scene.pairs.iter().skip(index).step_by(count).collect();
-            (format!("{} {}/{count}", scene.name, index + 1), pairs)
+/// A scene, or a part of one, that is held out.
+pub(super) struct Part<'a, P> {
+    pub(super) name: String,
+    /// The name of the scene.
+    pub(super) scene: &'a str,
+    pub(super) pairs: Vec<&'a P>,
+}
+
+/// The scenes; of a single one, `folds` parts.
+pub(super) fn split<'a, P>(scenes: &'a [Scene<P>], folds: usize) -> Result<Vec<Part<'a, P>>> {
+    let [Scene { name, pairs }] = scenes else {
+        let whole = |scene: &'a Scene<P>| Part {
+            name: scene.name.clone(),
+            scene: &scene.name,
+            pairs: scene.pairs.iter().collect(),
         };
-        return Ok((0..count).map(fold).collect());
+        return Ok(scenes.iter().map(whole).collect());
+    };
+    let count = pairs.len().min(folds);
+    if count < 2 {
+        return Err(Error::Usage(format!(
+            "{} pairs in {folds} folds leave none to fit to or none to validate on; use at least two pairs in two folds",
+            pairs.len()
+        )));
     }
-    Ok(scenes.iter().map(|scene| (scene.name.clone(), scene.pairs.iter().collect())).collect())
+    let part = |index: usize| Part {
+        name: format!("{name} {}/{count}", index + 1),
+        scene: name,
+        pairs: pairs.iter().skip(index).step_by(count).collect(),
+    };
+    Ok((0..count).map(part).collect())
+}
+
+/// All parts except one.
+pub(super) fn all_except<'a, 'p, P>(
+    parts: &'a [Part<'p, P>],
+    index: usize,
+) -> impl Iterator<Item = &'a Part<'p, P>> {
+    parts.iter().enumerate().filter(move |(other, _)| *other != index).map(|(_, part)| part)
 }

@@ -7,8 +7,7 @@ use exr::meta::attribute::AttributeValue;
 use exr::prelude::{ReadChannels, ReadLayers, SpecificChannels, Vec2, WritableImage};
 
 use super::colour::{self, Chromaticities, Conversion};
-use super::decoded::{Decoded, Meaning};
-use super::source::{Source, not_an_image};
+use super::source::{Decoded, Meaning, Source, not_an_image};
 use super::{Image, srgb_from_linear};
 use crate::base::output::write_whole;
 use crate::{Error, Result};
@@ -81,10 +80,8 @@ fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>
         let channel = channel
             .ok_or_else(|| Error::input(path, format!("this EXR file has neither {name} nor Y")))?;
         if channel.sample_data.len() != pixels {
-            return Err(Error::input(
-                path,
-                "this EXR file has subsampled channels; save it as plain RGB",
-            ));
+            let problem = "this EXR file has subsampled channels; save it as plain RGB";
+            return Err(Error::input(path, problem));
         }
         data.extend(channel.sample_data.values_as_f32());
     }

@@ -102,22 +102,20 @@ impl Mask {
     /// The mask that masks some pixels of an image; `None` if there are none.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn hiding(image: &Image, pixels: &[usize]) -> Option<Self> {
-        let mut weights = vec![1.0; image.pixel_count()];
-        pixels.iter().for_each(|&pixel| weights[pixel] = 0.0);
-        let Image { width, height, .. } = *image;
-        (!pixels.is_empty()).then_some(Self { width, height, weights })
+        Self::masked_at(None, (image.width, image.height), pixels)
     }
-    /// A mask of this size that masks these pixels in addition to those of `own`; `None` if there are none.
-    pub(crate) fn hiding_too(
-        own: Option<Self>,
+
+    /// `mask`, of this size, that also masks these pixels; `None` if nothing is masked.
+    pub(crate) fn masked_at(
+        mask: Option<Self>,
         (width, height): (u32, u32),
         pixels: &[usize],
     ) -> Option<Self> {
         if pixels.is_empty() {
-            return own;
+            return mask;
         }
         let all = || Self { width, height, weights: vec![1.0; width as usize * height as usize] };
-        let mut mask = own.unwrap_or_else(all);
+        let mut mask = mask.unwrap_or_else(all);
         pixels.iter().for_each(|&pixel| mask.weights[pixel] = 0.0);
         Some(mask)
     }

@@ -1,5 +1,6 @@
 //! Extracts the sharpest frame of each time window of a clip.
 
+use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -26,18 +27,9 @@ pub(super) fn frames(
     let filters = filters(ffmpeg, clip, transfer.as_deref().unwrap_or_default())?;
     let filter = format!("fps={}{filters}", fps * CANDIDATES as f64);
     let pattern = folder.join("frame_%06d.png");
-    ffmpeg.run(
-        "",
-        &[
-            "-hide_banner".as_ref(),
-            "-nostdin".as_ref(),
-            "-i".as_ref(),
-            clip.as_os_str(),
-            "-vf".as_ref(),
-            filter.as_ref(),
-            pattern.as_os_str(),
-        ],
-    )?;
+    let options = ["-hide_banner", "-nostdin", "-i"].map(OsStr::new);
+    let files = [clip.as_os_str(), "-vf".as_ref(), filter.as_ref(), pattern.as_os_str()];
+    ffmpeg.run("", &[&options[..], &files].concat(), |_| {})?;
     let frames = photographs_in(folder)?;
     if frames.is_empty() {
         return Err(Error::input(clip, "contains no frame that ffmpeg can decode"));
@@ -52,9 +44,10 @@ pub(super) fn frames(
     let sharpness = sharpness.collect::<Result<Vec<f64>>>()?;
     let mut kept = vec![];
     for (window, sharpness) in frames.chunks(CANDIDATES).zip(sharpness.chunks(CANDIDATES)) {
-        let place = (0..window.len()).rev().max_by(|&a, &b| sharpness[a].total_cmp(&sharpness[b]));
+        let sharpest =
+            (0..window.len()).rev().max_by(|&a, &b| sharpness[a].total_cmp(&sharpness[b]));
         for (at, frame) in window.iter().enumerate() {
-            if place == Some(at) {
+            if sharpest == Some(at) {
                 kept.push(frame.clone());
             } else {
                 fs::remove_file(frame)

@@ -221,7 +221,7 @@ impl<'a> Reconstruction<'a> {
                     .map_err(|error| Error::output(&list, format!("cannot be written: {error}")))?;
                 options.push(("image_list_path".to_owned(), list.into()));
             }
-            self.run(&self.colmap, command, options, ("features", report))?;
+            self.run(&self.colmap, command, options, "features", report)?;
         }
         report(Progress::Line(&match runs.len() {
             1 => "features extracted".to_owned(),
@@ -246,7 +246,7 @@ impl<'a> Reconstruction<'a> {
             let block = (count / 6).clamp(4, 50);
             options.push(("ExhaustiveMatching.block_size".to_owned(), block.to_string().into()));
         }
-        self.run(&self.colmap, command, options, ("matching", report))?;
+        self.run(&self.colmap, command, options, "matching", report)?;
         report(Progress::Line("features matched"));
         Ok(())
     }
@@ -254,19 +254,19 @@ impl<'a> Reconstruction<'a> {
     fn register(&self, tone_mapped: &Path, report: &dyn Fn(Progress<'_>)) -> Result<()> {
         let mut files = self.files(tone_mapped);
         files.push(("output_path".to_owned(), self.models.clone().into()));
-        let stage = ("registering", report);
+        let run = |tool, command, files| self.run(tool, command, files, "registering", report);
         let registered = match (self.options.mapper, &self.glomap) {
             (Mapper::Incremental, _) => {
                 let relaxed = self.relaxed.iter();
                 files.extend(relaxed.map(|(name, value)| ((*name).to_owned(), (*value).into())));
-                self.run(&self.colmap, "mapper", files, stage)
+                run(&self.colmap, "mapper", files)
             }
-            (Mapper::Global, Some(glomap)) => self.run(glomap, "mapper", files, stage),
+            (Mapper::Global, Some(glomap)) => run(glomap, "mapper", files),
             (Mapper::Global, None) => {
                 // Global registration requires focal lengths.
                 let (command, database) = ("view_graph_calibrator", files[..1].to_vec());
-                let calibrated = self.run(&self.colmap, command, database, ("calibrating", report));
-                calibrated.and_then(|()| self.run(&self.colmap, GLOBAL, files, stage))
+                let calibrated = self.run(&self.colmap, command, database, "calibrating", report);
+                calibrated.and_then(|()| run(&self.colmap, GLOBAL, files))
             }
         };
         // COLMAP fails without an initial pair; the error then names the photographs.
@@ -284,7 +284,8 @@ impl<'a> Reconstruction<'a> {
         tool: &Tool<'_>,
         command: &str,
         mut options: Options,
-        (what, report): (&str, &dyn Fn(Progress<'_>)),
+        what: &str,
+        report: &dyn Fn(Progress<'_>),
     ) -> Result<()> {
         for (_, name, value) in self.user_options.iter().filter(|(of, ..)| *of == command) {
             options.retain(|(own, _)| own != name);
@@ -294,7 +295,7 @@ impl<'a> Reconstruction<'a> {
             options.into_iter().map(|(name, value)| [format!("--{name}").into(), value]).collect();
         let arguments: Vec<&OsStr> = options.iter().flatten().map(OsString::as_os_str).collect();
         let mut stage = Stage::new(what);
-        tool.run_and_watch(command, &arguments, |printed| {
+        tool.run(command, &arguments, |printed| {
             if let Some(line) = stage.due(printed) {
                 report(Progress::Line(&line));
             }
@@ -310,8 +311,8 @@ impl<'a> Reconstruction<'a> {
 
     /// The name of an option in this version of COLMAP; its group changed in 3.12.
     fn named(&self, command: &str, [new, old]: [&str; 2], option: &str) -> String {
-        let own = format!("{new}.{option}");
-        if self.colmap.has_option(command, &own) { own } else { format!("{old}.{option}") }
+        let name = format!("{new}.{option}");
+        if self.colmap.has_option(command, &name) { name } else { format!("{old}.{option}") }
     }
 
     fn gpu(&self) -> &'static str {

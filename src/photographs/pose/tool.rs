@@ -72,23 +72,16 @@ impl<'a> Tool<'a> {
         output.status.success().then(|| text.lines().next().unwrap_or_default().to_owned())
     }
 
-    /// Runs one of its commands to completion.
-    pub(super) fn run(&self, command: &str, arguments: &[&OsStr]) -> Result<()> {
-        self.run_and_watch(command, arguments, |_| {})
-    }
-
-    /// [`Tool::run`] that passes the output so far to `watch`, twice a second.
-    pub(super) fn run_and_watch(
+    /// Runs one of its commands to completion, and passes the output so far to `watch`, twice a second.
+    pub(super) fn run(
         &self,
         command: &str,
         arguments: &[&OsStr],
         mut watch: impl FnMut(&str),
     ) -> Result<()> {
         let cannot = |error: std::io::Error| {
-            Error::output(
-                self.log,
-                format!("cannot be written ({error}); check the folder and the disk"),
-            )
+            let problem = format!("cannot be written ({error}); check the folder and the disk");
+            Error::output(self.log, problem)
         };
         let mut log =
             OpenOptions::new().create(true).append(true).open(self.log).map_err(cannot)?;

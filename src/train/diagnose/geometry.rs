@@ -69,7 +69,7 @@ impl Shared {
         let points: Vec<&Point> = points.iter().step_by(stride).collect();
         let inside = |point: &&Point| -> Vec<usize> {
             let sees = |view: &View| pixel(&view.camera, point).is_some();
-            (0..views.len()).filter(|&place| sees(views[place].1)).collect()
+            (0..views.len()).filter(|&index| sees(views[index].1)).collect()
         };
         let seen: Vec<Vec<usize>> = points.par_iter().map(inside).collect();
         let tracked: Vec<Vec<usize>> = points.iter().map(|point| track(point, views)).collect();
@@ -78,15 +78,15 @@ impl Shared {
 
         let others = views.len().saturating_sub(1).max(1) as f64;
         let mut shares = vec![(0.0, 0_usize); views.len()];
-        for places in &seen {
-            for &place in places {
-                let (sum, count) = &mut shares[place];
-                *sum += (places.len() - 1) as f64 / others;
+        for seeing in &seen {
+            for &view in seeing {
+                let (sum, count) = &mut shares[view];
+                *sum += (seeing.len() - 1) as f64 / others;
                 *count += 1;
             }
         }
         let mut counts = vec![0; views.len()];
-        counted.iter().flatten().for_each(|&place| counts[place] += 1);
+        counted.iter().flatten().for_each(|&view| counts[view] += 1);
         let visible = seen.iter().map(Vec::len).filter(|&count| count > 0);
         let (sum, visible) = visible.fold((0, 0), |(sum, n), count| (sum + count, n + 1));
         // Random points are not points of the dataset.
@@ -105,9 +105,9 @@ impl Shared {
 
 /// The positions, in `views`, of those that triangulated a point; ascending.
 fn track(point: &Point, views: &[(usize, &View)]) -> Vec<usize> {
-    let place =
+    let position =
         |&view: &u32| views.binary_search_by_key(&(view as usize), |(index, _)| *index).ok();
-    point.views.iter().filter_map(place).collect()
+    point.views.iter().filter_map(position).collect()
 }
 
 fn pixel(camera: &Camera, point: &Point) -> Option<DVec2> {
@@ -123,12 +123,12 @@ fn observations(
     views: &[(usize, &View)],
 ) -> Result<Vec<Vec<Observation>>> {
     let mut of_view = vec![vec![]; views.len()];
-    for (point, places) in seen.iter().enumerate() {
-        places.iter().for_each(|&place| of_view[place].push(point));
+    for (point, seeing) in seen.iter().enumerate() {
+        seeing.iter().for_each(|&view| of_view[view].push(point));
     }
     let mut lights = vec![vec![]; points.len()];
     // One photograph at a time, since they may have to be read again.
-    for (place, ((_, view), shown)) in views.iter().zip(of_view).enumerate() {
+    for (index, ((_, view), shown)) in views.iter().zip(of_view).enumerate() {
         let Some(image) = view.loaded()? else { continue };
         for point in shown {
             let at = pixel(&view.camera, points[point]);
@@ -139,7 +139,7 @@ fn observations(
             let distance = in_view.length();
             let off_axis = 1.0 - in_view.z / distance;
             let light = light.log2();
-            lights[point].push(Observation { view: place, light, distance, off_axis, is_clipped });
+            lights[point].push(Observation { view: index, light, distance, off_axis, is_clipped });
         }
     }
     lights.retain(|seen| seen.len() >= 2);
@@ -241,12 +241,8 @@ pub(super) fn median(mut values: Vec<f64>) -> Option<f64> {
 mod tests {
     use super::*;
 
-    #[test]
-    fn the_median_is_the_middle_value() {
-        assert_eq!(median(vec![]), None);
-        assert_eq!(median(vec![3.0]), Some(3.0));
-        assert_eq!(median(vec![3.0, 1.0]), Some(2.0));
-        assert_eq!(median(vec![5.0, 1.0, 2.0]), Some(2.0));
+    fn observed(view: usize, light: f64) -> Observation {
+        Observation { view, light, distance: 1.0, off_axis: 0.0, is_clipped: false }
     }
 
     #[test]
@@ -255,11 +251,7 @@ mod tests {
         let point = |index: usize| -> Vec<Observation> {
             let level = -3.0 - 0.1 * (index % 17) as f64;
             let views = (0..4).filter(|view| view % 3 != index % 3 || index.is_multiple_of(2));
-            let seen = |view: usize| {
-                let light = level + truth[view];
-                Observation { view, light, distance: 1.0, off_axis: 0.0, is_clipped: false }
-            };
-            views.map(seen).collect()
+            views.map(|view| observed(view, level + truth[view])).collect()
         };
         let points: Vec<_> = (0..200).map(point).collect();
         for (found, truth) in exposures(&points, 4).into_iter().zip(truth) {
@@ -273,11 +265,8 @@ mod tests {
         let truth = [-0.5, -0.75, -0.75, 2.0];
         let point = |index: usize| -> Vec<Observation> {
             let level = -4.0 + 0.02 * index as f64;
-            let seen = |view: usize| {
-                let light = level + truth[view];
-                Observation { view, light, distance: 1.0, off_axis: 0.0, is_clipped: false }
-            };
-            (0..4).map(seen).filter(|one| one.view < 3 || index < 80).collect()
+            let views = (0..4).filter(|&view| view < 3 || index < 80);
+            views.map(|view| observed(view, level + truth[view])).collect()
         };
         let points: Vec<_> = (0..200).map(point).collect();
         for (found, truth) in exposures(&points, 4).into_iter().zip(truth) {

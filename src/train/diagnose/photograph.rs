@@ -2,8 +2,9 @@
 
 use super::noise::{self, Noise, Patch};
 use super::sharpness;
-use crate::photographs::image::{Image, linear_from_srgb};
-use crate::photographs::tone::{Statistics, luminance, measurable};
+use super::target_noise::{TargetNoise, target_noise};
+use crate::photographs::image::{Image, Mask, linear_from_srgb};
+use crate::photographs::tone::{Exposure, LuminanceHistogram, Statistics, luminance, measurable};
 
 /// Blur is measured in the middle of the photograph, in at most this many pixels each way.
 const BLUR_SIDE: u32 = 640;
@@ -13,7 +14,10 @@ const REGIONS: [usize; 2] = [8, 6];
 /// Measurements of one photograph; fractions are over the values of all channels.
 #[derive(Clone, Debug)]
 pub(super) struct PhotographStatistics {
+    pub(super) size: [u32; 2],
     pub(super) statistics: Statistics,
+    pub(super) histogram: LuminanceHistogram,
+    pub(super) noise_in_target: Option<TargetNoise>,
     /// The mean luminance in linear light.
     pub(super) light: f64,
     pub(super) clipped_fraction: f64,
@@ -30,8 +34,12 @@ pub(super) struct PhotographStatistics {
 }
 
 impl PhotographStatistics {
-    /// Measures an image; `counted` holds the values of its unmasked pixels.
-    pub(super) fn of(image: &Image, counted: &[f32]) -> Self {
+    /// Measures the unmasked pixels of an image; noise and blur are those of the whole.
+    pub(super) fn of(image: &Image, mask: Option<&Mask>) -> Self {
+        let counted = mask.map(|mask| mask.counted(image));
+        let counted = counted.as_deref().unwrap_or(&image.data);
+        let histogram = LuminanceHistogram::of(counted);
+        let exposure = Exposure::of([&histogram], None);
         let values = counted.len().max(1) as f64;
         let fraction = |is: fn(f32) -> bool| {
             counted.iter().filter(|&&value| is(value)).count() as f64 / values
@@ -43,7 +51,10 @@ impl PhotographStatistics {
         }
         let luminance = luminances(&linear.planes);
         Self {
+            size: [image.width, image.height],
             statistics: Statistics::of(counted),
+            histogram,
+            noise_in_target: exposure.and_then(|exposure| target_noise(image, &exposure)),
             light: mean(&luminance),
             // Written so that a NaN is neither.
             clipped_fraction: fraction(|value| value >= 1.0),
@@ -108,9 +119,9 @@ fn mean(values: &[f32]) -> f64 {
 fn blur(image: &Image) -> Option<f64> {
     let (width, height) = (image.width.min(BLUR_SIDE), image.height.min(BLUR_SIDE));
     let (left, top) = ((image.width - width) / 2, (image.height - height) / 2);
-    let place = |index: u32| (left + index % width, top + index / width);
-    let pixel = |(x, y)| luminance(image.pixel(x, y).map(measurable));
-    let middle: Vec<f32> = (0..width * height).map(|index| pixel(place(index))).collect();
+    let pixel = |index: u32| image.pixel(left + index % width, top + index / width);
+    let value = |index: u32| luminance(pixel(index).map(measurable));
+    let middle: Vec<f32> = (0..width * height).map(value).collect();
     sharpness::blur(&middle, width as usize)
 }
 

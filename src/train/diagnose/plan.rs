@@ -192,24 +192,21 @@ impl Plan {
 
     /// Name, decision and reason of every item.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn decisions(&self) -> Vec<(&'static str, String, &str)> {
-        let switch = |name, switch: &'_ PlannedPart| {
-            let on = if switch.on { "on" } else { "off" };
-            (name, on.to_owned())
-        };
-        let number = |name, number: &'_ PlannedNumber| (name, number.value.to_string());
-        let named = [
-            (switch("curve", &self.curve), &self.curve.why),
-            (switch("exposure", &self.exposure), &self.exposure.why),
-            (("lamp", if self.lamp.on { "on" } else { "off" }.to_owned()), &self.lamp.why),
-            (switch("denoiser", &self.denoiser), &self.denoiser.why),
-            (switch("tonemapper", &self.tonemapper), &self.tonemapper.why),
-            (switch("structure", &self.structure), &self.structure.why),
-            (switch("depth", &self.depth), &self.depth.why),
-            (number("sh_degree", &self.sh_degree), &self.sh_degree.why),
-            (number("max_gaussians", &self.max_gaussians), &self.max_gaussians.why),
-        ];
-        named.into_iter().map(|((name, value), why)| (name, value, why.as_str())).collect()
+    pub(crate) fn decisions<'a>(&'a self) -> Vec<(&'static str, String, &'a str)> {
+        let switch = |on: bool| if on { "on" } else { "off" }.to_owned();
+        let part = |name, part: &'a PlannedPart| (name, switch(part.on), part.why.as_str());
+        let number = |name, it: &'a PlannedNumber| (name, it.value.to_string(), it.why.as_str());
+        vec![
+            part("curve", &self.curve),
+            part("exposure", &self.exposure),
+            ("lamp", switch(self.lamp.on), &self.lamp.why),
+            part("denoiser", &self.denoiser),
+            part("tonemapper", &self.tonemapper),
+            part("structure", &self.structure),
+            part("depth", &self.depth),
+            number("sh_degree", &self.sh_degree),
+            number("max_gaussians", &self.max_gaussians),
+        ]
     }
 
     /// The plan as TOML.
@@ -225,9 +222,9 @@ impl Plan {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn load(path: &Path, dataset: &Dataset) -> Result<Self> {
         let plan = Self::read(path)?;
-        let own = PlannedViews::of(dataset);
-        if plan.dataset != own {
-            let (of, is) = (plan.dataset.described(), own.described());
+        let loaded = PlannedViews::of(dataset);
+        if plan.dataset != loaded {
+            let (of, is) = (plan.dataset.described(), loaded.described());
             let problem = format!(
                 "is the plan of another dataset ({of}; {} has {is}, with other names or sizes); diagnose this one",
                 dataset.root.display()
@@ -242,12 +239,11 @@ impl Plan {
         let text = input::text(path)?;
         toml::from_str(&text).map_err(|error| {
             let line = error.span().map(|span| text[..span.start].matches('\n').count() + 1);
-            let place = line.map(|line| format!(" (line {line})")).unwrap_or_default();
+            let line = line.map(|line| format!(" (line {line})")).unwrap_or_default();
             let message = error.message().lines().next().unwrap_or_default();
-            Error::input(
-                path,
-                format!("is not a plan: {message}{place}; make one with `nightsplat diagnose`"),
-            )
+            let problem =
+                format!("is not a plan: {message}{line}; make one with `nightsplat diagnose`");
+            Error::input(path, problem)
         })
     }
 }

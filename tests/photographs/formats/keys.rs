@@ -205,6 +205,8 @@ fn keys_that_are_not_supported_are_named_in_one_line() {
     let folder = tempfile::tempdir().unwrap();
     single(folder.path(), |listing| {
         listing["semantics_file"] = json!("classes.json");
+        listing["k5"] = json!(0.0);
+        listing["rolling_shutter"] = json!([0.0, 0.1]);
         for index in 0..9 {
             listing["frames"][index]["normal_path"] = json!(format!("normals/{index}.png"));
             listing["frames"][index]["colmap_im_id"] = json!(index);
@@ -214,7 +216,8 @@ fn keys_that_are_not_supported_are_named_in_one_line() {
     assert_eq!(lines.lines().count(), 1, "{lines}");
     assert!(
         lines.contains(
-            "normal_path (9 times, normals/0.png the first), semantics_file (classes.json)"
+            "normal_path (9 times, normals/0.png the first), rolling_shutter ([0.0,0.1]), semantics_file \
+             (classes.json)"
         ),
         "{lines}"
     );

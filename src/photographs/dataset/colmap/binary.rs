@@ -11,7 +11,7 @@ use crate::camera::Lens;
 use crate::{Error, Result};
 
 pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, Lens>> {
-    let bytes = bytes(path)?;
+    let bytes = input::bytes(path)?;
     let mut reader = Reader::new(path, "camera", &bytes);
     reader.records(|reader| {
         let (id, model) = (reader.u32()?, reader.u32()?);
@@ -28,7 +28,7 @@ pub(super) fn cameras(path: &Path) -> Result<BTreeMap<u32, Lens>> {
 }
 
 pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
-    let bytes = bytes(path)?;
+    let bytes = input::bytes(path)?;
     let mut reader = Reader::new(path, "image", &bytes);
     reader.records(|reader| {
         let id = reader.u32()?;
@@ -48,7 +48,7 @@ pub(super) fn images_renamed(
     path: &Path,
     renamed: impl Fn(&str) -> Option<String>,
 ) -> Result<Vec<u8>> {
-    let bytes = bytes(path)?;
+    let bytes = input::bytes(path)?;
     let mut reader = Reader::new(path, "image", &bytes);
     let kept: Vec<Option<Vec<u8>>> = reader.records(|reader| {
         // Id, pose and camera.
@@ -64,7 +64,7 @@ pub(super) fn images_renamed(
 }
 
 pub(super) fn points(path: &Path) -> Result<BTreeMap<u64, ModelPoint>> {
-    let bytes = bytes(path)?;
+    let bytes = input::bytes(path)?;
     let mut reader = Reader::new(path, "point", &bytes);
     reader.records(|reader| {
         let id = reader.u64()?;
@@ -78,10 +78,6 @@ pub(super) fn points(path: &Path) -> Result<BTreeMap<u64, ModelPoint>> {
         }
         Ok((id, ModelPoint { position, images }))
     })
-}
-
-fn bytes(path: &Path) -> Result<Vec<u8>> {
-    input::bytes(path)
 }
 
 struct Reader<'a> {
@@ -150,9 +146,7 @@ impl<'a> Reader<'a> {
 
     fn cut_short(&self) -> Error {
         let (record, (index, count)) = (self.record, self.progress);
-        Error::input(
-            self.path,
-            format!("is cut short at {record} {index} of {count}; copy it again"),
-        )
+        let problem = format!("is cut short at {record} {index} of {count}; copy it again");
+        Error::input(self.path, problem)
     }
 }

@@ -8,7 +8,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use super::Scene;
 use super::lamp::{self, CameraLamp};
-use super::shapes::{Noise, Shape, Surface, hidden_by_sphere, nearest, smoothstep};
+use super::shapes::{Noise, Shape, Surface, nearest, open_beside, smoothstep};
 use crate::base::random::Stream;
 
 /// The look of a surface.
@@ -52,11 +52,8 @@ impl Room {
             look: Look { albedo, gloss: 0.25 },
         };
         let block = |center, half, yaw: f64, albedo| {
-            let turn = DMat3::from_rotation_z(-yaw);
-            Surface {
-                shape: Shape::Block { center, half, turn },
-                look: Look { albedo, gloss: 0.0 },
-            }
+            let shape = Shape::Block { center, half, turn: DMat3::from_rotation_z(-yaw) };
+            Surface { shape, look: Look { albedo, gloss: 0.0 } }
         };
         let surfaces = vec![
             plane(DVec3::Z, 0.0, Self::planks),
@@ -100,8 +97,7 @@ impl Room {
 
     /// The share of the sky that is visible above a position.
     ///
-    /// Each solid occludes as its bounding sphere, cosine-weighted (sphere occlusion after Quilez); each plane darkens
-    /// nearby positions.
+    /// Each plane darkens nearby positions.
     fn openness(&self, position: DVec3, normal: DVec3) -> f64 {
         const REACH: f64 = 0.4;
         let open = |surface: &Surface<Look>| match surface.shape {
@@ -110,12 +106,7 @@ impl Room {
                 let away = 0.5 - 0.5 * normal.dot(facing);
                 1.0 - away * (-distance / REACH).exp() * 0.6
             }
-            Shape::Sphere { center, radius } => {
-                1.0 - hidden_by_sphere(position, normal, center, radius)
-            }
-            Shape::Block { center, half, .. } => {
-                1.0 - 0.8 * hidden_by_sphere(position, normal, center, half.element_sum() / 3.0)
-            }
+            _ => open_beside(surface, position, normal),
         };
         self.surfaces.iter().map(open).product()
     }
@@ -237,14 +228,14 @@ impl Scene for Room {
         let up = 0.5 + 0.5 * hit.normal.z;
         let ambient = GROUND_RADIANCE.lerp(SKY_RADIANCE, up) * self.openness(position, hit.normal);
         let (lit, highlight) = self.lamp(position, hit.normal, direction, surface.look.gloss);
-        let own = albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * highlight;
-        let Some(carried) = carried else { return [own; 2] };
+        let radiance = albedo * (ambient + LAMP_RADIANCE * lit) + LAMP_RADIANCE * highlight;
+        let Some(carried) = carried else { return [radiance; 2] };
         let is_clear = |start, direction, distance| self.is_clear(start, direction, distance);
         let light = carried.light(position, hit.normal, is_clear).map(|light| {
             let shine = surface.look.gloss * shine(light.to_lamp, hit.normal, direction);
             light.radiance * (albedo * light.cosine + shine)
         });
-        [lamp::EVEN * albedo, lamp::AMBIENT * own + light.unwrap_or(DVec3::ZERO)]
+        [lamp::EVEN * albedo, lamp::AMBIENT * radiance + light.unwrap_or(DVec3::ZERO)]
     }
 
     fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {

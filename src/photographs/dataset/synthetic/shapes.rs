@@ -104,10 +104,20 @@ impl Noise {
 }
 
 /// The share of the light from above, cosine-weighted, that a sphere hides (sphere occlusion after Quilez).
-pub(super) fn hidden_by_sphere(position: DVec3, normal: DVec3, center: DVec3, radius: f64) -> f64 {
+fn hidden_by_sphere(position: DVec3, normal: DVec3, center: DVec3, radius: f64) -> f64 {
     let to_center = center - position;
     let distance = to_center.length().max(radius);
     (normal.dot(to_center) / distance).max(0.0) * (radius / distance).powi(2)
+}
+
+/// The share of the sky above a position that a solid leaves visible: it hides what its bounding sphere hides.
+pub(super) fn open_beside<L>(solid: &Surface<L>, position: DVec3, normal: DVec3) -> f64 {
+    let hidden = |center, radius| hidden_by_sphere(position, normal, center, radius);
+    match solid.shape {
+        Shape::Plane { .. } => 1.0,
+        Shape::Sphere { center, radius } => 1.0 - hidden(center, radius),
+        Shape::Block { center, half, .. } => 1.0 - 0.8 * hidden(center, half.element_sum() / 3.0),
+    }
 }
 
 /// 0 up to `low`, 1 from `high` on, and a cubic between them.

@@ -7,7 +7,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use super::Scene;
 use super::lamp::{self, CameraLamp};
-use super::shapes::{Hit, Noise, Shape, Surface, hidden_by_sphere, nearest, smoothstep};
+use super::shapes::{Hit, Noise, Shape, Surface, nearest, open_beside, smoothstep};
 use crate::base::random::Stream;
 
 /// How much darker the last plot's light is than the first one's, on the photographs.
@@ -85,16 +85,7 @@ impl Street {
         let Some(plot) = self.plots.get((position.x + BEYOND as f64).max(0.0) as usize) else {
             return 1.0;
         };
-        let open = |surface: &Surface<Look>| match surface.shape {
-            Shape::Plane { .. } => 1.0,
-            Shape::Sphere { center, radius } => {
-                1.0 - hidden_by_sphere(position, normal, center, radius)
-            }
-            Shape::Block { center, half, .. } => {
-                1.0 - 0.8 * hidden_by_sphere(position, normal, center, half.element_sum() / 3.0)
-            }
-        };
-        plot.iter().map(open).product()
+        plot.iter().map(|surface| open_beside(surface, position, normal)).product()
     }
 
     fn ground(&self, place: DVec3, _look: &Look) -> DVec3 {
@@ -179,9 +170,9 @@ impl Scene for Street {
         let cosine = hit.normal.dot(SUN);
         let lit = cosine > 0.0 && self.nearest(position + 1e-6 * hit.normal, SUN).is_none();
         let sun = if lit { SUN_RADIANCE * cosine } else { DVec3::ZERO };
-        let own = albedo * (ambient + sun);
+        let radiance = albedo * (ambient + sun);
         let Some(carried) = carried else {
-            return [own, own * FALL.powf(0.5 - position.x / self.length)];
+            return [radiance, radiance * FALL.powf(0.5 - position.x / self.length)];
         };
         let is_clear = |start, direction, distance| {
             let first = self.nearest(start, direction);
@@ -189,7 +180,7 @@ impl Scene for Street {
         };
         let light = carried.light(position, hit.normal, is_clear);
         let light = light.map_or(DVec3::ZERO, |light| light.radiance * light.cosine);
-        [lamp::EVEN * albedo, lamp::AMBIENT * own + albedo * light]
+        [lamp::EVEN * albedo, lamp::AMBIENT * radiance + albedo * light]
     }
 
     fn first_point(&self, origin: DVec3, direction: DVec3) -> Option<DVec3> {
@@ -237,52 +228,27 @@ fn plot(x: f64, draw: impl Fn(u64) -> f64) -> Vec<Surface<Look>> {
         let half = DVec2::new(uniform(3, 0.24, 0.33), uniform(4, 0.22, 0.32));
         let yaw = uniform(5, -0.2, 0.2);
         let house = middle.extend(0.5 * height);
-        surfaces.push(block(
-            house,
-            half.extend(0.5 * height),
-            yaw,
-            look(Street::facade, color(6), 9),
-        ));
-        let roof = middle.extend(height + 0.05);
-        surfaces.push(block(
-            roof,
-            (half + 0.04).extend(0.05),
-            yaw,
-            look(Street::tiles, color(10), 13),
-        ));
+        let facade = look(Street::facade, color(6), 9);
+        surfaces.push(block(house, half.extend(0.5 * height), yaw, facade));
+        let (roof, tiles) = (middle.extend(height + 0.05), look(Street::tiles, color(10), 13));
+        surfaces.push(block(roof, (half + 0.04).extend(0.05), yaw, tiles));
         let chimney = roof + DVec3::new(0.6 * half.x, 0.2 * across, 0.1);
-        surfaces.push(block(
-            chimney,
-            DVec3::new(0.05, 0.05, 0.07),
-            yaw,
-            look(Street::facade, color(14), 17),
-        ));
+        let bricks = look(Street::facade, color(14), 17);
+        surfaces.push(block(chimney, DVec3::new(0.05, 0.05, 0.07), yaw, bricks));
         let radius = uniform(18, 0.11, 0.19);
         let center =
             DVec3::new(x + uniform(19, 0.0, 1.0), across * uniform(20, 0.8, 0.95), 0.9 * radius);
         let green = DVec3::new(uniform(21, 0.2, 0.6), 0.5, 0.14);
-        surfaces.push(Surface {
-            shape: Shape::Sphere { center, radius },
-            look: look(Street::leaves, green, 22),
-        });
+        let tree = Shape::Sphere { center, radius };
+        surfaces.push(Surface { shape: tree, look: look(Street::leaves, green, 22) });
         if draw(32 * side + 23) < 0.6 {
             let center = DVec3::new(x + uniform(24, 0.2, 0.8), across * 0.3, 0.08);
-            let paint = 0.9 * color(25);
-            surfaces.push(block(
-                center,
-                DVec3::new(0.18, 0.085, 0.08),
-                0.0,
-                look(Street::car, paint, 28),
-            ));
+            let car = look(Street::car, 0.9 * color(25), 28);
+            surfaces.push(block(center, DVec3::new(0.18, 0.085, 0.08), 0.0, car));
         }
         let center = DVec3::new(x + 0.5, across * 2.15, 0.13);
-        let wood = DVec3::new(0.5, 0.36, 0.22);
-        surfaces.push(block(
-            center,
-            DVec3::new(0.5, 0.03, 0.13),
-            0.0,
-            look(Street::fence, wood, 29),
-        ));
+        let fence = look(Street::fence, DVec3::new(0.5, 0.36, 0.22), 29);
+        surfaces.push(block(center, DVec3::new(0.5, 0.03, 0.13), 0.0, fence));
     }
     surfaces
 }

@@ -81,29 +81,3 @@ fn meant(key: &str, value: &Value) -> Option<String> {
     };
     (MEANT.contains(&key) && !is_idle).then(|| value.to_string())
 }
-
-#[cfg(test)]
-mod tests {
-    use serde_json::json;
-
-    use super::*;
-
-    #[test]
-    fn keys_that_name_files_or_change_results_are_named_and_others_are_not() {
-        let mut unsupported = Unsupported::default();
-        let frame = json!({
-            "normal_path": "normals/a.png", "colmap_im_id": 3, "sharpness": 4.5, "note": "a.b",
-            "rolling_shutter": [0.0, 0.0, 0.1, 0.0], "k5": 0.0, "flow_file": "a",
-        });
-        let Value::Object(frame) = frame else { unreachable!() };
-        unsupported.add(&frame);
-        unsupported.add(&frame);
-        let line = unsupported.remark(Path::new("transforms.json")).unwrap();
-        assert_eq!(
-            line,
-            "transforms.json: not supported, without effect: flow_file (2 times, a the first), normal_path (2 times, \
-             normals/a.png the first), rolling_shutter (2 times, [0.0,0.0,0.1,0.0] the first)"
-        );
-        assert_eq!(Unsupported::default().remark(Path::new("a")), None);
-    }
-}

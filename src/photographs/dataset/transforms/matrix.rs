@@ -85,7 +85,8 @@ pub(super) fn pose(rows: &Rows, is_transposed: bool) -> Result<Pose, &'static st
     Ok(Pose { view_from_world, scale, is_rounded: off > IS_ROUNDED })
 }
 
-fn affine(rows: &Rows, is_transposed: bool) -> Option<DAffine3> {
+/// The transform of 4x4 or 3x4 rows.
+pub(super) fn affine(rows: &Rows, is_transposed: bool) -> Option<DAffine3> {
     let row = |index: usize| -> Option<[f64; 4]> {
         let entry = |other: usize| {
             let (row, column) = if is_transposed { (other, index) } else { (index, other) };
@@ -125,24 +126,6 @@ mod tests {
     }
 
     const AT: DVec3 = DVec3::new(0.5, -2.0, 3.0);
-
-    #[test]
-    fn scale_and_rounding_are_corrected_and_reported() {
-        let exact = pose(&rows(turned(), AT), false).unwrap();
-        assert_eq!((exact.scale, exact.is_rounded), (1.0, false));
-        let scaled = pose(&rows(turned() * 0.25, AT), false).unwrap();
-        assert!((scaled.scale - 0.25).abs() < 1e-12 && !scaled.is_rounded);
-        assert!(scaled.view_from_world.abs_diff_eq(exact.view_from_world, 1e-9));
-        for decimals in [1e2, 1e3] {
-            let round = |value: f64| (value * decimals).round() / decimals;
-            let rounded = DMat3::from_cols_array(&turned().to_cols_array().map(round));
-            let rounded = pose(&rows(rounded, AT), false).unwrap();
-            assert_eq!((rounded.scale, rounded.is_rounded), (1.0, true));
-            assert!(rounded.view_from_world.abs_diff_eq(exact.view_from_world, 4.0 / decimals));
-            let rotation = rounded.view_from_world.matrix3;
-            assert!((rotation.transpose() * rotation).abs_diff_eq(DMat3::IDENTITY, 1e-12));
-        }
-    }
 
     #[test]
     fn a_matrix_that_is_not_a_rotation_is_named() {
