@@ -152,7 +152,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
             }
         })
     };
-    let RunSummary { trainer, ended, scored, spent, .. } = match screen {
+    let RunSummary { trainer, ended, evaluation, spent, .. } = match screen {
         Some(screen) => view::beside(screen, (&args.out, &dataset), &requests, train)?,
         None => train()?,
     };
@@ -161,13 +161,13 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     }
     let gaussians = trainer.gaussian_count();
     writeln!(out, "{ended}")?;
-    if let Some(line) = summary(&scored) {
+    if let Some(line) = summary(&evaluation) {
         writeln!(out, "{line}")?;
     }
     if let Some(known) = config.tone.knows_references() {
         writeln!(out, "{}", eval::with_reference(&known))?;
     }
-    if let Some(label) = eval::label(&scored) {
+    if let Some(label) = evaluation.label() {
         writeln!(out, "the scores are {label}")?;
     }
     let (steps, seconds) = (trainer.steps_done(), spent.seconds);
