@@ -8,7 +8,7 @@ use super::eval::{
     self, After, Evaluation, Extras, Metric, ScoreReference, ScoredImages, with_reference,
 };
 use super::finished_run::{FinishedRun, Opener, is_model};
-use super::report::{Comparison, Picture, Report, Series, plot};
+use super::report::{Chart, Comparison, Picture, Report, Series};
 use super::run;
 use crate::Result;
 use crate::networks::lpips::{Lpips, Range};
@@ -172,7 +172,7 @@ impl RunEvaluation {
             title: format!("Evaluation of {}", self.run.display()),
             intro: mean.into_iter().chain(against).chain([shown]).collect(),
             tables: vec![evaluation.table()],
-            plots: history(&self.run),
+            charts: history(&self.run),
             comparisons,
             ..Report::default()
         }
@@ -202,7 +202,7 @@ fn keep_worst(worst: &mut Vec<(f64, Comparison)>, images: &ScoredImages<'_>) {
 }
 
 /// Loss and intermediate scores against the step, from the logs of the run.
-fn history(run: &Path) -> Vec<String> {
+fn history(run: &Path) -> Vec<Chart> {
     let log = std::fs::read_to_string(run.join("train.csv")).unwrap_or_default();
     let point = |line: &str| {
         let mut cells = line.split(',');
@@ -218,8 +218,9 @@ fn history(run: &Path) -> Vec<String> {
     let scores = run::load_progress(run).iter().map(|one| (one.step as f64, one.psnr)).collect();
     let series = [("loss", "loss", bins), ("PSNR, dB", "test views", scores)];
     let drawn = series.into_iter().filter(|(.., points): &(_, _, Vec<_>)| points.len() > 1);
-    let plots = drawn.map(|(axis, name, points)| {
-        plot("step", axis, &[Series { name: name.to_owned(), points, ..Series::default() }])
+    let charts = drawn.map(|(axis, name, points)| {
+        let series = Series { name: name.to_owned(), points, ..Series::default() };
+        Chart::new("step", axis, vec![series])
     });
-    plots.collect()
+    charts.collect()
 }

@@ -8,7 +8,7 @@ use super::rows::{Row, Rows, number, place};
 use super::runner::Failure;
 use crate::Result;
 use crate::base::output::{csv_field, write_whole};
-use crate::results::report::{Best, Column, Report, Table, Trace, traces};
+use crate::results::report::{Best, Chart, Column, Mark, Report, Series, Table};
 use crate::results::run::{Progress, energy_counters};
 
 /// The files of the costs.
@@ -125,12 +125,12 @@ impl Rows {
             title: format!("{title}: time and quality"),
             intro,
             tables: std::iter::once(self.costs()).chain(self.differences()).collect(),
-            plots: self.cost_plots(),
+            charts: self.cost_charts(),
             ..Report::default()
         };
         let [csv, html] = FILES.map(|file| folder.join(file));
         write_whole(&csv, self.costs_csv().as_bytes())?;
-        write_whole(&html, report.html_plots_first().as_bytes())
+        write_whole(&html, report.html_charts_first().as_bytes())
     }
 
     fn front_of(&self, cost: Measure, gain: Measure) -> Vec<usize> {
@@ -189,49 +189,52 @@ impl Rows {
         (!table.rows.is_empty()).then_some(table)
     }
 
-    fn cost_plots(&self) -> Vec<String> {
+    fn cost_charts(&self) -> Vec<Chart> {
         let fronts = FRONTS.into_iter().filter_map(|(cost, gain)| self.front_plot(cost, gain));
         fronts.chain(self.on_the_way()).collect()
     }
 
     /// Final score against cost; `None` unless two rows have both.
-    fn front_plot(&self, cost: Measure, gain: Measure) -> Option<String> {
+    fn front_plot(&self, cost: Measure, gain: Measure) -> Option<Chart> {
         let point = |row: &Row| Some((cost.shown(row)?, gain.shown(row)?));
         let front = self.front_of(cost, gain);
-        let trace = |(index, row): (usize, &Row)| Trace {
+        let series = |(index, row): (usize, &Row)| Series {
             points: point(row).into_iter().collect(),
-            is_minor: !front.contains(&index),
-            ..self.trace(index)
+            mark: if front.contains(&index) { Mark::Disc } else { Mark::Ring },
+            ..self.series(index)
         };
-        let drawn: Vec<Trace> = self.rows.iter().enumerate().map(trace).collect();
-        let steps: Vec<(f64, f64)> =
-            front.iter().filter_map(|&index| point(&self.rows[index])).collect();
-        // A plot of a single point shows nothing.
-        let count = drawn.iter().filter(|trace| !trace.points.is_empty()).count();
-        (count > 1).then(|| traces(cost.name, gain.name, &drawn, &steps))
+        let mut drawn: Vec<Series> = self.rows.iter().enumerate().map(series).collect();
+        // A chart of a single point shows nothing.
+        let count = drawn.iter().filter(|series| !series.points.is_empty()).count();
+        let points = front.iter().filter_map(|&index| point(&self.rows[index])).collect();
+        let name = "Pareto front".to_owned();
+        drawn.insert(0, Series { name, mark: Mark::Steps, points, ..Series::default() });
+        let chart = Chart::new(cost.name, gain.name, drawn);
+        (count > 1).then_some(Chart { is_logarithmic: true, ..chart })
     }
 
     /// Score against time during training; `None` without intermediate scores.
-    fn on_the_way(&self) -> Option<String> {
+    fn on_the_way(&self) -> Option<Chart> {
         let all = || self.rows.iter().flat_map(|row| &row.progress);
         let least = all().map(|one| one.psnr).fold(f64::NEG_INFINITY, f64::max) - SHOWN_DECIBELS;
-        let trace = |(index, row): (usize, &Row)| {
+        let series = |(index, row): (usize, &Row)| {
             let shown = row.progress.iter().filter(|one| one.psnr >= least);
             let points = shown.map(|one: &Progress| (one.seconds, one.psnr)).collect();
-            Trace { points, ..self.trace(index) }
+            Series { points, mark: Mark::Disc, ..self.series(index) }
         };
-        let drawn: Vec<Trace> = self.rows.iter().enumerate().take(MAX_NAMES).map(trace).collect();
+        let drawn: Vec<Series> = self.rows.iter().enumerate().take(MAX_NAMES).map(series).collect();
         let y_name = format!("{} during training", PSNR.name);
-        let has_lines = drawn.iter().any(|trace| trace.points.len() > 1);
-        has_lines.then(|| traces(SECONDS.name, &y_name, &drawn, &[]))
+        let has_lines = drawn.iter().any(|series| series.points.len() > 1);
+        let chart = Chart::new(SECONDS.name, &y_name, drawn);
+        has_lines.then_some(Chart { is_logarithmic: true, ..chart })
     }
 
-    /// Name and colour of a row in every plot.
-    fn trace(&self, index: usize) -> Trace {
+    /// Name and colour of a row in every chart.
+    fn series(&self, index: usize) -> Series {
         let (number, label) = (index + 1, self.label(&self.rows[index], None));
         let title = format!("{number}  {label}");
         let name = if self.rows.len() > MAX_NAMES { number.to_string() } else { label };
-        Trace { name, title, color: index, ..Trace::default() }
+        Series { name, title, color: Some(index), ..Series::default() }
     }
 
     /// A line per row: settings, mean and standard deviation of every quantity, and whether it is on the fronts of PSNR

@@ -15,7 +15,7 @@ use crate::photographs::image::Image;
 use crate::photographs::metrics::Scores;
 use crate::results::eval::{AGAINST, WITH_REFERENCE};
 use crate::results::report::{
-    Bar, Best, Column, Comparison, Mark, Picture, Report, Series, Table, bars, plot_points,
+    Best, Chart, Column, Comparison, Mark, Picture, Report, Series, Table,
 };
 
 /// The files of a leaderboard.
@@ -177,7 +177,7 @@ impl Leaderboard<'_> {
             intro: self.notes(),
             links: self.links.clone(),
             tables: vec![self.table()],
-            plots: self.plots(),
+            charts: self.charts(),
             comparisons: pictures.into_iter().collect(),
             ..Report::default()
         };
@@ -210,28 +210,34 @@ impl Leaderboard<'_> {
     }
 
     /// PSNR against every numeric setting; without one, a bar per row.
-    fn plots(&self) -> Vec<String> {
+    fn charts(&self) -> Vec<Chart> {
         let psnr = column("psnr");
         // A line keeps its colour in every plot.
         let mut lines = vec![];
         let numeric =
             self.rows.keys.iter().filter_map(|key| self.against(key, &psnr.name, &mut lines));
-        let plots: Vec<String> = numeric.collect();
+        let charts: Vec<Chart> = numeric.collect();
         let has_scores = self.rows.rows.iter().any(|row| row.score("psnr").is_some());
-        if !plots.is_empty() || !has_scores {
-            return plots;
+        if !charts.is_empty() || !has_scores {
+            return charts;
         }
-        let bar = |row: &Row| Bar {
-            name: self.rows.label(row, None),
-            value: row.score("psnr").unwrap_or(f64::NAN),
-            spread: row.extremes("psnr"),
+        let bar = |(index, row): (usize, &Row)| {
+            let x = index as f64;
+            let spread = row.extremes("psnr").map(|[low, high]| (x, low, high));
+            Series {
+                name: self.rows.label(row, None),
+                mark: Mark::Bar,
+                color: Some(1),
+                points: vec![(x, row.score("psnr").unwrap_or(f64::NAN))],
+                spreads: spread.into_iter().collect(),
+                ..Series::default()
+            }
         };
-        let rows: Vec<Bar> = self.rows.rows.iter().map(bar).collect();
-        vec![bars(&psnr.name, psnr.digits, &rows)]
+        vec![Chart::new("", &psnr.name, self.rows.rows.iter().enumerate().map(bar).collect())]
     }
 
     /// A line for each combination of the other settings; `None` if `key` is not numeric, or there are too many lines.
-    fn against(&self, key: &str, y_name: &str, known: &mut Vec<String>) -> Option<String> {
+    fn against(&self, key: &str, y_name: &str, known: &mut Vec<String>) -> Option<Chart> {
         let is_special = |value: &str| key == OFFSET && value == ADAPTIVE;
         let values = self.rows.rows.iter().filter_map(|row| row.point.value(key));
         let numbers: Vec<f64> = values
@@ -243,7 +249,7 @@ impl Leaderboard<'_> {
         if low == high {
             return None;
         }
-        let (mut lines, mut marks): (Vec<Series>, Vec<Mark>) = (vec![], vec![]);
+        let (mut lines, mut stars): (Vec<Series>, Vec<Series>) = (vec![], vec![]);
         for row in &self.rows.rows {
             let Some(psnr) = row.score("psnr") else { continue };
             let name = self.rows.label(row, Some(key));
@@ -251,7 +257,8 @@ impl Leaderboard<'_> {
                 Some(value) if is_special(value) => {
                     let offset = self.adaptive_offset?;
                     let name = format!("{name} adaptive {offset:.3}").trim().to_owned();
-                    marks.push(Mark { name, point: (offset, psnr) });
+                    let points = vec![(offset, psnr)];
+                    stars.push(Series { name, mark: Mark::Star, points, ..Series::default() });
                     continue;
                 }
                 Some(value) => vec![(value.parse().ok()?, psnr)],
@@ -267,7 +274,8 @@ impl Leaderboard<'_> {
                 }
                 None => {
                     let spreads = spreads.into_iter().collect();
-                    lines.push(Series { name, points, spreads, ..Series::default() });
+                    let mark = Mark::Dots;
+                    lines.push(Series { name, mark, points, spreads, ..Series::default() });
                 }
             }
         }
@@ -279,13 +287,14 @@ impl Leaderboard<'_> {
         lines.sort_by(|a, b| a.name.cmp(&b.name));
         for line in &mut lines {
             let place = known.iter().position(|name| *name == line.name);
-            line.line = Some(place.unwrap_or(known.len()));
+            line.color = Some(place.unwrap_or(known.len()));
             if place.is_none() {
                 known.push(line.name.clone());
             }
         }
         let is_legible = (1..=MAX_LINES).contains(&lines.len());
-        is_legible.then(|| plot_points(key, y_name, &lines, &marks))
+        lines.extend(stars);
+        is_legible.then(|| Chart::new(key, y_name, lines))
     }
 }
 

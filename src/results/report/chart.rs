@@ -125,8 +125,10 @@ impl Chart {
             let (legend, above) = legend_places(series);
             height += if first > 0 { GAP + above } else { above };
             let panel = frame.axes(self) + &frame.series(series, &legend);
-            let _ =
-                writeln!(panels, "<g class=\"panel\" transform=\"translate(0 {height})\">\n{panel}</g>");
+            let _ = writeln!(
+                panels,
+                "<g class=\"panel\" transform=\"translate(0 {height})\">\n{panel}</g>"
+            );
             height += frame.height;
         }
         let class = if frame.width < WIDTH { " class=\"half\"" } else { "" };
@@ -245,10 +247,7 @@ impl Frame {
         let (mut svg, mut legend) = (String::new(), legend.iter());
         for (index, one) in series.iter().enumerate() {
             let line = one.color.unwrap_or(index);
-            let color = match one.mark {
-                Mark::Star => "var(--best)".to_owned(),
-                _ => format!("var(--series-{})", line % COLORS),
-            };
+            let color = format!("var(--series-{})", line % COLORS);
             let title = if one.title.is_empty() { &one.name } else { &one.title };
             let dashes = DASHES[line / COLORS % DASHES.len()];
             let points = self.positions(&one.points);
@@ -267,17 +266,25 @@ impl Frame {
                 }
                 Mark::Star => points
                     .iter()
-                    .map(|&at| star(at) + &labels.label(at, &one.name, &color, false))
+                    .map(|&at| {
+                        star(at) + &labels.label(at, &one.name, " fill=\"var(--best)\"", false)
+                    })
                     .collect(),
                 Mark::Disc | Mark::Ring => {
                     let Some(&end) = points.last() else { continue };
                     let is_minor = one.mark == Mark::Ring;
                     let (width, radius) = if is_minor { (1.2, 3.5) } else { (2.0, 5.0) };
+                    let weight = if is_minor { "" } else { " font-weight=\"600\"" };
+                    let style = format!(" fill=\"{color}\"{weight}");
                     let fill = if is_minor { "var(--ground)" } else { color.as_str() };
                     let is_line = points.len() > 1;
-                    let path = if is_line { polyline(&points, &color, width, dashes) } else { String::new() };
+                    let path = if is_line {
+                        polyline(&points, &color, width, dashes)
+                    } else {
+                        String::new()
+                    };
                     path + &circle(end, radius, fill, &color)
-                        + &labels.label(end, &one.name, &color, is_line)
+                        + &labels.label(end, &one.name, &style, is_line)
                 }
                 Mark::Steps => self.steps(&points),
                 Mark::Bar => self.bar(one, &points, &color),
@@ -314,7 +321,7 @@ impl Frame {
     fn bar(&self, series: &Series, ends: &[DVec2], color: &str) -> String {
         let mut svg = String::new();
         let zero = self.position(0.0, 0.0).x;
-        let left = self.y.position(f64::NEG_INFINITY);
+        let left = self.y.from;
         let name = |x: f64| {
             let at = dvec2(left - 8.0, self.x.position(x + 0.5) + 4.0);
             text(at, " text-anchor=\"end\"", &series.name)
@@ -399,7 +406,8 @@ fn circle(at: DVec2, radius: f64, fill: &str, stroke: &str) -> String {
 fn star(at: DVec2) -> String {
     let corner = |index: u32| {
         let radius = if index.is_multiple_of(2) { 9.0 } else { 4.0 };
-        let corner = at - radius * DVec2::from_angle(std::f64::consts::PI * (0.5 + f64::from(index) / 5.0));
+        let corner =
+            at - radius * DVec2::from_angle(std::f64::consts::PI * (0.5 + f64::from(index) / 5.0));
         format!("{:.1} {:.1}", corner.x, corner.y)
     };
     let corners: Vec<String> = (0..10).map(corner).collect();

@@ -22,7 +22,7 @@ impl Labels {
     }
 
     /// A label beside a point, at a free place if there is one. At the end of a line, it is rather on the right.
-    pub(super) fn label(&mut self, at: DVec2, name: &str, color: &str, ends_line: bool) -> String {
+    pub(super) fn label(&mut self, at: DVec2, name: &str, style: &str, ends_line: bool) -> String {
         // The maximum width of a semibold letter of the page's font.
         let width = 8.4 * letters(name) as f64;
         let mut sides = [8.0, -8.0 - width];
@@ -37,8 +37,8 @@ impl Labels {
         let corners = |base: DVec2| [base - dvec2(0.0, 10.0), base + dvec2(width, 3.0)];
         let is_free = |base: &&DVec2| {
             let [low, high] = corners(**base);
-            let is_inside = low.cmpge(dvec2(0.0, 16.0)).all()
-                && high.cmple(self.area + dvec2(0.0, 4.0)).all();
+            let is_inside =
+                low.cmpge(dvec2(0.0, 16.0)).all() && high.cmple(self.area + dvec2(0.0, 4.0)).all();
             let meets = |[other_low, other_high]: &[DVec2; 2]| {
                 low.cmplt(*other_high).all() && other_low.cmplt(high).all()
             };
@@ -46,6 +46,6 @@ impl Labels {
         };
         let place = places.iter().find(is_free).copied().unwrap_or(places[0]);
         self.taken.push(corners(place));
-        text(place, &format!(" fill=\"{color}\" class=\"label\""), name)
+        text(place, &format!(" class=\"label\"{style}"), name)
     }
 }
