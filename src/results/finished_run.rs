@@ -22,6 +22,16 @@ pub(crate) struct Opener {
     pub(crate) open: fn(&DeviceChoice) -> Result<Gpu>,
 }
 
+impl Opener {
+    /// Opens the device for a run.
+    pub(crate) fn open(&self, config: &TrainConfig) -> Result<Gpu> {
+        match &self.device {
+            Some(device) => (self.open)(device),
+            None => (self.open)(&config.device.parse()?),
+        }
+    }
+}
+
 /// The model of a run with its dataset.
 pub(crate) struct FinishedRun {
     pub(crate) gpu: Gpu,
@@ -72,10 +82,7 @@ impl FinishedRun {
             tracing::warn!("{}: incomplete, at step {step} of {steps}", folder.display());
         }
         let lamp = run::load_lamp(folder)?;
-        let gpu = match &opener.device {
-            Some(device) => (opener.open)(device)?,
-            None => (opener.open)(&config.device.parse()?)?,
-        };
+        let gpu = opener.open(&config)?;
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
         if let Some(difference) = run::other_views(folder, &dataset).filter(|_| is_comparable) {
             let root = dataset.root.display();
