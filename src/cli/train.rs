@@ -136,7 +136,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let dataset = Arc::new(dataset);
     let page = args
         .view
-        .map(|listen| view::of_training(listen, &args.out, (&config, &dataset), &gpu, &requests));
+        .map(|listen| view::of_training(listen, &args.out, &config, &dataset, &gpu, &requests));
     let page = page.transpose()?;
     let session = Session {
         plan: plan.as_ref(),

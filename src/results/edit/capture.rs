@@ -71,7 +71,8 @@ impl Capture {
     pub(super) fn psnr(
         &self,
         run: Option<&Path>,
-        (gaussians, facts): (&Gaussians, &Facts),
+        gaussians: &Gaussians,
+        facts: &Facts,
         placement: &Placement,
         score_reference: &mut ScoreReference,
     ) -> Result<Option<f64>> {

@@ -172,7 +172,7 @@ impl Frame {
             series.points.iter().copied().chain(spreads).collect::<Vec<_>>()
         };
         let points: Vec<(f64, f64)> = chart.series.iter().flat_map(of_points).collect();
-        let is_drawable = |point: &&(f64, f64)| is_drawable(**point, chart.is_logarithmic);
+        let is_drawable = |&&(x, y): &&(f64, f64)| is_drawable(x, y, chart.is_logarithmic);
         let xs = || points.iter().filter(is_drawable).map(|point| point.0);
         let ys = || points.iter().filter(is_drawable).map(|point| point.1);
         let bars = chart.series.iter().filter(|series| series.mark == Mark::Bar);
@@ -208,7 +208,7 @@ impl Frame {
 
     /// The positions of the drawable points.
     fn positions(&self, points: &[(f64, f64)]) -> Vec<DVec2> {
-        let drawn = points.iter().filter(|point| is_drawable(**point, self.is_logarithmic));
+        let drawn = points.iter().filter(|&&(x, y)| is_drawable(x, y, self.is_logarithmic));
         drawn.map(|&(x, y)| self.position(x, y)).collect()
     }
 
@@ -327,7 +327,7 @@ impl Frame {
             text(at, " text-anchor=\"end\"", &series.name)
         };
         svg.extend(series.points.iter().map(|&(x, _)| name(x)));
-        let values = series.points.iter().filter(|point| is_drawable(**point, false));
+        let values = series.points.iter().filter(|&&(x, y)| is_drawable(x, y, false));
         for (&(_, value), end) in values.zip(ends) {
             let farthest = series.spreads.iter().map(|&(x, _, high)| self.position(x, high).x);
             let farthest = farthest.chain([end.x, zero]).filter(|x| x.is_finite());
@@ -345,7 +345,7 @@ impl Frame {
 }
 
 /// Written so that a NaN fails. The bound keeps differences finite.
-fn is_drawable((x, y): (f64, f64), is_logarithmic: bool) -> bool {
+fn is_drawable(x: f64, y: f64, is_logarithmic: bool) -> bool {
     x.abs() <= 1e30 && y.abs() <= 1e30 && (!is_logarithmic || x > 1e-9)
 }
 

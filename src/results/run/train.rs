@@ -125,7 +125,7 @@ pub fn train_in(
         metrics[HELD_OUT_CURVE] = curve;
     }
     directory.save_metrics(&metrics)?;
-    done::save(out, config, (trainer.fingerprint(), stamp), &ended, gpu)?;
+    done::save(out, config, trainer.fingerprint(), stamp, &ended, gpu)?;
     let trained = RunSummary { trainer, ended, evaluation, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
