@@ -168,13 +168,14 @@ impl RunComparison {
         let Some(first) = all.first().filter(|_| all.len() == self.runs.len()) else {
             return vec![];
         };
-        let mut keys: Vec<&String> = all.iter().flat_map(|own| own.keys()).collect();
+        let mut keys: Vec<&String> = all.iter().flat_map(|settings| settings.keys()).collect();
         keys.sort();
         keys.dedup();
-        let differs = |key: &&String| all.iter().any(|own| own.get(*key) != first.get(*key));
+        let differs =
+            |key: &&String| all.iter().any(|settings| settings.get(*key) != first.get(*key));
         let text = |key: &String| {
-            let value = |own: &std::collections::BTreeMap<String, toml::Value>| {
-                own.get(key).map_or_else(|| "none".to_owned(), ToString::to_string)
+            let value = |settings: &std::collections::BTreeMap<String, toml::Value>| {
+                settings.get(key).map_or_else(|| "none".to_owned(), ToString::to_string)
             };
             all.iter().map(value).collect::<Vec<_>>().join(" | ")
         };
@@ -256,7 +257,8 @@ fn add(
 fn names(paths: &[PathBuf]) -> Vec<String> {
     let last = |path: &PathBuf| path.file_name().unwrap_or(path.as_os_str()).to_owned();
     let all: Vec<_> = paths.iter().map(last).collect();
-    let is_unique = |name: &std::ffi::OsString| all.iter().filter(|own| *own == name).count() == 1;
+    let is_unique =
+        |name: &std::ffi::OsString| all.iter().filter(|other| *other == name).count() == 1;
     let name = |(path, name): (&PathBuf, &std::ffi::OsString)| match is_unique(name) {
         true => name.to_string_lossy().into_owned(),
         false => path.display().to_string(),
@@ -269,11 +271,11 @@ fn difference(one: &Dataset, other: &Dataset) -> Option<String> {
     let views = |dataset: &Dataset| {
         dataset.test_views().map(|view| (view.name.clone(), view.camera)).collect::<Vec<_>>()
     };
-    let (own, others) = (views(one), views(other));
-    if own.len() != others.len() {
-        return Some(format!("{} test views and {}", own.len(), others.len()));
+    let (views_of_one, others) = (views(one), views(other));
+    if views_of_one.len() != others.len() {
+        return Some(format!("{} test views and {}", views_of_one.len(), others.len()));
     }
-    for ((name, camera), (other_name, other)) in own.iter().zip(&others) {
+    for ((name, camera), (other_name, other)) in views_of_one.iter().zip(&others) {
         if name != other_name {
             return Some(format!("test view {name} is {other_name} in the other"));
         }

@@ -340,21 +340,21 @@ impl Editor {
             return refused(problem.to_owned());
         }
         self.facts.law = self.facts.law.filter(|law| facts.law == Some(*law));
-        let mut own = self.content.whole()?.into_owned();
-        if other.shape.features != own.shape.features {
+        let mut merged = self.content.whole()?.into_owned();
+        if other.shape.features != merged.shape.features {
             tracing::warn!("{}: has other features; those of both are dropped", file.display());
-            own = own.with_features(Features::NONE);
+            merged = merged.with_features(Features::NONE);
             other = other.with_features(Features::NONE);
         }
         let degree = |gaussians: &Gaussians| gaussians.shape.sh_degree;
-        let degree = degree(&other).max(degree(&own));
-        for gaussians in [&mut other, &mut own] {
+        let degree = degree(&other).max(degree(&merged));
+        for gaussians in [&mut other, &mut merged] {
             if gaussians.shape != (Shape { sh_degree: degree, ..gaussians.shape }) {
                 *gaussians = gaussians.with_sh_degree(degree);
             }
         }
-        own.append(&other);
-        self.content.set(own);
+        merged.append(&other);
+        self.content.set(merged);
         let line = format!("merge {}", file.display());
         Ok((line, Operation::Merge { file: file.to_owned(), hash: Some(fingerprint) }))
     }

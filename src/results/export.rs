@@ -343,8 +343,9 @@ pub(crate) mod tests {
         let provenance = Provenance::default();
         let numbers = "(4499999.6, 519997.7, -10001.8)";
         let turned = format!("world = (x, -y, -z) + {numbers}");
-        let has =
-            |file: &[u8], text: &str| file.windows(text.len()).any(|own| own == text.as_bytes());
+        let has = |file: &[u8], text: &str| {
+            file.windows(text.len()).any(|window| window == text.as_bytes())
+        };
         for version in [spz::Version::V3, spz::Version::V4] {
             let file = spz::encode(&model, &provenance, version).unwrap();
             assert!(has(&file, &turned), "{version:?}");

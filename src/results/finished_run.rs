@@ -105,9 +105,9 @@ impl FinishedRun {
 
     /// [`Self::open`] with renders in the light of the photographs, for scores.
     pub(crate) fn open_lit(folder: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
-        let mut own = Self::open(folder, dataset, opener)?;
-        own.model_renderer.set_lamp(own.lamp)?;
-        Ok(own)
+        let mut run = Self::open(folder, dataset, opener)?;
+        run.model_renderer.set_lamp(run.lamp)?;
+        Ok(run)
     }
 
     /// Opens a model file, which has few settings of its training.

@@ -123,8 +123,12 @@ impl Leaderboard<'_> {
         let mut pictures = vec![];
         if let Some(dark) = &dark {
             // A model must beat the score of the photograph itself.
-            let own = reference.as_ref().and_then(|reference| Scores::of(dark, reference).ok());
-            let scores = scored(own.map(|own| own.psnr), own.map(|own| own.ssim));
+            let of_photograph =
+                reference.as_ref().and_then(|reference| Scores::of(dark, reference).ok());
+            let scores = scored(
+                of_photograph.map(|scores| scores.psnr),
+                of_photograph.map(|scores| scores.ssim),
+            );
             pictures.push(picture("photograph", scores, dark));
         }
         // Second, so that it stays in the row of the best renders.
@@ -257,9 +261,9 @@ impl Leaderboard<'_> {
         }
         lines.sort_by(|a, b| a.name.cmp(&b.name));
         for line in &mut lines {
-            let place = known.iter().position(|name| *name == line.name);
-            line.color = Some(place.unwrap_or(known.len()));
-            if place.is_none() {
+            let index = known.iter().position(|name| *name == line.name);
+            line.color = Some(index.unwrap_or(known.len()));
+            if index.is_none() {
                 known.push(line.name.clone());
             }
         }

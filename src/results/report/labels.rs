@@ -44,8 +44,8 @@ impl Labels {
             };
             is_inside && !self.taken.iter().any(meets)
         };
-        let place = places.iter().find(is_free).copied().unwrap_or(places[0]);
-        self.taken.push(corners(place));
-        text(place, &format!(" class=\"label\"{style}"), name)
+        let base = places.iter().find(is_free).copied().unwrap_or(places[0]);
+        self.taken.push(corners(base));
+        text(base, &format!(" class=\"label\"{style}"), name)
     }
 }
