@@ -6,7 +6,7 @@
 
 use std::path::PathBuf;
 
-use nightsplat::run::{self, Event, IfExists};
+use nightsplat::run::{self, After, Event, IfExists, Metric};
 use nightsplat::synthetic::{self, SyntheticOptions};
 use nightsplat::{Dataset, DeviceChoice, Gpu, ToneCurve, ToneSettings, TrainConfig};
 
@@ -35,9 +35,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             Event::Step(report) if report.step.is_multiple_of(50) => {
                 println!("step {}, view {}: loss {:.4}", report.step, report.view, report.loss);
             }
-            Event::Evaluated { step, scored } => {
-                if let (Some(mean), _) = run::means(scored) {
-                    println!("step {step}: {:.2} dB on {} test views", mean.psnr, scored.len());
+            Event::Evaluated { step, evaluation } => {
+                if let Some(psnr) = evaluation.mean(Metric::Psnr, After::Model) {
+                    let views = evaluation.views().len();
+                    println!("step {step}: {psnr:.2} dB on {views} test views");
                 }
             }
             Event::Finished(trained) => {

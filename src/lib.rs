@@ -253,7 +253,7 @@ pub mod synthetic {
 #[cfg(feature = "io")]
 pub mod run {
     pub use crate::results::eval::{
-        ModelRenderer, ReferenceKind, RenderLayer, ResidualTransmittance, ViewScore, means,
+        After, Evaluation, Metric, ModelRenderer, ReferenceKind, RenderLayer, Score,
     };
     pub use crate::results::run::{
         Event, IfExists, ResourceUsage, RunSummary, load_config, load_networks, train,

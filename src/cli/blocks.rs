@@ -143,7 +143,8 @@ fn plan(args: &PlanArgs) -> Result<()> {
         return Ok(writeln!(std::io::stdout(), "{json:#}")?);
     }
     // What a few views cannot train, such as black ones, is no reason to plan nothing.
-    let hours = blocks::speed(&gpu, &planned).map(|speed| hours(steps, speed));
+    let hours = blocks::speed(&gpu, &planned)
+        .map(|(milliseconds, gaussians)| hours(steps, milliseconds, gaussians));
     write!(std::io::stdout(), "{}{}", printable(&summary), hours.unwrap_or_default())?;
     let Some(tasks) = tasks else { return Ok(()) };
     let (city, count) = (args.out.display(), tasks.len());
@@ -170,7 +171,7 @@ fn summary(plan: &BlockPlan) -> String {
 }
 
 /// The time of all steps at the speed of those that were measured.
-fn hours(steps: u64, (milliseconds, gaussians): (f64, usize)) -> String {
+fn hours(steps: u64, milliseconds: f64, gaussians: usize) -> String {
     let hours = steps as f64 * milliseconds / 3.6e6;
     format!(
         "{steps} steps of {milliseconds:.1} ms, as measured here with {gaussians} Gaussians, take {hours:.2} h on one \

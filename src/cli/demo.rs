@@ -67,7 +67,8 @@ pub fn run(args: &DemoArgs) -> Result<()> {
     sweep::run_titled(&sweep, title, &[intro], &[link])?;
     let shown = args.out.join(SHOWN);
     let export = command("export", &[&shown], &["--format", "html"]);
-    export::write(&parsed::<ExportArgs>("demo", export)?).map(drop)
+    export::write(&parsed::<ExportArgs>("demo", export)?)?;
+    Ok(())
 }
 
 /// Refuses a folder with anything but an earlier demo.

@@ -132,15 +132,14 @@ fn holes(
 ) -> Result<(String, BTreeMap<String, ResidualTransmittance>)> {
     let FinishedRun { config, dataset, mut model_renderer, .. } =
         FinishedRun::open(run, Some(&args.dataset), &driver::opener(args.device.as_ref()))?;
-    let mut residual_transmittances = BTreeMap::new();
+    let mut found = BTreeMap::new();
     for view in &dataset.views {
-        let own = ResidualTransmittance::of(&model_renderer.render(view)?, view);
-        residual_transmittances.extend(own.map(|own| (view.name.clone(), own)));
+        let residual_transmittance = ResidualTransmittance::of(&model_renderer.render(view)?, view);
+        found.extend(residual_transmittance.map(|one| (view.name.clone(), one)));
     }
-    let views = residual_transmittances.iter().map(|(name, own)| (name.as_str(), *own));
+    let views = found.iter().map(|(name, one)| (name.as_str(), one.mean));
     let healthy = || {
-        let mean = ResidualTransmittance::mean(residual_transmittances.values().copied())
-            .map_or(0.0, |own| own.mean);
+        let mean = found.values().map(|one| one.mean).sum::<f64>() / found.len().max(1) as f64;
         format!(
             "{}: {:.1} % of the background shows through the model",
             run.display(),
@@ -148,7 +147,7 @@ fn holes(
         )
     };
     let remark = hole_warning(views, config.background).unwrap_or_else(healthy);
-    Ok((remark, residual_transmittances))
+    Ok((remark, found))
 }
 
 fn text(device: &str, dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> String {

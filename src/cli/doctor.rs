@@ -55,7 +55,8 @@ pub fn run(args: &DoctorArgs) -> Result<()> {
         return compile(index);
     }
     let devices = devices()?;
-    let mut tested: Vec<_> = devices.iter().enumerate().map(self_tested).collect();
+    let tested = devices.iter().enumerate().map(|(index, device)| self_tested(index, device));
+    let mut tested: Vec<_> = tested.collect();
     let picked = SchedulerVariables::of_this_process().pick(&DeviceChoice::Best, &devices);
     let reason = picked.as_ref().ok().and_then(|picked| picked.reason.clone());
     let self_tests: Vec<_> = tested.iter().map(described).collect();
@@ -90,7 +91,7 @@ pub fn run(args: &DoctorArgs) -> Result<()> {
 }
 
 /// Opens a device that meets the requirements, which tests it.
-fn self_tested((index, device): (usize, &DeviceReport)) -> Option<crate::Result<()>> {
+fn self_tested(index: usize, device: &DeviceReport) -> Option<crate::Result<()>> {
     device.missing().is_none().then(|| Gpu::open(&DeviceChoice::Index(index))?.self_test())
 }
 

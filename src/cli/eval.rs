@@ -4,20 +4,16 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Result;
+use indicatif::ProgressBar;
 
 use super::{driver, finish, progress_bar, table, word};
 use crate::Error;
 use crate::base::output::{check_writable, printable, write_whole};
 use crate::gpu::DeviceChoice;
-use crate::networks::lpips::{Lpips, Range};
-use crate::photographs::dataset::{DOWNSCALE, View};
-use crate::photographs::metrics::psnr_of_counted;
-use crate::results::eval::{self, ScoreReference, ScoredImages};
-use crate::results::evaluation::{EvalPage, score_table};
-use crate::results::finished_run::{FinishedRun, is_model};
-use crate::results::linear_light::{photograph_of, slope_at, stops_between};
-use crate::results::run;
-use crate::train::{SceneLight, known_stops};
+use crate::networks::lpips::Range;
+use crate::photographs::dataset::DOWNSCALE;
+use crate::results::evaluation::{EvalOptions, RunEvaluation};
+use crate::results::finished_run::is_model;
 
 /// Score a run on the test views of its dataset.
 ///
@@ -87,150 +83,48 @@ impl From<LpipsRange> for Range {
     }
 }
 
-/// PSNR of a render as a photograph against the photograph of its view, the stops by which it is brighter, and the
-/// slope of the tone law; `None` if the view has no photograph.
-fn as_photograph(
-    light: &SceneLight,
-    compared: &ScoredImages<'_>,
-) -> crate::Result<Option<[f64; 3]>> {
-    let Some(photograph) = compared.view.loaded()? else { return Ok(None) };
-    let inverse = light.of_view(compared.view)?;
-    let (own, _) = photograph_of(&compared.render, &inverse);
-    let mask = compared.view.mask.as_ref();
-    let psnr = psnr_of_counted(&own, &photograph, mask)?;
-    let slope = slope_at(&compared.render, &inverse);
-    Ok(Some([psnr, stops_between(&own, &photograph), slope]))
-}
-
 /// Scores the run and prints the scores.
 pub fn run(args: &EvalArgs) -> Result<()> {
     args.report.iter().try_for_each(|path| check_writable(path))?;
-    if let Some(downscale) = args.downscale.filter(|&own| !DOWNSCALE.takes_number(own)) {
+    if let Some(downscale) = args.downscale.filter(|factor| !DOWNSCALE.takes_number(*factor)) {
         let (key, rule) = ("downscale".to_owned(), DOWNSCALE.to_string());
         return Err(Error::Setting { key, value: downscale.to_string(), rule }.into());
     }
-    let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, lamp } =
-        FinishedRun::open_with(
-            &args.run,
-            args.dataset.as_deref(),
-            &driver::opener(args.device.as_ref()),
-            |own| {
-                own.reference = args.reference.clone().or(own.reference.take());
-                own.downscale = args.downscale.unwrap_or(own.downscale);
-            },
-        )?;
-    model_renderer.set_lamp(lamp)?;
-    let load = |weights| Lpips::load(&gpu, weights, args.lpips_range.into());
-    let lpips = args.lpips.as_ref().map(load).transpose()?;
-    let measure = lpips.as_ref().map(Lpips::measure);
-    let light = args.photographs.then(|| SceneLight::of(&config.tone, &dataset)).transpose()?;
-    let stops = known_stops(&dataset, &config)?;
-    let mut score_reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
     let images = match is_model(&args.run) {
         true => args.run.with_extension("eval"),
         false => args.run.join("eval"),
     };
-    let mut page = args.report.as_ref().map(|_| EvalPage::default());
-    let bar = progress_bar(score_reference.view_count(&dataset));
-    let is_even = score_reference.is_evenly_lit(&dataset);
-    let render = |view: &View| {
-        bar.set_message(printable(&view.name).into_owned());
-        model_renderer.render_as(view, is_even)
+    let images = args.save_images.then_some(images);
+    let options = EvalOptions {
+        dataset: args.dataset.as_deref(),
+        reference: args.reference.as_deref(),
+        downscale: args.downscale,
+        opener: driver::opener(args.device.as_ref()),
+        lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range.into())),
+        align: args.align,
+        photographs: args.photographs,
+        images: images.as_deref(),
+        with_page: args.report.is_some(),
     };
-    let mut scored = eval::score_by(&mut score_reference, &dataset, render, |score, compared| {
-        let lpips = lpips.as_ref().map(|lpips| compared.lpips(&gpu, lpips));
-        score.scores.lpips = lpips.transpose()?;
-        if args.align || config.exposure.learn {
-            score.aligned = Some(compared.aligned()?);
-        }
-        if let Some(stops) = stops.get(&score.name) {
-            score.exposed = Some(compared.exposed(*stops)?);
-        }
-        if let Some(light) = &light {
-            score.photograph = as_photograph(light, compared)?;
-        }
-        if args.save_images {
-            compared.save(&images, score.against)?;
-        }
-        if let Some(page) = &mut page {
-            page.add(score, compared);
-        }
-        bar.inc(1);
-        Ok(())
-    })?;
-    bar.finish_and_clear();
-    if lamp.is_some() {
-        eval::score_lit(&mut scored, &dataset, |view| model_renderer.render(view))?;
+    let mut bar = None;
+    let scored = RunEvaluation::new(&args.run, &options, |index, count, view| {
+        let bar = bar.get_or_insert_with(|| progress_bar(count));
+        bar.set_position(index as u64);
+        bar.set_message(printable(view).into_owned());
+    });
+    bar.iter().for_each(ProgressBar::finish_and_clear);
+    let scored = scored?;
+    if let Some(path) = &args.report {
+        write_whole(path, scored.html().as_bytes())?;
     }
-    eval::warn_of_holes(&scored, &dataset, config.background, |view| model_renderer.render(view))?;
-    if scored.is_empty() {
-        let root = dataset.root.display();
-        tracing::warn!(
-            "{root}: no test view has a reference image or a photograph: nothing to score"
-        );
-    }
-    let mut wrote = vec![];
-    if let (Some(page), Some(path)) = (page, &args.report) {
-        write_whole(path, page.html(&args.run, &scored, measure).as_bytes())?;
-        wrote.push(path.display().to_string());
-    }
-    wrote.extend(args.save_images.then(|| images.display().to_string()));
     let mut out = std::io::stdout().lock();
     if args.json {
-        let recorded = run::load_metrics(&args.run);
-        let seconds = recorded["seconds"].as_f64();
-        let steps = recorded["steps"].as_u64().or_else(|| run::stopped_at(&args.run));
-        let steps = steps.unwrap_or(config.steps);
-        let mut metrics = eval::metrics(&scored, seconds, gaussian_count, steps);
-        if is_model(&args.run) {
-            metrics["steps"] = serde_json::Value::Null;
-        }
-        if let Some(measure) = measure {
-            eval::add_lpips(&mut metrics, &scored, measure);
-        }
-        eval::add_reference(&mut metrics, &config.tone);
-        for what in
-            [run::SPENT, run::TARGET_EXPOSURE, run::ENDED, run::TRAINED_WITH, run::HELD_OUT_CURVE]
-        {
-            if let Some(known) = recorded.get(what) {
-                metrics[what] = known.clone();
-            }
-        }
-        if config.exposure.learn {
-            eval::add_exposure(&mut metrics, &scored);
-        } else if args.align {
-            eval::add_aligned(&mut metrics, &scored);
-        }
-        eval::add_exposed(&mut metrics, &scored);
-        eval::add_lit(&mut metrics, &scored);
-        if args.photographs {
-            eval::add_photographs(&mut metrics, &scored);
-        }
-        writeln!(out, "{metrics:#}")?;
-    } else {
-        write!(out, "{}", table::of(&score_table(&scored, measure)))?;
-        if let Some(known) = config.tone.knows_references() {
-            writeln!(out, "{}", eval::with_reference(&known))?;
-        }
-        if let Some(lit) = eval::mean_lit(&scored) {
-            writeln!(
-                out,
-                "in the lamp's light, against lit/, after gain and bias of each channel: PSNR {:.2} dB, SSIM {:.3}",
-                lit.psnr, lit.ssim
-            )?;
-        }
-        if let Some([.., slope]) = eval::mean_photograph(&scored) {
-            writeln!(
-                out,
-                "the tone law multiplies differences of the photographs by {slope:.2}: {:.2} dB of PSNR, dark",
-                20.0 * slope.log10()
-            )?;
-        }
-        if let Some(label) = eval::label(&scored) {
-            writeln!(out, "{label}")?;
-        }
-        let run = word(&args.run);
-        finish(&wrote.join(", "), &format!("nightsplat render {run} --split all --out pictures"))?;
+        return Ok(writeln!(out, "{:#}", scored.json())?);
     }
-    Ok(())
+    write!(out, "{}", table::of(&scored.evaluation.table()))?;
+    scored.notes().iter().try_for_each(|note| writeln!(out, "{note}"))?;
+    drop(out);
+    let wrote = args.report.iter().chain(&images).map(|path| path.display().to_string());
+    let next = format!("nightsplat render {} --split all --out pictures", word(&args.run));
+    finish(&wrote.collect::<Vec<_>>().join(", "), &next)
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
-use crate::results::eval::{self, ReferenceKind, ViewScore};
+use crate::results::eval::{After, Evaluation, Metric, ReferenceKind};
 use crate::results::run::Event;
 use crate::train::{MemoryEstimate, StepReport};
 
@@ -122,8 +122,8 @@ impl Reporter {
                 let StepReport { loss, gaussians, .. } = report;
                 self.bar.set_message(format!("loss {loss:.4}  {gaussians} Gaussians"));
             }
-            Event::Evaluated { step, scored } => {
-                if let Some(line) = summary(scored).filter(|_| step < self.steps) {
+            Event::Evaluated { step, evaluation } => {
+                if let Some(line) = summary(evaluation).filter(|_| step < self.steps) {
                     self.bar.suspend(|| say(&format!("step {step}: {line}")));
                 }
             }
@@ -139,8 +139,8 @@ impl Reporter {
             Event::HeldOut { step, psnr } => {
                 say(&format!("step {step}: held-out views {psnr:.2} dB against their targets"));
             }
-            Event::Evaluated { step, scored } => {
-                if let Some(line) = summary(scored).filter(|_| step < self.steps) {
+            Event::Evaluated { step, evaluation } => {
+                if let Some(line) = summary(evaluation).filter(|_| step < self.steps) {
                     say(&format!("step {step}: {line}"));
                 }
             }
@@ -175,15 +175,15 @@ impl Reporter {
                 json!({ "event": "last_step", "step": step, "last": last })
             }
             Event::Ended(ended) => json!({ "event": "ended", "ended": ended }),
-            Event::Evaluated { step, scored } => {
-                json!({ "event": "evaluated", "step": step, "mean": scores(scored) })
+            Event::Evaluated { step, evaluation } => {
+                json!({ "event": "evaluated", "step": step, "mean": means(evaluation) })
             }
             Event::Finished(trained) => json!({
                 "event": "finished",
                 "step": trained.trainer.steps_done(),
                 "gaussians": trained.trainer.gaussian_count(),
                 "seconds": trained.spent.seconds,
-                "mean": scores(&trained.scored),
+                "mean": means(&trained.evaluation),
             }),
             _ => return,
         };
@@ -218,33 +218,33 @@ impl Reporter {
 }
 
 /// The mean scores in a line; `None` if nothing was scored.
-pub(crate) fn summary(scored: &[ViewScore]) -> Option<String> {
-    let (mean, r0) = eval::means(scored);
-    let mean = mean?;
-    let before = r0.map(|r0| format!("; before the denoiser {:.2} dB, {:.3}", r0.psnr, r0.ssim));
-    let against = scored.first().filter(|view| view.against != ReferenceKind::References);
-    let against = against.map(|view| format!(" against their {}", view.against.name()));
+pub(crate) fn summary(evaluation: &Evaluation) -> Option<String> {
+    let mean = |metric, after| evaluation.mean(metric, after);
+    let psnr = mean(Metric::Psnr, After::Model)?;
+    let channel_mean = mean(Metric::PsnrChannelMean, After::Model)?;
+    let ssim = mean(Metric::Ssim, After::Model)?;
+    let r0 = mean(Metric::Psnr, After::Gaussians).zip(mean(Metric::Ssim, After::Gaussians));
+    let r0 = r0.map(|(psnr, ssim)| format!("; before the denoiser {psnr:.2} dB, {ssim:.3}"));
+    let against = Some(evaluation.against()).filter(|kind| *kind != ReferenceKind::References);
+    let against = against.map(|kind| format!(" against their {}", kind.name()));
     Some(format!(
-        "{} test views{}: PSNR {:.2} dB (channel mean {:.2}), SSIM {:.3}{}",
-        scored.len(),
+        "{} test views{}: PSNR {psnr:.2} dB (channel mean {channel_mean:.2}), SSIM {ssim:.3}{}",
+        evaluation.views().len(),
         against.unwrap_or_default(),
-        mean.psnr,
-        mean.psnr_channel_mean,
-        mean.ssim,
-        before.unwrap_or_default()
+        r0.unwrap_or_default()
     ))
 }
 
 /// The means as JSON; null if nothing was scored.
-fn scores(scored: &[ViewScore]) -> Value {
-    let means = eval::means(scored).0;
-    means.map_or(Value::Null, |mean| {
+fn means(evaluation: &Evaluation) -> Value {
+    let mean = |metric| evaluation.mean(metric, After::Model);
+    mean(Metric::Psnr).map_or(Value::Null, |psnr| {
         json!({
-            "psnr": mean.psnr,
-            "psnr_channel_mean": mean.psnr_channel_mean,
-            "ssim": mean.ssim,
-            "views": scored.len(),
-            "against": scored.first().map(|view| view.against.name()),
+            "psnr": psnr,
+            "psnr_channel_mean": mean(Metric::PsnrChannelMean),
+            "ssim": mean(Metric::Ssim),
+            "views": evaluation.views().len(),
+            "against": evaluation.against().name(),
         })
     })
 }

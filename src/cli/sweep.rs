@@ -21,6 +21,7 @@ mod run;
 mod runner;
 mod scenes;
 mod scores;
+mod table;
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -160,7 +161,7 @@ fn swept(
         return Ok(None);
     }
     let bar = progress_bar(left.len());
-    let failures = runner::train(&left, args.jobs.into(), &bar, (&args.out, runs.len()))?;
+    let failures = runner::train(&left, args.jobs.into(), &bar, &args.out, runs.len())?;
 
     if let Some(weights) = &args.lpips {
         let finished = runs.iter().filter(|run| run.metrics().is_some());

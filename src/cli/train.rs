@@ -125,7 +125,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     let dataset = Arc::new(dataset);
     let page = args
         .view
-        .map(|listen| view::of_training(listen, &args.out, (&config, &dataset), &gpu, &requests));
+        .map(|listen| view::of_training(listen, &args.out, &config, &dataset, &gpu, &requests));
     let page = page.transpose()?;
     let session = Session {
         plan: plan.as_ref(),
@@ -140,19 +140,19 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         }
     };
     let done = run::train_in(&gpu, &config, &dataset, &args.out, &session, observe)?;
-    let RunSummary { trainer, ended, scored, spent, .. } = done;
+    let RunSummary { trainer, ended, evaluation, spent, .. } = done;
     if !is_text {
         return Ok(());
     }
     let gaussians = trainer.gaussian_count();
     writeln!(out, "{ended}")?;
-    if let Some(line) = summary(&scored) {
+    if let Some(line) = summary(&evaluation) {
         writeln!(out, "{line}")?;
     }
     if let Some(known) = config.tone.knows_references() {
         writeln!(out, "{}", eval::with_reference(&known))?;
     }
-    if let Some(label) = eval::label(&scored) {
+    if let Some(label) = evaluation.label() {
         writeln!(out, "the scores are {label}")?;
     }
     let (steps, seconds) = (trainer.steps_done(), spent.seconds);

@@ -60,7 +60,8 @@ pub fn run(args: &ViewArgs) -> Result<()> {
 pub(super) fn of_training(
     listen: Listen,
     run: &Path,
-    (config, dataset): (&TrainConfig, &Arc<Dataset>),
+    config: &TrainConfig,
+    dataset: &Arc<Dataset>,
     gpu: &Gpu,
     requests: &Requests,
 ) -> Result<(Arc<Site>, Server)> {
@@ -121,7 +122,7 @@ fn of_dataset(path: &Path, feed: Feed, pictures: Pictures, facts: &Facts) -> Res
         ..Default::default()
     };
     let origin = pictures.origin();
-    page(path, feed, Some(pictures), (bookmarks, up, provenance), origin)
+    page(path, feed, Some(pictures), bookmarks, up, provenance, origin)
 }
 
 /// The page of a model alone, which is seen from outside, with -y up.
@@ -129,15 +130,16 @@ fn of_model(path: &Path, feed: Feed, gaussians: &Gaussians, facts: &Facts) -> Re
     let bookmark =
         Bookmark { name: "overview".to_owned(), camera: overview(gaussians), pictures: vec![] };
     let provenance = Provenance { facts: *facts, ..Provenance::default() };
-    let shown = (vec![bookmark], DVec3::NEG_Y, provenance);
-    page(path, feed, None, shown, gaussians.origin)
+    page(path, feed, None, vec![bookmark], DVec3::NEG_Y, provenance, gaussians.origin)
 }
 
 fn page(
     path: &Path,
     feed: Feed,
     pictures: Option<Pictures>,
-    (bookmarks, up, provenance): (Vec<Bookmark>, DVec3, Provenance),
+    bookmarks: Vec<Bookmark>,
+    up: DVec3,
+    provenance: Provenance,
     origin: DVec3,
 ) -> Result<Arc<Site>> {
     let title = path.display().to_string();

@@ -9,6 +9,7 @@ use clap::builder::{PossibleValue, StringValueParser, TypedValueParser};
 use clap::{Arg, Command, Error};
 
 use crate::photographs::tone::ToneCurve;
+use crate::results::export::Format;
 use crate::train::{Part, Preset};
 
 /// Parses a `T`, of which some values have names. Others may exist, such as files.
@@ -29,6 +30,11 @@ pub(super) fn curves<T>() -> Words<T> {
 /// The names of all presets.
 pub(super) fn presets() -> Words<Preset> {
     Words::new(Preset::ALL.map(Preset::name))
+}
+
+/// The names of all formats of a model.
+pub(super) fn formats() -> Words<Format> {
+    Words::new(Format::ALL.map(Format::name))
 }
 
 /// The names of all parts of the model.

@@ -16,9 +16,6 @@ pub struct Scores {
     pub psnr_channel_mean: f64,
     /// Mean structural similarity.
     pub ssim: f64,
-    /// LPIPS, if the weights of its network are available.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub lpips: Option<f64>,
 }
 
 impl Scores {
@@ -44,7 +41,6 @@ impl Scores {
             psnr: decibels(mean(&errors)),
             psnr_channel_mean: mean(&errors.map(decibels)),
             ssim: mean_ssim(&counted(render, reference, mask), reference, mask)?,
-            lpips: None,
         })
     }
 
@@ -57,11 +53,6 @@ impl Scores {
             psnr: mean(|scores| scores.psnr),
             psnr_channel_mean: mean(|scores| scores.psnr_channel_mean),
             ssim: mean(|scores| scores.ssim),
-            lpips: scores
-                .iter()
-                .map(|scores| scores.lpips)
-                .sum::<Option<f64>>()
-                .map(|sum| sum / scores.len() as f64),
         })
     }
 }

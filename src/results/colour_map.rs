@@ -38,9 +38,9 @@ pub(crate) fn mapped(image: &Image, [from, to]: [f32; 2]) -> Image {
         }
         let span = to - from;
         let along = if span == 0.0 { 0.0 } else { ((value - from) / span).clamp(0.0, 1.0) };
-        let place = along * (VIRIDIS.len() - 1) as f32;
-        let below = (place as usize).min(VIRIDIS.len() - 2);
-        let share = place - below as f32;
+        let position = along * (VIRIDIS.len() - 1) as f32;
+        let below = (position as usize).min(VIRIDIS.len() - 2);
+        let share = position - below as f32;
         for plane in 0..3 {
             let [a, b] = [below, below + 1].map(|at| f32::from(VIRIDIS[at][plane]) / 255.0);
             data[plane * pixels + pixel] = a + (b - a) * share;

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
-use super::eval::{self, ScoreReference, ScoredImages, ViewScore};
+use super::eval::{After, Evaluation, Extras, Metric, ScoreReference, ScoredImages};
 use super::finished_run::{FinishedRun, Opener, is_model};
 use super::report::{Best, Column, Comparison, Facts, Picture, Report, Table};
 use super::run;
@@ -26,7 +26,7 @@ const POSE_ERROR: f64 = 1e-6;
 #[derive(Debug)]
 struct Compared {
     name: String,
-    scored: Vec<ViewScore>,
+    evaluation: Evaluation,
     gaussians: usize,
     /// `metrics.json`; null of a model.
     metrics: Value,
@@ -81,19 +81,20 @@ impl RunComparison {
             let is_even = reference.is_evenly_lit(&dataset);
             let render = |view: &View| model_renderer.render_as(view, is_even);
             let pictures = &mut comparison.pictures;
-            let scored = eval::score_by(reference, &dataset, render, |score, images| {
-                let distance = lpips.as_ref().map(|lpips| images.lpips(&gpu, lpips)).transpose()?;
-                score.scores.lpips = distance;
+            let keep = |images: &ScoredImages<'_>| {
                 if options.with_pictures && number % step == 0 {
-                    add(pictures, number / step, &name, score, images);
+                    add(pictures, number / step, &name, images);
                 }
                 number += 1;
                 Ok(())
-            })?;
+            };
+            let lpips = lpips.as_ref().map(|lpips| (lpips, &gpu));
+            let extras = Extras { lpips, ..Extras::default() };
+            let evaluation = Evaluation::new(reference, &dataset, &extras, render, keep)?;
             let is_run = !is_model(path);
             comparison.runs.push(Compared {
                 name,
-                scored,
+                evaluation,
                 gaussians: gaussian_count,
                 metrics: if is_run { run::load_metrics(path) } else { Value::Null },
                 config: is_run.then_some(config),
@@ -117,14 +118,10 @@ impl RunComparison {
             column("seconds", 0, Best::Unmarked),
         ]);
         let row = |run: &Compared| {
-            let mean = eval::means(&run.scored).0;
-            let score = |of: fn(&Scores) -> f64| mean.as_ref().map(of);
-            let mut values = vec![
-                score(|own| own.psnr),
-                score(|own| own.psnr_channel_mean),
-                score(|own| own.ssim),
-            ];
-            values.extend(self.measure.map(|_| mean.as_ref().and_then(|mean| mean.lpips)));
+            let mean = |metric| run.evaluation.mean(metric, After::Model);
+            let mut values =
+                vec![mean(Metric::Psnr), mean(Metric::PsnrChannelMean), mean(Metric::Ssim)];
+            values.extend(self.measure.map(|_| mean(Metric::Lpips)));
             values.extend([
                 Some(run.gaussians as f64),
                 run.metrics["steps"].as_f64(),
@@ -147,17 +144,20 @@ impl RunComparison {
         let mut columns = vec![column(format!("PSNR of {}, dB", first.name), Best::Unmarked)];
         let gains = others.iter().map(|run| column(format!("{} gains", run.name), Best::Unmarked));
         columns.extend(gains);
-        let row = |(index, view): (usize, &ViewScore)| {
-            let mut values = vec![Some(view.scores.psnr)];
-            let gain = |run: &Compared| Some(run.scored.get(index)?.scores.psnr - view.scores.psnr);
-            values.extend(others.iter().map(gain));
-            (view.name.clone(), values)
+        let psnr = |run: &Compared, view: &str| {
+            run.evaluation.value(Some(view), Metric::Psnr, After::Model)
+        };
+        let row = |view: &str| {
+            let of_first = psnr(first, view);
+            let gain = |run: &Compared| Some(psnr(run, view)? - of_first?);
+            let values = std::iter::once(of_first).chain(others.iter().map(gain));
+            (view.to_owned(), values.collect())
         };
         Table {
             title: "Test views".to_owned(),
             label: "view".to_owned(),
             columns,
-            rows: first.scored.iter().enumerate().map(row).collect(),
+            rows: first.evaluation.views().into_iter().map(row).collect(),
         }
     }
 
@@ -168,13 +168,14 @@ impl RunComparison {
         let Some(first) = all.first().filter(|_| all.len() == self.runs.len()) else {
             return vec![];
         };
-        let mut keys: Vec<&String> = all.iter().flat_map(|own| own.keys()).collect();
+        let mut keys: Vec<&String> = all.iter().flat_map(|settings| settings.keys()).collect();
         keys.sort();
         keys.dedup();
-        let differs = |key: &&String| all.iter().any(|own| own.get(*key) != first.get(*key));
+        let differs =
+            |key: &&String| all.iter().any(|settings| settings.get(*key) != first.get(*key));
         let text = |key: &String| {
-            let value = |own: &std::collections::BTreeMap<String, toml::Value>| {
-                own.get(key).map_or_else(|| "none".to_owned(), ToString::to_string)
+            let value = |settings: &std::collections::BTreeMap<String, toml::Value>| {
+                settings.get(key).map_or_else(|| "none".to_owned(), ToString::to_string)
             };
             all.iter().map(value).collect::<Vec<_>>().join(" | ")
         };
@@ -183,7 +184,7 @@ impl RunComparison {
 
     /// A note for readers of the scores, unless they are against reference images.
     pub(crate) fn label(&self) -> Option<String> {
-        let label = self.runs.first().and_then(|run| eval::label(&run.scored))?;
+        let label = self.runs.first().and_then(|run| run.evaluation.label())?;
         Some(format!("scores are {label}; all against the targets of {}", self.runs[0].name))
     }
 
@@ -191,10 +192,7 @@ impl RunComparison {
         let entry = |run: &Compared| {
             let steps = run.metrics["steps"].as_u64().unwrap_or_default();
             let seconds = run.metrics["seconds"].as_f64();
-            let mut metrics = eval::metrics(&run.scored, seconds, run.gaussians, steps);
-            if let Some(measure) = self.measure {
-                eval::add_lpips(&mut metrics, &run.scored, measure);
-            }
+            let mut metrics = run.evaluation.json(seconds, run.gaussians, Some(steps));
             metrics["run"] = json!(run.name);
             metrics
         };
@@ -236,23 +234,22 @@ fn spread(comparison: &Comparison) -> f64 {
 /// Adds the render of a run to the images of a view, which the first run begins with the image of comparison.
 fn add(
     pictures: &mut Vec<Comparison>,
-    place: usize,
+    index: usize,
     run: &str,
-    score: &ViewScore,
-    ScoredImages { view, render, target }: &ScoredImages<'_>,
+    ScoredImages { view, render, target, against, scores }: &ScoredImages<'_>,
 ) {
     let picture = |caption: &str, scores: String, image: &Image| {
         Picture::shrunk(caption, scores, &view.upright(image.clone()), PICTURE_WIDTH)
     };
-    if pictures.len() == place {
-        let name = score.against.name().trim_end_matches('s');
+    if pictures.len() == index {
+        let name = against.name().trim_end_matches('s');
         let shown = vec![picture(name, String::new(), target)];
         pictures.push(Comparison { title: view.name.clone(), pictures: shown });
     }
-    let Scores { psnr, ssim, .. } = score.scores;
+    let Scores { psnr, ssim, .. } = scores;
     let scores = format!("{psnr:.2} dB, SSIM {ssim:.3}");
-    if let Some(own) = pictures.get_mut(place) {
-        own.pictures.push(picture(run, scores, render));
+    if let Some(comparison) = pictures.get_mut(index) {
+        comparison.pictures.push(picture(run, scores, render));
     }
 }
 
@@ -260,7 +257,8 @@ fn add(
 fn names(paths: &[PathBuf]) -> Vec<String> {
     let last = |path: &PathBuf| path.file_name().unwrap_or(path.as_os_str()).to_owned();
     let all: Vec<_> = paths.iter().map(last).collect();
-    let is_unique = |name: &std::ffi::OsString| all.iter().filter(|own| *own == name).count() == 1;
+    let is_unique =
+        |name: &std::ffi::OsString| all.iter().filter(|other| *other == name).count() == 1;
     let name = |(path, name): (&PathBuf, &std::ffi::OsString)| match is_unique(name) {
         true => name.to_string_lossy().into_owned(),
         false => path.display().to_string(),
@@ -273,11 +271,11 @@ fn difference(one: &Dataset, other: &Dataset) -> Option<String> {
     let views = |dataset: &Dataset| {
         dataset.test_views().map(|view| (view.name.clone(), view.camera)).collect::<Vec<_>>()
     };
-    let (own, others) = (views(one), views(other));
-    if own.len() != others.len() {
-        return Some(format!("{} test views and {}", own.len(), others.len()));
+    let (views_of_one, others) = (views(one), views(other));
+    if views_of_one.len() != others.len() {
+        return Some(format!("{} test views and {}", views_of_one.len(), others.len()));
     }
-    for ((name, camera), (other_name, other)) in own.iter().zip(&others) {
+    for ((name, camera), (other_name, other)) in views_of_one.iter().zip(&others) {
         if name != other_name {
             return Some(format!("test view {name} is {other_name} in the other"));
         }

@@ -228,7 +228,7 @@ pub(crate) fn page(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
             facts("The columns of the table below", MEASURES.iter().map(meaning).collect()),
         ],
         tables: vec![table(diagnosis)],
-        plots: vec![distributions(&[dark, bright])],
+        charts: vec![distributions(&[dark, bright])],
         comparisons,
         ..Report::default()
     }

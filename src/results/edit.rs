@@ -21,7 +21,7 @@ use glam::DVec3;
 use self::capture::Capture;
 use self::content::Content;
 use self::evidence::Measured;
-use self::floaters::Found;
+use self::floaters::{CameraPositions, Floaters};
 use self::placement::Placement;
 use self::step::Step;
 use crate::base::output::{check_writable, is_same_file, write_whole};
@@ -205,16 +205,16 @@ impl Editor {
         let Some(capture) = &self.capture else { return Ok(String::new()) };
         let mut reference = capture.score_reference()?;
         let mut psnr = |gaussians: &Gaussians| {
-            capture.psnr(run.as_deref(), (gaussians, &facts), &placement, &mut reference)
+            capture.psnr(run.as_deref(), gaussians, &facts, &placement, &mut reference)
         };
         let measured = |gaussians: &Gaussians| Measured::new(capture, placement, gaussians, &facts);
         let gaussians = self.content.whole()?;
         let before = psnr(&gaussians)?;
-        let cameras: Vec<DVec3> =
-            capture.cameras().iter().map(|camera| placement.camera(camera).center()).collect();
-        let near = capture.near(&facts, &placement);
-        let Found { keep, contradicted, unseen } =
-            floaters::found(&gaussians, &capture.targets()?, (&cameras, near), measured)?;
+        let cameras = capture.cameras();
+        let positions = cameras.iter().map(|camera| placement.camera(camera).center()).collect();
+        let cameras = CameraPositions { positions, near: capture.near(&facts, &placement) };
+        let Floaters { keep, contradicted, unseen } =
+            floaters::find(&gaussians, &capture.targets()?, &cameras, measured)?;
         let kept = retained("floaters", gaussians.into_owned(), &keep)?;
         let after = psnr(&kept)?;
         self.content.set(kept);
@@ -340,21 +340,21 @@ impl Editor {
             return refused(problem.to_owned());
         }
         self.facts.law = self.facts.law.filter(|law| facts.law == Some(*law));
-        let mut own = self.content.whole()?.into_owned();
-        if other.shape.features != own.shape.features {
+        let mut merged = self.content.whole()?.into_owned();
+        if other.shape.features != merged.shape.features {
             tracing::warn!("{}: has other features; those of both are dropped", file.display());
-            own = own.with_features(Features::NONE);
+            merged = merged.with_features(Features::NONE);
             other = other.with_features(Features::NONE);
         }
         let degree = |gaussians: &Gaussians| gaussians.shape.sh_degree;
-        let degree = degree(&other).max(degree(&own));
-        for gaussians in [&mut other, &mut own] {
+        let degree = degree(&other).max(degree(&merged));
+        for gaussians in [&mut other, &mut merged] {
             if gaussians.shape != (Shape { sh_degree: degree, ..gaussians.shape }) {
                 *gaussians = gaussians.with_sh_degree(degree);
             }
         }
-        own.append(&other);
-        self.content.set(own);
+        merged.append(&other);
+        self.content.set(merged);
         let line = format!("merge {}", file.display());
         Ok((line, Operation::Merge { file: file.to_owned(), hash: Some(fingerprint) }))
     }

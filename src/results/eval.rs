@@ -4,34 +4,34 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use serde_json::{Map, Value, json};
-
 use crate::camera::{Camera, TrainingFrame};
 use crate::gpu::Gpu;
 use crate::loss::exposure::Affine;
-use crate::networks::lpips::{Lpips, Measure};
+use crate::networks::lpips::Lpips;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
-use crate::photographs::metrics::{self, Scores};
+use crate::photographs::metrics::{self, Scores, psnr_of_counted};
 use crate::photographs::tone::{SceneTone, ToneCurve, ToneSettings};
+use crate::results::linear_light::{photograph_of, slope_at, stops_between};
 use crate::splats::lamp::Lamp;
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::{DeviceGaussians, Shape};
-use crate::train::{Networks, Rendered, TestTargets, TrainConfig};
+use crate::train::{Networks, Rendered, SceneLight, TestTargets, TrainConfig};
 use crate::{Error, Result};
 
 mod layers;
 mod lit;
+mod scores;
 mod transmittance;
 
 use layers::Normals;
 pub use layers::RenderLayer;
 use lit::lit_folder;
-pub(crate) use lit::{add_lit, mean_lit, score_lit};
-pub use transmittance::{
-    MAX_RESIDUAL_TRANSMITTANCE, ResidualTransmittance, hole_warning, warn_of_holes,
-};
+pub(crate) use scores::{AGAINST, WITH_REFERENCE, add_reference, with_reference};
+pub use scores::{After, Evaluation, Metric, Score};
+pub(crate) use transmittance::warn_of_holes;
+pub use transmittance::{MAX_RESIDUAL_TRANSMITTANCE, ResidualTransmittance, hole_warning};
 
 /// The images that test views are scored against.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -43,6 +43,8 @@ pub enum ReferenceKind {
     PseudoGt,
     /// The photographs of the test views: without a curve, they are the targets.
     Photographs,
+    /// The views in the light of the lamp at the camera, of a dataset that has them.
+    LitByLamp,
 }
 
 impl ReferenceKind {
@@ -57,6 +59,7 @@ impl ReferenceKind {
             Self::Photographs => Some(
                 "against the photographs themselves, as there are no reference images and no curve",
             ),
+            Self::LitByLamp => Some("against the dataset's images in the light of the lamp"),
         }
     }
 
@@ -66,6 +69,7 @@ impl ReferenceKind {
             Self::References => "reference images",
             Self::PseudoGt => "pseudo-GT",
             Self::Photographs => "photographs",
+            Self::LitByLamp => "images in the light of the lamp",
         }
     }
 }
@@ -149,31 +153,6 @@ impl ScoreReference {
     }
 }
 
-/// The scores of a test view.
-#[derive(Clone, Debug)]
-pub struct ViewScore {
-    /// The view's name.
-    pub name: String,
-    /// Scores of the final image: R_K, or R_0 without a denoiser.
-    pub scores: Scores,
-    /// Scores of R_0, if the model has a denoiser.
-    pub r0: Option<Scores>,
-    /// Scores after the least-squares gain and bias of each channel, if requested.
-    pub aligned: Option<Scores>,
-    /// Scores at the view's own exposure, if it is known.
-    pub exposed: Option<Scores>,
-    /// Scores in the light of the lamp, against `lit/NAME.png`, after the least-squares gain and bias of each channel;
-    /// if the model has a lamp and the dataset the image.
-    pub lit: Option<Scores>,
-    /// The view as a photograph against its own photograph, if requested: PSNR in dB, by how many stops of linear light
-    /// it is brighter, and how many times a small difference of photographs is that of their targets.
-    pub photograph: Option<[f64; 3]>,
-    /// The background that shows through; `None` if the image is not a render.
-    pub residual_transmittance: Option<ResidualTransmittance>,
-    /// What the view was scored against.
-    pub against: ReferenceKind,
-}
-
 /// The two images that a view's scores compare, in 8 bits as they are saved.
 #[derive(Debug)]
 pub struct ScoredImages<'a> {
@@ -183,20 +162,18 @@ pub struct ScoredImages<'a> {
     pub render: Image,
     /// The image that it is compared with.
     pub target: Image,
+    /// The kind of that image.
+    pub against: ReferenceKind,
+    /// The scores of the render.
+    pub scores: Scores,
 }
 
 impl ScoredImages<'_> {
     /// LPIPS of the unmasked pixels.
     pub fn lpips(&self, gpu: &Gpu, lpips: &Lpips) -> Result<f64> {
-        let Self { view, render, target } = self;
+        let Self { view, render, target, .. } = self;
         let mask = view.mask.as_ref().map(|mask| mask.resized(render.width, render.height));
         lpips.distance(gpu, &metrics::counted(render, target, mask.as_deref()), target)
-    }
-
-    /// The scores after the gain and bias of each channel that minimise the squared error to the target.
-    pub fn aligned(&self) -> Result<Scores> {
-        let affine = Affine::least_squares(&self.render, &self.target)?;
-        Scores::of(&quantized(&affine.applied(&self.render)), &self.target)
     }
 
     /// The scores of the render by some stops of linear light brighter.
@@ -208,10 +185,23 @@ impl ScoredImages<'_> {
         Scores::of_counted(&brighter, &self.target, self.view.mask.as_ref())
     }
 
+    /// The scores of the render as a photograph, against the photograph of the view; none if it has no photograph.
+    fn as_photograph(&self, light: &SceneLight) -> Result<Vec<(Metric, f64)>> {
+        let Self { view, render, .. } = self;
+        let Some(photograph) = view.loaded()? else { return Ok(vec![]) };
+        let inverse = light.of_view(view)?;
+        let (dark, _) = photograph_of(render, &inverse);
+        Ok(vec![
+            (Metric::Psnr, psnr_of_counted(&dark, &photograph, view.mask.as_ref())?),
+            (Metric::Stops, stops_between(&dark, &photograph)),
+            (Metric::Slope, slope_at(render, &inverse)),
+        ])
+    }
+
     /// Writes `renders/NAME.png` and `references/NAME.png` in `folder`; `targets/NAME.png` if there are no reference
     /// images.
-    pub fn save(&self, folder: &Path, against: ReferenceKind) -> Result<()> {
-        let targets = match against {
+    pub fn save(&self, folder: &Path) -> Result<()> {
+        let targets = match self.against {
             ReferenceKind::References => "references",
             _ => "targets",
         };
@@ -315,198 +305,112 @@ impl ModelRenderer {
     }
 }
 
-/// Scores every test view that has a reference image; `render` renders a view. Both images are clamped and rounded to 8
-/// bits first, as they are saved.
+/// What is scored in addition to the renders.
+#[derive(Debug, Default)]
+pub(crate) struct Extras<'a> {
+    /// LPIPS of the renders, and the device of its network.
+    pub(crate) lpips: Option<(&'a Lpips, &'a Gpu)>,
+    /// The renders after the least-squares gain and bias of each channel.
+    pub(crate) with_gain_and_bias: bool,
+    /// The exposures of views by name: stops relative to the mean of the training views.
+    pub(crate) stops: BTreeMap<String, f64>,
+    /// The renders as photographs in this light, against the photographs.
+    pub(crate) light: Option<SceneLight>,
+}
+
+impl Evaluation {
+    /// Scores every test view that has a target; `render` renders a view. Both images are clamped and rounded to 8 bits
+    /// first, as they are saved. `look` is called with the images of each view.
+    pub(crate) fn new(
+        score_reference: &mut ScoreReference,
+        dataset: &Dataset,
+        extras: &Extras<'_>,
+        mut render: impl FnMut(&View) -> Result<Rendered>,
+        mut look: impl FnMut(&ScoredImages<'_>) -> Result<()>,
+    ) -> Result<Self> {
+        let requested = [
+            extras.with_gain_and_bias.then_some(After::GainAndBias),
+            extras.light.as_ref().map(|_| After::InverseCurve),
+        ];
+        let mut evaluation = Self {
+            scores: vec![],
+            lpips: extras.lpips.map(|(lpips, _)| lpips.measure()),
+            requested: requested.into_iter().flatten().collect(),
+        };
+        for view in dataset.test_views() {
+            let Some(target) = score_reference.target(view)? else { continue };
+            let rendered = render(view)?;
+            let render = quantized(rendered.output());
+            let scores = Scores::of_counted(&render, &target, view.mask.as_ref())?;
+            let against = score_reference.against;
+            let images = ScoredImages { view, render, target, against, scores };
+            evaluation.add_view(&rendered, &images, extras)?;
+            look(&images)?;
+        }
+        Ok(evaluation)
+    }
+
+    /// Adds the rows of a view.
+    fn add_view(
+        &mut self,
+        rendered: &Rendered,
+        images: &ScoredImages<'_>,
+        extras: &Extras<'_>,
+    ) -> Result<()> {
+        let ScoredImages { view, target, against, scores, .. } = images;
+        let (name, against) = (view.name.as_str(), *against);
+        self.add(name, scores, against, After::Model);
+        if rendered.denoised.is_some() {
+            let image = quantized(&rendered.colors);
+            let scores = Scores::of_counted(&image, target, view.mask.as_ref())?;
+            self.add(name, &scores, against, After::Gaussians);
+        }
+        if extras.with_gain_and_bias {
+            self.add(name, &aligned(&images.render, target)?, against, After::GainAndBias);
+        }
+        if let Some(stops) = extras.stops.get(name) {
+            self.add(name, &images.exposed(*stops)?, against, After::OwnExposure);
+        }
+        let mut values = vec![];
+        if let Some((lpips, gpu)) = extras.lpips {
+            values.push((Metric::Lpips, images.lpips(gpu, lpips)?));
+        }
+        if let Some(ResidualTransmittance { mean, q99 }) = ResidualTransmittance::of(rendered, view)
+        {
+            values.push((Metric::ResidualTransmittance, mean));
+            values.push((Metric::ResidualTransmittanceQ99, q99));
+        }
+        let row = |against, after, (metric, value)| Score {
+            view: name.to_owned(),
+            metric,
+            against,
+            after,
+            value,
+        };
+        self.scores.extend(values.into_iter().map(|value| row(against, After::Model, value)));
+        if let Some(light) = &extras.light {
+            let values = images.as_photograph(light)?;
+            let row = |value| row(ReferenceKind::Photographs, After::InverseCurve, value);
+            self.scores.extend(values.into_iter().map(row));
+        }
+        Ok(())
+    }
+}
+
+/// Scores every test view that has a reference image; `render` renders a view.
 #[cfg(feature = "testing")]
 pub fn score(
     dataset: &Dataset,
     render: impl FnMut(&View) -> Result<Rendered>,
-) -> Result<Vec<ViewScore>> {
-    score_by(&mut ScoreReference::default(), dataset, render, |_, _| Ok(()))
+) -> Result<Evaluation> {
+    let reference = &mut ScoreReference::default();
+    Evaluation::new(reference, dataset, &Extras::default(), render, |_| Ok(()))
 }
 
-/// [`score`] against any reference; `inspect` is called with the images of each view.
-pub fn score_by(
-    score_reference: &mut ScoreReference,
-    dataset: &Dataset,
-    mut render: impl FnMut(&View) -> Result<Rendered>,
-    mut look: impl FnMut(&mut ViewScore, &ScoredImages<'_>) -> Result<()>,
-) -> Result<Vec<ViewScore>> {
-    let (mut scored, against) = (vec![], score_reference.against);
-    for view in dataset.test_views() {
-        let Some(target) = score_reference.target(view)? else { continue };
-        let rendered = render(view)?;
-        let compared = ScoredImages { view, render: quantized(rendered.output()), target };
-        let of = |render: &Image| Scores::of_counted(render, &compared.target, view.mask.as_ref());
-        let has_denoiser = rendered.denoised.is_some();
-        let mut score = ViewScore {
-            name: view.name.clone(),
-            scores: of(&compared.render)?,
-            r0: has_denoiser.then(|| of(&quantized(&rendered.colors))).transpose()?,
-            aligned: None,
-            exposed: None,
-            lit: None,
-            photograph: None,
-            residual_transmittance: ResidualTransmittance::of(&rendered, view),
-            against,
-        };
-        look(&mut score, &compared)?;
-        scored.push(score);
-    }
-    Ok(scored)
-}
-
-/// `metrics.json`: means, views, and the resources of the run; unknown values are null. [`add_lpips`] adds LPIPS.
-pub fn metrics(
-    scored: &[ViewScore],
-    seconds: impl Into<Option<f64>>,
-    gaussians: usize,
-    steps: u64,
-) -> Value {
-    let (all, r0) = means(scored);
-    let mean = all.map_or(Value::Null, |mean| entry(&mean, r0.as_ref()));
-    let views: Map<String, Value> = scored
-        .iter()
-        .map(|view| (view.name.clone(), entry(&view.scores, view.r0.as_ref())))
-        .collect();
-    let mut metrics = json!({
-        "mean": mean,
-        "views": views,
-        "seconds": seconds.into(),
-        "gaussians": gaussians,
-        "steps": steps,
-    });
-    if let Some(label) = label(scored) {
-        metrics[AGAINST] = json!(label);
-    }
-    let residual_transmittances =
-        || scored.iter().filter_map(|view| Some((&view.name, view.residual_transmittance?)));
-    if let Some(mean) = ResidualTransmittance::mean(
-        residual_transmittances().map(|(_, residual_transmittance)| residual_transmittance),
-    ) {
-        let views: BTreeMap<_, _> = residual_transmittances().collect();
-        metrics["residual_transmittance"] = json!({ "mean": mean, "views": views });
-    }
-    metrics
-}
-
-/// Key in `metrics.json` for what the scores are against, unless it is reference images.
-pub const AGAINST: &str = "against";
-
-/// Note for readers of the scores, unless they are against reference images.
-pub fn label(scored: &[ViewScore]) -> Option<&'static str> {
-    scored.first().and_then(|view| view.against.label())
-}
-
-/// Key in `metrics.json` for what the targets take from reference images, if anything.
-pub const WITH_REFERENCE: &str = "with_reference";
-
-/// The note next to scores whose targets depend on reference images.
-pub fn with_reference(known: &str) -> String {
-    format!(
-        "with reference: the targets depend on {known}; not comparable with scores without reference"
-    )
-}
-
-/// Adds [`WITH_REFERENCE`] to `metrics.json` if the targets depend on reference images.
-pub fn add_reference(metrics: &mut Value, tone: &ToneSettings) {
-    if let Some(known) = tone.knows_references() {
-        metrics[WITH_REFERENCE] = json!(known);
-    }
-}
-
-/// Adds the mean LPIPS and that of each view to `metrics.json`, with the name of the measure.
-pub fn add_lpips(metrics: &mut Value, scored: &[ViewScore], measure: Measure) {
-    let key = measure.key();
-    let Measure { network, range } = measure;
-    metrics["lpips"] = json!({ "network": network.name(), "range": range.name(), "key": key });
-    let (mean, _) = means(scored);
-    if let Some(lpips) = mean.and_then(|mean| mean.lpips) {
-        metrics["mean"][&key] = json!(lpips);
-    }
-    for ViewScore { name, scores, .. } in scored {
-        if let Some(lpips) = scores.lpips {
-            metrics["views"][name][&key] = json!(lpips);
-        }
-    }
-}
-
-/// Adds to `metrics.json` of a model with learned exposures the exposure at which the test views were scored: the
-/// neutral one, the mean of the training views, since no exposure is learned for test views. Also adds the scores after
-/// a least-squares affine correction of each channel to the reference image, as other work reports them; these use the
-/// reference and are not comparable with other scores here.
-pub fn add_exposure(metrics: &mut Value, scored: &[ViewScore]) {
-    metrics["exposure"] = json!("neutral: the mean of the training views' in stops");
-    add_aligned(metrics, scored);
-}
-
-/// Adds to `metrics.json` the scores after a least-squares affine correction of each channel to the reference image.
-pub(crate) fn add_aligned(metrics: &mut Value, scored: &[ViewScore]) {
-    let what = "after the least-squares gain and bias of each channel of each test view against its reference image";
-    metrics["aligned_with_reference"] = other_scores(what, scored, |view| view.aligned);
-}
-
-/// Adds to `metrics.json` the scores of test views at their own exposure, relative to the mean of the training views.
-pub(crate) fn add_exposed(metrics: &mut Value, scored: &[ViewScore]) {
-    if scored.iter().any(|view| view.exposed.is_some()) {
-        let what = "at each test view's own exposure, from EXIF or exposures.csv: the render is brighter by those \
-                    stops of linear light; no pixel of a test view is used";
-        metrics["at_own_exposure"] = other_scores(what, scored, |view| view.exposed);
-    }
-}
-
-/// A second kind of scores of some views, with its description.
-fn other_scores(
-    what: &str,
-    scored: &[ViewScore],
-    of: impl Fn(&ViewScore) -> Option<Scores>,
-) -> Value {
-    let all = || scored.iter().filter_map(|view| Some((&view.name, of(view)?)));
-    let scores: Vec<Scores> = all().map(|(_, scores)| scores).collect();
-    let views: Map<String, Value> =
-        all().map(|(name, scores)| (name.clone(), entry(&scores, None))).collect();
-    let mean = Scores::mean(&scores).map(|mean| entry(&mean, None));
-    json!({ "what": what, "mean": mean, "views": views })
-}
-
-/// Adds to `metrics.json` the scores of renders in the light of the photographs, against these.
-pub(crate) fn add_photographs(metrics: &mut Value, scored: &[ViewScore]) {
-    let entry =
-        |[psnr, stops, slope]: [f64; 3]| json!({ "psnr": psnr, "stops": stops, "slope": slope });
-    let all = || scored.iter().filter_map(|view| Some((&view.name, view.photograph?)));
-    let views: Map<String, Value> = all().map(|(name, own)| (name.clone(), entry(own))).collect();
-    metrics["as_photographs"] = json!({
-        "what": "renders through the inverse of the tone curve, against the dark photographs",
-        "mean": mean_photograph(scored).map(entry),
-        "views": views,
-    });
-}
-
-/// The mean scores against the photographs, if there are any.
-pub(crate) fn mean_photograph(scored: &[ViewScore]) -> Option<[f64; 3]> {
-    let all: Vec<[f64; 3]> = scored.iter().filter_map(|view| view.photograph).collect();
-    let mean = |at: usize| all.iter().map(|own| own[at]).sum::<f64>() / all.len() as f64;
-    (!all.is_empty()).then(|| [0, 1, 2].map(mean))
-}
-
-/// The mean scores, and the mean scores of R_0 if the model has a denoiser.
-pub fn means(scored: &[ViewScore]) -> (Option<Scores>, Option<Scores>) {
-    let all: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
-    let r0: Vec<Scores> = scored.iter().filter_map(|view| view.r0).collect();
-    (Scores::mean(&all), Scores::mean(&r0))
-}
-
-/// A score as JSON, with that of R_0; the infinite PSNR of equal images is null.
-fn entry(scores: &Scores, r0: Option<&Scores>) -> Value {
-    let mut entry = json!({
-        "psnr": scores.psnr,
-        "psnr_channel_mean": scores.psnr_channel_mean,
-        "ssim": scores.ssim,
-    });
-    if let Some(r0) = r0 {
-        entry["r0"] = self::entry(r0, None);
-    }
-    entry
+/// The scores after the gain and bias of each channel that minimise the squared error to the target.
+fn aligned(render: &Image, target: &Image) -> Result<Scores> {
+    let affine = Affine::least_squares(render, target)?;
+    Scores::of(&quantized(&affine.applied(render)), target)
 }
 
 /// Clamps to [0, 1] and rounds to multiples of 1/255. A NaN becomes 0.

@@ -1,13 +1,21 @@
-//! Scores as a table, and the page of one run: scores, error maps with the worst view first, history of training.
+//! A run scored on its test views, and its page: scores, error maps with the worst view first, history of training.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use super::eval::{ResidualTransmittance, ScoredImages, ViewScore, label, mean_photograph, means};
-use super::report::{Best, Column, Comparison, Picture, Report, Series, Table, plot};
-use super::run::load_progress;
-use crate::networks::lpips::Measure;
+use serde_json::Value;
+
+use super::eval::{
+    self, After, Evaluation, Extras, Metric, ScoreReference, ScoredImages, with_reference,
+};
+use super::finished_run::{FinishedRun, Opener, is_model};
+use super::report::{Chart, Comparison, Picture, Report, Series};
+use super::run;
+use crate::Result;
+use crate::networks::lpips::{Lpips, Range};
+use crate::photographs::dataset::View;
 use crate::photographs::image::Image;
 use crate::photographs::metrics::Scores;
+use crate::train::{SceneLight, TrainConfig, known_stops};
 
 /// Maximum width of an image, pixels.
 const PICTURE_WIDTH: u32 = 480;
@@ -18,132 +26,153 @@ const ERROR_SCALE: f32 = 5.0;
 /// Maximum number of points of the loss curve.
 const LOSS_POINTS: usize = 200;
 
-/// The scores of each view, and their means.
-pub(crate) fn score_table(scored: &[ViewScore], measure: Option<Measure>) -> Table {
-    let (mean, mean_r0) = means(scored);
-    let mean_transmittance =
-        ResidualTransmittance::mean(scored.iter().filter_map(|view| view.residual_transmittance));
-    let column = |name: &str, digits, best| Column { name: name.to_owned(), digits, best };
-    let mut columns = vec![
-        column("PSNR", 2, Best::Unmarked),
-        column("channel mean", 2, Best::Unmarked),
-        column("SSIM", 4, Best::Unmarked),
-    ];
-    columns.extend(measure.map(|measure| column(&measure.title(), 4, Best::Unmarked)));
-    // R_0 is the render before the denoiser.
-    if mean_r0.is_some() {
-        columns.push(column("PSNR of R_0", 2, Best::Unmarked));
-        columns.push(column("SSIM of R_0", 4, Best::Unmarked));
-    }
-    if mean_transmittance.is_some() {
-        columns
-            .extend(["residual transmittance", "99 %"].map(|name| column(name, 4, Best::Unmarked)));
-    }
-    let aligned: Vec<Scores> = scored.iter().filter_map(|view| view.aligned).collect();
-    let mean_aligned = Scores::mean(&aligned);
-    if mean_aligned.is_some() {
-        columns.extend(
-            [("PSNR, aligned", 2), ("SSIM, aligned", 4)]
-                .map(|(name, digits)| column(name, digits, Best::Unmarked)),
-        );
-    }
-    let mean_photograph = mean_photograph(scored);
-    if mean_photograph.is_some() {
-        columns.extend(
-            [("PSNR, dark", 2), ("stops", 3)]
-                .map(|(name, digits)| column(name, digits, Best::Unmarked)),
-        );
-    }
-    let exposed: Vec<Scores> = scored.iter().filter_map(|view| view.exposed).collect();
-    let mean_exposed = Scores::mean(&exposed);
-    if mean_exposed.is_some() {
-        columns.push(column("PSNR, own exposure", 2, Best::Unmarked));
-    }
-    let row = |name: &str,
-               scores: &Scores,
-               [r0, aligned, exposed]: [Option<&Scores>; 3],
-               photograph: Option<[f64; 3]>,
-               residual_transmittance: Option<ResidualTransmittance>| {
-        let Scores { psnr, psnr_channel_mean, ssim, lpips } = *scores;
-        let mut values = vec![Some(psnr), Some(psnr_channel_mean), Some(ssim)];
-        values.extend(measure.map(|_| lpips));
-        if mean_r0.is_some() {
-            values.extend([r0.map(|r0| r0.psnr), r0.map(|r0| r0.ssim)]);
-        }
-        if mean_transmittance.is_some() {
-            values.extend([
-                residual_transmittance.map(|own| own.mean),
-                residual_transmittance.map(|own| own.q99),
-            ]);
-        }
-        if mean_aligned.is_some() {
-            values.extend([aligned.map(|own| own.psnr), aligned.map(|own| own.ssim)]);
-        }
-        if mean_photograph.is_some() {
-            values.extend([photograph.map(|own| own[0]), photograph.map(|own| own[1])]);
-        }
-        if mean_exposed.is_some() {
-            values.push(exposed.map(|own| own.psnr));
-        }
-        (name.to_owned(), values)
-    };
-    let of_view = |view: &ViewScore| {
-        let others = [view.r0.as_ref(), view.aligned.as_ref(), view.exposed.as_ref()];
-        row(&view.name, &view.scores, others, view.photograph, view.residual_transmittance)
-    };
-    let mut rows: Vec<_> = scored.iter().map(of_view).collect();
-    let others = [mean_r0.as_ref(), mean_aligned.as_ref(), mean_exposed.as_ref()];
-    rows.extend(mean.map(|mean| row("mean", &mean, others, mean_photograph, mean_transmittance)));
-    Table { title: "Test views".to_owned(), label: "view".to_owned(), columns, rows }
+/// What is scored of a run.
+#[derive(Debug)]
+pub(crate) struct EvalOptions<'a> {
+    /// `None`: the run's dataset, reference images and downscale factor.
+    pub(crate) dataset: Option<&'a Path>,
+    pub(crate) reference: Option<&'a Path>,
+    pub(crate) downscale: Option<f64>,
+    pub(crate) opener: Opener,
+    /// The weights and the input range of LPIPS.
+    pub(crate) lpips: Option<(&'a Path, Range)>,
+    /// Whether scores after gain and bias are added.
+    pub(crate) align: bool,
+    /// Whether scores of the renders as photographs are added.
+    pub(crate) photographs: bool,
+    /// The folder for renders and the images that they are compared with.
+    pub(crate) images: Option<&'a Path>,
+    /// Whether images for the page are kept.
+    pub(crate) with_page: bool,
 }
 
-/// The images of the page, gathered while views are scored.
-#[derive(Debug, Default)]
-pub(crate) struct EvalPage {
-    /// PSNR, and the images of a view.
-    views: Vec<(f64, Comparison)>,
+/// The scores of a run or a model.
+#[derive(Debug)]
+pub(crate) struct RunEvaluation {
+    run: PathBuf,
+    config: TrainConfig,
+    gaussians: usize,
+    pub(crate) evaluation: Evaluation,
+    /// Images of the views with the lowest PSNR, the lowest first.
+    worst: Vec<(f64, Comparison)>,
 }
 
-impl EvalPage {
-    /// Adds a scored view.
-    pub(crate) fn add(&mut self, score: &ViewScore, compared: &ScoredImages<'_>) {
-        let ScoredImages { view, render, target } = compared;
-        let picture = |caption: &str, image: &Image| {
-            Picture::shrunk(caption, String::new(), &view.upright(image.clone()), PICTURE_WIDTH)
+impl RunEvaluation {
+    /// Scores the run; `begin` is called before each view with its index, the number of views and its name.
+    pub(crate) fn new(
+        run: &Path,
+        options: &EvalOptions<'_>,
+        mut begin: impl FnMut(usize, usize, &str),
+    ) -> Result<Self> {
+        let change = |config: &mut TrainConfig| {
+            config.reference = options.reference.map(Path::to_owned).or(config.reference.take());
+            config.downscale = options.downscale.unwrap_or(config.downscale);
         };
-        let error = |(a, b): (&f32, &f32)| (ERROR_SCALE * (a - b).abs()).min(1.0);
-        let data = render.data.iter().zip(&target.data).map(error).collect();
-        let error = Image { data, ..*render };
-        let Scores { psnr, ssim, .. } = score.scores;
-        let pictures = vec![
-            picture("render", render),
-            picture(score.against.name().trim_end_matches('s'), target),
-            picture(&format!("error, times {ERROR_SCALE}"), &error),
-        ];
-        let title = format!("{}: {psnr:.2} dB, SSIM {ssim:.3}", score.name);
-        self.views.push((psnr, Comparison { title, pictures }));
-        // Only the worst views are shown.
-        self.views.sort_by(|a, b| a.0.total_cmp(&b.0));
-        self.views.truncate(SHOWN);
+        let FinishedRun { gpu, config, dataset, gaussian_count, mut model_renderer, lamp } =
+            FinishedRun::open_with(run, options.dataset, &options.opener, change)?;
+        model_renderer.set_lamp(lamp)?;
+        let lpips = options.lpips.map(|(weights, range)| Lpips::load(&gpu, weights, range));
+        let lpips = lpips.transpose()?;
+        let light = options.photographs.then(|| SceneLight::of(&config.tone, &dataset));
+        let extras = Extras {
+            lpips: lpips.as_ref().map(|lpips| (lpips, &gpu)),
+            with_gain_and_bias: options.align || config.exposure.learn,
+            light: light.transpose()?,
+            stops: known_stops(&dataset, &config)?,
+        };
+        let mut reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
+        let (count, mut index) = (reference.view_count(&dataset), 0);
+        let is_even = reference.is_evenly_lit(&dataset);
+        let render = |view: &View| {
+            begin(index, count, &view.name);
+            index += 1;
+            model_renderer.render_as(view, is_even)
+        };
+        let mut worst = vec![];
+        let keep = |images: &ScoredImages<'_>| {
+            if let Some(folder) = options.images {
+                images.save(folder)?;
+            }
+            if options.with_page {
+                keep_worst(&mut worst, images);
+            }
+            Ok(())
+        };
+        let mut evaluation = Evaluation::new(&mut reference, &dataset, &extras, render, keep)?;
+        if lamp.is_some() {
+            evaluation.add_lit(&dataset, |view| model_renderer.render(view))?;
+        }
+        let render = |view: &View| model_renderer.render(view);
+        eval::warn_of_holes(&evaluation, &dataset, config.background, render)?;
+        if evaluation.scores.is_empty() {
+            let root = dataset.root.display();
+            tracing::warn!(
+                "{root}: no test view has a reference image or a photograph: nothing to score"
+            );
+        }
+        Ok(Self { run: run.to_owned(), config, gaussians: gaussian_count, evaluation, worst })
     }
 
-    /// The page of the run in the folder `run`.
-    pub(crate) fn html(self, run: &Path, scored: &[ViewScore], measure: Option<Measure>) -> String {
+    /// The scores with what `metrics.json` of the run records besides.
+    pub(crate) fn json(&self) -> Value {
+        let recorded = run::load_metrics(&self.run);
+        let steps = recorded["steps"].as_u64().or_else(|| run::stopped_at(&self.run));
+        let steps = steps.or(Some(self.config.steps)).filter(|_| !is_model(&self.run));
+        let mut metrics = self.evaluation.json(recorded["seconds"].as_f64(), self.gaussians, steps);
+        eval::add_reference(&mut metrics, &self.config.tone);
+        for key in
+            [run::SPENT, run::TARGET_EXPOSURE, run::ENDED, run::TRAINED_WITH, run::HELD_OUT_CURVE]
+        {
+            if let Some(value) = recorded.get(key) {
+                metrics[key] = value.clone();
+            }
+        }
+        let learns_exposures = self.config.exposure.learn;
+        self.evaluation.add_other_steps(&mut metrics, learns_exposures);
+        metrics
+    }
+
+    /// Notes below the table of scores.
+    pub(crate) fn notes(&self) -> Vec<String> {
+        let mean = |metric, after| self.evaluation.mean(metric, after);
+        let lit = mean(Metric::Psnr, After::LampLight).zip(mean(Metric::Ssim, After::LampLight));
+        let lit = lit.map(|(psnr, ssim)| {
+            format!(
+                "in the lamp's light, against lit/, after gain and bias of each channel: PSNR {psnr:.2} dB, \
+                 SSIM {ssim:.3}"
+            )
+        });
+        let slope = mean(Metric::Slope, After::InverseCurve).map(|slope| {
+            let decibels = 20.0 * slope.log10();
+            format!(
+                "the tone law multiplies differences of the photographs by {slope:.2}: {decibels:.2} dB of PSNR, dark"
+            )
+        });
+        let reference = self.config.tone.knows_references().map(|known| with_reference(&known));
+        let label = self.evaluation.label().map(str::to_owned);
+        [reference, lit, slope, label].into_iter().flatten().collect()
+    }
+
+    /// The page of the run.
+    pub(crate) fn html(&self) -> String {
+        let evaluation = &self.evaluation;
         let mut comparisons: Vec<Comparison> =
-            self.views.into_iter().map(|(_, view)| view).collect();
+            self.worst.iter().map(|(_, view)| view.clone()).collect();
         if let [worst, _, ..] = &mut comparisons[..] {
             worst.title = format!("The worst view, {}", worst.title);
         }
-        let mean = means(scored).0.map(|Scores { psnr, ssim, .. }| {
-            format!("Mean over {} test views: {psnr:.2} dB, SSIM {ssim:.3}.", scored.len())
+        let mean = |metric| evaluation.mean(metric, After::Model);
+        let mean = mean(Metric::Psnr).zip(mean(Metric::Ssim)).map(|(psnr, ssim)| {
+            let views = evaluation.views().len();
+            format!("Mean over {views} test views: {psnr:.2} dB, SSIM {ssim:.3}.")
         });
         let shown = format!("Images of {} views, the worst first.", comparisons.len());
-        let against = label(scored).map(|label| format!("Scores are {label}."));
+        let against = evaluation.label().map(|label| format!("Scores are {label}."));
         Report {
-            title: format!("Evaluation of {}", run.display()),
+            title: format!("Evaluation of {}", self.run.display()),
             intro: mean.into_iter().chain(against).chain([shown]).collect(),
-            tables: vec![score_table(scored, measure)],
-            plots: history(run),
+            tables: vec![evaluation.table()],
+            charts: history(&self.run),
             comparisons,
             ..Report::default()
         }
@@ -151,8 +180,29 @@ impl EvalPage {
     }
 }
 
+/// Adds the images of a view, and drops those of the best view beyond [`SHOWN`].
+fn keep_worst(worst: &mut Vec<(f64, Comparison)>, images: &ScoredImages<'_>) {
+    let ScoredImages { view, render, target, against, scores } = images;
+    let picture = |caption: &str, image: &Image| {
+        Picture::shrunk(caption, String::new(), &view.upright(image.clone()), PICTURE_WIDTH)
+    };
+    let error = |(a, b): (&f32, &f32)| (ERROR_SCALE * (a - b).abs()).min(1.0);
+    let data = render.data.iter().zip(&target.data).map(error).collect();
+    let error = Image { data, ..*render };
+    let Scores { psnr, ssim, .. } = *scores;
+    let pictures = vec![
+        picture("render", render),
+        picture(against.name().trim_end_matches('s'), target),
+        picture(&format!("error, times {ERROR_SCALE}"), &error),
+    ];
+    let title = format!("{}: {psnr:.2} dB, SSIM {ssim:.3}", view.name);
+    worst.push((psnr, Comparison { title, pictures }));
+    worst.sort_by(|a, b| a.0.total_cmp(&b.0));
+    worst.truncate(SHOWN);
+}
+
 /// Loss and intermediate scores against the step, from the logs of the run.
-fn history(run: &Path) -> Vec<String> {
+fn history(run: &Path) -> Vec<Chart> {
     let log = std::fs::read_to_string(run.join("train.csv")).unwrap_or_default();
     let point = |line: &str| {
         let mut cells = line.split(',');
@@ -165,11 +215,12 @@ fn history(run: &Path) -> Vec<String> {
         (sum.0 / points.len() as f64, sum.1 / points.len() as f64)
     };
     let bins = losses.chunks(losses.len().div_ceil(LOSS_POINTS).max(1)).map(mean).collect();
-    let scores = load_progress(run).iter().map(|one| (one.step as f64, one.psnr)).collect();
+    let scores = run::load_progress(run).iter().map(|one| (one.step as f64, one.psnr)).collect();
     let series = [("loss", "loss", bins), ("PSNR, dB", "test views", scores)];
     let drawn = series.into_iter().filter(|(.., points): &(_, _, Vec<_>)| points.len() > 1);
-    let plots = drawn.map(|(axis, name, points)| {
-        plot("step", axis, &[Series { name: name.to_owned(), points, ..Series::default() }])
+    let charts = drawn.map(|(axis, name, points)| {
+        let series = Series { name: name.to_owned(), points, ..Series::default() };
+        Chart::new("step", axis, vec![series])
     });
-    plots.collect()
+    charts.collect()
 }

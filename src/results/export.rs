@@ -7,12 +7,19 @@
 pub mod glb;
 pub mod page;
 mod palette;
+#[cfg(feature = "cli")]
+pub(crate) mod run;
+#[cfg(feature = "cli")]
+mod run_page;
 pub mod sog;
 pub mod spz;
 pub mod streamed;
+#[cfg(feature = "cli")]
+pub(crate) mod up;
 
 use std::io::Write as _;
 use std::path::Path;
+use std::str::FromStr;
 
 use flate2::{Compression, GzBuilder};
 use glam::{DMat3, DQuat, DVec3, Vec3};
@@ -22,7 +29,7 @@ use crate::splats::model::Model;
 use crate::splats::scene::{Facts, Gaussians, ply};
 use crate::{Error, Result};
 
-/// Model file formats.
+/// The formats of a model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     /// The layout that every viewer opens, with provenance in its header.
@@ -33,25 +40,47 @@ pub enum Format {
     Glb,
     /// A fifteenth of the size; `PlayCanvas`.
     Sog,
+    /// A folder of SOG in chunks at several levels of detail, which viewers of `PlayCanvas` load as needed.
+    StreamedSog,
+    /// A page with a viewer and photographs. Only a run is exported as one.
+    Html,
 }
 
 impl Format {
-    /// The format that a file's extension names.
+    /// Every format.
+    pub(crate) const ALL: [Self; 6] = [
+        Self::Ply,
+        Self::Spz(spz::Version::V4),
+        Self::Glb,
+        Self::Sog,
+        Self::StreamedSog,
+        Self::Html,
+    ];
+
+    /// The name on the command line, and the extension of its files.
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Ply => "ply",
+            Self::Spz(_) => "spz",
+            Self::Glb => "glb",
+            Self::Sog => "sog",
+            Self::StreamedSog => "streamed-sog",
+            Self::Html => "html",
+        }
+    }
+
+    /// The format that a file's extension names: `ply`, `spz`, `glb` or `sog`.
     ///
     /// # Errors
     /// [`Error::Usage`] for any other extension.
     pub fn of(path: &Path) -> Result<Self> {
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-        match extension.as_str() {
-            "ply" => Ok(Self::Ply),
-            "spz" => Ok(Self::Spz(spz::Version::default())),
-            "glb" => Ok(Self::Glb),
-            "sog" => Ok(Self::Sog),
-            _ => {
-                let problem = "has no extension of a model file; name it .ply, .spz, .glb or .sog";
-                Err(Error::Usage(format!("{} {problem}", path.display())))
-            }
-        }
+        let is_file = |format: &Self| !matches!(format, Self::StreamedSog | Self::Html);
+        let mut files = Self::ALL.into_iter().filter(is_file);
+        files.find(|format| format.name() == extension).ok_or_else(|| {
+            let problem = "has no extension of a model file; name it .ply, .spz, .glb or .sog";
+            Error::Usage(format!("{} {problem}", path.display()))
+        })
     }
 
     /// Writes Gaussians in the colours that viewers show; the file appears under its name only once it is complete.
@@ -63,17 +92,34 @@ impl Format {
     ) -> Result<()> {
         let bytes = match self {
             Self::Ply => {
-                return ply::save_with_comments(
-                    gaussians,
-                    path,
-                    &provenance.ply_comments(gaussians),
-                );
+                let comments = provenance.ply_comments(gaussians);
+                return ply::save_with_comments(gaussians, path, &comments);
+            }
+            Self::StreamedSog => {
+                let tile = streamed::Tile::whole(path, gaussians);
+                let division = streamed::Division::default();
+                return streamed::write(path, &[tile], provenance, division).map(drop);
+            }
+            Self::Html => {
+                let problem = "a page needs photographs: `nightsplat export RUN --format html`";
+                return Err(Error::Usage(problem.to_owned()));
             }
             Self::Spz(version) => spz::encode(gaussians, provenance, version)?,
             Self::Glb => glb::encode(gaussians, provenance)?,
             Self::Sog => sog::encode(gaussians, provenance)?,
         };
         write_whole(path, &bytes)
+    }
+}
+
+impl FromStr for Format {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        Self::ALL.into_iter().find(|format| format.name() == name).ok_or_else(|| {
+            let names = Self::ALL.map(Self::name).join(", ");
+            Error::Usage(format!("unknown format `{name}`; the formats are {names}"))
+        })
     }
 }
 
@@ -297,8 +343,9 @@ pub(crate) mod tests {
         let provenance = Provenance::default();
         let numbers = "(4499999.6, 519997.7, -10001.8)";
         let turned = format!("world = (x, -y, -z) + {numbers}");
-        let has =
-            |file: &[u8], text: &str| file.windows(text.len()).any(|own| own == text.as_bytes());
+        let has = |file: &[u8], text: &str| {
+            file.windows(text.len()).any(|window| window == text.as_bytes())
+        };
         for version in [spz::Version::V3, spz::Version::V4] {
             let file = spz::encode(&model, &provenance, version).unwrap();
             assert!(has(&file, &turned), "{version:?}");

@@ -22,6 +22,16 @@ pub(crate) struct Opener {
     pub(crate) open: fn(&DeviceChoice) -> Result<Gpu>,
 }
 
+impl Opener {
+    /// Opens the device for a run.
+    pub(crate) fn open(&self, config: &TrainConfig) -> Result<Gpu> {
+        match &self.device {
+            Some(device) => (self.open)(device),
+            None => (self.open)(&config.device.parse()?),
+        }
+    }
+}
+
 /// The model of a run with its dataset.
 pub(crate) struct FinishedRun {
     pub(crate) gpu: Gpu,
@@ -72,10 +82,7 @@ impl FinishedRun {
             tracing::warn!("{}: incomplete, at step {step} of {steps}", folder.display());
         }
         let lamp = run::load_lamp(folder)?;
-        let gpu = match &opener.device {
-            Some(device) => (opener.open)(device)?,
-            None => (opener.open)(&config.device.parse()?)?,
-        };
+        let gpu = opener.open(&config)?;
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
         if let Some(difference) = run::other_views(folder, &dataset).filter(|_| is_comparable) {
             let root = dataset.root.display();
@@ -98,9 +105,9 @@ impl FinishedRun {
 
     /// [`Self::open`] with renders in the light of the photographs, for scores.
     pub(crate) fn open_lit(folder: &Path, dataset: Option<&Path>, opener: &Opener) -> Result<Self> {
-        let mut own = Self::open(folder, dataset, opener)?;
-        own.model_renderer.set_lamp(own.lamp)?;
-        Ok(own)
+        let mut run = Self::open(folder, dataset, opener)?;
+        run.model_renderer.set_lamp(run.lamp)?;
+        Ok(run)
     }
 
     /// Opens a model file, which has few settings of its training.

@@ -23,9 +23,9 @@ pub(crate) fn photograph_of(target: &Image, inverse: &InverseTone) -> (Image, us
     (Image { data, ..*target }, inverted.iter().filter(|pixel| pixel.is_clipped).count())
 }
 
-/// How many times a small difference between photographs is that between their targets, at the values of a target: of
-/// such differences, PSNR is higher by 20 log10 of it in the photographs. The inverse of the root mean square slope of
-/// the inverse, over values that the curve determines.
+/// The slope of the tone curve at the values of a target: the inverse of the root mean square slope of the inverse
+/// curve, over the values that the curve determines. The PSNR of photographs is higher than that of their targets by
+/// 20 log10 of it.
 pub(crate) fn slope_at(target: &Image, inverse: &InverseTone) -> f64 {
     /// Half a code of 8 bits.
     const STEP: f64 = 0.5 / 255.0;

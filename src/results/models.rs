@@ -50,7 +50,7 @@ pub(crate) fn read(path: &Path) -> Result<(Gaussians, Facts)> {
     Ok((gaussians, facts))
 }
 
-/// [`read`], but part by part: `None` if it is no PLY.
+/// Opens a PLY for reading part by part; `None` for other formats.
 pub(crate) fn open_parts(path: &Path, part: usize) -> Result<Option<(PartFile, Facts)>> {
     if path.is_dir() {
         let config = run::load_config(path)?;

@@ -1,25 +1,22 @@
-//! A self-contained HTML page of a run: tables, plots and images, without external resources.
+//! A self-contained HTML page of a run: tables, charts and images, without external resources.
 
 use std::fmt::Write as _;
 
 use crate::photographs::image::Image;
 
-pub use self::bars::{Bar, bars};
+pub use self::chart::{Chart, Mark, Series, VerticalLine};
 pub(crate) use self::data_uri::{base64, jpeg};
 pub use self::distribution::{Distribution, distributions};
-pub use self::plot::{Mark, Series, VerticalLine, plot, plot_in_groups, plot_points, svg_file};
 pub use self::table::{Best, Column, Table};
-pub use self::traces::{Trace, traces};
 
 mod axis;
-mod bars;
+mod chart;
 mod data_uri;
 mod distribution;
-mod plot;
+mod labels;
 mod table;
-mod traces;
 
-/// A page. All text is escaped; `plots` are SVG from [`plot`] and [`bars`].
+/// A page. All text is escaped.
 #[derive(Clone, Debug, Default)]
 pub struct Report {
     /// The heading, also the window's title.
@@ -34,8 +31,8 @@ pub struct Report {
     pub facts: Vec<Facts>,
     /// Tables of numbers, in order.
     pub tables: Vec<Table>,
-    /// Plots, in order.
-    pub plots: Vec<String>,
+    /// Charts, in order.
+    pub charts: Vec<Chart>,
 }
 
 /// A table of text.
@@ -78,24 +75,24 @@ impl Picture {
 }
 
 impl Report {
-    /// The page as HTML: text, images, tables, plots.
+    /// The page as HTML: text, images, tables, charts.
     pub fn html(&self) -> String {
         let facts: String = self.facts.iter().map(Facts::html).collect();
-        self.page(&(facts + &self.pictures_html() + &self.tables_html() + &self.plots_html()))
+        self.page(&(facts + &self.pictures_html() + &self.tables_html() + &self.charts_html()))
     }
 
-    /// The page as HTML with the plots first and the tables last.
-    pub fn html_plots_first(&self) -> String {
-        self.page(&(self.plots_html() + &self.pictures_html() + &self.tables_html()))
+    /// The page as HTML with the charts first and the tables last.
+    pub fn html_charts_first(&self) -> String {
+        self.page(&(self.charts_html() + &self.pictures_html() + &self.tables_html()))
     }
 
     fn tables_html(&self) -> String {
         self.tables.iter().map(Table::html).collect()
     }
 
-    fn plots_html(&self) -> String {
-        let figure = |plot: &String| format!("<figure class=\"plot\">{plot}</figure>\n");
-        let plots: String = self.plots.iter().map(figure).collect();
+    fn charts_html(&self) -> String {
+        let figure = |chart: &Chart| format!("<figure class=\"plot\">{}</figure>\n", chart.svg());
+        let plots: String = self.charts.iter().map(figure).collect();
         if plots.is_empty() { plots } else { format!("<div class=\"plots\">\n{plots}</div>\n") }
     }
 

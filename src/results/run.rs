@@ -21,6 +21,7 @@ pub use directory::{Progress, RunDirectory, load_progress};
 pub use done::{done_steps, done_steps_by_stamp};
 pub use events::{Event, RunSummary};
 pub(crate) use files::{ENDED, HELD_OUT_CURVE, SPENT, TARGET_EXPOSURE, TRAINED_WITH};
+pub(crate) use load::{RecordedExposure, load_target_exposure};
 pub use load::{
     is_finished, load_config, load_exposures, load_gaussians, load_lamp, load_metrics,
     load_networks, other_views, plan_of, stopped_at,

@@ -14,7 +14,7 @@ pub(crate) enum ViewExposures {
     /// Learned gain and bias per view.
     Learned(BTreeMap<String, Affine>),
     /// Gains of the targets.
-    OfTargets(serde_json::Value),
+    OfTargets(run::RecordedExposure),
 }
 
 impl ViewExposures {
@@ -23,8 +23,7 @@ impl ViewExposures {
         if !learned.is_empty() {
             return Ok(Self::Learned(learned));
         }
-        let exposure = run::load_metrics(run)[run::TARGET_EXPOSURE].take();
-        if exposure["model_gain"].is_number() {
+        if let Some(exposure) = run::load_target_exposure(run) {
             return Ok(Self::OfTargets(exposure));
         }
         let problem = "has one exposure for all targets; leave out --view-exposure";
@@ -33,7 +32,6 @@ impl ViewExposures {
 
     /// Changes a render of `view` from the model's exposure to that of the view's target.
     pub(crate) fn applied(&self, view: &str, mut image: Image) -> Image {
-        let number = |value: &serde_json::Value| value.as_f64();
         let exposure = match self {
             Self::Learned(exposures) => {
                 let own = exposures.get(view);
@@ -41,9 +39,9 @@ impl ViewExposures {
             }
             Self::OfTargets(exposure) => exposure,
         };
-        let gains = number(&exposure["model_gain"]).zip(number(&exposure["gains"][view]));
-        let Some((from, to)) = gains else { return image };
-        let knots = exposed_anew([from, to], number(&exposure["scene"]["weight"]).unwrap_or(1.0));
+        let Some(gain) = exposure.gains.get(view) else { return image };
+        let weight = exposure.scene.weight.unwrap_or(1.0);
+        let knots = exposed_anew([exposure.model_gain, *gain], weight);
         for x in &mut image.data {
             let inside = x.clamp(knots[0][0], knots[knots.len() - 1][0]);
             let above = knots.partition_point(|knot| knot[0] <= inside).clamp(1, knots.len() - 1);

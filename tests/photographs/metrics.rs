@@ -63,7 +63,7 @@ fn empty_and_truncated_images_are_refused() {
 #[test]
 fn the_mean_of_no_scores_is_none() {
     assert_eq!(Scores::mean(&[]), None);
-    let scores = |psnr| Scores { psnr, psnr_channel_mean: psnr + 1.0, ssim: 0.5, lpips: None };
+    let scores = |psnr| Scores { psnr, psnr_channel_mean: psnr + 1.0, ssim: 0.5 };
     assert_eq!(Scores::mean(&[scores(20.0), scores(30.0)]), Some(scores(25.0)));
 }
 

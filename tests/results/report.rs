@@ -2,8 +2,8 @@
 
 use nightsplat::photographs::image::Image;
 use nightsplat::results::report::{
-    Bar, Best, Column, Comparison, Distribution, Facts, Mark, Picture, Report, Series, Table,
-    Trace, bars, distributions, plot, plot_in_groups, plot_points, svg_file, traces,
+    Best, Chart, Column, Comparison, Distribution, Facts, Mark, Picture, Report, Series, Table,
+    distributions,
 };
 
 fn column(name: &str, digits: usize, best: Best) -> Column {
@@ -74,15 +74,15 @@ fn page(text: &str) -> String {
         scores: scores.into(),
         image: Image::filled(4, 3, [0.5, 2.0, -1.0]),
     };
-    let series =
-        [Series { name: text.into(), points: vec![(0.0, 1.0), (10.0, 0.2)], ..Series::default() }];
+    let points = vec![(0.0, 1.0), (10.0, 0.2)];
+    let series = Series { name: text.into(), points, ..Series::default() };
     Report {
         title: text.into(),
         intro: vec![text.into()],
         links: vec![[text.into(), text.into()]],
         facts: vec![Facts { title: text.into(), rows: vec![[text.into(), text.into()]] }],
         tables: vec![table()],
-        plots: vec![plot(text, text, &series)],
+        charts: vec![Chart::new(text, text, vec![series])],
         comparisons: vec![Comparison {
             title: text.into(),
             pictures: vec![picture("20 dB"), picture("")],
@@ -118,14 +118,15 @@ fn a_plot_draws_each_series_within_its_frame() {
         points: points.to_vec(),
         ..Series::default()
     };
-    let svg = plot(
+    let svg = Chart::new(
         "step",
         "loss",
-        &[
+        vec![
             series("linear", &[(0.0, 0.31), (50.0, f64::NAN), (100.0, 0.1)]),
             series("ap3", &[(0.0, 0.2), (100.0, 0.05)]),
         ],
-    );
+    )
+    .svg();
     assert_eq!(svg.matches("<polyline").count(), 2);
     let lines = svg.split(" points=\"").skip(1).map(|rest| rest.split('"').next().unwrap());
     let points: Vec<Vec<(f64, f64)>> = lines
@@ -155,8 +156,12 @@ fn empty_constant_and_extreme_plots_are_well_formed() {
     let extremes = [f64::MAX, f64::MIN, 1e30, -1e30, 0.0, 1e-300];
     let plots = [vec![], vec![(1.0, 2.0)], extremes.iter().map(|&value| (value, value)).collect()];
     for points in plots {
-        let svg = plot("step", "PSNR", &[Series { name: "a".into(), points, ..Series::default() }]);
-        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+        let mark =
+            |mark| Series { name: "a".into(), mark, points: points.clone(), ..Series::default() };
+        for series in [vec![mark(Mark::Dots), mark(Mark::Star)], vec![mark(Mark::Bar)]] {
+            let svg = Chart::new("step", "PSNR", series).svg();
+            assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
+        }
     }
 }
 
@@ -174,7 +179,7 @@ fn a_distribution_has_the_skewness_of_its_luminance_and_draws_its_density() {
     for constant in [&[][..], &[0.3], &[0.0; 9], &[1.0; 9]] {
         assert_eq!(of(constant).skewness(), 0.0, "{constant:?}");
     }
-    let svg = distributions(&[of(&[0.0, 0.1, 0.1, 0.9]), Distribution::new("nothing")]);
+    let svg = distributions(&[of(&[0.0, 0.1, 0.1, 0.9]), Distribution::new("nothing")]).svg();
     assert!(svg.contains("grey (skewness") && svg.matches("<polyline").count() == 2, "{svg}");
     assert!(!svg.contains("NaN"));
 }
@@ -186,20 +191,24 @@ fn a_legend_of_many_names_has_rows_and_a_plot_can_be_a_file() {
         points: vec![(0.0, 0.0), (1.0, 1.0)],
         ..Series::default()
     };
-    let svg = svg_file(&plot("t", "y", &(0..12).map(series).collect::<Vec<_>>()));
+    let svg = Chart::new("t", "y", (0..12).map(series).collect()).svg_file();
     assert!(
         svg.starts_with("<svg xmlns=\"http://www.w3.org/2000/svg\"") && svg.contains("<style>")
     );
-    assert!(svg.contains("--series-0") && !svg.contains("viewBox=\"0 0 "), "{svg}");
+    let rows: std::collections::BTreeSet<&str> = svg
+        .split("class=\"sample\"")
+        .filter_map(|before| before.rsplit("y1=\"").next()?.split('"').next())
+        .collect();
+    assert!(svg.contains("--series-0") && rows.len() > 3, "{rows:?} {svg}");
     assert!(svg.contains("stroke-dasharray"));
 }
 
 #[test]
 fn a_line_looks_the_same_in_every_plot_of_a_page_and_in_its_legend() {
-    let series = |line: Option<usize>| Series {
+    let series = |color: Option<usize>| Series {
         name: "ap3".into(),
         points: vec![(0.0, 0.0), (1.0, 1.0)],
-        line,
+        color,
         ..Series::default()
     };
     let look = |svg: &str, element: &str| {
@@ -209,9 +218,8 @@ fn a_line_looks_the_same_in_every_plot_of_a_page_and_in_its_legend() {
         (stroke, dashes)
     };
     // The seventh line of the page, alone in one plot and after another in the next.
-    for svg in
-        [plot("t", "y", &[series(Some(6))]), plot("t", "y", &[series(Some(6)), series(None)])]
-    {
+    for series in [vec![series(Some(6))], vec![series(Some(6)), series(None)]] {
+        let svg = Chart::new("t", "y", series).svg();
         for element in ["<polyline", "class=\"sample\""] {
             assert_eq!(
                 look(&svg, element),
@@ -229,14 +237,15 @@ fn many_series_are_divided_into_plots_with_the_same_axes() {
     let series = |index: usize| Series {
         name: format!("curve {index}"),
         points: vec![(0.0, 0.0), (3.0, index as f64)],
-        line: Some(index),
+        color: Some(index),
         ..Series::default()
     };
-    let svg = svg_file(&plot_in_groups("t", "y", &(0..37).map(series).collect::<Vec<_>>(), &[]));
-    let plots: Vec<&str> = svg.split("<svg y=").skip(1).collect();
-    assert_eq!((plots.len(), svg.matches("<polyline").count()), (7, 37));
-    for plot in plots {
-        assert!(plot.matches("<polyline").count() <= 6 && plot.contains(">30<"), "{plot}");
+    let chart = Chart::new("t", "y", (0..37).map(series).collect());
+    let svg = Chart { panel: Some(6), ..chart }.svg_file();
+    let panels: Vec<&str> = svg.split("class=\"panel\"").skip(1).collect();
+    assert_eq!((panels.len(), svg.matches("<polyline").count()), (7, 37));
+    for panel in panels {
+        assert!(panel.matches("<polyline").count() <= 6 && panel.contains(">30<"), "{panel}");
     }
     assert!(svg.contains(":hover"), "a line cannot be told from the others");
 }
@@ -245,15 +254,17 @@ fn many_series_are_divided_into_plots_with_the_same_axes() {
 fn the_range_of_a_mean_is_drawn_as_a_line() {
     let series = Series {
         name: "ap3".into(),
+        mark: Mark::Dots,
         points: vec![(0.0, 20.0), (1.0, 21.0)],
         spreads: vec![(0.0, 18.0, 30.0)],
         ..Series::default()
     };
-    let svg = plot_points("gain", "PSNR", &[series], &[]);
+    let svg = Chart::new("gain", "PSNR", vec![series.clone()]).svg();
     assert_eq!(svg.matches("class=\"spread\"").count(), 1);
     assert!(svg.contains(">30<"), "the axis does not reach the greatest: {svg}");
-    let bar = Bar { name: "a".into(), value: 20.0, spread: Some([19.0, 22.0]) };
-    assert_eq!(bars("PSNR", 2, &[bar]).matches("class=\"spread\"").count(), 1);
+    let bar = Series { mark: Mark::Bar, ..series };
+    let svg = Chart::new("", "PSNR", vec![bar]).svg();
+    assert_eq!(svg.matches("class=\"spread\"").count(), 1);
 }
 
 #[test]
@@ -266,26 +277,37 @@ fn text_comes_before_images_and_images_before_tables_and_plots() {
 
 #[test]
 fn few_points_have_dots_and_a_special_one_a_star() {
-    let series = [Series {
-        name: "ap3".into(),
-        points: vec![(0.0, 20.0), (0.1, 24.0)],
-        ..Series::default()
-    }];
-    let mark = |name: &str, point| Mark { name: name.into(), point };
-    let marks = [mark("adaptive <0.2>", (0.2, 30.0)), mark("nowhere", (f64::NAN, 1.0))];
-    let svg = plot_points("delta0", "PSNR", &series, &marks);
+    let series =
+        |name: &str, mark, points| Series { name: name.into(), mark, points, ..Series::default() };
+    let points = vec![(0.0, 20.0), (0.1, 24.0)];
+    let svg = Chart::new(
+        "delta0",
+        "PSNR",
+        vec![
+            series("ap3", Mark::Dots, points.clone()),
+            series("adaptive <0.2>", Mark::Star, vec![(0.2, 30.0)]),
+            series("nowhere", Mark::Star, vec![(f64::NAN, 1.0)]),
+        ],
+    )
+    .svg();
     assert_eq!((svg.matches("<circle").count(), svg.matches("<path").count()), (2, 1));
     assert!(svg.contains("adaptive &lt;0.2&gt;") && !svg.contains("NaN"), "{svg}");
-    // The axes reach to the mark.
+    // The axes reach to the star.
     assert!(svg.contains(">0.20<") && svg.contains(">30<"), "{svg}");
-    assert_eq!(plot("delta0", "PSNR", &series).matches("<circle").count(), 0);
+    let svg = Chart::new("delta0", "PSNR", vec![series("ap3", Mark::Line, points)]).svg();
+    assert_eq!(svg.matches("<circle").count(), 0);
 }
 
 #[test]
 fn bars_start_at_zero_and_are_proportional_to_their_values() {
-    let bar = |name: &str, value| Bar { name: name.into(), value, spread: None };
-    let rows = [bar("a", 20.0), bar("b & c", 5.0), bar("d", -5.0), bar("failed", f64::NAN)];
-    let svg = bars("PSNR, dB", 2, &rows);
+    let bar = |(row, (name, value)): (usize, (&str, f64))| Series {
+        name: name.into(),
+        mark: Mark::Bar,
+        points: vec![(row as f64, value)],
+        ..Series::default()
+    };
+    let rows = [("a", 20.0), ("b & c", 5.0), ("d", -5.0), ("failed", f64::NAN)];
+    let svg = Chart::new("", "PSNR, dB", rows.into_iter().enumerate().map(bar).collect()).svg();
     let widths = svg.split(" width=\"").skip(1).map(|rest| rest.split('"').next().unwrap());
     let widths: Vec<f64> = widths.map(|width| width.parse().unwrap()).collect();
     assert_eq!(widths.len(), 3);
@@ -293,37 +315,43 @@ fn bars_start_at_zero_and_are_proportional_to_their_values() {
     for text in [">20.00<", ">b &amp; c<", ">failed<", ">-5.00<"] {
         assert!(svg.contains(text), "{text} is missing in {svg}");
     }
-    assert!(!bars("PSNR", 2, &[]).contains("NaN"));
+    assert!(!Chart::new("", "PSNR", vec![]).svg().contains("NaN"));
 }
 
 #[test]
-fn a_run_has_one_colour_in_every_drawing_and_its_name_next_to_its_last_point() {
-    let trace = |name: &str, color, points: &[(f64, f64)]| Trace {
+fn a_run_has_one_colour_in_every_chart_and_its_name_next_to_its_last_point() {
+    let series = |name: &str, color, points: &[(f64, f64)]| Series {
         name: name.into(),
         title: format!("the run <{name}>"),
-        color,
-        is_minor: color > 0,
+        mark: if color > 0 { Mark::Ring } else { Mark::Disc },
+        color: Some(color),
         points: points.to_vec(),
+        ..Series::default()
     };
-    let of = [
-        trace("fast", 0, &[(10.0, 24.0)]),
-        trace("2", 1, &[(10.0, 24.0)]),
-        trace("lost", 2, &[(f64::NAN, 1.0)]),
-    ];
-    let svg = traces("time, s", "PSNR, dB", &of, &[(10.0, 24.0)]);
-    assert_eq!((svg.matches("<circle").count(), svg.matches("<path").count()), (2, 1));
-    assert!(svg.contains("--series-0") && svg.contains("--series-1") && !svg.contains("lost"));
-    assert!(svg.contains("the run &lt;fast&gt;") && !svg.contains("NaN"), "{svg}");
+    let front = |points: &[(f64, f64)]| Series { mark: Mark::Steps, ..series("", 0, points) };
+    let svg = |series: Vec<Series>| {
+        Chart { is_logarithmic: true, ..Chart::new("time, s", "PSNR, dB", series) }.svg()
+    };
+    let drawn = svg(vec![
+        series("fast", 0, &[(10.0, 24.0)]),
+        series("2", 1, &[(10.0, 24.0)]),
+        series("lost", 2, &[(f64::NAN, 1.0)]),
+        front(&[(10.0, 24.0)]),
+    ]);
+    assert_eq!((drawn.matches("<circle").count(), drawn.matches("<path").count()), (2, 1));
+    assert!(drawn.contains("--series-0") && drawn.contains("--series-1"));
+    assert!(!drawn.contains("lost"), "{drawn}");
+    assert!(drawn.contains("the run &lt;fast&gt;") && !drawn.contains("NaN"), "{drawn}");
     // Two names at one place do not overlap.
     let place = |name: &str| {
-        let before = svg.split(&format!(">{name}</text>")).next().unwrap();
+        let before = drawn.split(&format!(">{name}</text>")).next().unwrap();
         before.rsplit("<text ").next().unwrap().to_owned()
     };
-    assert_ne!(place("fast").split(" fill").next(), place("2").split(" fill").next());
-    let curve = traces("s", "dB", &[trace("a", 0, &[(1.0, 20.0), (9.0, 25.0)])], &[]);
+    assert_ne!(place("fast").split(" class").next(), place("2").split(" class").next());
+    let curve = svg(vec![series("a", 0, &[(1.0, 20.0), (9.0, 25.0)])]);
     assert_eq!((curve.matches("<polyline").count(), curve.matches("<path").count()), (1, 0));
     for points in [&[][..], &[(0.0, 1.0)], &[(-1.0, 2.0)], &[(1e-300, 1e300)]] {
-        let svg = traces("s", "dB", &[trace("a", 0, points)], points);
+        let svg = svg(vec![series("a", 0, points), front(points)]);
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
     }
 }

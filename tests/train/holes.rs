@@ -13,7 +13,7 @@ use nightsplat::photographs::dataset::{Dataset, View};
 use nightsplat::photographs::image::{Image, Mask};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::results::eval::{
-    self, MAX_RESIDUAL_TRANSMITTANCE, ModelRenderer, ResidualTransmittance,
+    self, MAX_RESIDUAL_TRANSMITTANCE, Metric, ModelRenderer, ResidualTransmittance,
 };
 use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 
@@ -91,10 +91,11 @@ fn residuals(background: Background, dataset: &Dataset) -> (Vec<f64>, Option<Str
     let mut trainer = Trainer::new(&gpu(), config.clone(), dataset).unwrap();
     advance(&mut trainer, config.steps);
     let scored = eval::score(dataset, |view| trainer.render(&view.camera)).unwrap();
-    let views =
-        scored.iter().map(|view| (view.name.as_str(), view.residual_transmittance.unwrap()));
-    let warning = eval::hole_warning(views.clone(), background);
-    (views.map(|(_, residual_transmittance)| residual_transmittance.mean).collect(), warning)
+    let scores = scored.scores.iter();
+    let means = scores.filter(|score| score.metric == Metric::ResidualTransmittance);
+    let means = means.map(|score| (score.view.as_str(), score.value));
+    let warning = eval::hole_warning(means.clone(), background);
+    (means.map(|(_, mean)| mean).collect(), warning)
 }
 
 #[test]

@@ -276,9 +276,13 @@ fn a_run_reports_every_event_to_its_observer_in_order() {
                 Event::Started { step, steps, .. } => format!("started {step} of {steps}"),
                 Event::Step(report) => format!("step {}", report.step),
                 Event::Checkpointed { step } => format!("checkpointed {step}"),
-                Event::Evaluated { step, scored } => format!("evaluated {step}: {}", scored.len()),
+                Event::Evaluated { step, evaluation } => {
+                    format!("evaluated {step}: {}", evaluation.views().len())
+                }
                 Event::Ended(ended) => format!("ended {}", ended.step),
-                Event::Finished(trained) => format!("finished {}", trained.scored.len()),
+                Event::Finished(trained) => {
+                    format!("finished {}", trained.evaluation.views().len())
+                }
                 _ => String::new(),
             });
         });

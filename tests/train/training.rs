@@ -7,7 +7,7 @@ use std::time::Duration;
 use glam::{DVec2, UVec2, Vec3};
 use nightsplat::Error;
 use nightsplat::photographs::dataset::{Dataset, Split};
-use nightsplat::results::eval::{self, ModelRenderer};
+use nightsplat::results::eval::{self, After, Metric, ModelRenderer};
 use nightsplat::splats::densify::DensityControl;
 
 use nightsplat::gpu::testing::{gpu, gpu_with, recorded, submitted};
@@ -41,9 +41,8 @@ fn mean_psnr(dataset: &Dataset, gaussians: &Gaussians) -> f64 {
     let model = Model::from(gaussians.clone());
     let mut model_renderer =
         ModelRenderer::new(&gpu(), &model, &TrainConfig::bare(), None).unwrap();
-    let scored = eval::score(dataset, |view| model_renderer.render(view)).unwrap();
-    let scores: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
-    Scores::mean(&scores).unwrap().psnr
+    let evaluation = eval::score(dataset, |view| model_renderer.render(view)).unwrap();
+    evaluation.mean(Metric::Psnr, After::Model).unwrap()
 }
 
 #[test]

@@ -6,8 +6,7 @@ use glam::{DAffine3, DVec3};
 use nightsplat::camera::TrainingFrame;
 use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::dataset::Dataset;
-use nightsplat::photographs::metrics::Scores;
-use nightsplat::results::eval::{self, ModelRenderer, ViewScore};
+use nightsplat::results::eval::{self, After, Evaluation, Metric, ModelRenderer};
 use nightsplat::results::run::{self, IfExists};
 use nightsplat::splats::model::Model;
 use nightsplat::splats::scene::ply;
@@ -37,9 +36,8 @@ fn moved(dataset: &Dataset, scale: f64, offset: DVec3) -> Dataset {
     moved
 }
 
-fn mean_psnr(scored: &[ViewScore]) -> f64 {
-    let scores: Vec<Scores> = scored.iter().map(|view| view.scores).collect();
-    Scores::mean(&scores).unwrap().psnr
+fn mean_psnr(evaluation: &Evaluation) -> f64 {
+    evaluation.mean(Metric::Psnr, After::Model).unwrap()
 }
 
 const WORLDS: [(f64, f64); 7] =
@@ -81,7 +79,7 @@ fn a_run_in_any_world_is_scored_as_trained_and_its_model_is_in_that_world() {
         assert!((f64::from(model.near) * frame.scale - 0.2).abs() < 1e-6, "{stated}");
         let gaussians = model.gaussians;
         let scored = eval::score(&there, |view| model_renderer.render(view)).unwrap();
-        let (again, then) = (mean_psnr(&scored), mean_psnr(&trained.scored));
+        let (again, then) = (mean_psnr(&scored), mean_psnr(&trained.evaluation));
         assert!((again - then).abs() < 0.01, "{scale} at {offset}: {again}, not {then}");
 
         // Other programs see positions in the world, relative to the origin in the header.

@@ -6,8 +6,8 @@ use clap::parser::ValueSource;
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, Error, FromArgMatches};
 use glam::DVec3;
 
-use crate::cli::export::Up;
 use crate::results::edit::{Operation, Region, Scale};
+use crate::results::export::up::Up;
 
 /// Operations in the order of the command line.
 #[derive(Clone, Debug)]

@@ -4,11 +4,12 @@ use std::path::Path;
 
 use serde_json::{Map, Value, json};
 
-use super::rows::{Row, Rows, number, place};
+use super::rows::{Row, Rows};
 use super::runner::Failure;
+use super::table::{DEVICE, HOST, JOULES, PROCESSOR, PSNR, Quantity, SECONDS, SSIM, Statistic};
 use crate::Result;
-use crate::base::output::{csv_field, write_whole};
-use crate::results::report::{Best, Column, Report, Table, Trace, traces};
+use crate::base::output::write_whole;
+use crate::results::report::{Chart, Mark, Report, Series, Table};
 use crate::results::run::{Progress, energy_counters};
 
 /// The files of the costs.
@@ -20,49 +21,8 @@ const SHOWN_DECIBELS: f64 = 3.0;
 /// More rows than this are numbered in plots, where their names would not fit.
 const MAX_NAMES: usize = 8;
 
-/// A quantity of a run: key in CSV and JSON, place in `metrics.json`, heading, digits and unit.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Measure {
-    key: &'static str,
-    place: &'static str,
-    name: &'static str,
-    digits: usize,
-    unit: f64,
-}
-
-const fn measure(
-    key: &'static str,
-    place: &'static str,
-    name: &'static str,
-    digits: usize,
-    unit: f64,
-) -> Measure {
-    Measure { key, place, name, digits, unit }
-}
-
-const MIB: f64 = 1_048_576.0;
-const PSNR: Measure = measure("psnr", "/mean/psnr", "PSNR, dB", 2, 1.0);
-const SSIM: Measure = measure("ssim", "/mean/ssim", "SSIM", 3, 1.0);
-const SECONDS: Measure = measure("seconds", "/seconds", "time, s", 1, 1.0);
-const PROCESSOR: Measure =
-    measure("processor_seconds", "/spent/processor_seconds", "processor time, s", 1, 1.0);
-const JOULES: Measure = measure("joules", "/spent/joules", "energy, J", 0, 1.0);
-const DEVICE: Measure = measure("device_bytes", "/spent/device_bytes", "device, MiB", 1, MIB);
-const HOST: Measure = measure("host_bytes", "/spent/host_bytes", "host, MiB", 0, MIB);
-const ALL: [Measure; 9] = [
-    PSNR,
-    SSIM,
-    SECONDS,
-    PROCESSOR,
-    JOULES,
-    measure("steps", "/steps", "steps", 0, 1.0),
-    measure("gaussians", "/gaussians", "Gaussians", 0, 1.0),
-    DEVICE,
-    HOST,
-];
-
 /// The plots: cost and score.
-const FRONTS: [(Measure, Measure); 8] = [
+const FRONTS: [(Quantity, Quantity); 8] = [
     (SECONDS, PSNR),
     (SECONDS, SSIM),
     (PROCESSOR, PSNR),
@@ -74,15 +34,8 @@ const FRONTS: [(Measure, Measure); 8] = [
 ];
 
 /// The fronts in CSV and JSON.
-const NAMED_FRONTS: [(&str, Measure); 2] =
+const NAMED_FRONTS: [(&str, Quantity); 2] =
     [("on_front", SECONDS), ("on_processor_front", PROCESSOR)];
-
-impl Measure {
-    /// The mean in the displayed unit.
-    fn shown(self, row: &Row) -> Option<f64> {
-        Some(row.mean(self.place)? / self.unit)
-    }
-}
 
 /// Indices of the Pareto-optimal points (cost, gain), cheapest first. Of equal points, the first is taken.
 fn front(points: &[(f64, f64)]) -> Vec<usize> {
@@ -114,7 +67,7 @@ impl Rows {
         let time = "Time is that of the steps, without loading and scoring. The dotted line is the Pareto \
          front: the best score for each cost. Discs are points on it, rings are not.";
         let mut intro = vec![format!("{time} {energy}")];
-        let on_front = self.front_of(SECONDS, PSNR);
+        let on_front = self.front_of(&SECONDS, &PSNR);
         let names = on_front.into_iter().map(|index| self.label(&self.rows[index], None));
         let names = names.collect::<Vec<_>>().join("; ");
         if !names.is_empty() {
@@ -125,147 +78,117 @@ impl Rows {
             title: format!("{title}: time and quality"),
             intro,
             tables: std::iter::once(self.costs()).chain(self.differences()).collect(),
-            plots: self.cost_plots(),
+            charts: self.cost_charts(),
             ..Report::default()
         };
         let [csv, html] = FILES.map(|file| folder.join(file));
         write_whole(&csv, self.costs_csv().as_bytes())?;
-        write_whole(&html, report.html_plots_first().as_bytes())
+        write_whole(&html, report.html_charts_first().as_bytes())
     }
 
-    fn front_of(&self, cost: Measure, gain: Measure) -> Vec<usize> {
-        let value = |row: &Row, of: Measure| row.mean(of.place).unwrap_or(f64::NAN);
+    fn front_of(&self, cost: &Quantity, gain: &Quantity) -> Vec<usize> {
+        let value = |row: &Row, of: &Quantity| row.mean(&of.pointer).unwrap_or(f64::NAN);
         let points = self.rows.iter().map(|row| (value(row, cost), value(row, gain)));
         front(&points.collect::<Vec<_>>())
     }
 
     /// The quantities that any row has.
-    fn measures(&self) -> Vec<Measure> {
-        let has = |of: &Measure| self.rows.iter().any(|row| row.mean(of.place).is_some());
-        ALL.into_iter().filter(has).collect()
+    fn quantities(&self, statistic: Statistic) -> Vec<(Quantity, Statistic)> {
+        let has = |of: &Quantity| self.rows.iter().any(|row| of.mean(row).is_some());
+        Quantity::all().into_iter().filter(has).map(|of| (of, statistic)).collect()
     }
 
     /// All rows with all quantities.
     pub(super) fn costs(&self) -> Table {
-        let measures = self.measures();
-        let is_score = |of: &Measure| [PSNR, SSIM].contains(of);
-        let column = |of: &Measure| Column {
-            name: of.name.to_owned(),
-            digits: of.digits,
-            best: if is_score(of) { Best::Greatest } else { Best::Unmarked },
-        };
-        let row = |(index, row): (usize, &Row)| {
-            let values = measures.iter().map(|of| of.shown(row)).collect();
-            (format!("{}  {}", index + 1, self.label(row, None)), values)
-        };
-        Table {
-            title: "All points".to_owned(),
-            label: "point".to_owned(),
-            columns: measures.iter().map(column).collect(),
-            rows: self.rows.iter().enumerate().map(row).collect(),
+        let mut table = self.table("All points", &self.quantities(Statistic::Mean));
+        for (number, (label, _)) in (1..).zip(&mut table.rows) {
+            *label = format!("{number}  {label}");
         }
+        table
     }
 
     /// Differences to the baseline; `None` without a finished baseline.
     fn differences(&self) -> Option<Table> {
         let (base, name) = self.baseline().filter(|(row, _)| !row.metrics.is_empty())?;
-        let measures = self.measures();
-        let row = |row: &Row| {
-            let values = measures.iter().map(|of| Some(of.shown(row)? - of.shown(base)?));
-            (self.label(row, None), values.collect())
-        };
-        let others = self.rows.iter().filter(|row| row.point != base.point);
-        let column = |of: &Measure| Column {
-            name: of.name.to_owned(),
-            digits: of.digits,
-            best: Best::Unmarked,
-        };
-        let table = Table {
-            title: format!("The difference to {name}"),
-            label: "point".to_owned(),
-            columns: measures.iter().map(column).collect(),
-            rows: others.map(row).collect(),
-        };
+        let quantities = self.quantities(Statistic::Gain);
+        let mut table = self.table(&format!("The difference to {name}"), &quantities);
+        for (column, (quantity, _)) in table.columns.iter_mut().zip(&quantities) {
+            column.name = quantity.name.to_string();
+        }
+        let mut rows = self.rows.iter();
+        table.rows.retain(|_| rows.next().is_some_and(|row| row.point != base.point));
         (!table.rows.is_empty()).then_some(table)
     }
 
-    fn cost_plots(&self) -> Vec<String> {
-        let fronts = FRONTS.into_iter().filter_map(|(cost, gain)| self.front_plot(cost, gain));
+    fn cost_charts(&self) -> Vec<Chart> {
+        let fronts = FRONTS.into_iter().filter_map(|(cost, gain)| self.front_chart(&cost, &gain));
         fronts.chain(self.on_the_way()).collect()
     }
 
     /// Final score against cost; `None` unless two rows have both.
-    fn front_plot(&self, cost: Measure, gain: Measure) -> Option<String> {
-        let point = |row: &Row| Some((cost.shown(row)?, gain.shown(row)?));
+    fn front_chart(&self, cost: &Quantity, gain: &Quantity) -> Option<Chart> {
+        let point = |row: &Row| Some((cost.mean(row)?, gain.mean(row)?));
         let front = self.front_of(cost, gain);
-        let trace = |(index, row): (usize, &Row)| Trace {
+        let series = |(index, row): (usize, &Row)| Series {
             points: point(row).into_iter().collect(),
-            is_minor: !front.contains(&index),
-            ..self.trace(index)
+            mark: if front.contains(&index) { Mark::Disc } else { Mark::Ring },
+            ..self.series(index)
         };
-        let drawn: Vec<Trace> = self.rows.iter().enumerate().map(trace).collect();
-        let steps: Vec<(f64, f64)> =
-            front.iter().filter_map(|&index| point(&self.rows[index])).collect();
-        // A plot of a single point shows nothing.
-        let count = drawn.iter().filter(|trace| !trace.points.is_empty()).count();
-        (count > 1).then(|| traces(cost.name, gain.name, &drawn, &steps))
+        let mut drawn: Vec<Series> = self.rows.iter().enumerate().map(series).collect();
+        // A chart of a single point shows nothing.
+        let count = drawn.iter().filter(|series| !series.points.is_empty()).count();
+        let points = front.iter().filter_map(|&index| point(&self.rows[index])).collect();
+        let name = "Pareto front".to_owned();
+        drawn.insert(0, Series { name, mark: Mark::Steps, points, ..Series::default() });
+        let chart = Chart::new(&cost.name, &gain.name, drawn);
+        (count > 1).then_some(Chart { is_logarithmic: true, ..chart })
     }
 
     /// Score against time during training; `None` without intermediate scores.
-    fn on_the_way(&self) -> Option<String> {
+    fn on_the_way(&self) -> Option<Chart> {
         let all = || self.rows.iter().flat_map(|row| &row.progress);
         let least = all().map(|one| one.psnr).fold(f64::NEG_INFINITY, f64::max) - SHOWN_DECIBELS;
-        let trace = |(index, row): (usize, &Row)| {
+        let series = |(index, row): (usize, &Row)| {
             let shown = row.progress.iter().filter(|one| one.psnr >= least);
             let points = shown.map(|one: &Progress| (one.seconds, one.psnr)).collect();
-            Trace { points, ..self.trace(index) }
+            Series { points, mark: Mark::Disc, ..self.series(index) }
         };
-        let drawn: Vec<Trace> = self.rows.iter().enumerate().take(MAX_NAMES).map(trace).collect();
+        let drawn: Vec<Series> = self.rows.iter().enumerate().take(MAX_NAMES).map(series).collect();
         let y_name = format!("{} during training", PSNR.name);
-        let has_lines = drawn.iter().any(|trace| trace.points.len() > 1);
-        has_lines.then(|| traces(SECONDS.name, &y_name, &drawn, &[]))
+        let has_lines = drawn.iter().any(|series| series.points.len() > 1);
+        let chart = Chart::new(&SECONDS.name, &y_name, drawn);
+        has_lines.then_some(Chart { is_logarithmic: true, ..chart })
     }
 
-    /// Name and colour of a row in every plot.
-    fn trace(&self, index: usize) -> Trace {
+    /// Name and colour of a row in every chart.
+    fn series(&self, index: usize) -> Series {
         let (number, label) = (index + 1, self.label(&self.rows[index], None));
         let title = format!("{number}  {label}");
         let name = if self.rows.len() > MAX_NAMES { number.to_string() } else { label };
-        Trace { name, title, color: index, ..Trace::default() }
+        Series { name, title, color: Some(index), ..Series::default() }
     }
 
     /// A line per row: settings, mean and standard deviation of every quantity, and whether it is on the fronts of PSNR
     /// against wall time and processor time.
     fn costs_csv(&self) -> String {
-        let mut header = self.keys.clone();
-        header.push("runs".to_owned());
-        header.extend(ALL.iter().flat_map(|of| [of.key.to_owned(), format!("{}_sd", of.key)]));
-        header.extend(NAMED_FRONTS.iter().map(|(name, _)| (*name).to_owned()));
-        let fronts = NAMED_FRONTS.map(|(_, cost)| self.front_of(cost, PSNR));
-        let line = |(index, row): (usize, &Row)| {
-            let values = self.keys.iter().map(|key| row.point.value(key).unwrap_or_default());
-            let mut cells: Vec<String> = values.map(|value| csv_field(value).to_string()).collect();
-            cells.push(row.metrics.len().to_string());
-            for Measure { place, .. } in ALL {
-                cells.extend([number(row.mean(place)), number(row.deviation(place))]);
-            }
-            cells.extend(fronts.iter().map(|front| front.contains(&index).to_string()));
-            cells.join(",")
-        };
-        let lines = std::iter::once(header.join(",")).chain(self.rows.iter().enumerate().map(line));
-        lines.map(|line| line + "\n").collect()
+        let mut columns = vec![self.csv_column("runs", |_, row| row.metrics.len().to_string())];
+        columns.extend(Quantity::all().iter().flat_map(|of| self.csv_numbers(of, true)));
+        for (name, cost) in NAMED_FRONTS {
+            let front = self.front_of(&cost, &PSNR);
+            columns.push(self.csv_column(name, |index, _| front.contains(&index).to_string()));
+        }
+        self.csv(columns)
     }
 
     /// All quantities as JSON, with the differences to the baseline.
     pub(super) fn json(&self, dataset: &Path, failures: &[Failure]) -> Value {
-        let scores = self.scores.iter().map(|score| (score.clone(), place(score)));
-        let costs = ALL.iter().map(|of| (of.key.to_owned(), of.place.to_owned()));
-        let figures: Vec<(String, String)> = costs.chain(scores).collect();
+        let scores = self.scores.iter().map(|score| Quantity::score(score));
+        let quantities: Vec<Quantity> = Quantity::all().into_iter().chain(scores).collect();
         let of = |value: &dyn Fn(&str) -> Option<f64>| {
-            let figure = |(key, place): &(String, String)| (key.clone(), json!(value(place)));
-            figures.iter().map(figure).collect::<Map<_, _>>()
+            let entry = |of: &Quantity| (of.key.to_string(), json!(value(&of.pointer)));
+            quantities.iter().map(entry).collect::<Map<_, _>>()
         };
-        let fronts = NAMED_FRONTS.map(|(name, cost)| (name, self.front_of(cost, PSNR)));
+        let fronts = NAMED_FRONTS.map(|(name, cost)| (name, self.front_of(&cost, &PSNR)));
         let baseline = self.baseline();
         let point = |(index, row): (usize, &Row)| {
             let mut entry = json!({
@@ -273,11 +196,11 @@ impl Rows {
                 "settings": row.point.values.iter().cloned().collect::<std::collections::BTreeMap<_, _>>(),
                 "runs": row.metrics.len(),
                 "scored": row.against().unwrap_or("against reference images"),
-                "mean": of(&|place| row.mean(place)),
+                "mean": of(&|pointer| row.mean(pointer)),
             });
             if let Some((base, _)) = baseline.as_ref().filter(|(base, _)| base.point != row.point) {
                 entry["difference"] =
-                    of(&|place| Some(row.mean(place)? - base.mean(place)?)).into();
+                    of(&|pointer| Some(row.mean(pointer)? - base.mean(pointer)?)).into();
             }
             for (name, front) in &fronts {
                 entry[*name] = front.contains(&index).into();
@@ -298,6 +221,8 @@ impl Rows {
 mod tests {
     use super::*;
     use crate::cli::sweep::point::Point;
+
+    const MIB: f64 = 1_048_576.0;
 
     #[test]
     fn the_front_has_what_nothing_beats_the_cheapest_first() {

@@ -112,7 +112,7 @@ pub(super) fn points(given: &[Axis], table: Option<Grid>) -> Result<Vec<Point>> 
     }
     let mut grids = table.map_or_else(|| vec![vec![]], Grid::grids);
     for grid in &mut grids {
-        grid.retain(|axis| given.iter().all(|own| own.key != axis.key));
+        grid.retain(|axis| given.iter().all(|other| other.key != axis.key));
         grid.extend(given.iter().cloned());
     }
     let has = |curve: &str| {

@@ -3,20 +3,18 @@
 use std::path::Path;
 
 use super::point::{ADAPTIVE, OFFSET};
-use super::rows::{Row, Rows, number, place};
+use super::rows::{Row, Rows};
 use super::run::Run;
 use super::runner::Failure;
+use super::table::{CsvColumn, GAUSSIANS, PSNR, Quantity, Statistic};
 use crate::Result;
 use crate::base::output::{csv_field, write_whole};
 use crate::gpu::Gpu;
-use crate::networks::lpips::Measure;
 use crate::photographs::dataset::Dataset;
 use crate::photographs::image::Image;
 use crate::photographs::metrics::Scores;
 use crate::results::eval::{AGAINST, WITH_REFERENCE};
-use crate::results::report::{
-    Bar, Best, Column, Comparison, Mark, Picture, Report, Series, Table, bars, plot_points,
-};
+use crate::results::report::{Chart, Column, Comparison, Mark, Picture, Report, Series, Table};
 
 /// The files of a leaderboard.
 pub(super) const FILES: [&str; 3] = ["leaderboard.csv", "leaderboard.md", "index.html"];
@@ -53,71 +51,45 @@ impl Leaderboard<'_> {
     /// The rows with their scores and the differences to the baseline, if there is one.
     pub(super) fn table(&self) -> Table {
         let Rows { keys, rows, scores, .. } = self.rows;
-        let (mut columns, baseline) = (vec![], self.rows.baseline());
         let has_seeds = self.rows.has_seeds();
-        for score in scores {
-            let column = column(score);
-            let beside = |what: &str| Column {
-                name: what.to_owned(),
-                best: Best::Unmarked,
-                ..column.clone()
-            };
-            let spread = has_seeds.then(|| beside("sd"));
-            let gain = baseline.as_ref().map(|_| beside("gain"));
-            columns.push(column);
-            columns.extend(spread.into_iter().chain(gain));
+        let mut columns = vec![];
+        for quantity in scores.iter().map(|score| Quantity::score(score)) {
+            columns.push((quantity.clone(), Statistic::Mean));
+            columns.extend(has_seeds.then(|| (quantity.clone(), Statistic::Deviation)));
+            let gain = self.rows.baseline().map(|_| (quantity, Statistic::Gain));
+            columns.extend(gain);
         }
-        let plain = |name: &str| Column { name: name.to_owned(), ..Column::default() };
-        columns.push(plain("Gaussians"));
-        columns.extend(has_seeds.then(|| plain("seeds")));
-        let values = |row: &Row| {
-            let mut values = vec![];
-            for score in scores {
-                let mean = row.score(score);
-                values.push(mean);
-                values.extend(has_seeds.then(|| row.deviation(&place(score))));
-                let gain = |(base, _): &(&Row, String)| Some(mean? - base.score(score)?);
-                values.extend(baseline.as_ref().map(gain));
+        columns.push((GAUSSIANS, Statistic::Mean));
+        let mut table = self.rows.table("Means over the test views", &columns);
+        if let [key] = &keys[..] {
+            table.label.clone_from(key);
+        }
+        if has_seeds {
+            table.columns.push(Column { name: "seeds".to_owned(), ..Column::default() });
+            for ((_, values), row) in table.rows.iter_mut().zip(rows) {
+                values.push(Some(row.metrics.len() as f64));
             }
-            values.push(row.mean("/gaussians"));
-            values.extend(has_seeds.then_some(Some(row.metrics.len() as f64)));
-            values
-        };
-        Table {
-            title: "Means over the test views".to_owned(),
-            label: keys.first().filter(|_| keys.len() == 1).map_or("point", |key| key).to_owned(),
-            columns,
-            rows: rows.iter().map(|row| (self.rows.label(row, None), values(row))).collect(),
         }
+        table
     }
 
     fn csv(&self) -> String {
-        let Rows { keys, rows, scores, .. } = self.rows;
+        let Rows { rows, scores, .. } = self.rows;
         let has_seeds = self.rows.has_seeds();
-        let mut header = keys.clone();
-        for score in scores {
-            header.push(score.clone());
-            header.extend(has_seeds.then(|| format!("{score}_sd")));
+        let scores = scores.iter().map(|score| Quantity::score(score));
+        let mut columns: Vec<CsvColumn> =
+            scores.flat_map(|score| self.rows.csv_numbers(&score, has_seeds)).collect();
+        columns.extend(self.rows.csv_numbers(&GAUSSIANS, false));
+        columns.push(self.rows.csv_column("runs", |_, row| row.metrics.len().to_string()));
+        if rows.iter().any(Row::knows_references) {
+            let cell = |_, row: &Row| row.knows_references().to_string();
+            columns.push(self.rows.csv_column(WITH_REFERENCE, cell));
         }
-        let is_marked = rows.iter().any(Row::knows_references);
-        header.extend(["gaussians", "runs"].map(str::to_owned));
-        let against = rows.iter().any(|row| row.against().is_some());
-        header.extend(is_marked.then(|| WITH_REFERENCE.to_owned()));
-        header.extend(against.then(|| AGAINST.to_owned()));
-        let cells = |row: &Row| {
-            let values = keys.iter().map(|key| csv_field(row.point.value(key).unwrap_or_default()));
-            let mut cells: Vec<String> = values.collect();
-            for score in scores {
-                cells.push(number(row.score(score)));
-                cells.extend(has_seeds.then(|| number(row.deviation(&place(score)))));
-            }
-            cells.extend([number(row.mean("/gaussians")), row.metrics.len().to_string()]);
-            cells.extend(is_marked.then(|| row.knows_references().to_string()));
-            cells.extend(against.then(|| csv_field(row.against().unwrap_or_default())));
-            cells.join(",")
-        };
-        let lines = std::iter::once(header.join(",")).chain(rows.iter().map(cells));
-        lines.map(|line| line + "\n").collect()
+        if rows.iter().any(|row| row.against().is_some()) {
+            let cell = |_, row: &Row| csv_field(row.against().unwrap_or_default()).to_string();
+            columns.push(self.rows.csv_column(AGAINST, cell));
+        }
+        self.rows.csv(columns)
     }
 
     fn markdown(&self) -> String {
@@ -151,8 +123,12 @@ impl Leaderboard<'_> {
         let mut pictures = vec![];
         if let Some(dark) = &dark {
             // A model must beat the score of the photograph itself.
-            let own = reference.as_ref().and_then(|reference| Scores::of(dark, reference).ok());
-            let scores = scored(own.map(|own| own.psnr), own.map(|own| own.ssim));
+            let of_photograph =
+                reference.as_ref().and_then(|reference| Scores::of(dark, reference).ok());
+            let scores = scored(
+                of_photograph.map(|scores| scores.psnr),
+                of_photograph.map(|scores| scores.ssim),
+            );
             pictures.push(picture("photograph", scores, dark));
         }
         // Second, so that it stays in the row of the best renders.
@@ -177,7 +153,7 @@ impl Leaderboard<'_> {
             intro: self.notes(),
             links: self.links.clone(),
             tables: vec![self.table()],
-            plots: self.plots(),
+            charts: self.charts(),
             comparisons: pictures.into_iter().collect(),
             ..Report::default()
         };
@@ -210,28 +186,33 @@ impl Leaderboard<'_> {
     }
 
     /// PSNR against every numeric setting; without one, a bar per row.
-    fn plots(&self) -> Vec<String> {
-        let psnr = column("psnr");
+    fn charts(&self) -> Vec<Chart> {
         // A line keeps its colour in every plot.
         let mut lines = vec![];
         let numeric =
-            self.rows.keys.iter().filter_map(|key| self.against(key, &psnr.name, &mut lines));
-        let plots: Vec<String> = numeric.collect();
+            self.rows.keys.iter().filter_map(|key| self.against(key, &PSNR.name, &mut lines));
+        let charts: Vec<Chart> = numeric.collect();
         let has_scores = self.rows.rows.iter().any(|row| row.score("psnr").is_some());
-        if !plots.is_empty() || !has_scores {
-            return plots;
+        if !charts.is_empty() || !has_scores {
+            return charts;
         }
-        let bar = |row: &Row| Bar {
-            name: self.rows.label(row, None),
-            value: row.score("psnr").unwrap_or(f64::NAN),
-            spread: row.extremes("psnr"),
+        let bar = |(index, row): (usize, &Row)| {
+            let x = index as f64;
+            let spread = row.extremes("psnr").map(|[low, high]| (x, low, high));
+            Series {
+                name: self.rows.label(row, None),
+                mark: Mark::Bar,
+                color: Some(1),
+                points: vec![(x, row.score("psnr").unwrap_or(f64::NAN))],
+                spreads: spread.into_iter().collect(),
+                ..Series::default()
+            }
         };
-        let rows: Vec<Bar> = self.rows.rows.iter().map(bar).collect();
-        vec![bars(&psnr.name, psnr.digits, &rows)]
+        vec![Chart::new("", &PSNR.name, self.rows.rows.iter().enumerate().map(bar).collect())]
     }
 
     /// A line for each combination of the other settings; `None` if `key` is not numeric, or there are too many lines.
-    fn against(&self, key: &str, y_name: &str, known: &mut Vec<String>) -> Option<String> {
+    fn against(&self, key: &str, y_name: &str, known: &mut Vec<String>) -> Option<Chart> {
         let is_special = |value: &str| key == OFFSET && value == ADAPTIVE;
         let values = self.rows.rows.iter().filter_map(|row| row.point.value(key));
         let numbers: Vec<f64> = values
@@ -243,7 +224,7 @@ impl Leaderboard<'_> {
         if low == high {
             return None;
         }
-        let (mut lines, mut marks): (Vec<Series>, Vec<Mark>) = (vec![], vec![]);
+        let (mut lines, mut stars): (Vec<Series>, Vec<Series>) = (vec![], vec![]);
         for row in &self.rows.rows {
             let Some(psnr) = row.score("psnr") else { continue };
             let name = self.rows.label(row, Some(key));
@@ -251,7 +232,8 @@ impl Leaderboard<'_> {
                 Some(value) if is_special(value) => {
                     let offset = self.adaptive_offset?;
                     let name = format!("{name} adaptive {offset:.3}").trim().to_owned();
-                    marks.push(Mark { name, point: (offset, psnr) });
+                    let points = vec![(offset, psnr)];
+                    stars.push(Series { name, mark: Mark::Star, points, ..Series::default() });
                     continue;
                 }
                 Some(value) => vec![(value.parse().ok()?, psnr)],
@@ -267,7 +249,8 @@ impl Leaderboard<'_> {
                 }
                 None => {
                     let spreads = spreads.into_iter().collect();
-                    lines.push(Series { name, points, spreads, ..Series::default() });
+                    let mark = Mark::Dots;
+                    lines.push(Series { name, mark, points, spreads, ..Series::default() });
                 }
             }
         }
@@ -278,44 +261,14 @@ impl Leaderboard<'_> {
         }
         lines.sort_by(|a, b| a.name.cmp(&b.name));
         for line in &mut lines {
-            let place = known.iter().position(|name| *name == line.name);
-            line.line = Some(place.unwrap_or(known.len()));
-            if place.is_none() {
+            let index = known.iter().position(|name| *name == line.name);
+            line.color = Some(index.unwrap_or(known.len()));
+            if index.is_none() {
                 known.push(line.name.clone());
             }
         }
         let is_legible = (1..=MAX_LINES).contains(&lines.len());
-        is_legible.then(|| plot_points(key, y_name, &lines, &marks))
-    }
-}
-
-/// Heading and digits of a score of `metrics.json`.
-fn column(score: &str) -> Column {
-    if let Some(measure) = Measure::all().find(|measure| measure.key() == score) {
-        return Column { name: measure.title(), digits: 3, best: Best::Least };
-    }
-    if let Some(score) = score.strip_prefix("r0/") {
-        let column = column(score);
-        return Column { name: format!("{} of R_0", column.name), ..column };
-    }
-    let (name, digits, best) = match score {
-        "psnr" => ("PSNR, dB", 2, Best::Greatest),
-        "psnr_channel_mean" => ("channel-mean PSNR, dB", 2, Best::Greatest),
-        "ssim" => ("SSIM", 3, Best::Greatest),
-        other => (other, 4, Best::Unmarked),
-    };
-    Column { name: name.to_owned(), digits, best }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn of_every_lpips_the_least_is_best() {
-        for measure in Measure::all() {
-            let Column { name, best, .. } = column(&measure.key());
-            assert!(matches!(best, Best::Least) && name == measure.title(), "{name}");
-        }
+        lines.extend(stars);
+        is_legible.then(|| Chart::new(key, y_name, lines))
     }
 }

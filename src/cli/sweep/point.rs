@@ -131,7 +131,7 @@ pub(super) struct Point {
 
 impl Point {
     pub(super) fn value(&self, key: &str) -> Option<&str> {
-        self.values.iter().find(|(own, _)| own == key).map(|(_, value)| value.as_str())
+        self.values.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
     }
 
     /// The point without its seed.

@@ -110,14 +110,14 @@ impl Rows {
 }
 
 impl Row {
-    /// Mean over finished runs of the number at `place` in `metrics.json`.
-    pub(super) fn mean(&self, place: &str) -> Option<f64> {
-        mean(&self.values(place))
+    /// Mean over finished runs of the number at a JSON pointer in `metrics.json`.
+    pub(super) fn mean(&self, pointer: &str) -> Option<f64> {
+        mean(&self.values(pointer))
     }
 
     /// Sample standard deviation; `None` for fewer than two runs.
-    pub(super) fn deviation(&self, place: &str) -> Option<f64> {
-        let values = self.values(place);
+    pub(super) fn deviation(&self, pointer: &str) -> Option<f64> {
+        let values = self.values(pointer);
         let mean = mean(&values).filter(|_| values.len() > 1)?;
         let squares = values.iter().map(|value| (value - mean) * (value - mean));
         Some((squares.sum::<f64>() / (values.len() - 1) as f64).sqrt())
@@ -125,12 +125,12 @@ impl Row {
 
     /// Mean of a score.
     pub(super) fn score(&self, name: &str) -> Option<f64> {
-        self.mean(&place(name))
+        self.mean(&pointer(name))
     }
 
     /// Minimum and maximum of a score; `None` for fewer than two runs.
     pub(super) fn extremes(&self, name: &str) -> Option<[f64; 2]> {
-        let values = self.values(&place(name));
+        let values = self.values(&pointer(name));
         let least = values.iter().copied().min_by(f64::total_cmp)?;
         let greatest = values.iter().copied().max_by(f64::total_cmp)?;
         (values.len() > 1).then_some([least, greatest])
@@ -146,19 +146,19 @@ impl Row {
         self.metrics.iter().find_map(|metrics| metrics.get(AGAINST)?.as_str())
     }
 
-    fn values(&self, place: &str) -> Vec<f64> {
+    fn values(&self, pointer: &str) -> Vec<f64> {
         // Without a denoiser, the scored image is R_0.
         let value = |metrics: &Value| {
             let found =
-                metrics.pointer(place).or_else(|| metrics.pointer(&place.replace("/r0", "")));
+                metrics.pointer(pointer).or_else(|| metrics.pointer(&pointer.replace("/r0", "")));
             found?.as_f64()
         };
         self.metrics.iter().filter_map(value).collect()
     }
 }
 
-/// The place of a score in `metrics.json`.
-pub(super) fn place(score: &str) -> String {
+/// The JSON pointer of a score in `metrics.json`.
+fn pointer(score: &str) -> String {
     format!("/mean/{score}")
 }
 

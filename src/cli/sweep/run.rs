@@ -62,13 +62,13 @@ impl Run {
         let found = run::load_config(&self.folder)?;
         let plan = if self.args.plan.is_none() { run::plan_of(&self.folder) } else { None };
         let plan = plan.map(|path| Plan::read(&path)).transpose()?;
-        let own = self.args.options.config(&self.args.dataset, plan.as_ref())?;
-        let own = own.with_absolute_paths();
+        let config = self.args.options.config(&self.args.dataset, plan.as_ref())?;
+        let config = config.with_absolute_paths();
         // A run records its tile, frame and up direction; if none is required, any matches.
-        let (tile, frame) = (own.tile.and(found.tile), own.frame.and(found.frame));
-        let found = TrainConfig { tile, frame, up: own.up.and(found.up), ..found };
-        if found != own {
-            let differs = difference(&found.to_toml()?, &own.to_toml()?);
+        let (tile, frame) = (config.tile.and(found.tile), config.frame.and(found.frame));
+        let found = TrainConfig { tile, frame, up: config.up.and(found.up), ..found };
+        if found != config {
+            let differs = difference(&found.to_toml()?, &config.to_toml()?);
             let problem = format!("contains another run ({differs}); choose another --out");
             return Err(Error::output(&self.folder, problem));
         }

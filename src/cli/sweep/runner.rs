@@ -36,7 +36,8 @@ pub(super) fn train(
     runs: &[&Run],
     jobs: usize,
     bar: &ProgressBar,
-    (folder, all): (&Path, usize),
+    folder: &Path,
+    all: usize,
 ) -> Result<Vec<Failure>> {
     let requests = signals::requests()?;
     let time_up = AtomicBool::new(false);

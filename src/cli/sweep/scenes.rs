@@ -44,14 +44,16 @@ pub(super) fn run(args: &SweepArgs) -> Result<()> {
     }
     let (mut scenes, mut failed) = (vec![], vec![]);
     for (dataset, name) in datasets.zip(names) {
-        let own = SweepArgs {
+        let args_of_scene = SweepArgs {
             dataset: dataset.clone(),
             more: vec![],
             out: args.out.join(&name),
             ..args.clone()
         };
         let title = format!("Sweep of {}", dataset.display());
-        let Some((rows, failures)) = super::swept(&own, &title, &[], &[])? else { continue };
+        let Some((rows, failures)) = super::swept(&args_of_scene, &title, &[], &[])? else {
+            continue;
+        };
         failed.extend(failures.into_iter().map(|failure| (name.clone(), failure)));
         scenes.push(Scene { name, rows });
     }
@@ -102,7 +104,7 @@ impl SceneTable {
         scores.extend(measures().filter(known));
         let mut points: Vec<&Row> = vec![];
         for row in scenes.iter().flat_map(|scene| &scene.rows.rows) {
-            if !points.iter().any(|own| own.point == row.point) {
+            if !points.iter().any(|point| point.point == row.point) {
                 points.push(row);
             }
         }
@@ -124,7 +126,7 @@ impl SceneTable {
     fn means(scenes: &[Vec<Option<f64>>]) -> Vec<Option<f64>> {
         let count = scenes.first().map_or(0, Vec::len);
         let mean = |score: usize| {
-            let all: Option<Vec<f64>> = scenes.iter().map(|own| own[score]).collect();
+            let all: Option<Vec<f64>> = scenes.iter().map(|values| values[score]).collect();
             all.map(|all| all.iter().sum::<f64>() / all.len() as f64)
         };
         (0..count).map(mean).collect()
@@ -146,7 +148,7 @@ impl SceneTable {
         heads.extend((self.scenes.len() > 1).then(|| "mean".to_owned()));
         let row = |(label, scenes): &(String, Vec<Vec<Option<f64>>>)| {
             let mut cells = vec![label.clone()];
-            cells.extend(scenes.iter().map(|own| Self::cell(own)));
+            cells.extend(scenes.iter().map(|values| Self::cell(values)));
             cells.extend((scenes.len() > 1).then(|| Self::cell(&Self::means(scenes))));
             cells
         };
@@ -195,8 +197,8 @@ impl SceneTable {
         for (label, scenes) in &self.rows {
             let means = Self::means(scenes);
             let mean = (scenes.len() > 1).then_some(("mean", &means));
-            let own = self.scenes.iter().map(String::as_str).zip(scenes).chain(mean);
-            for (scene, values) in own {
+            let named = self.scenes.iter().map(String::as_str).zip(scenes).chain(mean);
+            for (scene, values) in named {
                 let rounded = |value: f64| (value * 1e6).round() / 1e6;
                 let numbers = values.iter().map(|value| number(value.map(rounded)));
                 let numbers: Vec<String> = numbers.collect();

@@ -9,7 +9,7 @@ use crate::cli::driver;
 use crate::gpu::Gpu;
 use crate::networks::lpips::{Lpips, Range};
 use crate::photographs::dataset::View;
-use crate::results::eval::{self, ScoreReference};
+use crate::results::eval::{Evaluation, Extras, ScoreReference};
 use crate::results::finished_run::FinishedRun;
 use crate::{Error, Result};
 
@@ -30,11 +30,9 @@ pub(super) fn add_lpips(runs: &[&Path], gpu: &Gpu, weights: &Path, range: Range)
         let mut reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
         let is_even = reference.is_evenly_lit(&dataset);
         let render = |view: &View| model_renderer.render_as(view, is_even);
-        let scored = eval::score_by(&mut reference, &dataset, render, |score, images| {
-            score.scores.lpips = Some(images.lpips(&gpu, &lpips)?);
-            Ok(())
-        })?;
-        eval::add_lpips(&mut known, &scored, lpips.measure());
+        let extras = Extras { lpips: Some((&lpips, &gpu)), ..Extras::default() };
+        let evaluation = Evaluation::new(&mut reference, &dataset, &extras, render, |_| Ok(()))?;
+        evaluation.add_lpips(&mut known);
         let text = serde_json::to_string_pretty(&known)
             .map_err(|error| Error::output(run.join(FILE), error.to_string()))?;
         write_whole(&run.join(FILE), text.as_bytes())?;

@@ -10,7 +10,7 @@ use crate::photographs::image::{ColourCounts, Image};
 use crate::photographs::tone::{
     CurveChoice, FAMILIES, Family, Statistics, ToneCurve, ToneSettings,
 };
-use crate::results::report::{Series, VerticalLine, plot_in_groups, svg_file};
+use crate::results::report::{Chart, Series, VerticalLine};
 use crate::{Error, Result};
 
 /// List the tone curves, print their values or plot them.
@@ -78,7 +78,7 @@ pub fn text(args: &ListArgs) -> Result<String> {
         text += &values(&curves, &args.at, scene.as_ref());
     }
     if let Some(path) = &args.plot {
-        let svg = svg_file(&drawing(&curves, scene.as_ref()));
+        let svg = chart(&curves, scene.as_ref()).svg_file();
         write_whole(path, svg.as_bytes())?;
         let others = if is_plain_plot { "; name curves to plot others" } else { "" };
         text += &format!("wrote {}: {} curves{others}\n", path.display(), curves.len());
@@ -163,11 +163,13 @@ fn values(curves: &[Curve], at: &[f64], scene: Option<&Statistics>) -> String {
     table::aligned(&rows)
 }
 
-fn drawing(curves: &[Curve], scene: Option<&Statistics>) -> String {
+fn chart(curves: &[Curve], scene: Option<&Statistics>) -> Chart {
     const LAST: f64 = 3.0;
     const POINTS: u32 = 300;
-    let series = |(line, curve): (usize, &Curve)| Series {
-        line: Some(line),
+    /// The most curves that can be told apart in a panel.
+    const PANEL: usize = 6;
+    let series = |(index, curve): (usize, &Curve)| Series {
+        color: Some(index),
         name: curve.name.clone(),
         points: (0..=POINTS)
             .map(|i| LAST * f64::from(i) / f64::from(POINTS))
@@ -180,6 +182,7 @@ fn drawing(curves: &[Curve], scene: Option<&Statistics>) -> String {
         let mean = f64::from(scene.mean_luminance) / f64::from(scene.p90);
         vec![mark(scene.ratio(), "p10"), mark(mean, "mean Y"), mark(1.0, "p90")]
     });
-    let series: Vec<Series> = curves.iter().enumerate().map(series).collect();
-    plot_in_groups("t = x / p90", "target", &series, &marks.unwrap_or_default())
+    let series = curves.iter().enumerate().map(series).collect();
+    let chart = Chart::new("t = x / p90", "target", series);
+    Chart { lines: marks.unwrap_or_default(), panel: Some(PANEL), ..chart }
 }

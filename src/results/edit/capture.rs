@@ -12,7 +12,7 @@ use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
 use crate::photographs::tone::ToneSettings;
-use crate::results::eval::{self, ModelRenderer, ScoreReference};
+use crate::results::eval::{After, Evaluation, Extras, Metric, ModelRenderer, ScoreReference};
 use crate::results::finished_run::{FinishedRun, Opener, is_model};
 use crate::results::run;
 use crate::splats::model::Model;
@@ -71,7 +71,8 @@ impl Capture {
     pub(super) fn psnr(
         &self,
         run: Option<&Path>,
-        (gaussians, facts): (&Gaussians, &Facts),
+        gaussians: &Gaussians,
+        facts: &Facts,
         placement: &Placement,
         score_reference: &mut ScoreReference,
     ) -> Result<Option<f64>> {
@@ -91,8 +92,9 @@ impl Capture {
             model_renderer.set_lamp(lamp.map(|lamp| lamp.scaled(placement.scale)))?;
         }
         let render = |view: &View| model_renderer.render_camera(&placement.camera(&view.camera));
-        let scored = eval::score_by(score_reference, dataset, render, |_, _| Ok(()))?;
-        Ok(eval::means(&scored).0.map(|mean| mean.psnr))
+        let evaluation =
+            Evaluation::new(score_reference, dataset, &Extras::default(), render, |_| Ok(()))?;
+        Ok(evaluation.mean(Metric::Psnr, After::Model))
     }
 
     /// The cameras of the training views.

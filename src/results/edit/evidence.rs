@@ -139,7 +139,7 @@ impl<'a> Measured<'a> {
                 &options,
                 &mut gradients,
                 |patch, planes| {
-                    let d_renders = d_renders((view, target), patch, planes, signs, adjusts);
+                    let d_renders = d_renders(view, target, patch, planes, signs, adjusts);
                     let squares = d_renders[0].iter().map(|d| f64::from(d / 2.0).powi(2));
                     errors += squares.sum::<f64>();
                     values += d_renders[0].len();
@@ -173,7 +173,8 @@ impl<'a> Measured<'a> {
 /// The gradient of the squared error with respect to the render of a patch, and images of signs; without masked
 /// pixels. With `adjusts`, the target takes the gain and bias of the render.
 fn d_renders(
-    (view, target): (&View, &Image),
+    view: &View,
+    target: &Image,
     patch: &Patch,
     planes: &[f32],
     signs: Stream,

@@ -45,8 +45,15 @@ const UNSEEN: f64 = 1e-4;
 /// An unseen Gaussian stands alone from this many times the median distance to its neighbours.
 const ALONE: f64 = 6.0;
 
+/// The training cameras.
+pub(super) struct CameraPositions {
+    pub(super) positions: Vec<DVec3>,
+    /// The distance before a camera at which nothing is.
+    pub(super) near: f64,
+}
+
 /// The Gaussians that are no floaters, and how many are.
-pub(super) struct Found {
+pub(super) struct Floaters {
     pub(super) keep: Vec<bool>,
     /// Those that the training views contradict.
     pub(super) contradicted: usize,
@@ -54,14 +61,13 @@ pub(super) struct Found {
     pub(super) unseen: usize,
 }
 
-/// Finds the floaters of Gaussians; `cameras` are the positions of the training cameras, and `near` the distance before
-/// them at which nothing is, in the same units.
-pub(super) fn found<'a>(
+/// Finds the floaters of Gaussians.
+pub(super) fn find<'a>(
     gaussians: &Gaussians,
     targets: &[Option<Image>],
-    (cameras, near): (&[DVec3], f64),
+    cameras: &CameraPositions,
     measured: impl Fn(&Gaussians) -> Measured<'a>,
-) -> Result<Found> {
+) -> Result<Floaters> {
     let evidence_of = |shares: &[f64]| measured(&faded(gaussians, shares)).evidence(targets);
     let mut keep = vec![true; gaussians.count];
     for _ in 0..PASSES {
@@ -72,10 +78,9 @@ pub(super) fn found<'a>(
         }
     }
     let contradicted = keep.iter().filter(|keep| !**keep).count();
-    let unseen = drop_unseen(gaussians, &mut keep, (cameras, near), |rest| {
-        measured(rest).evidence(targets)
-    })?;
-    Ok(Found { keep, contradicted, unseen })
+    let unseen =
+        drop_unseen(gaussians, &mut keep, cameras, |rest| measured(rest).evidence(targets))?;
+    Ok(Floaters { keep, contradicted, unseen })
 }
 
 /// Lets opacities of what is kept follow the error; returns the share of each that is left.
@@ -216,18 +221,19 @@ fn faded(gaussians: &Gaussians, shares: &[f64]) -> Gaussians {
 fn drop_unseen(
     gaussians: &Gaussians,
     keep: &mut [bool],
-    (cameras, near): (&[DVec3], f64),
+    cameras: &CameraPositions,
     evidence: impl Fn(&Gaussians) -> Result<Evidence>,
 ) -> Result<usize> {
-    let left: Vec<usize> = (0..keep.len()).filter(|&index| keep[index]).collect();
-    let mut rest = gaussians.clone();
-    rest.retain(keep);
-    let (evidence, alone) = (evidence(&rest)?, alone(&rest));
+    let indices: Vec<usize> = (0..keep.len()).filter(|&index| keep[index]).collect();
+    let mut kept = gaussians.clone();
+    kept.retain(keep);
+    let (evidence, are_alone) = (evidence(&kept)?, are_alone(&kept));
     let mut unseen = 0;
-    for (number, &index) in left.iter().enumerate() {
+    for (kept_index, &index) in indices.iter().enumerate() {
         let position = gaussians.position(index);
-        let is_before = || cameras.iter().any(|camera| camera.distance(position) < near);
-        if evidence.square[number] < UNSEEN && (alone[number] || is_before()) {
+        let is_near = |camera: &DVec3| camera.distance(position) < cameras.near;
+        let is_before = || cameras.positions.iter().any(is_near);
+        if evidence.square[kept_index] < UNSEEN && (are_alone[kept_index] || is_before()) {
             keep[index] = false;
             unseen += 1;
         }
@@ -236,7 +242,7 @@ fn drop_unseen(
 }
 
 /// Which Gaussians are far from others.
-fn alone(gaussians: &Gaussians) -> Vec<bool> {
+fn are_alone(gaussians: &Gaussians) -> Vec<bool> {
     let distances = gaussians.distances_to_nearest();
     let mut sorted = distances.clone();
     sorted.sort_unstable_by(f64::total_cmp);

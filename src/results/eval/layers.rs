@@ -196,8 +196,9 @@ impl Normals {
             .iter()
             .zip(axes.iter())
             .map(|(mean, axis)| {
-                let own = if axis.dot(mean.as_dvec3() - center) > 0.0 { -*axis } else { *axis };
-                let DVec3 { x, y, z } = to_view * own;
+                let facing_camera =
+                    if axis.dot(mean.as_dvec3() - center) > 0.0 { -*axis } else { *axis };
+                let DVec3 { x, y, z } = to_view * facing_camera;
                 DVec3::new(x, -y, -z).as_vec3() / SH_C0
             })
             .collect();
@@ -208,8 +209,8 @@ impl Normals {
         let mut image = renderer.render_image(&on_device, camera, &options)?;
         let pixels = image.pixel_count();
         for pixel in 0..pixels {
-            let own = [0, 1, 2].map(|plane| image.data[plane * pixels + pixel]);
-            let unit = Vec3::from_array(own).normalize_or_zero().to_array();
+            let sum = [0, 1, 2].map(|plane| image.data[plane * pixels + pixel]);
+            let unit = Vec3::from_array(sum).normalize_or_zero().to_array();
             (0..3).for_each(|plane| image.data[plane * pixels + pixel] = unit[plane]);
         }
         Ok(image)

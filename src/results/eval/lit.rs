@@ -2,13 +2,10 @@
 
 use std::path::PathBuf;
 
-use serde_json::Value;
-
-use super::{ScoredImages, ViewScore, other_scores, quantized};
+use super::{After, Evaluation, ReferenceKind, aligned, quantized};
 use crate::Result;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
-use crate::photographs::metrics::Scores;
 use crate::train::Rendered;
 
 /// The test views in the light of the lamp at the camera, bright and without noise, if a dataset has these.
@@ -16,35 +13,24 @@ pub(super) fn lit_folder(dataset: &Dataset) -> PathBuf {
     dataset.root.join("lit")
 }
 
-/// Adds the scores in the light of the lamp; `render` renders a view so.
-pub(crate) fn score_lit(
-    scored: &mut [ViewScore],
-    dataset: &Dataset,
-    mut render: impl FnMut(&View) -> Result<Rendered>,
-) -> Result<()> {
-    let folder = lit_folder(dataset);
-    for score in scored {
-        let path = folder.join(format!("{}.png", score.name));
-        let view = dataset.test_views().find(|view| view.name == score.name);
-        let Some(view) = view.filter(|_| path.is_file()) else { continue };
-        let (width, height) = (view.camera.width, view.camera.height);
-        let target = quantized(&Image::load(&path)?.resized(width, height));
-        let compared = ScoredImages { view, render: quantized(render(view)?.output()), target };
-        score.lit = Some(compared.aligned()?);
+impl Evaluation {
+    /// Adds the scores in the light of the lamp; `render` renders a view in this light.
+    pub(crate) fn add_lit(
+        &mut self,
+        dataset: &Dataset,
+        mut render: impl FnMut(&View) -> Result<Rendered>,
+    ) -> Result<()> {
+        let folder = lit_folder(dataset);
+        let names: Vec<String> = self.views().into_iter().map(str::to_owned).collect();
+        for name in names {
+            let path = folder.join(format!("{name}.png"));
+            let view = dataset.test_views().find(|view| view.name == name);
+            let Some(view) = view.filter(|_| path.is_file()) else { continue };
+            let (width, height) = (view.camera.width, view.camera.height);
+            let target = quantized(&Image::load(&path)?.resized(width, height));
+            let scores = aligned(&quantized(render(view)?.output()), &target)?;
+            self.add(&name, &scores, ReferenceKind::LitByLamp, After::LampLight);
+        }
+        Ok(())
     }
-    Ok(())
-}
-
-/// Adds to `metrics.json` the scores in the light of the lamp, if there are any.
-pub(crate) fn add_lit(metrics: &mut Value, scored: &[ViewScore]) {
-    if scored.iter().any(|view| view.lit.is_some()) {
-        let what = "in the light of the lamp at the camera, against the dataset's lit/, after the least-squares gain \
-                    and bias of each channel";
-        metrics["lit_by_lamp"] = other_scores(what, scored, |view| view.lit);
-    }
-}
-
-/// The mean scores in the light of the lamp, if there are any.
-pub(crate) fn mean_lit(scored: &[ViewScore]) -> Option<Scores> {
-    Scores::mean(&scored.iter().filter_map(|view| view.lit).collect::<Vec<_>>())
 }

@@ -5,7 +5,7 @@
 
 use serde::Serialize;
 
-use super::ViewScore;
+use super::{Evaluation, Metric};
 use crate::Result;
 use crate::photographs::dataset::{Dataset, View};
 use crate::train::{Background, Rendered};
@@ -44,29 +44,17 @@ impl ResidualTransmittance {
         let (_, q99, _) = pixels.select_nth_unstable_by(rank, f32::total_cmp);
         Some(Self { mean, q99: (*q99).into() })
     }
-
-    /// The mean of each over several views; `None` if there are none.
-    pub(crate) fn mean(views: impl Iterator<Item = Self>) -> Option<Self> {
-        let (mut sum, mut count) = (Self { mean: 0.0, q99: 0.0 }, 0);
-        for Self { mean, q99 } in views {
-            (sum.mean, sum.q99, count) = (sum.mean + mean, sum.q99 + q99, count + 1);
-        }
-        let count = f64::from(count);
-        (count > 0.0).then(|| Self { mean: sum.mean / count, q99: sum.q99 / count })
-    }
 }
 
-/// A warning about the view with the largest hole, with a remedy, for a model trained over `background`; `None` if no
-/// view exceeds [`MAX_RESIDUAL_TRANSMITTANCE`].
+/// A warning about the view with the largest hole, with a remedy, for a model trained over `background`; `None` if the
+/// mean residual transmittance of no view exceeds [`MAX_RESIDUAL_TRANSMITTANCE`].
 pub fn hole_warning<'a>(
-    views: impl IntoIterator<Item = (&'a str, ResidualTransmittance)>,
+    views: impl IntoIterator<Item = (&'a str, f64)>,
     background: Background,
 ) -> Option<String> {
-    let views: Vec<(&str, ResidualTransmittance)> = views.into_iter().collect();
-    let open = views.iter().filter(|(_, residual_transmittance)| {
-        residual_transmittance.mean > MAX_RESIDUAL_TRANSMITTANCE
-    });
-    let (name, worst) = open.clone().max_by(|(_, a), (_, b)| a.mean.total_cmp(&b.mean))?;
+    let views: Vec<(&str, f64)> = views.into_iter().collect();
+    let open = views.iter().filter(|(_, mean)| *mean > MAX_RESIDUAL_TRANSMITTANCE);
+    let (name, worst) = open.clone().max_by(|(_, a), (_, b)| a.total_cmp(b))?;
     let cause = match background {
         Background::Black => {
             "dark surfaces can stay empty over black; train with `--background random`"
@@ -76,7 +64,7 @@ pub fn hole_warning<'a>(
     Some(format!(
         "view {name}: {:.0} % of the background shows through the model (above {:.0} % in {} of {} views): {cause}, or \
          mask what is to stay empty",
-        100.0 * worst.mean,
+        100.0 * worst,
         100.0 * MAX_RESIDUAL_TRANSMITTANCE,
         open.count(),
         views.len()
@@ -85,26 +73,26 @@ pub fn hole_warning<'a>(
 
 /// Warns of holes in the scored views of a model that was trained over `background`; without scored views, in some of
 /// the training views, which `render` renders.
-pub fn warn_of_holes(
-    scored: &[ViewScore],
+pub(crate) fn warn_of_holes(
+    evaluation: &Evaluation,
     dataset: &Dataset,
     background: Background,
     mut render: impl FnMut(&View) -> Result<Rendered>,
 ) -> Result<()> {
     /// The maximum number of training views to render, evenly spread.
     const MOST: usize = 8;
-    let own = |view: &ViewScore| Some((view.name.clone(), view.residual_transmittance?));
-    let mut residual_transmittances: Vec<(String, ResidualTransmittance)> =
-        scored.iter().filter_map(own).collect();
-    if residual_transmittances.is_empty() {
+    let scores = evaluation.scores.iter();
+    let means = scores.filter(|score| score.metric == Metric::ResidualTransmittance);
+    let mut means: Vec<(&str, f64)> =
+        means.map(|score| (score.view.as_str(), score.value)).collect();
+    if means.is_empty() {
         let views: Vec<&View> = dataset.views.iter().filter(|v| v.is_for_training()).collect();
         for view in views.iter().step_by(views.len().div_ceil(MOST).max(1)) {
-            let own = ResidualTransmittance::of(&render(view)?, view);
-            residual_transmittances.extend(own.map(|own| (view.name.clone(), own)));
+            let found = ResidualTransmittance::of(&render(view)?, view);
+            means.extend(found.map(|found| (view.name.as_str(), found.mean)));
         }
     }
-    let views = residual_transmittances.iter().map(|(name, own)| (name.as_str(), *own));
-    if let Some(warning) = hole_warning(views, background) {
+    if let Some(warning) = hole_warning(means, background) {
         tracing::warn!("{warning}");
     }
     Ok(())
@@ -128,22 +116,11 @@ mod tests {
             Some(ResidualTransmittance { mean: 0.25, q99: 0.25 })
         );
         assert_eq!(ResidualTransmittance::of_pixels(&mut []), None);
-        let both = ResidualTransmittance::mean(
-            [residual_transmittance, ResidualTransmittance { mean: 0.0, q99: 1.0 }].into_iter(),
-        )
-        .unwrap();
-        assert_eq!(both, ResidualTransmittance { mean: 99.5 / 512.0, q99: 453.0 / 512.0 });
-        assert_eq!(ResidualTransmittance::mean([].into_iter()), None);
     }
 
     #[test]
     fn the_warning_names_the_worst_view_and_a_remedy() {
-        let residual_transmittance = |mean| ResidualTransmittance { mean, q99: 1.0 };
-        let views = [
-            ("a", residual_transmittance(0.3)),
-            ("b", residual_transmittance(0.62)),
-            ("c", residual_transmittance(0.1)),
-        ];
+        let views = [("a", 0.3), ("b", 0.62), ("c", 0.1)];
         let message = hole_warning(views, Background::Black).unwrap();
         for part in ["view b: 62 %", "above 10 % in 2 of 3 views", "--background random", "mask"] {
             assert!(message.contains(part), "{message}");
@@ -151,7 +128,7 @@ mod tests {
         assert!(!message.contains('\n'), "{message}");
         let message = hole_warning(views, Background::Random).unwrap();
         assert!(message.contains("view b") && !message.contains("--background"), "{message}");
-        assert_eq!(hole_warning([("c", residual_transmittance(0.1))], Background::Black), None);
+        assert_eq!(hole_warning([("c", 0.1)], Background::Black), None);
         assert_eq!(hole_warning([], Background::Black), None);
     }
 }

@@ -53,7 +53,7 @@ fn planes(gaussians: &Gaussians, are_linear: bool) -> Vec<Plane> {
     let rotation =
         gaussians.quats().iter().map(|&quat| unit(quat)).flat_map(|[w, x, y, z]| [x, y, z, w]);
     // Point colours for readers without the extension, in the linear light of glTF.
-    let light = |own: f32| if are_linear { own } else { linear_from_srgb(own) };
+    let light = |value: f32| if are_linear { value } else { linear_from_srgb(value) };
     let seen = |dc: f32| light((0.5 + SH_C0 * dc).clamp(0.0, 1.0));
     let colors = gaussians.dc().iter().zip(&opacity);
     let colors = colors.flat_map(|(dc, &opacity)| [seen(dc.x), seen(dc.y), seen(dc.z), opacity]);
@@ -69,10 +69,12 @@ fn planes(gaussians: &Gaussians, are_linear: bool) -> Vec<Plane> {
     let coefficients = rest_coefficients(gaussians.shape.sh_degree);
     for degree in 1..=gaussians.shape.sh_degree {
         let first = rest_coefficients(degree - 1);
-        for place in first..rest_coefficients(degree) {
-            let values =
-                gaussians.rest().chunks_exact(coefficients).flat_map(|rest| rest[place].to_array());
-            let name = format!("SH_DEGREE_{degree}_COEF_{}", place - first);
+        for coefficient in first..rest_coefficients(degree) {
+            let values = gaussians
+                .rest()
+                .chunks_exact(coefficients)
+                .flat_map(|rest| rest[coefficient].to_array());
+            let name = format!("SH_DEGREE_{degree}_COEF_{}", coefficient - first);
             planes.push(plane(&name, "VEC3", values.collect()));
         }
     }
@@ -167,8 +169,8 @@ mod tests {
             let scale = turned.log_scales()[8].x.exp();
             assert_eq!(values("KHR_gaussian_splatting:SCALE")[24], scale);
             if degree > 1 {
-                let place = 9 * rest_coefficients(degree) - rest_coefficients(degree) + 3;
-                let expected = turned.rest()[place].to_array();
+                let coefficient = 9 * rest_coefficients(degree) - rest_coefficients(degree) + 3;
+                let expected = turned.rest()[coefficient].to_array();
                 assert_eq!(values("KHR_gaussian_splatting:SH_DEGREE_2_COEF_0")[24..], expected);
             }
         }

@@ -76,7 +76,7 @@ impl Page<'_> {
     pub fn html(&self) -> Result<String> {
         let Self { title, gaussians, provenance, bookmarks, origin, fingerprint, near, up, lamp } =
             self;
-        let other = bookmarks.iter().find(|own| own.camera.model != CameraModel::Pinhole);
+        let other = bookmarks.iter().find(|bookmark| bookmark.camera.model != CameraModel::Pinhole);
         if let Some(Bookmark { name, .. }) = other {
             return Err(Error::Usage(format!(
                 "view {name} is a fisheye, and the page renders pinhole cameras; load its dataset with --undistort"

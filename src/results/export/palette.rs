@@ -103,7 +103,7 @@ impl Cell {
         let members = &order[range.clone()];
         let (axis, (mean, error)) = (0..width)
             .map(|axis| (axis, moments(points, width, members, axis)))
-            .fold((0, (0.0, -1.0)), |best, own| if own.1.1 > best.1.1 { own } else { best });
+            .fold((0, (0.0, -1.0)), |best, next| if next.1.1 > best.1.1 { next } else { best });
         Self { range, axis, mean: mean as f32, error }
     }
 }

@@ -311,8 +311,8 @@ pub(crate) fn decode(file: &[u8]) -> Result<(Gaussians, Facts), String> {
     if let Some(rest) = &meta.rest {
         decode_rest(&mut zip, rest, &mut gaussians)?;
     }
-    if let Some(place) = gaussians.parameters.iter().position(|value| !value.is_finite()) {
-        return Err(format!("number {place} is not finite"));
+    if let Some(index) = gaussians.parameters.iter().position(|value| !value.is_finite()) {
+        return Err(format!("number {index} is not finite"));
     }
     let facts = Facts::of_json(&meta.asset["nightsplat"])?;
     gaussians.origin = facts.origin;
@@ -336,8 +336,8 @@ fn decode_rest(
     let rows = gaussians.rest_mut().chunks_exact_mut(coefficients.max(1));
     for (values, [a, b, ..]) in rows.zip(&labels.0) {
         let first = coefficients * usize::from(u16::from_le_bytes([*a, *b]));
-        for (value, place) in values.iter_mut().zip(first..) {
-            let codes = sets.0.get(place).ok_or("has a label beyond its coefficients")?;
+        for (value, coefficient) in values.iter_mut().zip(first..) {
+            let codes = sets.0.get(coefficient).ok_or("has a label beyond its coefficients")?;
             *value = decoded(&rest.codebook, *codes)?;
         }
     }
@@ -423,8 +423,8 @@ mod tests {
                 let distance = |j: &usize| back.means()[*j].distance(model.means()[i]);
                 let nearest = (0..back.count).min_by(|a, b| distance(a).total_cmp(&distance(b)));
                 let j = nearest.unwrap();
-                let [own, other] = [unit(model.quats()[i]), back.quats()[j]];
-                let dot: f32 = own.iter().zip(other).map(|(a, b)| a * b).sum();
+                let [quat, other] = [unit(model.quats()[i]), back.quats()[j]];
+                let dot: f32 = quat.iter().zip(other).map(|(a, b)| a * b).sum();
                 let error = [
                     distance(&j),
                     (back.log_scales()[j] - model.log_scales()[i]).abs().max_element(),
@@ -450,9 +450,9 @@ mod tests {
         for length in (0..file.len()).step_by(7) {
             assert!(decode(&file[..length]).is_err(), "{length} bytes");
         }
-        for place in (0..file.len()).step_by(3) {
+        for byte in (0..file.len()).step_by(3) {
             let mut edited = file.clone();
-            edited[place] ^= 0x41;
+            edited[byte] ^= 0x41;
             drop(decode(&edited));
         }
         let of_meta = |meta: &str| Encoded { meta: meta.to_owned(), images: vec![] };

@@ -209,14 +209,14 @@ fn unpacked(file: &[u8]) -> Result<(Header, Streams, Vec<u8>), String> {
     let mut rest = file.get(table..).and_then(|table| table.get(16 * stream_count..));
     let mut streams = Streams::default();
     let lengths = header.lengths();
-    for (place, stream) in streams.iter_mut().enumerate().take(stream_count) {
-        let length = word(file, table + 16 * place)? as usize;
+    for (index, stream) in streams.iter_mut().enumerate().take(stream_count) {
+        let length = word(file, table + 16 * index)? as usize;
         let (packed, after) =
             rest.and_then(|rest| rest.split_at_checked(length)).ok_or(TRUNCATED)?;
         rest = Some(after);
         let mut decoder = StreamingDecoder::new(packed)
             .map_err(|error| format!("cannot be unpacked: {error}"))?;
-        *stream = exactly(&mut decoder, lengths[place])?;
+        *stream = exactly(&mut decoder, lengths[index])?;
     }
     match streams.iter().zip(lengths).all(|(stream, length)| stream.len() == length) {
         true => Ok((header, streams, rest.unwrap_or_default().to_vec())),
@@ -233,8 +233,8 @@ fn vectors(vectors: &mut [Vec3], bytes: &[u8], value: impl Fn(f32) -> f32) {
 fn of_smallest_three(code: u32) -> [f32; 4] {
     let largest = (code >> 30) as usize;
     let mut parts = [0.0_f32; 4];
-    for (place, i) in (0..4).filter(|&i| i != largest).enumerate() {
-        let bits = code >> (10 * (2 - place));
+    for (part, i) in (0..4).filter(|&i| i != largest).enumerate() {
+        let bits = code >> (10 * (2 - part));
         let magnitude = (bits & 511) as f32 / 511.0 * std::f32::consts::FRAC_1_SQRT_2;
         parts[i] = if bits & 512 == 0 { magnitude } else { -magnitude };
     }
@@ -358,9 +358,9 @@ mod tests {
     #[test]
     fn a_rotation_is_decoded_within_the_precision_of_ten_bits() {
         for quat in drawn(200, 0).quats() {
-            let own = unit(*quat);
+            let quat = unit(*quat);
             let back = of_smallest_three(smallest_three(*quat));
-            let dot: f32 = own.iter().zip(back).map(|(a, b)| a * b).sum();
+            let dot: f32 = quat.iter().zip(back).map(|(a, b)| a * b).sum();
             assert!(dot.abs() > 1.0 - 5e-6, "{quat:?}: {dot}");
         }
         let back = of_first_three([127.5, 255.0, 127.5]);
@@ -388,8 +388,8 @@ mod tests {
             }
             let (back, stated) = decode(&file).unwrap();
             assert_eq!((stated, back.origin, back.shape), (facts, model.origin, model.shape));
-            let error = |own: &[f32], back: &[f32]| {
-                own.iter().zip(back).fold(0.0_f32, |most, (a, b)| most.max((a - b).abs()))
+            let error = |values: &[f32], back: &[f32]| {
+                values.iter().zip(back).fold(0.0_f32, |most, (a, b)| most.max((a - b).abs()))
             };
             let pairs = [
                 (error(floats(model.means()), floats(back.means())), 1e-6),
@@ -419,15 +419,15 @@ mod tests {
             for length in 0..end {
                 assert!(decode(&file[..length]).is_err(), "{version:?}: {length} bytes");
             }
-            for place in 0..file.len() {
+            for byte in 0..file.len() {
                 let mut edited = file.clone();
-                edited[place] ^= 0x41;
+                edited[byte] ^= 0x41;
                 drop(decode(&edited));
             }
         }
         let mut file = encode(&drawn(5, 1), &provenance, Version::V4).unwrap();
-        let place = file.len() - 3;
-        file[place] = b'x';
+        let byte = file.len() - 3;
+        file[byte] = b'x';
         let problem = decode(&file).unwrap_err();
         assert_eq!(problem, "states near `x.1`, which is not a finite number above 0");
         file[4] = 9;

@@ -318,7 +318,7 @@ struct Chunks<'a> {
 struct Pending {
     /// Chunks of its level before it.
     number: usize,
-    /// Its place in the list of files.
+    /// Its index in the list of files.
     file: usize,
     cells: Vec<Gaussians>,
     count: usize,
@@ -342,9 +342,9 @@ impl<'a> Chunks<'a> {
                 pending.file = self.names.len();
                 self.names.push(format!("{level}_{}/{}", pending.number, sog::META));
             }
-            let place =
+            let range =
                 json!({ "file": pending.file, "offset": pending.count, "count": cell.count });
-            lods.insert(level.to_string(), place);
+            lods.insert(level.to_string(), range);
             pending.count += cell.count;
             self.counts[level] += cell.count;
             pending.cells.push(cell);

@@ -1,12 +1,12 @@
 //! The axes of the plots.
 
-/// A range of values and its place in the drawing.
+/// A range of values and its position in the drawing.
 pub(super) struct Axis {
     low: f64,
     high: f64,
     /// Distance of ticks, a round number; `None` on a logarithmic axis.
     step: Option<f64>,
-    from: f64,
+    pub(super) from: f64,
     to: f64,
 }
 
@@ -43,6 +43,11 @@ impl Axis {
         Self { low, high, step: None, from, to }
     }
 
+    /// The axis of rows from `from` to `to`, each of length 1.
+    pub(super) fn rows(count: usize, from: f64, to: f64) -> Self {
+        Self { low: 0.0, high: count as f64, step: Some(1.0), from, to }
+    }
+
     /// Whether a value lies on the axis.
     pub(super) fn contains(&self, value: f64) -> bool {
         (self.low..=self.high).contains(&value)
@@ -62,7 +67,7 @@ impl Axis {
         (0..=count).map(|tick| self.low + f64::from(tick) * step).collect()
     }
 
-    pub(super) fn place(&self, value: f64) -> f64 {
+    pub(super) fn position(&self, value: f64) -> f64 {
         let scaled = |value: f64| if self.step.is_some() { value } else { value.max(1e-30).ln() };
         let (low, high) = (scaled(self.low), scaled(self.high));
         self.from + (scaled(value) - low) / (high - low) * (self.to - self.from)
@@ -107,10 +112,12 @@ mod tests {
         let axis = Axis::logarithmic([5.0, 100.0].into_iter(), 0.0, 100.0);
         let labels: Vec<String> = axis.ticks().into_iter().map(|tick| axis.label(tick)).collect();
         assert_eq!(labels, ["5", "10", "20", "50", "100"]);
-        assert!((axis.place(5.0)).abs() < 1e-9 && (axis.place(100.0) - 100.0).abs() < 1e-9);
+        assert!((axis.position(5.0)).abs() < 1e-9 && (axis.position(100.0) - 100.0).abs() < 1e-9);
         // Equal ratios have equal distances.
         assert!(
-            (axis.place(20.0) - axis.place(10.0) - axis.place(100.0) + axis.place(50.0)).abs()
+            (axis.position(20.0) - axis.position(10.0) - axis.position(100.0)
+                + axis.position(50.0))
+            .abs()
                 < 1e-9
         );
     }

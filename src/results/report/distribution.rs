@@ -1,6 +1,6 @@
 //! Histograms of luminance: of a photograph, its target and the reference image.
 
-use super::plot::{Series, plot};
+use super::chart::{Chart, Series};
 use crate::photographs::tone::{luminance, measurable};
 
 /// Bins over [0, 1]; higher values count in the last.
@@ -54,8 +54,8 @@ impl Distribution {
     }
 }
 
-/// Draws the densities in one plot, each relative to its peak, with the skewness in the legend.
-pub fn distributions(of: &[Distribution]) -> String {
+/// The densities in one chart, each relative to its peak, with the skewness in the legend.
+pub fn distributions(of: &[Distribution]) -> Chart {
     let series = |distribution: &Distribution| {
         let density = distribution.density();
         let peak = density.iter().map(|&(_, y)| y).fold(f64::MIN_POSITIVE, f64::max);
@@ -65,5 +65,5 @@ pub fn distributions(of: &[Distribution]) -> String {
             ..Series::default()
         }
     };
-    plot("luminance", "density / its peak", &of.iter().map(series).collect::<Vec<_>>())
+    Chart::new("luminance", "density / its peak", of.iter().map(series).collect())
 }

@@ -33,7 +33,8 @@ struct Done {
 pub(super) fn save(
     run: &Path,
     config: &TrainConfig,
-    (dataset, stamp): (&Fingerprint, Option<String>),
+    dataset: &Fingerprint,
+    stamp: Option<String>,
     ended: &Ended,
     gpu: &Gpu,
 ) -> Result<()> {

@@ -1,7 +1,7 @@
 //! Events of a run, for its observer.
 
 use super::meter::ResourceUsage;
-use crate::results::eval::ViewScore;
+use crate::results::eval::Evaluation;
 use crate::splats::model::Model;
 use crate::train::{Ended, MemoryEstimate, StepReport, Trainer};
 
@@ -56,8 +56,8 @@ pub enum Event<'a> {
     Evaluated {
         /// Steps done.
         step: u64,
-        /// The views that have a reference image.
-        scored: &'a [ViewScore],
+        /// The scores of the views that have a reference image.
+        evaluation: &'a Evaluation,
     },
     /// The run directory is complete.
     Finished(&'a RunSummary),
@@ -70,8 +70,8 @@ pub struct RunSummary {
     pub trainer: Trainer,
     /// How it ended.
     pub ended: Ended,
-    /// The test views that have a reference image.
-    pub scored: Vec<ViewScore>,
+    /// The scores of the test views that have a reference image.
+    pub evaluation: Evaluation,
     /// The loss of every step of this call.
     pub losses: Vec<f64>,
     /// Resources of the steps, without loading and scoring, including the seconds before a resumed run.

@@ -6,7 +6,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use super::directory::view_lines;
-use super::files::{EXPOSURES, LAMP, NETWORKS, PLAN, VIEWS};
+use super::files::{EXPOSURES, LAMP, NETWORKS, PLAN, TARGET_EXPOSURE, VIEWS};
 use super::generations;
 use crate::base::input;
 use crate::gpu::Gpu;
@@ -27,6 +27,30 @@ pub fn is_finished(run: &Path) -> bool {
 pub fn load_metrics(run: &Path) -> serde_json::Value {
     let text = std::fs::read(run.join("metrics.json")).ok();
     text.and_then(|text| serde_json::from_slice(&text).ok()).unwrap_or_default()
+}
+
+/// The exposures of the targets, as `metrics.json` of a run has them.
+#[derive(Clone, Debug, serde::Deserialize)]
+pub(crate) struct RecordedExposure {
+    /// The exposure at which the model renders.
+    pub(crate) model_gain: f64,
+    /// The gain of every training view, by name.
+    #[serde(default)]
+    pub(crate) gains: BTreeMap<String, f64>,
+    #[serde(default)]
+    pub(crate) scene: RecordedScene,
+}
+
+/// The exposure of the training photographs together.
+#[derive(Clone, Debug, Default, serde::Deserialize)]
+pub(crate) struct RecordedScene {
+    /// The weight of the curve.
+    pub(crate) weight: Option<f64>,
+}
+
+/// The exposures of the targets of a run; `None` if they are unknown.
+pub(crate) fn load_target_exposure(run: &Path) -> Option<RecordedExposure> {
+    serde_json::from_value(load_metrics(run)[TARGET_EXPOSURE].take()).ok()
 }
 
 /// The configuration of a finished or unfinished run.

@@ -1,7 +1,7 @@
 //! The rows of `evals.csv`: intermediate scores of a run.
 
 use super::meter::ResourceUsage;
-use crate::photographs::metrics::Scores;
+use crate::results::eval::{After, Evaluation, Metric};
 
 /// The mean scores of the test views at one step, and the resources up to it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -30,24 +30,25 @@ impl Progress {
     pub(super) const COLUMNS: &str =
         "step,views,psnr,psnr_channel_mean,ssim,seconds,processor_seconds,joules,gaussians";
 
+    /// The means of an evaluation; `None` without scored views.
     pub(super) fn new(
         step: u64,
         gaussians: usize,
-        views: usize,
-        scores: &Scores,
+        evaluation: &Evaluation,
         spent: &ResourceUsage,
-    ) -> Self {
-        Self {
+    ) -> Option<Self> {
+        let mean = |metric| evaluation.mean(metric, After::Model);
+        Some(Self {
             step,
-            views,
-            psnr: scores.psnr,
-            psnr_channel_mean: scores.psnr_channel_mean,
-            ssim: scores.ssim,
+            views: evaluation.views().len(),
+            psnr: mean(Metric::Psnr)?,
+            psnr_channel_mean: mean(Metric::PsnrChannelMean)?,
+            ssim: mean(Metric::Ssim)?,
             seconds: spent.seconds,
             processor_seconds: spent.processor_seconds,
             joules: spent.joules,
             gaussians: gaussians as u64,
-        }
+        })
     }
 
     pub(super) fn line(&self) -> String {

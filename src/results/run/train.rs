@@ -10,7 +10,7 @@ use super::tensorboard::EventFile;
 use super::{Event, Requests, RunDirectory, RunSummary, done, generations, load};
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, View};
-use crate::results::eval::{self, ScoreReference, ScoredImages, ViewScore};
+use crate::results::eval::{self, After, Evaluation, Extras, Metric, ScoreReference, ScoredImages};
 use crate::splats::attributes::{ATTRIBUTES, AttributeSpec};
 use crate::train::diagnose::Plan;
 use crate::train::{Ended, MemoryEstimate, Settings, StepReport, TrainConfig, Trainer};
@@ -109,27 +109,24 @@ pub fn train_in(
     let losses = losses
         .inspect_err(|error| train_loop.save_on_error(error, &mut trainer, &mut directory))?;
     let finished = train_loop.finish(&mut trainer, &mut directory, &mut observe);
-    let (ended, scored, spent) = finished
+    let (ended, evaluation, spent) = finished
         .inspect_err(|error| train_loop.save_on_error(error, &mut trainer, &mut directory))?;
     let (gaussians, steps) = (trainer.gaussian_count(), trainer.steps_done());
-    let mut metrics = eval::metrics(&scored, spent.seconds, gaussians, steps);
+    let mut metrics = evaluation.json(Some(spent.seconds), gaussians, Some(steps));
     metrics[SPENT] = serde_json::json!(spent);
     eval::add_reference(&mut metrics, &config.tone);
     if let Some(exposure) = trainer.target_exposure() {
         metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
     }
-    if config.exposure.learn {
-        eval::add_exposure(&mut metrics, &scored);
-    }
-    eval::add_lit(&mut metrics, &scored);
+    evaluation.add_other_steps(&mut metrics, config.exposure.learn);
     metrics[ENDED] = serde_json::json!(ended);
     metrics[TRAINED_WITH] = trained_with(gpu);
     if let Some(curve) = held_out_curve(&trainer) {
         metrics[HELD_OUT_CURVE] = curve;
     }
     directory.save_metrics(&metrics)?;
-    done::save(out, config, (trainer.fingerprint(), stamp), &ended, gpu)?;
-    let trained = RunSummary { trainer, ended, scored, losses, spent };
+    done::save(out, config, trainer.fingerprint(), stamp, &ended, gpu)?;
+    let trained = RunSummary { trainer, ended, evaluation, losses, spent };
     observe(Event::Finished(&trained));
     Ok(trained)
 }
@@ -364,7 +361,7 @@ impl<'a> TrainLoop<'a> {
         trainer: &mut Trainer,
         directory: &mut RunDirectory,
         observe: &mut impl FnMut(Event<'_>),
-    ) -> Result<(Ended, Vec<ViewScore>, ResourceUsage)> {
+    ) -> Result<(Ended, Evaluation, ResourceUsage)> {
         let ended = trainer.end()?;
         if let Some(events) = &mut self.events {
             events.text(ended.step, "run/ended", &ended.to_string())?;
@@ -372,11 +369,11 @@ impl<'a> TrainLoop<'a> {
         observe(Event::Ended(&ended));
         trainer.drop_unused_degree()?;
         let spent = self.meter.spent(self.gpu.peak_memory());
-        let scored = self.evaluate(trainer, directory, observe)?;
+        let evaluation = self.evaluate(trainer, directory, observe)?;
         let render = |view: &View| trainer.render(&view.camera);
-        eval::warn_of_holes(&scored, self.dataset, self.config.background, render)?;
+        eval::warn_of_holes(&evaluation, self.dataset, self.config.background, render)?;
         directory.save_trained(trainer)?;
-        Ok((ended, scored, spent))
+        Ok((ended, evaluation, spent))
     }
 
     /// Saves the state before an error that does not damage it, such as a lack of memory or a missing file.
@@ -407,7 +404,7 @@ impl<'a> TrainLoop<'a> {
         trainer: &mut Trainer,
         directory: &RunDirectory,
         observe: &mut impl FnMut(Event<'_>),
-    ) -> Result<Vec<ViewScore>> {
+    ) -> Result<Evaluation> {
         let mut score_reference = match self.score_reference.take() {
             Some(known) => known,
             None => ScoreReference::in_scene(
@@ -423,30 +420,31 @@ impl<'a> TrainLoop<'a> {
             true => trainer.render_in_even_light(&view.camera),
             false => trainer.render(&view.camera),
         };
-        let mut scored =
-            eval::score_by(&mut score_reference, self.dataset, render, |score, compared| {
-                if self.config.exposure.learn {
-                    score.aligned = Some(compared.aligned()?);
-                }
-                if std::mem::take(&mut is_first) {
-                    self.write_event_images(step, score, compared)?;
-                }
-                Ok(())
-            })?;
+        let with_gain_and_bias = self.config.exposure.learn;
+        let extras = Extras { with_gain_and_bias, ..Extras::default() };
+        let dataset = self.dataset;
+        let write_first = |images: &ScoredImages<'_>| match std::mem::take(&mut is_first) {
+            true => self.write_event_images(step, images),
+            false => Ok(()),
+        };
+        let mut evaluation =
+            Evaluation::new(&mut score_reference, dataset, &extras, render, write_first)?;
         self.score_reference = Some(score_reference);
         if self.config.model.lamp {
-            eval::score_lit(&mut scored, self.dataset, |view| trainer.render(&view.camera))?;
+            evaluation.add_lit(dataset, |view| trainer.render(&view.camera))?;
         }
-        observe(Event::Evaluated { step, scored: &scored });
-        self.write_event_scores(step, &scored)?;
-        if let Some(scores) = eval::means(&scored).0.filter(|_| self.config.eval_every > 0) {
+        observe(Event::Evaluated { step, evaluation: &evaluation });
+        self.write_event_scores(step, &evaluation)?;
+        if self.config.eval_every > 0 {
             let (gaussians, spent) = (trainer.gaussian_count(), self.meter.spent(0));
-            // An extended run begins at a step that was scored before.
-            self.progress.retain(|earlier| earlier.step < step);
-            self.progress.push(Progress::new(step, gaussians, scored.len(), &scores, &spent));
-            directory.save_progress(&self.progress)?;
+            if let Some(progress) = Progress::new(step, gaussians, &evaluation, &spent) {
+                // An extended run begins at a step that was scored before.
+                self.progress.retain(|earlier| earlier.step < step);
+                self.progress.push(progress);
+                directory.save_progress(&self.progress)?;
+            }
         }
-        Ok(scored)
+        Ok(evaluation)
     }
 }
 
@@ -509,31 +507,35 @@ impl TrainLoop<'_> {
     fn write_event_images(
         &mut self,
         step: u64,
-        ViewScore { name, against, .. }: &ViewScore,
-        ScoredImages { view, render, target }: &ScoredImages<'_>,
+        ScoredImages { view, render, target, against, .. }: &ScoredImages<'_>,
     ) -> Result<()> {
         let Some(events) = &mut self.events else { return Ok(()) };
         for (what, image) in [("render", render), (against.name(), target)] {
             let image = view.upright(image.clone());
             let size = [image.width, image.height];
-            events.picture(step, &format!("view {name}/{what}"), size, &image.to_png8()?)?;
+            events.picture(step, &format!("view {}/{what}", view.name), size, &image.to_png8()?)?;
         }
         Ok(())
     }
 
     /// Writes the mean scores.
-    fn write_event_scores(&mut self, step: u64, scored: &[ViewScore]) -> Result<()> {
-        let (Some(events), Some(first)) = (&mut self.events, scored.first()) else { return Ok(()) };
-        let group = format!("test views against {}", first.against.name());
-        if let Some(mean) = eval::means(scored).0 {
-            let values = [
-                ("PSNR", mean.psnr),
-                ("channel-mean PSNR", mean.psnr_channel_mean),
-                ("SSIM", mean.ssim),
-            ];
-            events
-                .scalars(step, &values.map(|(name, value)| (format!("{group}/{name}"), value)))?;
+    fn write_event_scores(&mut self, step: u64, evaluation: &Evaluation) -> Result<()> {
+        let Some(events) = &mut self.events else { return Ok(()) };
+        let against = evaluation.against().name();
+        let named = [
+            ("PSNR", Metric::Psnr),
+            ("channel-mean PSNR", Metric::PsnrChannelMean),
+            ("SSIM", Metric::Ssim),
+        ];
+        let value = |(name, metric)| {
+            let mean = evaluation.mean(metric, After::Model)?;
+            Some((format!("test views against {against}/{name}"), mean))
+        };
+        let values: Vec<(String, f64)> = named.into_iter().filter_map(value).collect();
+        if values.is_empty() {
+            return Ok(());
         }
+        events.scalars(step, &values)?;
         events.flush()
     }
 }

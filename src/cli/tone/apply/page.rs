@@ -96,7 +96,7 @@ impl Page {
             title: format!("Tone curve {}", self.curve),
             intro,
             tables: vec![table(output)],
-            plots: vec![distributions(&drawn)],
+            charts: vec![distributions(&drawn)],
             comparisons: self.comparison.into_iter().collect(),
             ..Report::default()
         };

@@ -3,7 +3,7 @@
 use super::Fitted;
 use crate::photographs::fit::{Channels, FitOptions, Histogram, Pair};
 use crate::photographs::tone::{Statistics, ToneCurve, ToneSettings};
-use crate::results::report::{Series, plot, svg_file};
+use crate::results::report::{Chart, Series};
 
 /// Share of the pixels that the t axis covers.
 const SHARE: f64 = 0.995;
@@ -54,12 +54,12 @@ pub(super) fn svg(fitted: &Fitted, pairs: &[&Pair], options: &FitOptions) -> Str
         let points = (0..POINTS).map(point).collect();
         Series { name: name.to_owned(), points, ..Series::default() }
     };
-    let series = [
+    let series = vec![
         curve(&format!("{} fitted", fitted.family), &fitted.fit.settings),
         line("pairs, mean", 0.0),
         curve("AP3", &ToneSettings::new(ToneCurve::Ap3)),
         line("mean - 1 sd", -1.0),
         line("mean + 1 sd", 1.0),
     ];
-    svg_file(&plot("t = x / p90", "reference", &series))
+    Chart::new("t = x / p90", "reference", series).svg_file()
 }

@@ -4,8 +4,8 @@ use std::str::FromStr;
 
 use glam::{DQuat, DVec3};
 
-use super::{ExportArgs, To};
-use crate::splats::scene::Gaussians;
+use super::Format;
+use super::run::ExportOptions;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
@@ -45,9 +45,21 @@ impl FromStr for Up {
     }
 }
 
-impl ExportArgs {
+/// The rotation of a file.
+#[derive(Clone, Debug)]
+pub(crate) struct Turn {
+    pub(crate) rotation: DQuat,
+    /// Radians.
+    pub(crate) angle: f64,
+    /// The up direction in the model's world, a unit vector.
+    pub(crate) up: DVec3,
+    /// The axis of the file that is up.
+    pub(crate) axis: &'static str,
+}
+
+impl ExportOptions<'_> {
     /// The up direction in the model's world, if given or known: a unit vector.
-    pub(super) fn up(&self, config: &TrainConfig) -> Option<DVec3> {
+    pub(super) fn up_of(&self, config: &TrainConfig) -> Option<DVec3> {
         match self.up {
             Some(Up::Direction(up)) => Some(up),
             Some(Up::Keep) => None,
@@ -55,37 +67,28 @@ impl ExportArgs {
         }
     }
 
-    /// The rotation that maps the model's up direction to that of the format, and a message about it.
+    /// The rotation that maps the model's up direction to that of the format.
     ///
     /// In every format except the page, up is -y of the model's axes, which is +y in GLB and SPZ. GLB and SPZ, whose
     /// readers interpret the axes, are rotated by the run's up direction; PLY and SOG only if `--up` is given.
-    pub(super) fn rotation(&self, config: &TrainConfig) -> Option<(DQuat, String)> {
-        let has_axes = matches!(self.to, To::Glb | To::Spz);
-        if self.to == To::Html || self.up == Some(Up::Keep) || !(has_axes || self.up.is_some()) {
+    pub(super) fn turn(&self, config: &TrainConfig) -> Option<Turn> {
+        let has_axes = matches!(self.format, Format::Glb | Format::Spz(_));
+        let is_asked = has_axes || self.up.is_some();
+        if self.format == Format::Html || self.up == Some(Up::Keep) || !is_asked {
             return None;
         }
-        let Some(up) = self.up(config) else {
+        let Some(up) = self.up_of(config) else {
             tracing::warn!(
                 "{}: has no up direction, -y of its axes is used; --up names another",
-                self.run.display()
+                self.source.display()
             );
             return None;
         };
         let rotation = DQuat::from_rotation_arc(up, DVec3::NEG_Y);
         let angle = up.angle_between(DVec3::NEG_Y);
-        let [x, y, z] = up.to_array().map(|part| format!("{:.3}", part + 0.0));
         let axis = if has_axes { "+Y" } else { "-Y" };
-        let line = format!(
-            "; turned by {:.1} degrees: ({x}, {y}, {z}) of the dataset is {axis}, up",
-            angle.to_degrees()
-        );
-        (angle > NO_TURN).then_some((rotation, line))
+        (angle > NO_TURN).then_some(Turn { rotation, angle, up, axis })
     }
-}
-
-/// The rotated model; unchanged for the identity.
-pub(super) fn turned(gaussians: Gaussians, rotation: DQuat) -> Gaussians {
-    if rotation == DQuat::IDENTITY { gaussians } else { gaussians.rotated(rotation) }
 }
 
 #[cfg(test)]

@@ -1,0 +1,218 @@
+//! The export of a run or of a model file.
+
+use std::borrow::Cow;
+use std::path::{Path, PathBuf};
+
+use glam::{DQuat, DVec3};
+
+use super::streamed::{self, Division, Tile, Written};
+use super::up::{Turn, Up};
+use super::{Format, Provenance};
+use crate::base::output::{is_same_file, write_whole};
+use crate::photographs::dataset::Dataset;
+use crate::results::finished_run::{Opener, config_of_file, is_model, needs_photographs};
+use crate::results::linear_light::linear_gaussians;
+use crate::results::{models, run};
+use crate::splats::joined::Manifest;
+use crate::splats::levels;
+use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE};
+use crate::train::{SceneLight, TrainConfig};
+use crate::{Error, Result};
+
+/// What is exported, and how.
+#[derive(Debug)]
+pub(crate) struct ExportOptions<'a> {
+    /// A run directory or a model file.
+    pub(crate) source: &'a Path,
+    pub(crate) format: Format,
+    /// `None`: the model's name with the ending of the format.
+    pub(crate) out: Option<&'a Path>,
+    /// `None`: the run's, for formats whose readers interpret the axes.
+    pub(crate) up: Option<Up>,
+    /// Whether colours are in linear light.
+    pub(crate) linear: bool,
+    /// The level of detail.
+    pub(crate) level: usize,
+    pub(crate) division: Division,
+    /// The number of views of a page.
+    pub(crate) views: usize,
+    /// `None`: the run's.
+    pub(crate) dataset: Option<&'a Path>,
+    pub(crate) opener: Opener,
+}
+
+/// A written export.
+#[derive(Debug)]
+pub(crate) struct Exported {
+    pub(crate) path: PathBuf,
+    /// The number of Gaussians of the finest level.
+    pub(crate) count: usize,
+    /// The levels of a streamed model.
+    pub(crate) streamed: Option<Written>,
+    /// The position in the world that those of the file are relative to.
+    pub(crate) origin: DVec3,
+    pub(crate) turn: Option<Turn>,
+}
+
+impl ExportOptions<'_> {
+    /// Writes the export.
+    pub(crate) fn write(&self) -> Result<Exported> {
+        let joined = if is_model(self.source) { None } else { Manifest::of_scene(self.source)? };
+        match joined {
+            Some(tiles) if self.format == Format::StreamedSog => self.write_tiles(&tiles),
+            joined => self.write_whole(joined.as_ref()),
+        }
+    }
+
+    /// Writes the tiles of a joined model, one at a time.
+    fn write_tiles(&self, manifest: &Manifest) -> Result<Exported> {
+        let config = run::load_config(self.source)?;
+        let turn = self.turn(&config);
+        let rotation = turn.as_ref().map_or(DQuat::IDENTITY, |turn| turn.rotation);
+        let facts = config.facts(&config.frame.unwrap_or_default());
+        let provenance = Provenance { rotation, facts, ..self.provenance(&config) };
+        let tiles: Vec<Tile<'_>> = manifest
+            .tiles
+            .iter()
+            .map(|tile| Tile {
+                name: manifest.folder.join(&tile.file),
+                count: tile.count,
+                load: Box::new(move || Ok(Cow::Owned(turned(manifest.read(tile)?, rotation)))),
+            })
+            .collect();
+        let path = self.out.map_or_else(|| self.default_path(), Path::to_owned);
+        let written = streamed::write(&path, &tiles, &provenance, self.division)?;
+        let (count, origin) = (written.counts[0], DVec3::ZERO);
+        Ok(Exported { path, count, streamed: Some(written), origin, turn })
+    }
+
+    fn write_whole(&self, joined: Option<&Manifest>) -> Result<Exported> {
+        let (gaussians, facts, config) = self.open()?;
+        let (gaussians, facts) = match self.linear {
+            true => self.in_linear_light(&gaussians, facts, &config)?,
+            false => (gaussians, facts),
+        };
+        let default_path = self.default_path();
+        let path = self.out.unwrap_or(&default_path).to_owned();
+        if self.format == Format::Ply && is_same_file(&path, &default_path) {
+            let problem = "is the model itself; name another file with --out";
+            return Err(Error::output(path, problem));
+        }
+        let source = self.source.display();
+        if let Some(step) = run::stopped_at(self.source) {
+            tracing::warn!("{source}: stopped at step {step} of {}", config.steps);
+        }
+        if has_networks(&config) {
+            tracing::warn!("{source}: the networks are not exported, only the Gaussians");
+        }
+        let turn = self.turn(&config);
+        let rotation = turn.as_ref().map_or(DQuat::IDENTITY, |turn| turn.rotation);
+        let mut gaussians = turned(gaussians, rotation);
+        if self.level > 0 {
+            let tiles = joined.map_or_else(|| vec![gaussians.count], Manifest::counts);
+            gaussians = levels::level(&gaussians, &tiles, self.division.cell(), self.level);
+        }
+        let provenance = Provenance { rotation, facts, ..self.provenance(&config) };
+        let mut streamed = None;
+        match self.format {
+            // Viewers with a fixed layout expect the coefficients of degree 3.
+            Format::Ply => {
+                let padded = gaussians.with_sh_degree(MAX_SH_DEGREE);
+                Format::Ply.write(&padded, &provenance, &path)?;
+            }
+            Format::StreamedSog => {
+                let tile = Tile::whole(self.source, &gaussians);
+                streamed = Some(streamed::write(&path, &[tile], &provenance, self.division)?);
+            }
+            Format::Html => {
+                let page = self.page(&config, &gaussians, provenance)?;
+                write_whole(&path, page.as_bytes())?;
+            }
+            format => format.write(&gaussians, &provenance, &path)?,
+        }
+        let (count, origin) = (gaussians.count, gaussians.origin);
+        Ok(Exported { path, count, streamed, origin, turn })
+    }
+
+    /// The model as stored, what is stated of it, and its settings.
+    fn open(&self) -> Result<(Gaussians, Facts, TrainConfig)> {
+        let source = self.source;
+        if !is_model(source) {
+            let config = run::load_config(source)?;
+            let (gaussians, facts) = models::read(source)?;
+            return Ok((gaussians, facts, config));
+        }
+        if self.format == Format::Html && self.dataset.is_none() {
+            return Err(needs_photographs(source));
+        }
+        let (gaussians, facts) = models::read(source)?;
+        let config = config_of_file(&gaussians, &facts, self.dataset);
+        Ok((gaussians, facts, config))
+    }
+
+    /// The model in linear light, and the facts that state it.
+    fn in_linear_light(
+        &self,
+        gaussians: &Gaussians,
+        facts: Facts,
+        config: &TrainConfig,
+    ) -> Result<(Gaussians, Facts)> {
+        let config = self.with_dataset(config);
+        let dataset = Dataset::load(&config.dataset, &config.load_options())?;
+        let inverse = SceneLight::of(&config.tone, &dataset)?.of_scene()?;
+        let stops = inverse.stops_to_target();
+        let (linear, clipped) = linear_gaussians(gaussians, &inverse, stops);
+        if clipped > 0 {
+            let count = gaussians.count;
+            tracing::warn!(
+                "{clipped} of {count} Gaussians are as bright as the tone curve gets in some direction: their light is \
+                 at least what is written"
+            );
+        }
+        Ok((linear, Facts { linear: Some(stops as f32), law: None, ..facts }))
+    }
+
+    /// The settings with the dataset where it is now.
+    pub(super) fn with_dataset(&self, config: &TrainConfig) -> TrainConfig {
+        let mut config = config.clone();
+        if let Some(dataset) = self.dataset {
+            config.move_dataset(dataset);
+        }
+        config
+    }
+
+    fn provenance(&self, config: &TrainConfig) -> Provenance {
+        let dataset = config.dataset.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        if is_model(self.source) {
+            return Provenance { dataset, ..Provenance::default() };
+        }
+        let exposure = run::load_target_exposure(self.source).map(|exposure| {
+            let gain = exposure.model_gain;
+            format!("{gain:.2} times that of its photographs, before the curve")
+        });
+        Provenance {
+            dataset,
+            curve: config.tone.curve.to_string(),
+            exposure: exposure.unwrap_or_else(|| "that of its targets".to_owned()),
+            ..Provenance::default()
+        }
+    }
+
+    fn default_path(&self) -> PathBuf {
+        let ending = self.format.name();
+        match is_model(self.source) {
+            true => self.source.with_extension(ending),
+            false => self.source.join(format!("model.{ending}")),
+        }
+    }
+}
+
+/// Whether the model of a run has networks, which no file format holds.
+pub(super) fn has_networks(config: &TrainConfig) -> bool {
+    config.model.denoiser || config.model.tonemapper
+}
+
+/// The rotated model; unchanged for the identity.
+fn turned(gaussians: Gaussians, rotation: DQuat) -> Gaussians {
+    if rotation == DQuat::IDENTITY { gaussians } else { gaussians.rotated(rotation) }
+}

@@ -1,0 +1,121 @@
+//! The page of a run: its model with bookmarks of views.
+
+use glam::DVec3;
+
+use super::Provenance;
+use super::page::{Bookmark, Page, Picture, moved};
+use super::run::{ExportOptions, has_networks};
+use crate::Result;
+use crate::gpu::Gpu;
+use crate::photographs::dataset::{Dataset, View};
+use crate::photographs::image::Image;
+use crate::photographs::tone::ToneCurve;
+use crate::results::edit::fingerprint;
+use crate::results::eval::ModelRenderer;
+use crate::results::finished_run::{FinishedRun, is_model};
+use crate::results::run;
+use crate::splats::render::RenderSettings;
+use crate::splats::scene::Gaussians;
+use crate::train::{TestTargets, TrainConfig};
+
+impl ExportOptions<'_> {
+    /// The page, with bookmarks of test views, or of all views if there are none. Its viewer has a pinhole camera:
+    /// photographs of a fisheye are undistorted and cropped to 60 degrees off the axis.
+    pub(super) fn page(
+        &self,
+        config: &TrainConfig,
+        gaussians: &Gaussians,
+        provenance: Provenance,
+    ) -> Result<String> {
+        let mut opened = None;
+        let (dataset, mut renderer) = if has_networks(config) {
+            let undistort = |config: &mut TrainConfig| config.undistort = true;
+            let run = FinishedRun::open_with(self.source, self.dataset, &self.opener, undistort)?;
+            opened = Some(run.gpu);
+            (run.dataset, Some(run.model_renderer))
+        } else {
+            let config = self.with_dataset(config);
+            let mut options = config.load_options();
+            options.load_low_test = true;
+            options.undistort = true;
+            (Dataset::load(&config.dataset, &options)?, None)
+        };
+        let device = || opened.map_or_else(|| self.opener.open(config), Ok);
+        let targets = targets(config, &dataset, device)?;
+        let bookmarks = self.bookmarks(gaussians.origin, &dataset, targets, renderer.as_mut())?;
+        let is_model = is_model(self.source);
+        let frame = if is_model { dataset.frame() } else { config.frame.unwrap_or_default() };
+        let near = provenance.facts.near.or(config.facts(&frame).near);
+        let page = Page {
+            title: format!("{} by nightsplat", provenance.dataset),
+            gaussians: Some(gaussians),
+            provenance,
+            bookmarks,
+            origin: gaussians.origin,
+            fingerprint: Some(fingerprint(gaussians)),
+            near: near.unwrap_or_else(|| RenderSettings::default().near).into(),
+            up: self.up_of(config).unwrap_or_else(|| dataset.up()),
+            lamp: if is_model { None } else { run::load_lamp(self.source)? },
+        };
+        page.html()
+    }
+
+    /// Bookmarks of evenly spread views, with photographs, reference images or targets, and renders.
+    fn bookmarks(
+        &self,
+        origin: DVec3,
+        dataset: &Dataset,
+        mut targets: Option<TestTargets>,
+        mut renderer: Option<&mut ModelRenderer>,
+    ) -> Result<Vec<Bookmark>> {
+        let mut views: Vec<&View> = dataset.test_views().collect();
+        if views.is_empty() {
+            views = dataset.views.iter().collect();
+        }
+        let (all, count) = (views.len(), self.views.clamp(1, views.len().max(1)));
+        let bookmark = |number: usize| {
+            let view = views[number * all / count];
+            let mut pictures: Vec<(&str, Image)> = vec![];
+            pictures.extend(view.loaded()?.map(|image| ("photograph", image.into_owned())));
+            if let Some(image) = view.loaded_reference()? {
+                pictures.push(("reference", image.into_owned()));
+            } else if let Some(targets) = &mut targets {
+                pictures.extend(targets.of(view)?.map(|image| ("target", image)));
+            }
+            if let Some(renderer) = &mut renderer {
+                pictures.push(("model with its networks", renderer.render(view)?.output().clone()));
+            }
+            // A mirrored photograph is of a mirrored world, which the page shows as it is.
+            let turned = |(label, image): (&str, Image)| {
+                let image = image.turned(view.orientation.turn());
+                (label.to_owned(), Picture::Embedded(image))
+            };
+            Ok(Bookmark {
+                name: view.name.clone(),
+                camera: moved(&view.upright_camera(), origin),
+                pictures: pictures.into_iter().map(turned).collect(),
+            })
+        };
+        (0..count).map(bookmark).collect()
+    }
+}
+
+/// What makes the targets of views that have a photograph and no reference image, where there are such views and a
+/// curve. Without a device the page has no targets.
+fn targets(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    gpu: impl FnOnce() -> Result<Gpu>,
+) -> Result<Option<TestTargets>> {
+    let lacks = |view: &View| view.has_photograph() && !view.has_reference();
+    if config.tone.curve == ToneCurve::None || !dataset.views.iter().any(lacks) {
+        return Ok(None);
+    }
+    match gpu() {
+        Ok(gpu) => TestTargets::new(&gpu, &config.tone, dataset).map(Some),
+        Err(error) => {
+            tracing::warn!("the page has no targets to compare with: {error}");
+            Ok(None)
+        }
+    }
+}
