@@ -73,8 +73,8 @@ impl Camera {
     /// Projects a world-space point to pixels (possibly outside the image); `None` behind the camera, or beyond the
     /// field of view of a fisheye.
     pub fn project(&self, point: DVec3) -> Option<DVec2> {
-        let place = self.model.place(self.view_from_world.transform_point3(point))?;
-        Some(self.focal * place + self.principal_point)
+        let position = self.model.project(self.view_from_world.transform_point3(point))?;
+        Some(self.focal * position + self.principal_point)
     }
 
     /// Unprojects a pixel at a depth, as defined by `CameraModel::depth`, to view space; `None` outside the field of
@@ -130,19 +130,19 @@ impl Camera {
     /// The camera rotated about its optical axis: its image is this one's, rotated clockwise by quarter turns.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn turned(&self, quarters: u32) -> Self {
-        (0..quarters % 4).fold(*self, |own, _| {
+        (0..quarters % 4).fold(*self, |camera, _| {
             // Right in the rotated image is up in the original, and down is right.
             let turn = DMat3::from_cols(DVec3::Y, DVec3::NEG_X, DVec3::Z);
             Self {
-                width: own.height,
-                height: own.width,
-                focal: own.focal.yx(),
+                width: camera.height,
+                height: camera.width,
+                focal: camera.focal.yx(),
                 principal_point: DVec2::new(
-                    f64::from(own.height) - own.principal_point.y,
-                    own.principal_point.x,
+                    f64::from(camera.height) - camera.principal_point.y,
+                    camera.principal_point.x,
                 ),
-                model: own.model,
-                view_from_world: DAffine3::from_mat3(turn) * own.view_from_world,
+                model: camera.model,
+                view_from_world: DAffine3::from_mat3(turn) * camera.view_from_world,
             }
         })
     }
@@ -512,8 +512,11 @@ mod tests {
                         / (2.0 * step)
                 };
                 let numeric = slope(DVec2::X).perp_dot(slope(DVec2::Y));
-                let own = distortion.determinant(at);
-                assert!((own - numeric).abs() < 1e-8, "{name} at {at}: {own}, not {numeric}");
+                let analytic = distortion.determinant(at);
+                assert!(
+                    (analytic - numeric).abs() < 1e-8,
+                    "{name} at {at}: {analytic}, not {numeric}"
+                );
             }
         }
     }

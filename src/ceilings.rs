@@ -86,12 +86,12 @@ impl Ceiling {
     #[cfg(feature = "check")]
     pub(crate) fn check(gpu: &Gpu) -> Result<CheckReport> {
         const VECTORS: usize = 1000;
-        let mut own = Self::new(gpu, [VECTORS; 2], 2)?;
+        let mut ceiling = Self::new(gpu, [VECTORS; 2], 2)?;
         let values: Vec<f32> = (0u16..4000).map(f32::from).collect();
-        gpu.write(&mut own.source, &values)?;
+        gpu.write(&mut ceiling.source, &values)?;
         let (done, report) = gpu.checked(|| {
             gpu.run("ceilings", |pass| {
-                OPERATIONS.into_iter().try_for_each(|operation| own.record(pass, operation))
+                OPERATIONS.into_iter().try_for_each(|operation| ceiling.record(pass, operation))
             })
         });
         done.map(|()| report)

@@ -53,7 +53,7 @@ pub enum Error {
         /// The feature, extension or limit, by its Vulkan name.
         feature: String,
     },
-    /// The device computes something else than what the kernels rely on.
+    /// The device fails a check of the operations that the kernels depend on.
     #[error("{device} fails the self-test: {what}; {remedy}, or pick another device with --device")]
     SelfTest {
         /// The device's name, with the driver.

@@ -311,14 +311,14 @@ impl LossRegion {
 
     /// Checks that the region is not empty and is inside a view of `size`.
     fn check(self, size: UVec2) -> Result<()> {
-        let Self { origin, size: own } = self;
-        let fits = own.min_element() > 0
-            && own.cmple(size).all()
-            && origin.cmple(size.saturating_sub(own)).all();
+        let Self { origin, size: region } = self;
+        let fits = region.min_element() > 0
+            && region.cmple(size).all()
+            && origin.cmple(size.saturating_sub(region)).all();
         if !fits {
             return Err(Error::Usage(format!(
                 "a loss region of {} x {} at {}, {} is not inside a view of {} x {}",
-                own.x, own.y, origin.x, origin.y, size.x, size.y
+                region.x, region.y, origin.x, origin.y, size.x, size.y
             )));
         }
         Ok(())
@@ -332,15 +332,6 @@ fn value_count(size: UVec2) -> u32 {
 
 fn pixel_count(size: UVec2) -> u32 {
     size.x.saturating_mul(size.y)
-}
-
-/// Checks that a buffer is long enough.
-fn holds(buffer: &Buffer<f32>, values: usize) -> Result<()> {
-    if buffer.len() >= values {
-        return Ok(());
-    }
-    let (name, len) = (buffer.name(), buffer.len());
-    Err(Error::Usage(format!("buffer `{name}` holds {len} values, the view has {values}")))
 }
 
 fn no_scratch(term: &str, size: UVec2) -> Error {

@@ -1,6 +1,6 @@
-//! Opens a device and tests what no limit of it tells: subgroups of the size that the kernels are compiled for, their
-//! operations, memory between workgroups, and functions. A device that fails would train to wrong results without a
-//! message.
+//! Opens a device and tests what its Vulkan limits and features do not guarantee: subgroups of the size that the kernels
+//! are compiled for, their operations, memory between workgroups, and functions. A device that fails would train to
+//! wrong results without a message.
 
 use crate::gpu::{DeviceChoice, Gpu, Properties, SUBGROUP_VARIABLE, Threads};
 use crate::kernels::self_test::{
@@ -90,8 +90,9 @@ impl Gpu {
         Ok(self)
     }
 
-    /// Tests what the kernels rely on and no limit of the device tells: subgroups, memory between workgroups, and
-    /// functions. A device that a host lends is not tested by itself, since that submits; the host may call this once.
+    /// Tests what the kernels depend on and Vulkan's limits and features do not guarantee: subgroups, memory between
+    /// workgroups, and functions. A device that a host lends is not tested automatically, since the test submits; the
+    /// host may call this once.
     ///
     /// # Errors
     /// [`Error::SelfTest`], which names the first check that fails; the device only records, refuses the kernel, or was
@@ -123,7 +124,7 @@ impl Gpu {
 
     fn run_self_test(&self) -> Result<Found> {
         #[cfg(feature = "testing")]
-        let planted = crate::gpu::testing::planted_check(self).unwrap_or(CHECKS);
+        let planted = crate::gpu::testing::faults(self).planted_check().unwrap_or(CHECKS);
         #[cfg(not(feature = "testing"))]
         let planted = CHECKS;
         let pipeline = self.pipeline::<Kernel>(&Constants::default())?;
@@ -133,8 +134,7 @@ impl Gpu {
         let mut differing = self.uninit("differing", 2 * CHECKS as usize)?;
         let mut values = self.uninit("values", 3 * COUNT)?;
         let mut words = self.uninit("words", 2)?;
-        let mut downloads = None;
-        self.run("self_test", |pass| {
+        let (differing, arrivals, values, words) = self.run("self_test", |pass| {
             pass.fill(&mut arrivals, 0);
             pass.fill(&mut differing, 0);
             for turn in 0..2 {
@@ -149,13 +149,9 @@ impl Gpu {
                 let threads = Threads::Workgroups([WORKGROUPS, 1, 1]);
                 pass.dispatch(&pipeline, &Params { turn, planted }, buffers, threads)?;
             }
-            let integers = (pass.download(&differing)?, pass.download(&arrivals)?);
-            downloads = Some((integers, pass.download(&values)?, pass.download(&words)?));
-            Ok(())
+            let (differing, arrivals) = (pass.download(&differing)?, pass.download(&arrivals)?);
+            Ok((differing, arrivals, pass.download(&values)?, pass.download(&words)?))
         })?;
-        let Some(((differing, arrivals), values, words)) = downloads else {
-            return Err(Error::Usage("the self-test was not recorded".to_owned()));
-        };
         Ok(Found {
             differing: differing.wait()?,
             arrivals: arrivals.wait()?,
@@ -176,14 +172,14 @@ impl Found {
                 bits != [2, 1].map(|word| NUMBERS[COUNT + word].to_bits())
             }
             CHECK_EXP | CHECK_LOG | CHECK_SQRT => {
-                let own = (check - CHECK_EXP) as usize * COUNT;
+                let first = (check - CHECK_EXP) as usize * COUNT;
                 let functions = functions(&NUMBERS);
                 // Positive phrasing: a NaN differs.
                 let agrees = |i: usize| {
                     let (value, bound) = functions[i];
                     (f64::from(self.values[i]) - value).abs() <= bound
                 };
-                !(own..own + COUNT).all(agrees)
+                !(first..first + COUNT).all(agrees)
             }
             _ => count > 0,
         };

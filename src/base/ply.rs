@@ -116,8 +116,8 @@ impl Header {
             match *line.split_whitespace().collect::<Vec<_>>() {
                 ["format", name, ..] => {
                     let all = [Encoding::Text, Encoding::Little, Encoding::Big];
-                    let own = all.into_iter().find(|own| own.name() == name);
-                    encoding = Some(own.ok_or_else(|| format!("has the unknown format {name}"))?);
+                    let found = all.into_iter().find(|encoding| encoding.name() == name);
+                    encoding = Some(found.ok_or_else(|| format!("has the unknown format {name}"))?);
                 }
                 ["element", "vertex", count] if !in_vertices => {
                     in_vertices = true;
@@ -160,6 +160,6 @@ impl Header {
 
     /// A number of every vertex, with its place among them.
     pub fn property(&self, name: &str) -> Option<(usize, &Property)> {
-        self.properties.iter().enumerate().find(|(_, own)| own.name == name)
+        self.properties.iter().enumerate().find(|(_, property)| property.name == name)
     }
 }

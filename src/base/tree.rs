@@ -102,8 +102,8 @@ impl Archive {
         let mut entries = HashMap::new();
         let mut folders = BTreeMap::from([(String::new(), BTreeSet::new())]);
         let mut expanded = 0_u64;
-        for place in 0..zip.len() {
-            let entry = zip.by_index_raw(place).map_err(io::Error::other)?;
+        for index in 0..zip.len() {
+            let entry = zip.by_index_raw(index).map_err(io::Error::other)?;
             // Names that lead out of the archive are ignored.
             let Some(name) = entry.enclosed_name().and_then(|name| slashed(&name)) else {
                 continue;
@@ -118,19 +118,19 @@ impl Archive {
             }
             let is_folder = entry.is_dir();
             let mut child = name.as_str();
-            while let Some((folder, own)) =
+            while let Some((folder, name_in_folder)) =
                 child.rsplit_once('/').or(Some(("", child))).filter(|_| !child.is_empty())
             {
                 folders
                     .entry(folder.to_owned())
                     .or_insert_with(BTreeSet::new)
-                    .insert(own.to_owned());
+                    .insert(name_in_folder.to_owned());
                 child = folder;
             }
             if is_folder {
                 folders.entry(name).or_default();
             } else {
-                entries.insert(name, (place, entry.size()));
+                entries.insert(name, (index, entry.size()));
             }
         }
         Ok(Self { zip: Mutex::new(zip), entries, folders, changed })
@@ -138,9 +138,9 @@ impl Archive {
 
     /// The decompressed bytes of an entry.
     fn read(&self, entry: &str) -> io::Result<Vec<u8>> {
-        let &(place, length) = self.entries.get(entry).ok_or(io::ErrorKind::NotFound)?;
+        let &(index, length) = self.entries.get(entry).ok_or(io::ErrorKind::NotFound)?;
         let mut zip = self.zip.lock().unwrap_or_else(PoisonError::into_inner);
-        let entry = zip.by_index(place).map_err(io::Error::other)?;
+        let entry = zip.by_index(index).map_err(io::Error::other)?;
         let mut bytes = vec![];
         // It may expand to more than it declares.
         entry.take(length).read_to_end(&mut bytes)?;

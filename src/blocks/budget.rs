@@ -100,10 +100,10 @@ mod tests {
     fn a_device_that_shares_the_memory_of_the_host_has_room_for_the_copies_that_are_saved() {
         let dataset = Dataset { root: "".into(), views: vec![], points: vec![], skipped: vec![] };
         let config = TrainConfig::default();
-        let [own, shared] = [false, true].map(|shared| Budget::of(&config, &dataset, shared));
+        let [alone, shared] = [false, true].map(|shared| Budget::of(&config, &dataset, shared));
         let floats = 14.0 + 3.0 * rest_coefficients(config.sh_degree) as f64;
-        let more = shared.memory(1e6, 0.0, 8e9) - own.memory(1e6, 0.0, 8e9);
+        let more = shared.memory(1e6, 0.0, 8e9) - alone.memory(1e6, 0.0, 8e9);
         assert!((more - 12e6 * floats).abs() < 1.0, "{more}");
-        assert!(shared.gaussians(8e9) < own.gaussians(8e9));
+        assert!(shared.gaussians(8e9) < alone.gaussians(8e9));
     }
 }

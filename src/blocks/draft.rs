@@ -45,10 +45,10 @@ impl Draft<'_> {
             for (number, (part, views)) in parts.iter().zip(serving).enumerate() {
                 let points = self.dataset.points.iter();
                 let points = points.filter(|point| part.halo.contains(point.position)).count();
-                let own = steps * views.len() as f64 / all.max(1) as f64;
+                let block_steps = steps * views.len() as f64 / all.max(1) as f64;
                 let gaussians = part.share * self.config.max_gaussians as f64;
                 let id = round_id(number, round);
-                rows.push(self.row(id, round, [views.len(), points], own, gaussians));
+                rows.push(self.row(id, round, [views.len(), points], block_steps, gaussians));
             }
         }
         rows
@@ -96,7 +96,8 @@ impl Draft<'_> {
             let halo = if row.round == 1 { halo } else { core };
             let mut block = self.block(&row.id, plan, [core, halo], &serving[number]);
             let others = parts.iter().enumerate();
-            let others = others.filter(|(other, own)| *other != number && own.halo.overlaps(&halo));
+            let others =
+                others.filter(|(other, part)| *other != number && part.halo.overlaps(&halo));
             block.neighbours = others.map(|(other, _)| block_id(other)).collect();
             blocks.push(block);
         }

@@ -37,12 +37,12 @@ impl BlockPlan {
         write(&folder.join(FRAME), frame_file(&self.config))?;
         let rows = std::iter::once(&self.file.coarse).chain(&self.file.blocks);
         for (row, block) in rows.zip(&self.blocks) {
-            let place = folder.join(place(&row.id));
-            output::create_folder(&place)?;
+            let task = folder.join(task_folder(&row.id));
+            output::create_folder(&task)?;
             let mut block = block.clone();
-            block.dataset = relative(&root, &place)?;
-            block.save(&place)?;
-            write(&place.join(CONFIG), self.settings(row).to_toml())?;
+            block.dataset = relative(&root, &task)?;
+            block.save(&task)?;
+            write(&task.join(CONFIG), self.settings(row).to_toml())?;
         }
         let text = toml::to_string(&self.file).map_err(|error| Error::Usage(error.to_string()));
         write(&path, text)?;
@@ -79,9 +79,9 @@ impl BlockPlan {
     }
 
     fn training(&self, row: &Row, before: &str) -> Task {
-        let place = place(&row.id);
-        let [config, run] = [CONFIG, "run"].map(|name| format!("{place}/{name}"));
-        let argv = ["nightsplat", "train", &place, "--config", &config, "--out", &run, "--resume"];
+        let folder = task_folder(&row.id);
+        let [config, run] = [CONFIG, "run"].map(|name| format!("{folder}/{name}"));
+        let argv = ["nightsplat", "train", &folder, "--config", &config, "--out", &run, "--resume"];
         let argv = argv.map(str::to_owned).to_vec();
         Task {
             id: row.id.clone(),
@@ -97,8 +97,8 @@ impl BlockPlan {
     /// The settings of a task, with paths from the plan's folder.
     fn settings(&self, row: &Row) -> TrainConfig {
         let memory = Some(CacheSize(self.file.memory));
-        let own = TrainConfig {
-            dataset: place(&row.id).into(),
+        let shared = TrainConfig {
+            dataset: task_folder(&row.id).into(),
             steps: row.steps,
             seed: row.seed,
             max_gaussians: row.gaussians,
@@ -109,17 +109,17 @@ impl BlockPlan {
         match row.round {
             // Blocks go on from the coarse model, which is trained at half size and has no cooldown.
             0 => TrainConfig {
-                schedule: Schedule { cooldown_steps: 0, ..own.schedule.clone() },
-                downscale: 2.0 * own.downscale,
-                max_resolution: own.max_resolution.div_ceil(2),
-                ..own
+                schedule: Schedule { cooldown_steps: 0, ..shared.schedule.clone() },
+                downscale: 2.0 * shared.downscale,
+                max_resolution: shared.max_resolution.div_ceil(2),
+                ..shared
             },
             round => {
                 let init = match round {
                     1 => format!("{COARSE}/run/model.ply"),
                     _ => model_of(round - 1, self.file.rounds()),
                 };
-                TrainConfig { init: Some(init.into()), schedule: self.schedule(row), ..own }
+                TrainConfig { init: Some(init.into()), schedule: self.schedule(row), ..shared }
             }
         }
     }
@@ -149,7 +149,7 @@ pub(super) fn model_of(round: u8, last: u8) -> String {
 }
 
 /// The folder of a task that trains, relative to the plan's.
-pub(super) fn place(id: &str) -> String {
+pub(super) fn task_folder(id: &str) -> String {
     if id == COARSE { id.to_owned() } else { format!("{BLOCKS}/{id}") }
 }
 

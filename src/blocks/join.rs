@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
-use super::folder::{model_of, place};
+use super::folder::{model_of, task_folder};
 use super::plan::PlanFile;
 use crate::base::{hash, input, output};
 use crate::photographs::dataset::block::{Block, Cell};
@@ -54,11 +54,11 @@ pub(crate) fn join(
     let mut tiles = vec![];
     let (mut cropped, mut origin) = (0, [0.0; 3]);
     for block in &blocks {
-        let (tile, left_out, own) = write_tile(folder, &model, block)?;
+        let (tile, left_out, tile_origin) = write_tile(folder, &model, block)?;
         observe(&tile);
         tiles.push(tile);
         cropped += left_out;
-        origin = own;
+        origin = tile_origin;
     }
     let count = tiles.iter().map(|tile| tile.count).sum();
     let manifest = Manifest {
@@ -91,14 +91,14 @@ fn withdraw(manifest: &Path) -> Result<()> {
 
 /// A block that is done.
 fn checked(folder: &Path, id: &str, plan: &str) -> Result<Block> {
-    let place = folder.join(place(id));
-    let missing = || Error::input(&place, "is missing; plan anew, or copy it here");
-    let block = Block::at(&place)?.ok_or_else(missing)?;
+    let task = folder.join(task_folder(id));
+    let missing = || Error::input(&task, "is missing; plan anew, or copy it here");
+    let block = Block::at(&task)?.ok_or_else(missing)?;
     if block.plan != plan {
         let problem = format!("is a block of another plan ({}, not {plan}); plan anew", block.plan);
-        return Err(Error::input(&place, problem));
+        return Err(Error::input(&task, problem));
     }
-    let run = place.join("run");
+    let run = task.join("run");
     if !run.join("done.json").is_file() {
         let problem = format!(
             "block {id} is not done; `nightsplat blocks run {}` trains it",
@@ -111,7 +111,7 @@ fn checked(folder: &Path, id: &str, plan: &str) -> Result<Block> {
 
 /// The run of a block.
 fn run_of(folder: &Path, id: &str) -> PathBuf {
-    folder.join(place(id)).join("run")
+    folder.join(task_folder(id)).join("run")
 }
 
 /// The devices on which the blocks were trained, ascending.
@@ -175,7 +175,8 @@ fn write_tile(folder: &Path, model: &Path, block: &Block) -> Result<(Tile, usize
 fn bounds(gaussians: &Gaussians) -> Option<Cell> {
     let mut positions = (0..gaussians.count).map(|index| gaussians.position(index));
     let first = positions.next()?;
-    let (from, to) = positions.fold((first, first), |(from, to), own| (from.min(own), to.max(own)));
+    let (from, to) = positions
+        .fold((first, first), |(from, to), position| (from.min(position), to.max(position)));
     Some(Cell { from: from.to_array(), to: to.to_array() })
 }
 

@@ -61,7 +61,7 @@ pub(crate) fn partition(points: &[WeightedPoint], up: DVec3, until: Until) -> Op
         };
         let Some(at) = next else { break };
         let halves = leaves[at].halves(up)?;
-        let new = halves.map(|(own, core)| Leaf::new(own, core, points, total));
+        let new = halves.map(|(half, core)| Leaf::new(half, core, points, total));
         leaves.splice(at..=at, new);
     }
     Some(leaves.into_iter().map(|leaf| leaf.part).collect())
@@ -118,8 +118,8 @@ impl Leaf {
         });
         // The plane is at a point, which belongs to the upper half; the lower half must not be empty.
         let lowest = coordinate(first);
-        let plane = median.map(coordinate).filter(|&own| own > lowest);
-        let plane = plane.or_else(|| sorted.iter().map(coordinate).find(|&own| own > lowest))?;
+        let plane = median.map(coordinate).filter(|&at| at > lowest);
+        let plane = plane.or_else(|| sorted.iter().map(coordinate).find(|&at| at > lowest))?;
         let (mut below, mut above) = (self.part.core, self.part.core);
         (below.to[axis], above.from[axis]) = (plane, plane);
         let (lower, upper) = self.points.iter().partition(|point| coordinate(point) < plane);
@@ -130,8 +130,8 @@ impl Leaf {
 /// Ascending by the coordinate on one axis, then by the others, then by weight.
 fn by_position(a: &WeightedPoint, b: &WeightedPoint, axis: usize) -> std::cmp::Ordering {
     let key = |point: &WeightedPoint| {
-        let own = point.position.to_array();
-        [own[axis], own[(axis + 1) % 3], own[(axis + 2) % 3], point.weight]
+        let at = point.position.to_array();
+        [at[axis], at[(axis + 1) % 3], at[(axis + 2) % 3], point.weight]
     };
     let pairs = key(a).into_iter().zip(key(b));
     pairs
@@ -143,11 +143,11 @@ fn by_position(a: &WeightedPoint, b: &WeightedPoint, axis: usize) -> std::cmp::O
 /// The sides of a cell's points along the axes, without outliers.
 fn sides(points: &[WeightedPoint]) -> [f64; 3] {
     [0, 1, 2].map(|axis| {
-        let mut own: Vec<f64> =
+        let mut coordinates: Vec<f64> =
             points.iter().map(|point| point.position.to_array()[axis]).collect();
-        own.sort_by(f64::total_cmp);
-        let cut = (OUTLIERS * own.len() as f64) as usize;
-        match (own.get(cut), own.get(own.len().saturating_sub(cut + 1))) {
+        coordinates.sort_by(f64::total_cmp);
+        let cut = (OUTLIERS * coordinates.len() as f64) as usize;
+        match (coordinates.get(cut), coordinates.get(coordinates.len().saturating_sub(cut + 1))) {
             (Some(from), Some(to)) => to - from,
             _ => 0.0,
         }
@@ -189,8 +189,8 @@ mod tests {
             assert_eq!(cores.count(), 1);
         }
         for part in &parts {
-            let own = points.iter().filter(|point| part.core.contains(point.position));
-            let weight: f64 = own.map(|point| point.weight).sum();
+            let inside = points.iter().filter(|point| part.core.contains(point.position));
+            let weight: f64 = inside.map(|point| point.weight).sum();
             let total: f64 = points.iter().map(|point| point.weight).sum();
             assert!((weight / total - 0.25).abs() < 0.01, "{}", weight / total);
             assert!(part.share > 0.25 && part.share < 0.36, "{}", part.share);

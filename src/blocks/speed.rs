@@ -22,7 +22,7 @@ pub(crate) fn speed(gpu: &Gpu, planned: &PlannedRun) -> Result<(f64, usize)> {
     let training: Vec<&View> = dataset.train_views().filter(|view| view.has_photograph()).collect();
     let cameras: Vec<Camera> = training.iter().map(|view| view.camera).collect();
     let kept: BTreeSet<usize> = Camera::covering(&cameras, VIEWS).into_iter().collect();
-    let others = training.iter().enumerate().filter(|(place, _)| !kept.contains(place));
+    let others = training.iter().enumerate().filter(|(index, _)| !kept.contains(index));
     let others: Vec<String> = others.map(|(_, view)| view.name.clone()).collect();
     dataset.leave_out(&others);
     let every = dataset.points.len().div_ceil(MAX_POINTS).max(1);

@@ -37,12 +37,12 @@ impl<'a> Visibility<'a> {
         let all = dataset.views.iter().enumerate();
         let training: Vec<usize> =
             all.filter(|(_, view)| is_used(view)).map(|(index, _)| index).collect();
-        let mut place = vec![None; dataset.views.len()];
-        training.iter().enumerate().for_each(|(own, &index)| place[index] = Some(own));
+        let mut index_of = vec![None; dataset.views.len()];
+        training.iter().enumerate().for_each(|(at, &index)| index_of[index] = Some(at));
         let mut seen = vec![vec![]; training.len()];
         for (number, point) in (0..).zip(&dataset.points) {
-            for own in point.views.iter().filter_map(|&view| place[view as usize]) {
-                seen[own].push(number);
+            for at in point.views.iter().filter_map(|&view| index_of[view as usize]) {
+                seen[at].push(number);
             }
         }
         let mut visibility = Self { dataset, training, seen, up: dataset.up() };
@@ -98,19 +98,20 @@ impl<'a> Visibility<'a> {
 
     fn of_part(&self, part: usize, shares: &[Vec<f64>]) -> Vec<usize> {
         let share = |view: usize| shares[view][part];
-        let mut own: Vec<usize> = (0..shares.len()).filter(|&view| share(view) >= SHARE).collect();
+        let mut serving: Vec<usize> =
+            (0..shares.len()).filter(|&view| share(view) >= SHARE).collect();
         let mut others: Vec<usize> =
             (0..shares.len()).filter(|&view| (LEAST_SHARE..SHARE).contains(&share(view))).collect();
         others.sort_by(|&a, &b| share(b).total_cmp(&share(a)).then(a.cmp(&b)));
         for quarter in 0..4 {
             let looks = |view: &&usize| self.quarter(**view) == quarter;
-            let count = own.iter().filter(looks).count();
+            let count = serving.iter().filter(looks).count();
             let more = others.iter().filter(looks).take(OF_QUARTER.saturating_sub(count));
             let more: Vec<usize> = more.copied().collect();
-            own.extend(more);
+            serving.extend(more);
         }
-        own.sort_unstable();
-        own
+        serving.sort_unstable();
+        serving
     }
 
     /// The quarter of the horizon into which a view looks.
@@ -125,17 +126,17 @@ impl<'a> Visibility<'a> {
     /// The views of the coarse model: in an order that covers the cameras, those that add to points seen by few.
     pub(crate) fn thinned(&self) -> Vec<usize> {
         let mut views_of = vec![0_usize; self.dataset.points.len()];
-        let mut own = vec![];
+        let mut views = vec![];
         for view in scattered(self.training.len()) {
             let seen = &self.seen[view];
             let lacking = seen.iter().filter(|&&point| views_of[point as usize] < OF_POINT).count();
             if lacking as f64 >= NEW_SHARE * seen.len() as f64 {
                 seen.iter().for_each(|&point| views_of[point as usize] += 1);
-                own.push(view);
+                views.push(view);
             }
         }
-        own.sort_unstable();
-        own
+        views.sort_unstable();
+        views
     }
 }
 
@@ -180,7 +181,8 @@ mod tests {
 
     fn parts(dataset: &Dataset, count: usize) -> Vec<Part> {
         let weighted = dataset.points.iter();
-        let weighted = weighted.map(|own| WeightedPoint { position: own.position, weight: 1.0 });
+        let weighted =
+            weighted.map(|point| WeightedPoint { position: point.position, weight: 1.0 });
         partition(&weighted.collect::<Vec<_>>(), DVec3::Y, Until::Count(count)).unwrap()
     }
 

@@ -1,4 +1,4 @@
-//! What the axes of a scene's cameras tell: which way is up, and what they look at.
+//! The up direction and the focus of a scene, estimated from the axes of its cameras.
 
 use glam::{DMat3, DVec3};
 
@@ -48,7 +48,7 @@ pub(crate) fn upwards(poses: &[Camera]) -> DVec3 {
 
 /// The point with the least squared distances to the optical axes; `None` where they are as good as parallel.
 pub(super) fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
-    /// Less of the cameras' turns says nothing of a distance.
+    /// Below it, the axes are too close to parallel to determine a distance.
     const MIN_DETERMINANT: f64 = 1e-6;
     let (mut matrix, mut vector) = (DMat3::ZERO, DVec3::ZERO);
     for pose in poses {
@@ -122,7 +122,7 @@ mod tests {
 
     #[test]
     fn cameras_that_look_one_way_have_what_is_up_in_their_images() {
-        // A hand's shake tells no pitch.
+        // Shake of the hand does not determine the pitch.
         let row = cameras((0..20).map(|i| [shake(i), shake(i + 40), 2.0 * shake(i + 80)]));
         assert!(off(&row) < 5.0, "{}", off(&row));
         let one = cameras([[20.0, 10.0, 0.0]].into_iter());

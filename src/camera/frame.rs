@@ -141,21 +141,14 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use glam::{DQuat, DVec2};
+    use glam::DQuat;
 
     use super::*;
-    use crate::camera::CameraModel;
 
     fn camera(translation: DVec3) -> Camera {
         let rotation = DQuat::from_euler(glam::EulerRot::XYZ, 0.3, -0.7, 1.1);
-        Camera {
-            width: 100,
-            height: 60,
-            focal: DVec2::new(80.0, 90.0),
-            principal_point: DVec2::new(47.0, 33.0),
-            model: CameraModel::Pinhole,
-            view_from_world: DAffine3::from_rotation_translation(rotation, translation),
-        }
+        let view_from_world = DAffine3::from_rotation_translation(rotation, translation);
+        Camera::perspective(view_from_world, 0.7, [100, 60])
     }
 
     #[test]

@@ -320,8 +320,8 @@ fn interpolated(knots: &[Knot], is_loop: bool, time: f64) -> Frame {
     let tangent = |index: usize| {
         let (before, after) = around(index);
         let span = (after.time - before.time).max(f64::MIN_POSITIVE);
-        let own = knots[index].turn;
-        let toward = |turn: DVec4| if own.dot(turn) < 0.0 { -turn } else { turn };
+        let turn = knots[index].turn;
+        let toward = |other: DVec4| if turn.dot(other) < 0.0 { -other } else { other };
         ((after.center - before.center) / span, (toward(after.turn) - toward(before.turn)) / span)
     };
     let [a, b, c, d] = hermite(t);

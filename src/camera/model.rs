@@ -84,7 +84,7 @@ impl CameraModel {
     }
 
     /// Projects a view-space point, in focal lengths from the principal point; `None` outside the field of view.
-    pub(crate) fn place(&self, point: DVec3) -> Option<DVec2> {
+    pub(crate) fn project(&self, point: DVec3) -> Option<DVec2> {
         self.depth(point)?;
         Some(match self {
             Self::Pinhole => point.truncate() / point.z,
@@ -98,12 +98,12 @@ impl CameraModel {
 
     /// Unprojects a position, in focal lengths from the principal point, at a depth, to view space; `None` outside the
     /// field of view.
-    pub(crate) fn point(&self, place: DVec2, depth: f64) -> Option<DVec3> {
+    pub(crate) fn point(&self, position: DVec2, depth: f64) -> Option<DVec3> {
         match self {
-            Self::Pinhole => Some(place.extend(1.0) * depth),
+            Self::Pinhole => Some(position.extend(1.0) * depth),
             Self::Fisheye(lens) => {
-                let (sin, cos) = lens.angle(place.length())?.sin_cos();
-                Some((sin * place.normalize_or(DVec2::X)).extend(cos) * depth)
+                let (sin, cos) = lens.angle(position.length())?.sin_cos();
+                Some((sin * position.normalize_or(DVec2::X)).extend(cos) * depth)
             }
         }
     }
@@ -126,15 +126,18 @@ mod tests {
         for coefficients in LENSES {
             let model = CameraModel::Fisheye(KannalaBrandt { coefficients });
             for (x, y) in [(0.0, 0.0), (0.3, -0.2), (-0.7, 0.1), (1e-9, 0.0), (0.5, 0.5)] {
-                let place = DVec2::new(x, y);
-                let point = model.point(place, 3.0).unwrap();
+                let position = DVec2::new(x, y);
+                let point = model.point(position, 3.0).unwrap();
                 assert!((model.depth(point).unwrap() - 3.0).abs() < 1e-12);
-                assert!(model.place(point).unwrap().distance(place) < 1e-12, "{coefficients:?}");
+                assert!(
+                    model.project(point).unwrap().distance(position) < 1e-12,
+                    "{coefficients:?}"
+                );
             }
         }
-        let place = DVec2::new(0.4, -3.0);
-        let point = CameraModel::Pinhole.point(place, 2.0).unwrap();
-        assert_eq!((point.z, CameraModel::Pinhole.place(point)), (2.0, Some(place)));
+        let position = DVec2::new(0.4, -3.0);
+        let point = CameraModel::Pinhole.point(position, 2.0).unwrap();
+        assert_eq!((point.z, CameraModel::Pinhole.project(point)), (2.0, Some(position)));
     }
 
     #[test]
@@ -145,12 +148,12 @@ mod tests {
         for lens in LENSES.map(|coefficients| KannalaBrandt { coefficients }) {
             let (model, largest) = (CameraModel::Fisheye(lens), lens.largest_angle());
             let at = |angle: f64| DVec3::new(0.6 * angle.sin(), -0.8 * angle.sin(), angle.cos());
-            assert!(model.place(at(largest - 1e-6)).is_some());
+            assert!(model.project(at(largest - 1e-6)).is_some());
             for angle in [largest + 1e-6, FRAC_PI_2 + 1e-6, 2.0, 3.0, std::f64::consts::PI] {
-                assert_eq!(model.place(at(angle)), None, "{lens:?} {angle}");
+                assert_eq!(model.project(at(angle)), None, "{lens:?} {angle}");
             }
             assert_eq!(model.point(DVec2::X * (lens.radius(largest) + 1e-9), 1.0), None);
-            assert_eq!(model.place(DVec3::NAN), None);
+            assert_eq!(model.project(DVec3::NAN), None);
         }
         assert_eq!(KannalaBrandt { coefficients: [f64::NAN; 4] }.angle(0.5), None);
     }

@@ -253,10 +253,10 @@ mod tests {
         let mut pasted = vec![-1.0; view.len()];
         for patch in camera.patches(|size| size.element_product() <= 20) {
             let around = patch.with_margin(2);
-            let own = patch.cut(&view);
-            assert_eq!(own.len(), 2 * patch.pixel_count());
+            let content = patch.cut(&view);
+            assert_eq!(content.len(), 2 * patch.pixel_count());
             let UVec2 { x, y } = patch.origin;
-            assert_eq!(own[0], (y * 13 + x) as f32);
+            assert_eq!(content[0], (y * 13 + x) as f32);
             let whole = Patch::from(&camera);
             patch.paste(&around, &around.cut(&view), &whole, &mut pasted);
             for half in patch.halves().unwrap() {

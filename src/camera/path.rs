@@ -159,7 +159,8 @@ impl Circle {
         let mut azimuths: Vec<f64> = poses.iter().map(azimuth).collect();
         azimuths.sort_by(f64::total_cmp);
         let next = azimuths.iter().skip(1).copied().chain([azimuths[0] + TAU]);
-        let gaps = azimuths.iter().zip(next).map(|(own, next)| (next - own, *own, next));
+        let gaps =
+            azimuths.iter().zip(next).map(|(azimuth, next)| (next - azimuth, *azimuth, next));
         let (_, end, begin) = gaps.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
         [begin, if end < begin { end + TAU } else { end }]
     }
@@ -223,10 +224,7 @@ pub(super) fn looking(center: DVec3, target: DVec3, up: DVec3) -> DAffine3 {
 
 #[cfg(test)]
 mod tests {
-    use glam::DVec2;
-
     use super::*;
-    use crate::camera::CameraModel;
     use crate::camera::axes::up;
 
     const TARGET: DVec3 = DVec3::new(0.5, -0.25, 2.0);
@@ -236,14 +234,7 @@ mod tests {
         let pose = |index: usize| {
             let (sin, cos) = (turn * index as f64 / count as f64).sin_cos();
             let center = TARGET + DVec3::new(3.0 * cos, -1.0, 3.0 * sin);
-            Camera {
-                width: 64,
-                height: 48,
-                focal: DVec2::splat(50.0),
-                principal_point: DVec2::new(32.0, 24.0),
-                model: CameraModel::Pinhole,
-                view_from_world: looking(center, TARGET, DVec3::NEG_Y),
-            }
+            Camera::perspective(looking(center, TARGET, DVec3::NEG_Y), 0.9, [64, 48])
         };
         (0..count).map(pose).collect()
     }

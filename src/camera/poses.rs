@@ -25,9 +25,9 @@ impl CameraPoses {
         let squares = cameras.iter().map(|camera| camera.center().distance_squared(middle));
         let deviation = (squares.sum::<f64>() / count).sqrt();
         let scale = if deviation > 0.0 { 1.0 / deviation } else { 0.0 };
-        let mut own = Self { middle, scale, poses: vec![] };
-        own.poses = cameras.iter().map(|camera| own.pose(camera)).collect();
-        own
+        let mut all = Self { middle, scale, poses: vec![] };
+        all.poses = cameras.iter().map(|camera| all.pose(camera)).collect();
+        all
     }
 
     /// Every `step`th pose, in the same units.
@@ -103,23 +103,14 @@ fn nearest_to_mean(poses: &[CameraPose], group: &[usize]) -> Option<usize> {
 
 #[cfg(test)]
 mod tests {
-    use glam::{DAffine3, DMat3, DVec2, DVec3};
+    use glam::{DAffine3, DMat3};
 
     use super::*;
-    use crate::camera::CameraModel;
 
     fn camera(position: DVec3, turn: f64) -> Camera {
         let rotation = DMat3::from_rotation_y(turn);
         let view_from_world = DAffine3::from_mat3_translation(rotation, -(rotation * position));
-        let (focal, principal_point) = (DVec2::splat(10.0), DVec2::splat(5.0));
-        Camera {
-            width: 10,
-            height: 10,
-            focal,
-            principal_point,
-            model: CameraModel::Pinhole,
-            view_from_world,
-        }
+        Camera::perspective(view_from_world, 0.9, [10, 10])
     }
 
     #[test]
@@ -147,9 +138,9 @@ mod tests {
     fn no_camera_is_selected_twice_nor_more_than_exist() {
         let cameras = vec![camera(DVec3::ONE, 0.0); 5];
         for (count, picked) in [(0, 0), (1, 1), (3, 3), (5, 5), (9, 5)] {
-            let mut own = Camera::covering(&cameras, count);
-            own.dedup();
-            assert_eq!(own.len(), picked, "{count}");
+            let mut indices = Camera::covering(&cameras, count);
+            indices.dedup();
+            assert_eq!(indices.len(), picked, "{count}");
         }
         assert!(Camera::covering(&[], 3).is_empty());
     }

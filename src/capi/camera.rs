@@ -10,15 +10,15 @@ use crate::camera::{Camera, CameraModel};
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspCamera {
-    /// Pixels.
+    /// Width in pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height in pixels.
     pub height: u32,
-    /// Along x and y, pixels.
+    /// Focal lengths along x and y in pixels.
     pub focal: [f64; 2],
-    /// From the corner of the first pixel, pixels.
+    /// The principal point in pixels, from the top left corner of the image.
     pub principal_point: [f64; 2],
-    /// A rotation and a translation, three rows of four.
+    /// The rigid transform from world to view space, three rows of four.
     pub view_from_world: [f64; 12],
 }
 
@@ -42,11 +42,11 @@ pub(super) fn affine(m: &[f64; 12]) -> DAffine3 {
     DAffine3 { matrix3: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) }
 }
 
-/// The camera of an engine's matrices, column by column, for Vulkan's clip space (x right, y down, depth 0 to 1 or
-/// reversed). The view space may look along z or against it, with y up or down. `width` and `height`: the viewport,
-/// pixels.
+/// The camera of an engine's column-major view and projection matrices, for Vulkan's clip space (x right, y down,
+/// depth 0 to 1, or reversed). The camera may look along z or -z, with y up or down. `width` and `height` are those of
+/// the viewport in pixels.
 ///
-/// Errors: `NSP_ERROR_USAGE` where the projection is orthographic or sheared, or the view is not rigid.
+/// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared.
 ///
 /// # Safety
 /// `view` and `projection` are NULL or hold 16 floats; `camera` is NULL or valid.

@@ -3,7 +3,14 @@
 use std::ffi::{CStr, c_char, c_void};
 
 use ash::vk;
-use ash::vk::Handle as _;
+pub use ash::vk::{
+    Device as VkDevice, DeviceMemory as VkDeviceMemory, DeviceSize as VkDeviceSize,
+    Instance as VkInstance, MemoryPropertyFlags as VkMemoryPropertyFlags,
+    MemoryRequirements as VkMemoryRequirements, PhysicalDevice as VkPhysicalDevice,
+    PipelineCache as VkPipelineCache, Queue as VkQueue, Result as VkResult,
+    Semaphore as VkSemaphore,
+};
+use ash::vk::{Handle as _, TaggedStructure as _};
 
 use super::error::{Failure, NSP_ERROR_DEVICE, NspResult, Object, guard};
 use super::structs::{Sized0, destroy, give, object, read, text};
@@ -12,26 +19,6 @@ use crate::gpu::{
     check_physical_device, required_device_features,
 };
 
-/// Vulkan's.
-pub type VkInstance = vk::Instance;
-/// Vulkan's.
-pub type VkPhysicalDevice = vk::PhysicalDevice;
-/// Vulkan's.
-pub type VkDevice = vk::Device;
-/// Vulkan's.
-pub type VkQueue = vk::Queue;
-/// Vulkan's.
-pub type VkPipelineCache = vk::PipelineCache;
-/// Vulkan's.
-pub type VkSemaphore = vk::Semaphore;
-/// Vulkan's.
-pub type VkDeviceMemory = vk::DeviceMemory;
-/// Vulkan's.
-pub type VkDeviceSize = vk::DeviceSize;
-/// Vulkan's.
-pub type VkMemoryRequirements = vk::MemoryRequirements;
-/// Vulkan's.
-pub type VkMemoryPropertyFlags = vk::MemoryPropertyFlags;
 /// Vulkan's.
 pub type VkAllocationCallbacks = vk::AllocationCallbacks<'static>;
 /// Vulkan's.
@@ -43,10 +30,8 @@ pub type VkPhysicalDeviceVulkan13Features = vk::PhysicalDeviceVulkan13Features<'
 #[allow(non_camel_case_types, reason = "Vulkan's own name")]
 /// Vulkan's.
 pub type PFN_vkGetInstanceProcAddr = Option<vk::PFN_vkGetInstanceProcAddr>;
-/// Vulkan's.
-pub type VkResult = vk::Result;
 
-/// A device and what belongs to it. Any thread may use it.
+/// A device. Any thread may use it.
 #[derive(Debug)]
 pub struct NspDevice(pub(super) Object<Gpu>);
 
@@ -65,17 +50,17 @@ impl NspDevice {
     }
 }
 
-/// A piece of device memory of the host's.
+/// A range of device memory that the host allocated.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspMemory {
-    /// The block that it is part of.
+    /// The memory object.
     pub memory: VkDeviceMemory,
-    /// From the start of the block; a multiple of the required alignment.
+    /// Bytes from the start of the memory object; a multiple of the required alignment.
     pub offset: VkDeviceSize,
-    /// The address of its first byte where host-visible memory is required; ignored otherwise.
+    /// The mapped address of the first byte if host-visible memory is required; ignored otherwise.
     pub mapped: *mut c_void,
-    /// The host's own.
+    /// For the host's use.
     pub cookie: *mut c_void,
 }
 
@@ -83,7 +68,7 @@ pub struct NspMemory {
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspMemoryFunctions {
-    /// Fills `out` with memory that has every `required` property and, where there is such, every `preferred` one.
+    /// Writes to `out` memory that has all `required` properties and, if there is such memory, all `preferred` ones.
     pub allocate: Option<
         unsafe extern "C" fn(
             user: *mut c_void,
@@ -94,17 +79,17 @@ pub struct NspMemoryFunctions {
             out: *mut NspMemory,
         ) -> VkResult,
     >,
-    /// Frees what `allocate` gave.
+    /// Frees memory of `allocate`.
     pub free: Option<unsafe extern "C" fn(user: *mut c_void, memory: *const NspMemory)>,
-    /// Passed to both.
+    /// Passed to both functions.
     pub user: *mut c_void,
 }
 
-/// The queue is never touched: uploads are part of the next recording, and training is refused.
+/// The library submits nothing: uploads are part of the next recording, and training is refused.
 pub const NSP_DEVICE_RECORD_ONLY: u32 = 1;
 /// The queue is internally synchronized (`VK_KHR_internally_synchronized_queues`): no lock is taken.
 pub const NSP_DEVICE_QUEUE_SYNCHRONIZED: u32 = 2;
-/// `VK_EXT_debug_utils` is enabled on the instance: objects are named, passes are labelled.
+/// `VK_EXT_debug_utils` is enabled on the instance: objects are named, and passes are labelled.
 pub const NSP_DEVICE_NAMES_OBJECTS: u32 = 4;
 
 /// A device that the host lends. It outlives everything that is made with it.
@@ -113,39 +98,39 @@ pub const NSP_DEVICE_NAMES_OBJECTS: u32 = 4;
 pub struct NspHostDevice {
     /// `sizeof(NspHostDevice)`.
     pub struct_size: usize,
-    /// Of the host's loader.
+    /// The function of the host's Vulkan loader.
     pub get_instance_proc_addr: PFN_vkGetInstanceProcAddr,
-    /// Of Vulkan 1.3 or later.
+    /// An instance of Vulkan 1.3 or later.
     pub instance: VkInstance,
-    /// One of the instance's.
+    /// A physical device of the instance.
     pub physical_device: VkPhysicalDevice,
-    /// Created with the features of `nsp_require_features`.
+    /// A device that was created with the features of `nsp_require_features`.
     pub device: VkDevice,
-    /// Of the family below; NULL where the device only records.
+    /// A queue of the family below; NULL with `NSP_DEVICE_RECORD_ONLY`.
     pub queue: VkQueue,
-    /// A family with compute.
+    /// The index of a queue family with compute.
     pub queue_family: u32,
     /// `NSP_DEVICE_*`.
     pub flags: u32,
-    /// Enabled device extensions; what is not listed is not used.
+    /// The names of the enabled device extensions; others are not used.
     pub extensions: *const *const c_char,
-    /// Their number.
+    /// The number of extensions.
     pub extension_count: u32,
-    /// Enabled features; NULL: those of `nsp_require_features`.
+    /// The enabled features; NULL: those of `nsp_require_features`.
     pub features: *const VkPhysicalDeviceFeatures2,
-    /// Held around `vkQueueSubmit2` alone. Both or none.
+    /// Locks the queue around each `vkQueueSubmit2`; set both functions, or none.
     pub lock_queue: Option<unsafe extern "C" fn(user: *mut c_void, queue: VkQueue)>,
-    /// Releases the lock.
+    /// Unlocks the queue.
     pub unlock_queue: Option<unsafe extern "C" fn(user: *mut c_void, queue: VkQueue)>,
-    /// Passed to both.
+    /// Passed to both functions.
     pub user: *mut c_void,
-    /// The host's; `VK_NULL_HANDLE`: one of ours that is not saved.
+    /// The host's pipeline cache; `VK_NULL_HANDLE`: one of the library's, which is not saved.
     pub pipeline_cache: VkPipelineCache,
-    /// For the objects that we create; NULL: the driver's. It outlives the device.
+    /// Allocates host memory for the objects that the library creates; NULL: the driver's. It outlives the device.
     pub host_memory: *const VkAllocationCallbacks,
-    /// NULL: blocks of 8 to 256 MiB of our own.
+    /// Allocates device memory; NULL: the library allocates blocks of 8 to 256 MiB.
     pub device_memory: *const NspMemoryFunctions,
-    /// A timeline that reaches the number of each frame; `VK_NULL_HANDLE`: the host calls `nsp_frames_done`.
+    /// A timeline semaphore that reaches the number of each frame; `VK_NULL_HANDLE`: the host calls `nsp_frames_done`.
     pub frames: VkSemaphore,
 }
 
@@ -155,7 +140,7 @@ unsafe impl Sized0 for NspHostDevice {
     const FIRST_SIZE: usize = size_of::<Self>();
 }
 
-/// Sets the features that the library needs in the structs with which the host creates its device; clears none.
+/// Enables the features that the library needs in the structs with which the host creates its device; clears none.
 ///
 /// # Safety
 /// Each is NULL or valid.
@@ -167,15 +152,15 @@ pub unsafe extern "C" fn nsp_require_features(
     let (needed12, needed13) = required_device_features();
     // SAFETY: as the caller promises.
     let (vulkan12, vulkan13) = unsafe { (vulkan12.as_mut(), vulkan13.as_mut()) };
-    if let Some(own) = vulkan12 {
-        own.timeline_semaphore |= needed12.timeline_semaphore;
-        own.scalar_block_layout |= needed12.scalar_block_layout;
-        own.host_query_reset |= needed12.host_query_reset;
+    if let Some(features) = vulkan12 {
+        features.timeline_semaphore |= needed12.timeline_semaphore;
+        features.scalar_block_layout |= needed12.scalar_block_layout;
+        features.host_query_reset |= needed12.host_query_reset;
     }
-    if let Some(own) = vulkan13 {
-        own.synchronization2 |= needed13.synchronization2;
-        own.subgroup_size_control |= needed13.subgroup_size_control;
-        own.compute_full_subgroups |= needed13.compute_full_subgroups;
+    if let Some(features) = vulkan13 {
+        features.synchronization2 |= needed13.synchronization2;
+        features.subgroup_size_control |= needed13.subgroup_size_control;
+        features.compute_full_subgroups |= needed13.compute_full_subgroups;
     }
 }
 
@@ -184,7 +169,7 @@ struct Names([*const c_char; 1]);
 unsafe impl Sync for Names {}
 static OPTIONAL: Names = Names([ash::khr::push_descriptor::NAME.as_ptr()]);
 
-/// The device extensions that make recording faster where the host enables them, and their number.
+/// The optional device extensions with which recording is faster, and their number.
 ///
 /// # Safety
 /// `count` is NULL or valid.
@@ -224,7 +209,7 @@ fn not_null<H: vk::Handle + Copy>(name: &str, handle: H) -> Result<H, Failure> {
     }
 }
 
-/// Takes a device that the host lends. It submits nothing.
+/// Creates a device from one that the host lends. Nothing is submitted.
 ///
 /// # Safety
 /// `host` says the truth, and everything it names outlives what is made with the device.
@@ -336,8 +321,8 @@ unsafe fn memory_functions(
     functions: *const NspMemoryFunctions,
 ) -> Result<Option<MemoryFunctions>, Failure> {
     // SAFETY: as the caller promises.
-    let Some(own) = (unsafe { functions.as_ref() }) else { return Ok(None) };
-    let (Some(allocate), Some(free)) = (own.allocate, own.free) else {
+    let Some(functions) = (unsafe { functions.as_ref() }) else { return Ok(None) };
+    let (Some(allocate), Some(free)) = (functions.allocate, functions.free) else {
         let text = "NspHostDevice::device_memory needs both allocate and free";
         return Err(Failure::usage(text));
     };
@@ -348,7 +333,7 @@ unsafe fn memory_functions(
             std::mem::transmute::<FreeOfC, Free>(free),
         )
     };
-    Ok(Some(MemoryFunctions { allocate, free, user: own.user }))
+    Ok(Some(MemoryFunctions { allocate, free, user: functions.user }))
 }
 
 /// Refuses a chain of enabled features without one that is needed.
@@ -359,61 +344,41 @@ unsafe fn check_features(features: *const VkPhysicalDeviceFeatures2) -> Result<(
     if features.is_null() {
         return Ok(());
     }
-    let mut enabled = [false; 6];
-    const NAMES: [&str; 6] = [
-        "timelineSemaphore",
-        "scalarBlockLayout",
-        "hostQueryReset",
-        "synchronization2",
-        "subgroupSizeControl",
-        "computeFullSubgroups",
-    ];
-    let mut add = |at: usize, value: vk::Bool32| enabled[at] |= value != vk::FALSE;
+    let mut enabled12 = vk::PhysicalDeviceVulkan12Features::default();
+    let mut enabled13 = vk::PhysicalDeviceVulkan13Features::default();
     let mut next = features.cast::<vk::BaseInStructure<'_>>();
     // SAFETY: each struct begins with its type, which says what it is, and the next of the chain.
     while let Some(base) = unsafe { next.as_ref() } {
-        // SAFETY: as above.
-        unsafe {
-            match base.s_type {
-                vk::StructureType::PHYSICAL_DEVICE_VULKAN_1_2_FEATURES => {
-                    let own = &*next.cast::<vk::PhysicalDeviceVulkan12Features<'_>>();
-                    add(0, own.timeline_semaphore);
-                    add(1, own.scalar_block_layout);
-                    add(2, own.host_query_reset);
+        macro_rules! add {
+            ($enabled:ident, $of:ident: $($feature:ident),+) => {
+                if base.s_type == vk::$of::STRUCTURE_TYPE {
+                    // SAFETY: it is of this type.
+                    let features = unsafe { &*next.cast::<vk::$of<'_>>() };
+                    $($enabled.$feature |= features.$feature;)+
                 }
-                vk::StructureType::PHYSICAL_DEVICE_VULKAN_1_3_FEATURES => {
-                    let own = &*next.cast::<vk::PhysicalDeviceVulkan13Features<'_>>();
-                    add(3, own.synchronization2);
-                    add(4, own.subgroup_size_control);
-                    add(5, own.compute_full_subgroups);
-                }
-                vk::StructureType::PHYSICAL_DEVICE_TIMELINE_SEMAPHORE_FEATURES => {
-                    let own = &*next.cast::<vk::PhysicalDeviceTimelineSemaphoreFeatures<'_>>();
-                    add(0, own.timeline_semaphore);
-                }
-                vk::StructureType::PHYSICAL_DEVICE_SCALAR_BLOCK_LAYOUT_FEATURES => {
-                    let own = &*next.cast::<vk::PhysicalDeviceScalarBlockLayoutFeatures<'_>>();
-                    add(1, own.scalar_block_layout);
-                }
-                vk::StructureType::PHYSICAL_DEVICE_HOST_QUERY_RESET_FEATURES => {
-                    let own = &*next.cast::<vk::PhysicalDeviceHostQueryResetFeatures<'_>>();
-                    add(2, own.host_query_reset);
-                }
-                vk::StructureType::PHYSICAL_DEVICE_SYNCHRONIZATION_2_FEATURES => {
-                    let own = &*next.cast::<vk::PhysicalDeviceSynchronization2Features<'_>>();
-                    add(3, own.synchronization2);
-                }
-                vk::StructureType::PHYSICAL_DEVICE_SUBGROUP_SIZE_CONTROL_FEATURES => {
-                    let own = &*next.cast::<vk::PhysicalDeviceSubgroupSizeControlFeatures<'_>>();
-                    add(4, own.subgroup_size_control);
-                    add(5, own.compute_full_subgroups);
-                }
-                _ => (),
-            }
+            };
         }
+        add!(enabled12, PhysicalDeviceVulkan12Features:
+            timeline_semaphore, scalar_block_layout, host_query_reset);
+        add!(enabled12, PhysicalDeviceTimelineSemaphoreFeatures: timeline_semaphore);
+        add!(enabled12, PhysicalDeviceScalarBlockLayoutFeatures: scalar_block_layout);
+        add!(enabled12, PhysicalDeviceHostQueryResetFeatures: host_query_reset);
+        add!(enabled13, PhysicalDeviceVulkan13Features:
+            synchronization2, subgroup_size_control, compute_full_subgroups);
+        add!(enabled13, PhysicalDeviceSynchronization2Features: synchronization2);
+        add!(enabled13, PhysicalDeviceSubgroupSizeControlFeatures:
+            subgroup_size_control, compute_full_subgroups);
         next = base.p_next;
     }
-    match NAMES.iter().zip(enabled).find(|(_, is_enabled)| !is_enabled) {
+    let required = [
+        ("timelineSemaphore", enabled12.timeline_semaphore),
+        ("scalarBlockLayout", enabled12.scalar_block_layout),
+        ("hostQueryReset", enabled12.host_query_reset),
+        ("synchronization2", enabled13.synchronization2),
+        ("subgroupSizeControl", enabled13.subgroup_size_control),
+        ("computeFullSubgroups", enabled13.compute_full_subgroups),
+    ];
+    match required.iter().find(|(_, enabled)| *enabled == vk::FALSE) {
         Some((name, _)) => Err(Failure::new(
             NSP_ERROR_DEVICE,
             format!(
@@ -424,8 +389,8 @@ unsafe fn check_features(features: *const VkPhysicalDeviceFeatures2) -> Result<(
     }
 }
 
-/// Opens a device of our own, for training without a host's: `choice` is what `nightsplat --device` takes, NULL or
-/// empty for the best.
+/// Opens a device of the library's own, for training without a host's. `choice` is a value of `nightsplat --device`;
+/// NULL or empty: the best device.
 ///
 /// # Safety
 /// `choice` is NULL or ends with NUL; `device` is valid.
@@ -446,8 +411,8 @@ pub unsafe extern "C" fn nsp_device_open(
     })
 }
 
-/// Tells that the host's device is done with all frames up to `frame`, or that those left were never submitted, and
-/// frees what they used. `UINT64_MAX`: all there ever were, also after the host lost its device.
+/// Reports that all frames up to `frame` are done or were never submitted, and frees what they used. `UINT64_MAX`
+/// stands for all frames, also after the device was lost.
 ///
 /// # Safety
 /// `device` is NULL or valid.
@@ -461,7 +426,7 @@ pub unsafe extern "C" fn nsp_frames_done(device: *mut NspDevice, frame: u64) -> 
     })
 }
 
-/// Destroys a device. Every frame is done by then; it waits for none.
+/// Destroys a device. All frames must be done; nothing is waited for.
 ///
 /// # Safety
 /// `device` is NULL or valid, and not used again.

@@ -18,32 +18,32 @@ use crate::gpu::HostMemoryError;
 /// The version of this header, as `VK_MAKE_API_VERSION(0, major, minor, patch)`.
 pub const NSP_HEADER_VERSION: u32 = 1 << 12;
 
-/// 0 or more: done. Otherwise an error, whose text is in `nsp_last_error`.
+/// 0 or more: success. Otherwise an error, whose message `nsp_last_error` returns.
 pub type NspResult = i32;
 
-/// Done.
+/// Success.
 pub const NSP_OK: NspResult = 0;
-/// Arguments that make no sense; nothing was recorded.
+/// An argument is invalid; nothing was recorded.
 pub const NSP_ERROR_USAGE: NspResult = -2;
-/// A file that cannot be used.
+/// A file is missing or invalid.
 pub const NSP_ERROR_INPUT: NspResult = -3;
-/// The device lacks a feature, or a limit of it is too low.
+/// The device lacks a feature, or one of its limits is too low.
 pub const NSP_ERROR_DEVICE: NspResult = -4;
-/// Out of device or host memory; the object is as it was.
+/// Out of device or host memory; the object is unchanged.
 pub const NSP_ERROR_MEMORY: NspResult = -5;
 /// The device was lost; destroy everything.
 pub const NSP_ERROR_LOST: NspResult = -6;
-/// A file that cannot be written.
+/// A file cannot be written.
 pub const NSP_ERROR_OUTPUT: NspResult = -7;
-/// A `struct_size` below that of version 0.1, or bytes that are not zero beyond what this library reads.
+/// A `struct_size` is below that of version 0.1, or members that this library does not know are not zero.
 pub const NSP_ERROR_VERSION: NspResult = -8;
-/// Not part of this build: training, or a file format.
+/// This build cannot train, or does not read the file format.
 pub const NSP_ERROR_UNSUPPORTED: NspResult = -9;
-/// A number that is not finite.
+/// A number is NaN or infinite.
 pub const NSP_ERROR_NOT_FINITE: NspResult = -10;
-/// Stopped on request.
+/// Training was stopped on request.
 pub const NSP_ERROR_STOPPED: NspResult = -11;
-/// A bug of the library, caught; the object can only be destroyed.
+/// A bug in the library was caught; the object can only be destroyed.
 pub const NSP_ERROR_INTERNAL: NspResult = -127;
 
 /// Bytes of an error's text, with the NUL at its end.
@@ -183,7 +183,7 @@ fn broken(what: &str) -> Failure {
     Failure::new(NSP_ERROR_INTERNAL, text)
 }
 
-/// The text of this thread's last error: one line, never NULL, valid until the thread's next error.
+/// The message of this thread's last error: one line, never NULL, valid until the thread's next error.
 #[unsafe(no_mangle)]
 pub extern "C" fn nsp_last_error() -> *const c_char {
     LAST.with_borrow(|last| last.as_ptr().cast())
@@ -214,8 +214,8 @@ unsafe impl Send for Log {}
 
 static LOG: Mutex<Log> = Mutex::new(Log { function: None, user: std::ptr::null_mut() });
 
-/// Sets the function that gets the log's lines, from any thread; NULL: none. `level`: 1 error, 2 warning,
-/// 3 information. It is the only state that is not of an object.
+/// Sets the function that receives the lines of the log, from any thread; NULL: none. `level` is 1 for errors, 2 for
+/// warnings, 3 for information. This is the only global state.
 ///
 /// # Safety
 /// `log` may be called from any thread with `user` until it is replaced.

@@ -10,7 +10,7 @@ use crate::gpu::Gpu;
 use crate::splats::model::Model;
 use crate::splats::scene::{DeviceGaussians, Gaussians};
 
-/// A model on a device. One thread uses it at a time.
+/// A model on a device. Use it from one thread at a time.
 #[derive(Debug)]
 pub struct NspModel(pub(super) Object<Loaded>);
 
@@ -29,26 +29,27 @@ impl NspModel {
     }
 }
 
-/// What is known of a model.
+/// The properties of a model.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspModelInfo {
     /// `sizeof(NspModelInfo)`.
     pub struct_size: usize,
-    /// Gaussians.
+    /// The number of Gaussians.
     pub count: u32,
-    /// 0 to 3.
+    /// The SH degree, 0 to 3.
     pub sh_degree: u32,
-    /// The near plane that it was trained with, world units.
+    /// The near plane of the training, in world units.
     pub near_plane: f32,
     /// The largest alpha of a splat on a pixel.
     pub max_alpha: f32,
-    /// 1: colours are the raw SH sum.
+    /// 1 if colours are the raw SH sum, without the usual offset of 0.5.
     pub raw_colors: u32,
-    /// The stops by which the photographs' linear light is raised to the brightness of the model's colours: their power
-    /// of two is the exposure for that with `NSP_RENDER_PHOTOGRAPH`. NaN: the model states no law.
+    /// The brightness of the model's colours relative to the photographs, in stops of linear light: with
+    /// `NSP_RENDER_PHOTOGRAPH` and an exposure of 2^`law_stops`, renders are as bright as the model. NaN: the model
+    /// states no tone law.
     pub law_stops: f32,
-    /// The world position of the model's own origin.
+    /// The position of the model's origin in the world.
     pub origin: [f64; 3],
 }
 
@@ -83,7 +84,7 @@ pub unsafe extern "C" fn nsp_model_load(
 const PLANES: [&str; 6] =
     ["means", "quats", "log scales", "raw opacities", "SH of degree 0", "SH above degree 0"];
 
-/// Makes a model of arrays: means (count, 3); rotations (count, 4) as w, x, y, z; natural logarithms of scales
+/// Creates a model from arrays: means (count, 3); rotations (count, 4) as w, x, y, z; natural logarithms of scales
 /// (count, 3); opacities before the sigmoid (count); SH of degree 0 (count, 3); SH above it (count,
 /// (degree + 1)^2 - 1, 3), NULL for degree 0.
 ///
@@ -122,18 +123,18 @@ unsafe fn gathered(
         return Err(Failure::usage("planes is NULL"));
     }
     let mut gaussians = Gaussians::zeros(count as usize, sh_degree);
-    let fill = |at: usize, own: &mut [f32]| {
+    let fill = |at: usize, values: &mut [f32]| {
         // SAFETY: as the caller promises.
         let plane = unsafe { *planes.add(at) };
-        if own.is_empty() {
+        if values.is_empty() {
             return Ok(());
         }
         if plane.is_null() {
             return Err(Failure::usage(format!("plane {at}, {}, is NULL", PLANES[at])));
         }
         // SAFETY: as the caller promises.
-        own.copy_from_slice(unsafe { std::slice::from_raw_parts(plane, own.len()) });
-        match own.iter().position(|x| !x.is_finite()) {
+        values.copy_from_slice(unsafe { std::slice::from_raw_parts(plane, values.len()) });
+        match values.iter().position(|x| !x.is_finite()) {
             Some(index) => Err(Failure::new(
                 super::error::NSP_ERROR_NOT_FINITE,
                 format!("number {index} of plane {at}, {}, is not finite", PLANES[at]),
@@ -150,8 +151,8 @@ unsafe fn gathered(
     Ok(gaussians)
 }
 
-/// Joins models into one, each moved by a rotation and translation (three rows of four), so that all are sorted
-/// together. Near plane, alpha limit and colours are the first one's, and the others have the same colours and limit.
+/// Joins models into one, each moved by a rigid transform (three rows of four), so that all splats are sorted
+/// together. The near plane is that of the first model. All have the same kind of colours and the same alpha limit.
 ///
 /// # Safety
 /// `models` and `poses` are NULL or hold `count` of each.
@@ -196,7 +197,7 @@ pub unsafe extern "C" fn nsp_model_count(model: *const NspModel) -> u32 {
     loaded.map_or(0, |loaded| loaded.model.gaussians.count as u32)
 }
 
-/// Fills `info`.
+/// Writes the properties of a model to `info`.
 ///
 /// # Safety
 /// `model` and `info` are NULL or valid.
@@ -208,7 +209,7 @@ pub unsafe extern "C" fn nsp_model_info(
     guard("nsp_model_info", || {
         // SAFETY: as the caller promises.
         let Loaded { model, .. } = unsafe { object(model, "model")? }.0.get("the model")?;
-        let own = NspModelInfo {
+        let filled = NspModelInfo {
             struct_size: size_of::<NspModelInfo>(),
             count: model.gaussians.count as u32,
             sh_degree: model.gaussians.shape.sh_degree,
@@ -219,7 +220,7 @@ pub unsafe extern "C" fn nsp_model_info(
             origin: model.gaussians.origin.to_array(),
         };
         // SAFETY: as the caller promises.
-        unsafe { write(info, &own) }
+        unsafe { write(info, &filled) }
     })
 }
 

@@ -14,73 +14,74 @@
 // The version of this header, as `VK_MAKE_API_VERSION(0, major, minor, patch)`.
 #define NSP_HEADER_VERSION (1 << 12)
 
-// The queue is never touched: uploads are part of the next recording, and training is refused.
+// The library submits nothing: uploads are part of the next recording, and training is refused.
 #define NSP_DEVICE_RECORD_ONLY 1
 
 // The queue is internally synchronized (`VK_KHR_internally_synchronized_queues`): no lock is taken.
 #define NSP_DEVICE_QUEUE_SYNCHRONIZED 2
 
-// `VK_EXT_debug_utils` is enabled on the instance: objects are named, passes are labelled.
+// `VK_EXT_debug_utils` is enabled on the instance: objects are named, and passes are labelled.
 #define NSP_DEVICE_NAMES_OBJECTS 4
 
-// Blended over what `color` holds, instead of replacing it.
+// Blends over the contents of `color` instead of replacing them.
 #define NSP_RENDER_OVER 1
 
-// A float image gets display-referred values, as they were trained.
+// Writes display-referred values, as they were trained, to a float `color` image; otherwise linear light.
 #define NSP_RENDER_DISPLAY_FLOAT 2
 
-// `scene_depth` is 1 at the near plane.
+// `scene_depth` is reversed: 1 at the near plane, 0 at the far plane.
 #define NSP_DEPTH_REVERSED 4
 
-// `scene_depth` is the depth in the view, world units.
+// `scene_depth` is linear view-space depth in world units.
 #define NSP_DEPTH_LINEAR 8
 
-// `depth_out` is the mean of what is seen; otherwise the depth at which half of it is.
+// `depth_out` is the expected depth, the mean of the splats' depths by their blending weights; otherwise the median
+// depth, at which the transmittance falls below 1/2.
 #define NSP_DEPTH_EXPECTED 16
 
-// Colours are those of the dark photographs, by the law that the model states: their linear light where the image is
-// linear, else their values. `background` stays.
+// Renders the colours of the dark photographs, by inverting the tone law that the model states: linear light in a
+// linear image, encoded values otherwise. `background` is not changed.
 #define NSP_RENDER_PHOTOGRAPH 32
 
-// A device and what belongs to it. Any thread may use it.
+// A device. Any thread may use it.
 typedef struct NspDevice NspDevice;
 
-// A model on a device. One thread uses it at a time.
+// A model on a device. Use it from one thread at a time.
 typedef struct NspModel NspModel;
 
-// A renderer: kernels, and memory that grows with the views. One thread uses it at a time.
+// A renderer: compiled kernels, and memory that grows with the views. Use it from one thread at a time.
 typedef struct NspRenderer NspRenderer;
 
-// A training. One thread uses it at a time.
+// A training run. Use it from one thread at a time.
 typedef struct NspTrainer NspTrainer;
 
-// 0 or more: done. Otherwise an error, whose text is in `nsp_last_error`.
+// 0 or more: success. Otherwise an error, whose message `nsp_last_error` returns.
 typedef int32_t NspResult;
 
-// A piece of device memory of the host's.
+// A range of device memory that the host allocated.
 typedef struct NspMemory {
-    // The block that it is part of.
+    // The memory object.
     VkDeviceMemory memory;
-    // From the start of the block; a multiple of the required alignment.
+    // Bytes from the start of the memory object; a multiple of the required alignment.
     VkDeviceSize offset;
-    // The address of its first byte where host-visible memory is required; ignored otherwise.
+    // The mapped address of the first byte if host-visible memory is required; ignored otherwise.
     void *mapped;
-    // The host's own.
+    // For the host's use.
     void *cookie;
 } NspMemory;
 
 // The host's allocator of device memory. It may be called from any thread.
 typedef struct NspMemoryFunctions {
-    // Fills `out` with memory that has every `required` property and, where there is such, every `preferred` one.
+    // Writes to `out` memory that has all `required` properties and, if there is such memory, all `preferred` ones.
     VkResult (*allocate)(void *user,
                          const VkMemoryRequirements *requirements,
                          VkMemoryPropertyFlags required,
                          VkMemoryPropertyFlags preferred,
                          const char *name,
                          struct NspMemory *out);
-    // Frees what `allocate` gave.
+    // Frees memory of `allocate`.
     void (*free)(void *user, const struct NspMemory *memory);
-    // Passed to both.
+    // Passed to both functions.
     void *user;
 } NspMemoryFunctions;
 
@@ -88,223 +89,229 @@ typedef struct NspMemoryFunctions {
 typedef struct NspHostDevice {
     // `sizeof(NspHostDevice)`.
     size_t struct_size;
-    // Of the host's loader.
+    // The function of the host's Vulkan loader.
     PFN_vkGetInstanceProcAddr get_instance_proc_addr;
-    // Of Vulkan 1.3 or later.
+    // An instance of Vulkan 1.3 or later.
     VkInstance instance;
-    // One of the instance's.
+    // A physical device of the instance.
     VkPhysicalDevice physical_device;
-    // Created with the features of `nsp_require_features`.
+    // A device that was created with the features of `nsp_require_features`.
     VkDevice device;
-    // Of the family below; NULL where the device only records.
+    // A queue of the family below; NULL with `NSP_DEVICE_RECORD_ONLY`.
     VkQueue queue;
-    // A family with compute.
+    // The index of a queue family with compute.
     uint32_t queue_family;
     // `NSP_DEVICE_*`.
     uint32_t flags;
-    // Enabled device extensions; what is not listed is not used.
+    // The names of the enabled device extensions; others are not used.
     const char *const *extensions;
-    // Their number.
+    // The number of extensions.
     uint32_t extension_count;
-    // Enabled features; NULL: those of `nsp_require_features`.
+    // The enabled features; NULL: those of `nsp_require_features`.
     const VkPhysicalDeviceFeatures2 *features;
-    // Held around `vkQueueSubmit2` alone. Both or none.
+    // Locks the queue around each `vkQueueSubmit2`; set both functions, or none.
     void (*lock_queue)(void *user, VkQueue queue);
-    // Releases the lock.
+    // Unlocks the queue.
     void (*unlock_queue)(void *user, VkQueue queue);
-    // Passed to both.
+    // Passed to both functions.
     void *user;
-    // The host's; `VK_NULL_HANDLE`: one of ours that is not saved.
+    // The host's pipeline cache; `VK_NULL_HANDLE`: one of the library's, which is not saved.
     VkPipelineCache pipeline_cache;
-    // For the objects that we create; NULL: the driver's. It outlives the device.
+    // Allocates host memory for the objects that the library creates; NULL: the driver's. It outlives the device.
     const VkAllocationCallbacks *host_memory;
-    // NULL: blocks of 8 to 256 MiB of our own.
+    // Allocates device memory; NULL: the library allocates blocks of 8 to 256 MiB.
     const struct NspMemoryFunctions *device_memory;
-    // A timeline that reaches the number of each frame; `VK_NULL_HANDLE`: the host calls `nsp_frames_done`.
+    // A timeline semaphore that reaches the number of each frame; `VK_NULL_HANDLE`: the host calls `nsp_frames_done`.
     VkSemaphore frames;
 } NspHostDevice;
 
 // A pinhole camera, in axes x right, y down, z forward.
 typedef struct NspCamera {
-    // Pixels.
+    // Width in pixels.
     uint32_t width;
-    // Pixels.
+    // Height in pixels.
     uint32_t height;
-    // Along x and y, pixels.
+    // Focal lengths along x and y in pixels.
     double focal[2];
-    // From the corner of the first pixel, pixels.
+    // The principal point in pixels, from the top left corner of the image.
     double principal_point[2];
-    // A rotation and a translation, three rows of four.
+    // The rigid transform from world to view space, three rows of four.
     double view_from_world[12];
 } NspCamera;
 
-// What is known of a model.
+// The properties of a model.
 typedef struct NspModelInfo {
     // `sizeof(NspModelInfo)`.
     size_t struct_size;
-    // Gaussians.
+    // The number of Gaussians.
     uint32_t count;
-    // 0 to 3.
+    // The SH degree, 0 to 3.
     uint32_t sh_degree;
-    // The near plane that it was trained with, world units.
+    // The near plane of the training, in world units.
     float near_plane;
     // The largest alpha of a splat on a pixel.
     float max_alpha;
-    // 1: colours are the raw SH sum.
+    // 1 if colours are the raw SH sum, without the usual offset of 0.5.
     uint32_t raw_colors;
-    // The stops by which the photographs' linear light is raised to the brightness of the model's colours: their power
-    // of two is the exposure for that with `NSP_RENDER_PHOTOGRAPH`. NaN: the model states no law.
+    // The brightness of the model's colours relative to the photographs, in stops of linear light: with
+    // `NSP_RENDER_PHOTOGRAPH` and an exposure of 2^`law_stops`, renders are as bright as the model. NaN: the model
+    // states no tone law.
     float law_stops;
-    // The world position of the model's own origin.
+    // The position of the model's origin in the world.
     double origin[3];
 } NspModelInfo;
 
 // The state of an image before or after a recording.
 typedef struct NspImageState {
-    // Its layout.
+    // The image layout.
     VkImageLayout layout;
-    // The queue family that owns it; `VK_QUEUE_FAMILY_IGNORED`: ownership is not transferred.
+    // The queue family that owns the image; `VK_QUEUE_FAMILY_IGNORED`: ownership is not transferred.
     uint32_t family;
-    // Of the host's commands that use it.
+    // The pipeline stages in which the host uses the image.
     VkPipelineStageFlags2 stages;
-    // Of these commands.
+    // The host's accesses in these stages.
     VkAccessFlags2 access;
 } NspImageState;
 
-// A layer of an image: mip level 0, one sample; usage `TRANSFER_DST` to be written, `TRANSFER_SRC` to be read.
+// An array layer of an image: mip level 0, single-sampled. Its usage includes `TRANSFER_DST` if it is written, and
+// `TRANSFER_SRC` if it is read.
 typedef struct NspImage {
     // The image.
     VkImage image;
     // Its format.
     VkFormat format;
-    // At least the camera's.
+    // Width and height in pixels, at least those of the cameras.
     VkExtent2D extent;
     // The array layer of the first camera.
     uint32_t layer;
-    // As the host leaves it.
+    // The state in which the host leaves the image.
     struct NspImageState before;
-    // As it is afterwards. Where the families differ, our half of the transfer is recorded.
+    // The state after the render. If the queue families differ, the library's half of the ownership transfer is
+    // recorded.
     struct NspImageState after;
 } NspImage;
 
-// One render.
+// The parameters of a render.
 typedef struct NspRender {
     // `sizeof(NspRender)`.
     size_t struct_size;
-    // Primary, recording, outside a render pass, of the lent family. It is submitted once, in the order of recording.
+    // A primary command buffer of the lent queue family, in the recording state, outside a render pass. The host
+    // submits it once, in the order of recording.
     VkCommandBuffer commands;
-    // The number that the host's timeline reaches after it; it never falls.
+    // The value that the host's timeline semaphore reaches when the command buffer is done; it never decreases.
     uint64_t frame;
     // Camera i is drawn into layer `layer + i` of each image.
     const struct NspCamera *cameras;
-    // Their number.
+    // The number of cameras.
     uint32_t camera_count;
     // `NSP_RENDER_*` and `NSP_DEPTH_*`.
     uint32_t flags;
-    // RGBA16F (linear), RGBA8 or BGRA8 as UNORM or SRGB, premultiplied; NULL: none.
+    // Colour with premultiplied alpha: RGBA16F (linear), or RGBA8 or BGRA8 as UNORM or SRGB; NULL: none.
     const struct NspImage *color;
-    // R32F: depth in the view, infinite where nothing is seen; NULL: none.
+    // View-space depth as R32F, infinite where there is no splat; NULL: none.
     const struct NspImage *depth_out;
-    // D32, D24 or D16 with or without stencil, or R32F: the depth beyond which nothing is drawn; NULL: none.
+    // The host's depth buffer, behind which splats are hidden: D32, D24 or D16 with or without stencil, or R32F;
+    // NULL: none.
     const struct NspImage *scene_depth;
-    // The near plane of `scene_depth`, world units.
+    // The near plane of `scene_depth` in world units.
     float scene_near;
-    // The far plane; 0: infinite.
+    // The far plane of `scene_depth` in world units; 0: at infinity.
     float scene_far;
-    // The factor on linear light; 0 is 1.
+    // The factor on linear light; 0 stands for 1.
     float exposure;
-    // Display-referred; shows where alpha is below 1, unless over.
+    // The background colour, display-referred; not used with `NSP_RENDER_OVER`.
     float background[3];
-    // The most intersections of a view, the nearest first; 0: as memory allows.
+    // The most intersections of splats and tiles in a view, of which the farthest are left out first; 0: as memory
+    // allows.
     uint32_t budget;
     // Unused.
     uint32_t reserved;
 } NspRender;
 
-// How the newest frame that is done went.
+// The outcome of the newest frame that is done.
 typedef struct NspStatus {
     // `sizeof(NspStatus)`.
     size_t struct_size;
-    // Its number; 0: none is done yet.
+    // The number of the frame; 0: none is done yet.
     uint64_t frame;
-    // Intersections of splats and tiles in its view with the most.
+    // Intersections of splats and tiles, in the view that has the most.
     uint32_t intersections;
-    // Those that memory and budget allowed.
+    // The intersections that memory and budget allowed.
     uint32_t capacity;
-    // Those that were left out, the farthest.
+    // The intersections that were left out, the farthest.
     uint32_t left_out;
-    // Splats of one tile, where the device cannot follow them all and the tile is empty; else 0.
+    // The splats of the fullest tile if the device cannot process so many, and the tile is not drawn; else 0.
     uint32_t splats_per_tile;
-    // Device memory in use by everything made with the device.
+    // Bytes of device memory in use by all objects of the device.
     uint64_t device_bytes;
 } NspStatus;
 
-// One step of a training.
+// A training step.
 typedef struct NspStep {
     // Counted from 1.
     uint64_t step;
     // The weighted sum of its loss terms.
     double loss;
-    // Gaussians.
+    // The number of Gaussians.
     uint32_t gaussians;
     // Unused.
     uint32_t reserved;
 } NspStep;
 
-// Done.
+// Success.
 #define NSP_OK 0
 
-// Arguments that make no sense; nothing was recorded.
+// An argument is invalid; nothing was recorded.
 #define NSP_ERROR_USAGE -2
 
-// A file that cannot be used.
+// A file is missing or invalid.
 #define NSP_ERROR_INPUT -3
 
-// The device lacks a feature, or a limit of it is too low.
+// The device lacks a feature, or one of its limits is too low.
 #define NSP_ERROR_DEVICE -4
 
-// Out of device or host memory; the object is as it was.
+// Out of device or host memory; the object is unchanged.
 #define NSP_ERROR_MEMORY -5
 
 // The device was lost; destroy everything.
 #define NSP_ERROR_LOST -6
 
-// A file that cannot be written.
+// A file cannot be written.
 #define NSP_ERROR_OUTPUT -7
 
-// A `struct_size` below that of version 0.1, or bytes that are not zero beyond what this library reads.
+// A `struct_size` is below that of version 0.1, or members that this library does not know are not zero.
 #define NSP_ERROR_VERSION -8
 
-// Not part of this build: training, or a file format.
+// This build cannot train, or does not read the file format.
 #define NSP_ERROR_UNSUPPORTED -9
 
-// A number that is not finite.
+// A number is NaN or infinite.
 #define NSP_ERROR_NOT_FINITE -10
 
-// Stopped on request.
+// Training was stopped on request.
 #define NSP_ERROR_STOPPED -11
 
-// A bug of the library, caught; the object can only be destroyed.
+// A bug in the library was caught; the object can only be destroyed.
 #define NSP_ERROR_INTERNAL -127
 
 #ifdef __cplusplus
 extern "C" {
 #endif // __cplusplus
 
-// The text of this thread's last error: one line, never NULL, valid until the thread's next error.
+// The message of this thread's last error: one line, never NULL, valid until the thread's next error.
 const char *nsp_last_error(void);
 
 // The library's version, as `VK_MAKE_API_VERSION(0, major, minor, patch)`.
 uint32_t nsp_version(void);
 
-// Sets the function that gets the log's lines, from any thread; NULL: none. `level`: 1 error, 2 warning,
-// 3 information. It is the only state that is not of an object.
+// Sets the function that receives the lines of the log, from any thread; NULL: none. `level` is 1 for errors, 2 for
+// warnings, 3 for information. This is the only global state.
 void nsp_set_log(void (*log)(void *user, int32_t level, const char *line), void *user);
 
-// Sets the features that the library needs in the structs with which the host creates its device; clears none.
+// Enables the features that the library needs in the structs with which the host creates its device; clears none.
 void nsp_require_features(VkPhysicalDeviceVulkan12Features *vulkan12, VkPhysicalDeviceVulkan13Features *vulkan13);
 
-// The device extensions that make recording faster where the host enables them, and their number.
+// The optional device extensions with which recording is faster, and their number.
 const char *const *nsp_device_extensions(uint32_t *count);
 
 // Whether the library can use a physical device; the error names what is missing.
@@ -312,25 +319,25 @@ NspResult nsp_check_device(PFN_vkGetInstanceProcAddr get_instance_proc_addr,
                            VkInstance instance,
                            VkPhysicalDevice physical_device);
 
-// Takes a device that the host lends. It submits nothing.
+// Creates a device from one that the host lends. Nothing is submitted.
 NspResult nsp_device_from_host(const struct NspHostDevice *host, struct NspDevice **device);
 
-// Opens a device of our own, for training without a host's: `choice` is what `nightsplat --device` takes, NULL or
-// empty for the best.
+// Opens a device of the library's own, for training without a host's. `choice` is a value of `nightsplat --device`;
+// NULL or empty: the best device.
 NspResult nsp_device_open(const char *choice, struct NspDevice **device);
 
-// Tells that the host's device is done with all frames up to `frame`, or that those left were never submitted, and
-// frees what they used. `UINT64_MAX`: all there ever were, also after the host lost its device.
+// Reports that all frames up to `frame` are done or were never submitted, and frees what they used. `UINT64_MAX`
+// stands for all frames, also after the device was lost.
 NspResult nsp_frames_done(struct NspDevice *device, uint64_t frame);
 
-// Destroys a device. Every frame is done by then; it waits for none.
+// Destroys a device. All frames must be done; nothing is waited for.
 void nsp_device_destroy(struct NspDevice *device);
 
-// The camera of an engine's matrices, column by column, for Vulkan's clip space (x right, y down, depth 0 to 1 or
-// reversed). The view space may look along z or against it, with y up or down. `width` and `height`: the viewport,
-// pixels.
+// The camera of an engine's column-major view and projection matrices, for Vulkan's clip space (x right, y down,
+// depth 0 to 1, or reversed). The camera may look along z or -z, with y up or down. `width` and `height` are those of
+// the viewport in pixels.
 //
-// Errors: `NSP_ERROR_USAGE` where the projection is orthographic or sheared, or the view is not rigid.
+// Errors: `NSP_ERROR_USAGE` if the projection is orthographic or sheared.
 NspResult nsp_camera_from_matrices(const float *view,
                                    const float *projection,
                                    uint32_t width,
@@ -340,7 +347,7 @@ NspResult nsp_camera_from_matrices(const float *view,
 // Loads a model: PLY, SPZ, SOG, or a run directory. The upload is part of the next recording.
 NspResult nsp_model_load(struct NspDevice *device, const char *path, struct NspModel **model);
 
-// Makes a model of arrays: means (count, 3); rotations (count, 4) as w, x, y, z; natural logarithms of scales
+// Creates a model from arrays: means (count, 3); rotations (count, 4) as w, x, y, z; natural logarithms of scales
 // (count, 3); opacities before the sigmoid (count); SH of degree 0 (count, 3); SH above it (count,
 // (degree + 1)^2 - 1, 3), NULL for degree 0.
 NspResult nsp_model_create(struct NspDevice *device,
@@ -349,8 +356,8 @@ NspResult nsp_model_create(struct NspDevice *device,
                            const float *const *planes,
                            struct NspModel **model);
 
-// Joins models into one, each moved by a rotation and translation (three rows of four), so that all are sorted
-// together. Near plane, alpha limit and colours are the first one's, and the others have the same colours and limit.
+// Joins models into one, each moved by a rigid transform (three rows of four), so that all splats are sorted
+// together. The near plane is that of the first model. All have the same kind of colours and the same alpha limit.
 NspResult nsp_model_join(struct NspDevice *device,
                          const struct NspModel *const *models,
                          const double (*poses)[12],
@@ -360,48 +367,48 @@ NspResult nsp_model_join(struct NspDevice *device,
 // The number of Gaussians; 0 for NULL.
 uint32_t nsp_model_count(const struct NspModel *model);
 
-// Fills `info`.
+// Writes the properties of a model to `info`.
 NspResult nsp_model_info(const struct NspModel *model, struct NspModelInfo *info);
 
 // Destroys a model; frames that show it may be in flight.
 void nsp_model_destroy(struct NspModel *model);
 
-// Makes a renderer for models with the SH degree, near plane, colours and law of `model`.
+// Creates a renderer for models with the SH degree, near plane, colours and tone law of `model`.
 NspResult nsp_renderer_create(struct NspDevice *device, const struct NspModel *model, struct NspRenderer **renderer);
 
-// Takes memory for views of this size, and for this many intersections, ahead of the first recording.
+// Allocates memory for views of this size and for this many intersections, ahead of the first recording.
 NspResult nsp_renderer_reserve(struct NspRenderer *renderer, uint32_t width, uint32_t height, uint32_t intersections);
 
-// Records the render of a model. It submits nothing and waits for nothing; where memory is too small for the view,
-// the nearest splats are drawn, and a later call grows it.
+// Records the render of a model. Nothing is submitted, and nothing is waited for. If the view needs more memory than
+// there is, the nearest splats are drawn, and a later call allocates more.
 //
-// It binds compute pipelines, descriptors of set 0 and push constants, and restores none of them.
+// It binds compute pipelines, descriptor set 0 and push constants, and restores none of them.
 NspResult nsp_record_render(struct NspRenderer *renderer, const struct NspModel *model, const struct NspRender *render);
 
-// Fills `status` with how the newest frame that is done went. It never waits.
+// Writes the outcome of the newest frame that is done to `status`. It never waits.
 NspResult nsp_renderer_status(const struct NspRenderer *renderer, struct NspStatus *status);
 
-// Destroys a renderer; its frames may be in flight.
+// Destroys a renderer; frames that use it may be in flight.
 void nsp_renderer_destroy(struct NspRenderer *renderer);
 
-// Begins a training on a dataset's folder. `config_toml` holds settings as config.toml does; NULL or empty: the
-// photographs decide. The device is not record-only.
+// Creates a trainer for the dataset in a folder. `config_toml` is text in the format of config.toml; NULL or empty:
+// the settings follow from the photographs. The device must not be record-only.
 NspResult nsp_trainer_create(struct NspDevice *device,
                              const char *dataset,
                              const char *config_toml,
                              struct NspTrainer **trainer);
 
-// Trains for about half a second, to step `until` at most. `steps` gets the last `*count` steps of those made, and
-// `*count` how many it got; both may be NULL. Fewer than asked for, none included: the training has ended.
+// Trains for about half a second, up to step `until` at most. Writes the last of these steps to `steps`, at most
+// `*count`, and their number to `*count`; both may be NULL. No step: `until` is reached, or the training has ended.
 NspResult nsp_trainer_advance(struct NspTrainer *trainer, uint64_t until, struct NspStep *steps, uint32_t *count);
 
-// A copy of the model as it is now, on the trainer's device.
+// Copies the current model, on the trainer's device.
 NspResult nsp_trainer_model(struct NspTrainer *trainer, struct NspModel **model);
 
-// Writes the model as it is now, in the format of the path's extension: `.ply`, `.spz`, `.sog` or `.glb`.
+// Saves the current model in the format of the path's extension: `.ply`, `.spz`, `.sog` or `.glb`.
 NspResult nsp_trainer_save(struct NspTrainer *trainer, const char *path);
 
-// Destroys a trainer; waits for its own work.
+// Destroys a trainer; waits for its submissions.
 void nsp_trainer_destroy(struct NspTrainer *trainer);
 
 #ifdef __cplusplus

@@ -2,6 +2,11 @@
 
 use ash::vk;
 use ash::vk::Handle as _;
+pub use ash::vk::{
+    AccessFlags2 as VkAccessFlags2, CommandBuffer as VkCommandBuffer, Extent2D as VkExtent2D,
+    Format as VkFormat, Image as VkImage, ImageLayout as VkImageLayout,
+    PipelineStageFlags2 as VkPipelineStageFlags2,
+};
 
 use super::camera::NspCamera;
 use super::device::NspDevice;
@@ -15,22 +20,7 @@ use crate::splats::render::{
     Target,
 };
 
-/// Vulkan's.
-pub type VkImage = vk::Image;
-/// Vulkan's.
-pub type VkFormat = vk::Format;
-/// Vulkan's.
-pub type VkExtent2D = vk::Extent2D;
-/// Vulkan's.
-pub type VkImageLayout = vk::ImageLayout;
-/// Vulkan's.
-pub type VkPipelineStageFlags2 = vk::PipelineStageFlags2;
-/// Vulkan's.
-pub type VkAccessFlags2 = vk::AccessFlags2;
-/// Vulkan's.
-pub type VkCommandBuffer = vk::CommandBuffer;
-
-/// A renderer: kernels, and memory that grows with the views. One thread uses it at a time.
+/// A renderer: compiled kernels, and memory that grows with the views. Use it from one thread at a time.
 #[derive(Debug)]
 pub struct NspRenderer(Object<Shown>);
 
@@ -47,17 +37,18 @@ struct Shown {
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspImageState {
-    /// Its layout.
+    /// The image layout.
     pub layout: VkImageLayout,
-    /// The queue family that owns it; `VK_QUEUE_FAMILY_IGNORED`: ownership is not transferred.
+    /// The queue family that owns the image; `VK_QUEUE_FAMILY_IGNORED`: ownership is not transferred.
     pub family: u32,
-    /// Of the host's commands that use it.
+    /// The pipeline stages in which the host uses the image.
     pub stages: VkPipelineStageFlags2,
-    /// Of these commands.
+    /// The host's accesses in these stages.
     pub access: VkAccessFlags2,
 }
 
-/// A layer of an image: mip level 0, one sample; usage `TRANSFER_DST` to be written, `TRANSFER_SRC` to be read.
+/// An array layer of an image: mip level 0, single-sampled. Its usage includes `TRANSFER_DST` if it is written, and
+/// `TRANSFER_SRC` if it is read.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspImage {
@@ -65,29 +56,31 @@ pub struct NspImage {
     pub image: VkImage,
     /// Its format.
     pub format: VkFormat,
-    /// At least the camera's.
+    /// Width and height in pixels, at least those of the cameras.
     pub extent: VkExtent2D,
     /// The array layer of the first camera.
     pub layer: u32,
-    /// As the host leaves it.
+    /// The state in which the host leaves the image.
     pub before: NspImageState,
-    /// As it is afterwards. Where the families differ, our half of the transfer is recorded.
+    /// The state after the render. If the queue families differ, the library's half of the ownership transfer is
+    /// recorded.
     pub after: NspImageState,
 }
 
-/// Blended over what `color` holds, instead of replacing it.
+/// Blends over the contents of `color` instead of replacing them.
 pub const NSP_RENDER_OVER: u32 = 1;
-/// A float image gets display-referred values, as they were trained.
+/// Writes display-referred values, as they were trained, to a float `color` image; otherwise linear light.
 pub const NSP_RENDER_DISPLAY_FLOAT: u32 = 2;
-/// `scene_depth` is 1 at the near plane.
+/// `scene_depth` is reversed: 1 at the near plane, 0 at the far plane.
 pub const NSP_DEPTH_REVERSED: u32 = 4;
-/// `scene_depth` is the depth in the view, world units.
+/// `scene_depth` is linear view-space depth in world units.
 pub const NSP_DEPTH_LINEAR: u32 = 8;
-/// `depth_out` is the mean of what is seen; otherwise the depth at which half of it is.
+/// `depth_out` is the expected depth, the mean of the splats' depths by their blending weights; otherwise the median
+/// depth, at which the transmittance falls below 1/2.
 pub const NSP_DEPTH_EXPECTED: u32 = 16;
 
-/// Colours are those of the dark photographs, by the law that the model states: their linear light where the image is
-/// linear, else their values. `background` stays.
+/// Renders the colours of the dark photographs, by inverting the tone law that the model states: linear light in a
+/// linear image, encoded values otherwise. `background` is not changed.
 pub const NSP_RENDER_PHOTOGRAPH: u32 = 32;
 
 const FLAGS: u32 = NSP_RENDER_OVER
@@ -97,37 +90,40 @@ const FLAGS: u32 = NSP_RENDER_OVER
     | NSP_DEPTH_LINEAR
     | NSP_DEPTH_EXPECTED;
 
-/// One render.
+/// The parameters of a render.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspRender {
     /// `sizeof(NspRender)`.
     pub struct_size: usize,
-    /// Primary, recording, outside a render pass, of the lent family. It is submitted once, in the order of recording.
+    /// A primary command buffer of the lent queue family, in the recording state, outside a render pass. The host
+    /// submits it once, in the order of recording.
     pub commands: VkCommandBuffer,
-    /// The number that the host's timeline reaches after it; it never falls.
+    /// The value that the host's timeline semaphore reaches when the command buffer is done; it never decreases.
     pub frame: u64,
     /// Camera i is drawn into layer `layer + i` of each image.
     pub cameras: *const NspCamera,
-    /// Their number.
+    /// The number of cameras.
     pub camera_count: u32,
     /// `NSP_RENDER_*` and `NSP_DEPTH_*`.
     pub flags: u32,
-    /// RGBA16F (linear), RGBA8 or BGRA8 as UNORM or SRGB, premultiplied; NULL: none.
+    /// Colour with premultiplied alpha: RGBA16F (linear), or RGBA8 or BGRA8 as UNORM or SRGB; NULL: none.
     pub color: *const NspImage,
-    /// R32F: depth in the view, infinite where nothing is seen; NULL: none.
+    /// View-space depth as R32F, infinite where there is no splat; NULL: none.
     pub depth_out: *const NspImage,
-    /// D32, D24 or D16 with or without stencil, or R32F: the depth beyond which nothing is drawn; NULL: none.
+    /// The host's depth buffer, behind which splats are hidden: D32, D24 or D16 with or without stencil, or R32F;
+    /// NULL: none.
     pub scene_depth: *const NspImage,
-    /// The near plane of `scene_depth`, world units.
+    /// The near plane of `scene_depth` in world units.
     pub scene_near: f32,
-    /// The far plane; 0: infinite.
+    /// The far plane of `scene_depth` in world units; 0: at infinity.
     pub scene_far: f32,
-    /// The factor on linear light; 0 is 1.
+    /// The factor on linear light; 0 stands for 1.
     pub exposure: f32,
-    /// Display-referred; shows where alpha is below 1, unless over.
+    /// The background colour, display-referred; not used with `NSP_RENDER_OVER`.
     pub background: [f32; 3],
-    /// The most intersections of a view, the nearest first; 0: as memory allows.
+    /// The most intersections of splats and tiles in a view, of which the farthest are left out first; 0: as memory
+    /// allows.
     pub budget: u32,
     /// Unused.
     pub reserved: u32,
@@ -139,23 +135,23 @@ unsafe impl Sized0 for NspRender {
     const FIRST_SIZE: usize = size_of::<Self>();
 }
 
-/// How the newest frame that is done went.
+/// The outcome of the newest frame that is done.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspStatus {
     /// `sizeof(NspStatus)`.
     pub struct_size: usize,
-    /// Its number; 0: none is done yet.
+    /// The number of the frame; 0: none is done yet.
     pub frame: u64,
-    /// Intersections of splats and tiles in its view with the most.
+    /// Intersections of splats and tiles, in the view that has the most.
     pub intersections: u32,
-    /// Those that memory and budget allowed.
+    /// The intersections that memory and budget allowed.
     pub capacity: u32,
-    /// Those that were left out, the farthest.
+    /// The intersections that were left out, the farthest.
     pub left_out: u32,
-    /// Splats of one tile, where the device cannot follow them all and the tile is empty; else 0.
+    /// The splats of the fullest tile if the device cannot process so many, and the tile is not drawn; else 0.
     pub splats_per_tile: u32,
-    /// Device memory in use by everything made with the device.
+    /// Bytes of device memory in use by all objects of the device.
     pub device_bytes: u64,
 }
 
@@ -165,7 +161,7 @@ unsafe impl Sized0 for NspStatus {
     const FIRST_SIZE: usize = size_of::<Self>();
 }
 
-/// Makes a renderer for models with the SH degree, near plane, colours and law of `model`.
+/// Creates a renderer for models with the SH degree, near plane, colours and tone law of `model`.
 ///
 /// # Safety
 /// `device` and `model` are NULL or valid; `renderer` is NULL or valid.
@@ -205,7 +201,7 @@ fn check_device(
     }
 }
 
-/// Takes memory for views of this size, and for this many intersections, ahead of the first recording.
+/// Allocates memory for views of this size and for this many intersections, ahead of the first recording.
 ///
 /// # Safety
 /// `renderer` is NULL or valid.
@@ -219,17 +215,17 @@ pub unsafe extern "C" fn nsp_renderer_reserve(
     guard("nsp_renderer_reserve", || {
         // SAFETY: as the caller promises.
         let renderer = unsafe { object_mut(renderer, "renderer")? };
-        renderer.0.with("the renderer", |own| {
-            own.renderer.reserve_draw(own.gaussian_count, [width, height], intersections)?;
+        renderer.0.with("the renderer", |shown| {
+            shown.renderer.reserve_draw(shown.gaussian_count, [width, height], intersections)?;
             Ok(())
         })
     })
 }
 
-/// Records the render of a model. It submits nothing and waits for nothing; where memory is too small for the view,
-/// the nearest splats are drawn, and a later call grows it.
+/// Records the render of a model. Nothing is submitted, and nothing is waited for. If the view needs more memory than
+/// there is, the nearest splats are drawn, and a later call allocates more.
 ///
-/// It binds compute pipelines, descriptors of set 0 and push constants, and restores none of them.
+/// It binds compute pipelines, descriptor set 0 and push constants, and restores none of them.
 ///
 /// # Safety
 /// `renderer` and `model` are NULL or valid; `render` says the truth.
@@ -245,14 +241,14 @@ pub unsafe extern "C" fn nsp_record_render(
             unsafe { (object_mut(renderer, "renderer")?, object(model, "model")?, read(render)?) };
         let loaded = model.0.get("the model")?;
         // SAFETY: as the caller promises.
-        renderer.0.with("the renderer", |own| unsafe { record(own, loaded, &render) })
+        renderer.0.with("the renderer", |shown| unsafe { record(shown, loaded, &render) })
     })
 }
 
 /// # Safety
 /// `render` says the truth.
-unsafe fn record(own: &mut Shown, loaded: &Loaded, render: &NspRender) -> Result<(), Failure> {
-    check_device(&own.gpu, &loaded.on_device)?;
+unsafe fn record(shown: &mut Shown, loaded: &Loaded, render: &NspRender) -> Result<(), Failure> {
+    check_device(&shown.gpu, &loaded.on_device)?;
     if render.commands == vk::CommandBuffer::null() {
         return Err(Failure::usage("NspRender::commands is NULL"));
     }
@@ -266,7 +262,7 @@ unsafe fn record(own: &mut Shown, loaded: &Loaded, render: &NspRender) -> Result
     // SAFETY: as the caller promises.
     let (cameras, color, depth, scene) = unsafe {
         let cameras = std::slice::from_raw_parts(render.cameras, render.camera_count as usize);
-        let image = |image: *const NspImage, name| image.as_ref().map(|own| lent(own, name));
+        let image = |image: *const NspImage, name| image.as_ref().map(|image| lent(image, name));
         (
             cameras.iter().map(Camera::from).collect::<Vec<_>>(),
             image(render.color, "NspRender::color").transpose()?,
@@ -293,9 +289,9 @@ unsafe fn record(own: &mut Shown, loaded: &Loaded, render: &NspRender) -> Result
         exposure: if render.exposure == 0.0 { 1.0 } else { render.exposure },
         budget: render.budget,
     };
-    let options = RenderOptions { sh_degree: own.sh_degree, background: render.background };
+    let options = RenderOptions { sh_degree: shown.sh_degree, background: render.background };
     let frame = HostFrame { commands: render.commands.as_raw(), number: render.frame, readers: 0 };
-    let Shown { gpu, renderer, .. } = own;
+    let Shown { gpu, renderer, .. } = shown;
     // What can fail does so before anything is recorded.
     renderer.prepare_draw(&loaded.on_device.layout, &cameras, &target)?;
     // SAFETY: as the caller promises.
@@ -315,11 +311,11 @@ fn lent(image: &NspImage, name: &str) -> Result<HostImage, Failure> {
             image.format
         ))
     })?;
-    let state = |own: NspImageState| ImageState {
-        layout: own.layout.as_raw(),
-        family: own.family,
-        stages: own.stages.as_raw(),
-        access: own.access.as_raw(),
+    let state = |state: NspImageState| ImageState {
+        layout: state.layout.as_raw(),
+        family: state.family,
+        stages: state.stages.as_raw(),
+        access: state.access.as_raw(),
     };
     Ok(HostImage {
         handle: image.image.as_raw(),
@@ -331,7 +327,7 @@ fn lent(image: &NspImage, name: &str) -> Result<HostImage, Failure> {
     })
 }
 
-/// Fills `status` with how the newest frame that is done went. It never waits.
+/// Writes the outcome of the newest frame that is done to `status`. It never waits.
 ///
 /// # Safety
 /// `renderer` and `status` are NULL or valid.
@@ -347,7 +343,7 @@ pub unsafe extern "C" fn nsp_renderer_status(
         let drawn = renderer.drawn();
         let of =
             |member: fn(&crate::splats::render::Drawn) -> u32| drawn.as_ref().map_or(0, member);
-        let own = NspStatus {
+        let filled = NspStatus {
             struct_size: size_of::<NspStatus>(),
             frame: drawn.map_or(0, |drawn| drawn.frame),
             intersections: of(|drawn| drawn.intersections),
@@ -357,11 +353,11 @@ pub unsafe extern "C" fn nsp_renderer_status(
             device_bytes: gpu.memory_in_use(),
         };
         // SAFETY: as the caller promises.
-        unsafe { write(status, &own) }
+        unsafe { write(status, &filled) }
     })
 }
 
-/// Destroys a renderer; its frames may be in flight.
+/// Destroys a renderer; frames that use it may be in flight.
 ///
 /// # Safety
 /// `renderer` is NULL or valid, and not used again.

@@ -26,10 +26,10 @@ pub(super) unsafe fn read<T: Sized0 + Copy>(from: *const T) -> Result<T, Failure
     // SAFETY: as the caller promises; the size is read unaligned, as a packed copy may hold it.
     let size = unsafe { size_of_struct(from)? };
     // SAFETY: valid where all bytes are zero, as its trait says.
-    let mut own: T = unsafe { std::mem::zeroed() };
+    let mut copy: T = unsafe { std::mem::zeroed() };
     let (taken, bytes) = (size.min(size_of::<T>()), from.cast::<u8>());
     // SAFETY: the caller's struct is `size` bytes, of which these fit ours.
-    unsafe { std::ptr::copy_nonoverlapping(bytes, (&raw mut own).cast(), taken) };
+    unsafe { std::ptr::copy_nonoverlapping(bytes, (&raw mut copy).cast(), taken) };
     // SAFETY: as above.
     let has_more = (taken..size).any(|at| unsafe { *bytes.add(at) } != 0);
     if has_more {
@@ -42,7 +42,7 @@ pub(super) unsafe fn read<T: Sized0 + Copy>(from: *const T) -> Result<T, Failure
             ),
         ));
     }
-    Ok(own)
+    Ok(copy)
 }
 
 /// # Safety
@@ -69,15 +69,15 @@ unsafe fn size_of_struct<T: Sized0>(from: *const T) -> Result<usize, Failure> {
 ///
 /// # Safety
 /// As [`read`], and nothing else uses it.
-pub(super) unsafe fn write<T: Sized0 + Copy>(to: *mut T, own: &T) -> Result<(), Failure> {
+pub(super) unsafe fn write<T: Sized0 + Copy>(to: *mut T, from: &T) -> Result<(), Failure> {
     // SAFETY: as the caller promises.
     let size = unsafe { size_of_struct(to)? };
     let skipped = size_of::<usize>();
     let taken = size.min(size_of::<T>()) - skipped;
     // SAFETY: both are this long beyond their first member.
     unsafe {
-        let from = std::ptr::from_ref(own).cast::<u8>().add(skipped);
-        std::ptr::copy_nonoverlapping(from, to.cast::<u8>().add(skipped), taken);
+        let bytes = std::ptr::from_ref(from).cast::<u8>().add(skipped);
+        std::ptr::copy_nonoverlapping(bytes, to.cast::<u8>().add(skipped), taken);
     }
     Ok(())
 }

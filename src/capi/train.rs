@@ -18,7 +18,7 @@ use crate::gpu::Gpu;
 #[cfg(feature = "io")]
 use crate::train::Trainer;
 
-/// A training. One thread uses it at a time.
+/// A training run. Use it from one thread at a time.
 #[derive(Debug)]
 pub struct NspTrainer(
     #[cfg(feature = "io")] Object<Training>,
@@ -32,7 +32,7 @@ struct Training {
     trainer: Trainer,
 }
 
-/// One step of a training.
+/// A training step.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub struct NspStep {
@@ -40,7 +40,7 @@ pub struct NspStep {
     pub step: u64,
     /// The weighted sum of its loss terms.
     pub loss: f64,
-    /// Gaussians.
+    /// The number of Gaussians.
     pub gaussians: u32,
     /// Unused.
     pub reserved: u32,
@@ -52,8 +52,8 @@ fn unsupported<T>() -> Result<T, Failure> {
     Err(Failure::new(NSP_ERROR_UNSUPPORTED, text))
 }
 
-/// Begins a training on a dataset's folder. `config_toml` holds settings as config.toml does; NULL or empty: the
-/// photographs decide. The device is not record-only.
+/// Creates a trainer for the dataset in a folder. `config_toml` is text in the format of config.toml; NULL or empty:
+/// the settings follow from the photographs. The device must not be record-only.
 ///
 /// # Safety
 /// The texts are NULL or end with NUL; the pointers are NULL or valid.
@@ -101,8 +101,8 @@ unsafe fn begin(
     Ok(NspTrainer(Object::new(Training { gpu: gpu.clone(), trainer })))
 }
 
-/// Trains for about half a second, to step `until` at most. `steps` gets the last `*count` steps of those made, and
-/// `*count` how many it got; both may be NULL. Fewer than asked for, none included: the training has ended.
+/// Trains for about half a second, up to step `until` at most. Writes the last of these steps to `steps`, at most
+/// `*count`, and their number to `*count`; both may be NULL. No step: `until` is reached, or the training has ended.
 ///
 /// # Safety
 /// `trainer` is NULL or valid; `steps` holds `*count`.
@@ -150,7 +150,7 @@ unsafe fn advance(
     })
 }
 
-/// A copy of the model as it is now, on the trainer's device.
+/// Copies the current model, on the trainer's device.
 ///
 /// # Safety
 /// The pointers are NULL or valid.
@@ -175,7 +175,7 @@ fn current(trainer: &mut NspTrainer) -> Result<NspModel, Failure> {
     trainer.0.with("the trainer", |Training { gpu, trainer }| NspModel::new(gpu, trainer.model()?))
 }
 
-/// Writes the model as it is now, in the format of the path's extension: `.ply`, `.spz`, `.sog` or `.glb`.
+/// Saves the current model in the format of the path's extension: `.ply`, `.spz`, `.sog` or `.glb`.
 ///
 /// # Safety
 /// `trainer` is NULL or valid; `path` is NULL or ends with NUL.
@@ -204,7 +204,7 @@ unsafe fn save(trainer: &mut NspTrainer, path: *const c_char) -> Result<(), Fail
     trainer.0.with("the trainer", |Training { trainer, .. }| Ok(trainer.model()?.save(path)?))
 }
 
-/// Destroys a trainer; waits for its own work.
+/// Destroys a trainer; waits for its submissions.
 ///
 /// # Safety
 /// `trainer` is NULL or valid, and not used again.

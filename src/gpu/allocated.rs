@@ -161,7 +161,7 @@ impl Allocation {
         }
     }
 
-    fn place(&self) -> (vk::DeviceMemory, u64) {
+    fn location(&self) -> (vk::DeviceMemory, u64) {
         match self {
             // SAFETY: the memory is bound to a buffer and not freed by hand.
             Self::Ours(piece) => (unsafe { piece.memory() }, piece.offset()),
@@ -202,7 +202,7 @@ impl DeviceMemory {
                     return Err(out_of_memory(name, size)(cause));
                 }
             };
-            let (memory, offset) = allocation.place();
+            let (memory, offset) = allocation.location();
             let bound = shared.device.bind_buffer_memory(raw, memory, offset);
             shared.usage.add(allocation.size());
             let shared = Arc::clone(shared);

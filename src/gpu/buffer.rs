@@ -57,6 +57,19 @@ impl<T: bytemuck::Pod> Buffer<T> {
         SliceMut::new(&self.memory, self.len)
     }
 
+    /// Refuses a buffer of fewer elements than a pass accesses.
+    pub(crate) fn check_len(&self, needed: usize) -> Result<()> {
+        self.slice().check_len(needed)
+    }
+
+    /// Reallocates it if it has fewer than `len` elements; its contents are then undefined.
+    pub(crate) fn grow(&mut self, gpu: &Gpu, len: usize) -> Result<()> {
+        if self.len < len {
+            *self = gpu.uninit(self.name(), len)?;
+        }
+        Ok(())
+    }
+
     /// All of it, for copies of a buffer within the limit of a binding.
     pub(super) fn bound(&self) -> Bound {
         Bound { raw: self.memory.handle(), offset: 0, size: (self.len * size_of::<T>()) as u64 }

@@ -91,8 +91,9 @@ impl CheckReport {
     pub fn extend(&mut self, later: Self) {
         let before = self.passes.len();
         self.passes.extend(later.passes.into_iter().map(|mut pass| {
-            pass.difference =
-                pass.difference.map(|own| Difference { pass: before + own.pass, ..own });
+            pass.difference = pass
+                .difference
+                .map(|difference| Difference { pass: before + difference.pass, ..difference });
             pass
         }));
     }
@@ -128,8 +129,8 @@ impl CheckReport {
         let mut kernels: Vec<(&'static str, usize, f64)> = vec![];
         for pass in &self.passes {
             let error = pass.error.unwrap_or_default();
-            if let Some(own) = kernels.iter_mut().find(|(name, ..)| *name == pass.kernel) {
-                *own = (own.0, own.1 + 1, own.2.max(error));
+            if let Some(entry) = kernels.iter_mut().find(|(name, ..)| *name == pass.kernel) {
+                *entry = (entry.0, entry.1 + 1, entry.2.max(error));
             } else {
                 kernels.push((pass.kernel, 1, error));
             }
@@ -209,7 +210,7 @@ fn farthest_bytes(device: u32, reference: u32) -> (f64, f64) {
 
 /// Of two words with two halves each, the pair of halves that is farther apart, by index among all halves.
 fn farthest_halves(device: u32, reference: u32) -> (f64, f64) {
-    let place = |half: u32| {
+    let rank = |half: u32| {
         let bits = half & 0x7fff;
         // No number is farther than a NaN, and every NaN is the same.
         if bits > 0x7c00 {
@@ -219,7 +220,7 @@ fn farthest_halves(device: u32, reference: u32) -> (f64, f64) {
         let magnitude = f64::from(bits.saturating_sub(0x3ff));
         if half & 0x8000 == 0 { magnitude } else { -magnitude }
     };
-    let [low, high] = [0, 16].map(|shift| (place(device >> shift), place(reference >> shift)));
+    let [low, high] = [0, 16].map(|shift| (rank(device >> shift), rank(reference >> shift)));
     if (low.0 - low.1).abs() > (high.0 - high.1).abs() { low } else { high }
 }
 

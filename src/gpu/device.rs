@@ -124,9 +124,8 @@ impl Gpu {
         supported.check()?;
         let (queue, family) = (vk::Queue::from_raw(host.queue), host.queue_family);
         check_family(&instance, physical, family)?;
-        let own = properties(&instance, physical, &supported)?;
-        let has_push_descriptors = own.has_push_descriptors && host.has_push_descriptors;
-        let properties = Properties { has_push_descriptors, ..own };
+        let mut properties = properties(&instance, physical, &supported)?;
+        properties.has_push_descriptors &= host.has_push_descriptors;
         let parts = DeviceParts { physical, properties, device, queue, family };
         Self::assemble(&instance, parts, Owner::Host(&host))
     }
@@ -190,8 +189,8 @@ impl Gpu {
 fn check_family(instance: &ash::Instance, physical: vk::PhysicalDevice, family: u32) -> Result<()> {
     // SAFETY: the handle was enumerated from the instance.
     let families = unsafe { instance.get_physical_device_queue_family_properties(physical) };
-    let own = families.get(family as usize);
-    if own.is_some_and(|own| own.queue_flags.contains(vk::QueueFlags::COMPUTE)) {
+    let properties = families.get(family as usize);
+    if properties.is_some_and(|family| family.queue_flags.contains(vk::QueueFlags::COMPUTE)) {
         return Ok(());
     }
     Err(Error::Usage(format!(

@@ -132,7 +132,7 @@ pub(super) fn report(
         uuid: hyphenated(&supported.uuid),
         pci: supported.pci,
         // What the variable requires of another device does not matter here.
-        subgroup_size: supported.lanes().unwrap_or(supported.subgroups.own),
+        subgroup_size: supported.lanes().unwrap_or(supported.subgroups.default),
         subgroup_sizes: supported.subgroups.all(),
         memory: device_memory(instance, physical),
         limits: DeviceLimits {

@@ -27,12 +27,7 @@ impl Gpu {
     /// The device is out of memory or lost.
     pub fn read<'a, T: bytemuck::Pod>(&self, buffer: impl Into<Slice<'a, T>>) -> Result<Vec<T>> {
         let buffer = buffer.into();
-        let mut download = None;
-        self.run("read", |pass| {
-            download = Some(pass.download(buffer)?);
-            Ok(())
-        })?;
-        download.map_or_else(|| Ok(vec![]), Download::wait)
+        self.run("read", |pass| pass.download(buffer))?.wait()
     }
 }
 
@@ -85,10 +80,10 @@ impl<T: bytemuck::Pod> Download<T> {
         let mut data = vec![T::zeroed(); bytes as usize / size_of::<T>()];
         let mut left = bytemuck::cast_slice_mut(&mut data);
         for (copy, size) in &self.host {
-            let (own, after) = left.split_at_mut(*size as usize);
+            let (part, after) = left.split_at_mut(*size as usize);
             left = after;
             if let Some(mapped) = copy.mapped() {
-                own.copy_from_slice(&mapped[..own.len()]);
+                part.copy_from_slice(&mapped[..part.len()]);
             }
         }
         Ok(data)

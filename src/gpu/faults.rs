@@ -15,7 +15,7 @@ const VARIABLE: &str = "NIGHTSPLAT_FAULT";
 
 /// Counts so far, and the count that fails; 0: none.
 #[derive(Debug, Default)]
-pub(super) struct Faults {
+pub struct Faults {
     allocations: AtomicU64,
     failing_allocation: AtomicU64,
     /// The names of the allocated buffers, where a test records them.
@@ -60,15 +60,15 @@ impl Faults {
         Ok(faults)
     }
 
-    /// Fails the allocation with this number, counted from now on.
-    pub(super) fn fail_allocation(&self, number: u64) {
+    /// Fails the allocation with this number, counted from 1 now on.
+    pub fn fail_allocation(&self, number: u64) {
         *lock(&self.names) = Some(vec![]);
         self.allocations.store(0, Ordering::Relaxed);
         self.failing_allocation.store(number, Ordering::Relaxed);
     }
 
-    /// Loses the device at the submission with this number, counted from now on.
-    pub(super) fn lose_at_submission(&self, number: u64) {
+    /// Loses the device at the submission with this number, counted from 1 now on.
+    pub fn lose_at_submission(&self, number: u64) {
         self.submissions.store(0, Ordering::Relaxed);
         self.losing_submission.store(number, Ordering::Relaxed);
     }
@@ -84,16 +84,18 @@ impl Faults {
         }
     }
 
-    pub(super) fn plant_check(&self, check: Option<u32>) {
+    /// Fails this check of the self-test.
+    pub fn plant_check(&self, check: Option<u32>) {
         *lock(&self.planted_check) = check;
     }
 
-    pub(super) fn planted_check(&self) -> Option<u32> {
+    /// The check of the self-test that fails.
+    pub fn planted_check(&self) -> Option<u32> {
         *lock(&self.planted_check)
     }
 
-    /// The buffers that were allocated since a failure was set.
-    pub(super) fn allocations(&self) -> Vec<String> {
+    /// The names of the buffers allocated since [`Self::fail_allocation`], in order.
+    pub fn allocations(&self) -> Vec<String> {
         lock(&self.names).take().unwrap_or_default()
     }
 
@@ -128,22 +130,5 @@ impl Faults {
     /// Whether the device counts as lost.
     pub(super) fn is_lost(&self) -> bool {
         self.is_lost.load(Ordering::Relaxed)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn one_allocation_fails_and_a_lost_device_stays_lost() {
-        let faults = Faults::default();
-        faults.fail_allocation(2);
-        let failed: Vec<bool> = (0..4).map(|_| faults.fails_allocation("buffer")).collect();
-        assert_eq!(failed, [false, true, false, false]);
-        assert_eq!(faults.allocations(), ["buffer"; 4]);
-        faults.lose_at_submission(2);
-        let lost: Vec<bool> = (0..4).map(|_| faults.loses_submission()).collect();
-        assert_eq!(lost, [false, true, true, true]);
     }
 }

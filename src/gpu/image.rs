@@ -6,7 +6,7 @@
 use ash::vk;
 use ash::vk::Handle as _;
 
-use super::{Bound, Buffer, Recorder};
+use super::{Buffer, Recorder};
 
 /// The state of an image before or after a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -119,7 +119,7 @@ const FORMATS: [(ImageFormat, vk::Format, usize); 11] = [
 impl ImageFormat {
     /// The format with this `VkFormat`; `None` for one that we neither read nor write.
     pub fn from_vulkan(format: i32) -> Option<Self> {
-        FORMATS.iter().find(|(_, own, _)| own.as_raw() == format).map(|(format, ..)| *format)
+        FORMATS.iter().find(|(_, vulkan, _)| vulkan.as_raw() == format).map(|(format, ..)| *format)
     }
 
     /// Bytes of a pixel in a copy.
@@ -156,11 +156,6 @@ pub struct HostImage {
     pub after: ImageState,
 }
 
-/// The state of an image between our own copies.
-fn copied(layout: vk::ImageLayout, access: vk::AccessFlags2) -> ImageState {
-    ImageState::new(layout, vk::PipelineStageFlags2::ALL_TRANSFER, access)
-}
-
 impl Recorder<'_> {
     /// Copies the pixels of `image` into `buffer`, (H, W) in rows without padding; only its `size` is read.
     pub(crate) fn take_image(
@@ -169,23 +164,7 @@ impl Recorder<'_> {
         size: [u32; 2],
         buffer: &mut Buffer<u32>,
     ) {
-        let source = copied(vk::ImageLayout::TRANSFER_SRC_OPTIMAL, vk::AccessFlags2::TRANSFER_READ);
-        self.image_barrier(image, image.before, source);
-        let Bound { raw, .. } = buffer.bound();
-        self.synchronize([(raw, true)].into_iter());
-        let (region, layout) = ([region(image, size)], vk::ImageLayout::TRANSFER_SRC_OPTIMAL);
-        let handle = vk::Image::from_raw(image.handle);
-        // SAFETY: recording; the host keeps its image alive, and the buffer holds the region.
-        unsafe {
-            self.shared().device.cmd_copy_image_to_buffer(
-                self.commands,
-                handle,
-                layout,
-                raw,
-                &region,
-            );
-        }
-        self.image_barrier(image, source, image.after);
+        self.copy_image(image, size, buffer.bound().raw, true);
     }
 
     /// Copies `buffer`, (H, W) in rows without padding, into the pixels of `image` within `size`.
@@ -195,33 +174,42 @@ impl Recorder<'_> {
         image: &HostImage,
         size: [u32; 2],
     ) {
-        let target =
-            copied(vk::ImageLayout::TRANSFER_DST_OPTIMAL, vk::AccessFlags2::TRANSFER_WRITE);
-        let Bound { raw, .. } = buffer.bound();
-        self.synchronize([(raw, false)].into_iter());
-        self.image_barrier(image, image.before, target);
-        let (region, layout) = ([region(image, size)], vk::ImageLayout::TRANSFER_DST_OPTIMAL);
-        let handle = vk::Image::from_raw(image.handle);
+        self.copy_image(image, size, buffer.bound().raw, false);
+    }
+
+    /// Copies from an image to a buffer or the reverse.
+    fn copy_image(
+        &mut self,
+        image: &HostImage,
+        size: [u32; 2],
+        buffer: vk::Buffer,
+        is_taken: bool,
+    ) {
+        let during =
+            if is_taken { ImageState::TRANSFER_SOURCE } else { ImageState::TRANSFER_TARGET };
+        self.synchronize([(buffer, is_taken)].into_iter());
+        self.image_barrier(image, image.before, during);
+        let (regions, layout) = ([region(image, size)], vk::ImageLayout::from_raw(during.layout));
+        let raw = vk::Image::from_raw(image.handle);
+        let device = &self.shared().device;
         // SAFETY: recording; the host keeps its image alive, and the buffer holds the region.
         unsafe {
-            self.shared().device.cmd_copy_buffer_to_image(
-                self.commands,
-                raw,
-                handle,
-                layout,
-                &region,
-            );
+            if is_taken {
+                device.cmd_copy_image_to_buffer(self.commands, raw, layout, buffer, &regions);
+            } else {
+                device.cmd_copy_buffer_to_image(self.commands, buffer, raw, layout, &regions);
+            }
         }
-        self.image_barrier(image, target, image.after);
+        self.image_barrier(image, during, image.after);
     }
 
     /// Takes the image from one state to another; where the families differ, our half of the transfer.
     fn image_barrier(&mut self, image: &HostImage, from: ImageState, to: ImageState) {
-        let own = self.family();
-        let is_foreign = |family: u32| family != vk::QUEUE_FAMILY_IGNORED && family != own;
+        let family = self.family();
+        let is_foreign = |other: u32| other != vk::QUEUE_FAMILY_IGNORED && other != family;
         let families = match (is_foreign(from.family), is_foreign(to.family)) {
-            (true, _) => [from.family, own],
-            (false, true) => [own, to.family],
+            (true, _) => [from.family, family],
+            (false, true) => [family, to.family],
             (false, false) => [vk::QUEUE_FAMILY_IGNORED; 2],
         };
         let [aspects, _] = image.format.aspects();

@@ -87,7 +87,7 @@ fn instance_has(entry: &ash::Entry, extension: &CStr) -> Result<bool> {
     // SAFETY: no preconditions.
     let all =
         unsafe { entry.enumerate_instance_extension_properties(None) }.map_err(loader_error)?;
-    Ok(all.iter().any(|own| own.extension_name_as_c_str() == Ok(extension)))
+    Ok(all.iter().any(|listed| listed.extension_name_as_c_str() == Ok(extension)))
 }
 
 pub(super) fn instance(validate: bool) -> Result<OwnedInstance> {

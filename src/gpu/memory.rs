@@ -36,8 +36,8 @@ impl BudgetQuery {
     pub(super) fn of(instance: &ash::Instance, physical: vk::PhysicalDevice) -> Option<Self> {
         // SAFETY: the handle was enumerated from the instance.
         let extensions = unsafe { instance.enumerate_device_extension_properties(physical) };
-        let is_offered = |own: &vk::ExtensionProperties| {
-            own.extension_name_as_c_str() == Ok(ext::memory_budget::NAME)
+        let is_offered = |extension: &vk::ExtensionProperties| {
+            extension.extension_name_as_c_str() == Ok(ext::memory_budget::NAME)
         };
         let is_offered = extensions.is_ok_and(|all| all.iter().any(is_offered));
         is_offered.then(|| Self { instance: instance.clone(), physical })
@@ -156,13 +156,5 @@ mod tests {
         gpu.free_unused();
         assert_eq!(gpu.memory_in_use(), before);
         gpu.uninit::<u8>("another", 1 << 20).unwrap();
-    }
-
-    #[test]
-    fn a_budget_is_at_least_the_memory_in_use() {
-        let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
-        if let Some(budget) = gpu.memory_budget() {
-            assert!(budget.budget > 0 && budget.budget >= budget.usage, "{budget:?}");
-        }
     }
 }

@@ -413,7 +413,7 @@ impl<'g> Recorder<'g> {
 
     /// The time when everything recorded so far is done.
     fn timestamp(&self, index: u32) {
-        let queries = self.timestamps.map(|own| match own {
+        let queries = self.timestamps.map(|timestamps| match timestamps {
             Timestamps::OfPasses(queries) | Timestamps::OfAll(queries) => queries,
         });
         if let Some(queries) = queries.filter(|_| index < MAX_TIMESTAMPS) {

@@ -95,7 +95,9 @@ pub const REQUIREMENTS: &[Requirement] = &[
     Requirement {
         name: "subgroup size 4 to 128",
         why: "a ballot fits four words, a tile at most 32 rows of lanes",
-        supported: |o| SUBGROUP_SIZES.contains(&o.subgroups.own) && !o.subgroups.all().is_empty(),
+        supported: |o| {
+            SUBGROUP_SIZES.contains(&o.subgroups.default) && !o.subgroups.all().is_empty()
+        },
     },
     Requirement {
         name: "maxComputeWorkGroupInvocations >= 256",
@@ -160,7 +162,7 @@ mod tests {
         Supported {
             properties,
             subgroups: SubgroupSizes {
-                own: 4,
+                default: 4,
                 are_selectable: false,
                 least: 4,
                 most: 4,
@@ -197,7 +199,7 @@ mod tests {
             ("subgroupSizeControl", |o| o.vulkan13.subgroup_size_control = vk::FALSE),
             ("computeFullSubgroups", |o| o.vulkan13.compute_full_subgroups = vk::FALSE),
             ("subgroup operations", |o| o.subgroup_operations = vk::SubgroupFeatureFlags::BASIC),
-            ("subgroup size", |o| o.subgroups.own = 2),
+            ("subgroup size", |o| o.subgroups.default = 2),
             ("maxComputeWorkGroupInvocations", |o| {
                 o.properties.limits.max_compute_work_group_invocations = 128;
             }),

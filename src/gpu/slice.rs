@@ -81,6 +81,17 @@ impl<'a, T: bytemuck::Pod> Slice<'a, T> {
         self.len == 0
     }
 
+    /// Refuses a slice of fewer elements than a pass accesses.
+    pub(crate) fn check_len(&self, needed: usize) -> Result<()> {
+        let (name, len) = (self.memory.name(), self.len);
+        match len < needed {
+            true => {
+                Err(Error::Usage(format!("buffer `{name}` holds {len} elements, not {needed}")))
+            }
+            false => Ok(()),
+        }
+    }
+
     /// The name of the buffer.
     pub(crate) fn name(&self) -> &str {
         self.memory.name()

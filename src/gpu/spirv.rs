@@ -55,8 +55,8 @@ pub(super) fn frozen(code: &[u32], values: &[(u32, u32)]) -> Vec<u32> {
         match (opcode, operands) {
             (OP_DECORATE, [_, DECORATION_SPEC_ID, ..])
             | (OP_DECORATE, [_, DECORATION_BUILT_IN, BUILT_IN_WORKGROUP_SIZE]) => {}
-            (OP_EXECUTION_MODE, [entry, MODE_LOCAL_SIZE, own @ ..]) => {
-                let size = constants.workgroup_size().unwrap_or_else(|| own.to_vec());
+            (OP_EXECUTION_MODE, [entry, MODE_LOCAL_SIZE, size @ ..]) => {
+                let size = constants.workgroup_size().unwrap_or_else(|| size.to_vec());
                 let operands = [&[*entry, MODE_LOCAL_SIZE], &*size].concat();
                 put(&mut frozen, opcode, &operands);
             }
@@ -94,7 +94,7 @@ struct Constants {
 impl Constants {
     fn of(code: &[u32], values: &[(u32, u32)]) -> Self {
         let values: BTreeMap<u32, u32> = values.iter().copied().collect();
-        let (mut own, mut specialised) = (Self::default(), BTreeMap::new());
+        let (mut all, mut specialised) = (Self::default(), BTreeMap::new());
         for (opcode, instruction) in instructions(code) {
             let value = |result: &u32| specialised.get(result).copied();
             match (opcode, &instruction[1..]) {
@@ -102,32 +102,32 @@ impl Constants {
                     specialised.extend(values.get(id).map(|&bits| (*target, bits)));
                 }
                 (OP_DECORATE, [target, DECORATION_BUILT_IN, BUILT_IN_WORKGROUP_SIZE]) => {
-                    own.workgroup_size = Some(*target);
+                    all.workgroup_size = Some(*target);
                 }
-                (OP_TYPE_BOOL, [ty]) => drop(own.bools.insert(*ty)),
-                (OP_TYPE_INT, [ty, 32, _]) => drop(own.ints.insert(*ty)),
+                (OP_TYPE_BOOL, [ty]) => drop(all.bools.insert(*ty)),
+                (OP_TYPE_INT, [ty, 32, _]) => drop(all.ints.insert(*ty)),
                 (OP_CONSTANT_TRUE | OP_SPEC_CONSTANT_TRUE, [_, result]) => {
-                    own.scalars.insert(*result, value(result).map_or(1, |bits| (bits != 0).into()));
+                    all.scalars.insert(*result, value(result).map_or(1, |bits| (bits != 0).into()));
                 }
                 (OP_CONSTANT_FALSE | OP_SPEC_CONSTANT_FALSE, [_, result]) => {
-                    own.scalars.insert(*result, value(result).map_or(0, |bits| (bits != 0).into()));
+                    all.scalars.insert(*result, value(result).map_or(0, |bits| (bits != 0).into()));
                 }
                 (OP_CONSTANT | OP_SPEC_CONSTANT, [_, result, default]) => {
-                    own.scalars.insert(*result, value(result).unwrap_or(*default));
+                    all.scalars.insert(*result, value(result).unwrap_or(*default));
                 }
                 (
                     OP_CONSTANT_COMPOSITE | OP_SPEC_CONSTANT_COMPOSITE,
                     [_, result, constituents @ ..],
-                ) => drop(own.composites.insert(*result, constituents.to_vec())),
+                ) => drop(all.composites.insert(*result, constituents.to_vec())),
                 (OP_SPEC_CONSTANT_OP, [ty, result, operation, operands @ ..])
-                    if own.ints.contains(ty) || own.bools.contains(ty) =>
+                    if all.ints.contains(ty) || all.bools.contains(ty) =>
                 {
-                    own.scalars.extend(own.evaluated(*operation, operands).map(|v| (*result, v)));
+                    all.scalars.extend(all.evaluated(*operation, operands).map(|v| (*result, v)));
                 }
                 _ => {}
             }
         }
-        own
+        all
     }
 
     /// An operation on scalars, if it is one of those that glslang makes of the constants of our kernels; another one

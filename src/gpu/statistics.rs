@@ -168,8 +168,8 @@ pub(super) unsafe fn read(
         for index in 0..executables.len() as u32 {
             let info = vk::PipelineExecutableInfoKHR::default();
             let info = info.pipeline(raw).executable_index(index);
-            let own = functions.get_pipeline_executable_statistics(&info)?;
-            all.extend(own.iter().map(Statistic::from));
+            let statistics = functions.get_pipeline_executable_statistics(&info)?;
+            all.extend(statistics.iter().map(Statistic::from));
         }
     }
     Ok(all)

@@ -14,7 +14,7 @@ const LEAST_BUILT_IN: u32 = 8;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SubgroupSizes {
     /// The default size.
-    pub(super) own: u32,
+    pub(super) default: u32,
     /// Kernels can require another.
     pub(super) are_selectable: bool,
     pub(super) least: u32,
@@ -53,7 +53,7 @@ impl SubgroupSizes {
             QUALCOMM => Some(64),
             _ => None,
         };
-        wanted.filter(|size| self.are_selectable && all.contains(size)).unwrap_or(self.own)
+        wanted.filter(|size| self.are_selectable && all.contains(size)).unwrap_or(self.default)
     }
 }
 
@@ -78,8 +78,8 @@ mod tests {
     const NVIDIA: u32 = 0x10de;
     const APPLE: u32 = 0x106b;
 
-    fn sizes(own: u32, [least, most]: [u32; 2]) -> SubgroupSizes {
-        SubgroupSizes { own, are_selectable: true, least, most, workgroup_limit: 32 }
+    fn sizes(default: u32, [least, most]: [u32; 2]) -> SubgroupSizes {
+        SubgroupSizes { default, are_selectable: true, least, most, workgroup_limit: 32 }
     }
 
     #[test]

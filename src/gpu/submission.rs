@@ -91,16 +91,22 @@ impl Gpu {
         self.record_and_submit(label, None, Box::new(record)).map(|(submission, _)| submission)
     }
 
-    /// Records passes, submits them and waits.
+    /// Records passes, submits them and waits; returns what `record` returns.
     ///
     /// # Errors
     /// The error of `record` (nothing is submitted then), this thread is recording already, or the device was lost.
-    pub fn run(
+    pub fn run<R>(
         &self,
         label: &str,
-        record: impl FnOnce(&mut Recorder<'_>) -> Result<()>,
-    ) -> Result<()> {
-        self.submit(label, record)?.wait()
+        record: impl FnOnce(&mut Recorder<'_>) -> Result<R>,
+    ) -> Result<R> {
+        let mut result = None;
+        let submission = self.submit(label, |pass| {
+            result = Some(record(pass)?);
+            Ok(())
+        })?;
+        submission.wait()?;
+        result.ok_or_else(|| Error::Usage(format!("`{label}` was not recorded")))
     }
 
     /// As [`Gpu::run`], and measures the time of each pass.

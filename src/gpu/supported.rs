@@ -89,7 +89,7 @@ impl Supported {
             max_allocation: vulkan11.max_memory_allocation_size,
             max_buffer: vulkan13_properties.max_buffer_size,
             subgroups: SubgroupSizes {
-                own: vulkan11.subgroup_size,
+                default: vulkan11.subgroup_size,
                 are_selectable: vulkan13_properties
                     .required_subgroup_size_stages
                     .contains(vk::ShaderStageFlags::COMPUTE),

@@ -9,6 +9,7 @@ use std::sync::{Arc, OnceLock};
 
 use ash::vk;
 
+pub use super::faults::Faults;
 use super::{DeviceChoice, Gpu, Interface, Properties, Shared};
 
 static GPU: OnceLock<Gpu> = OnceLock::new();
@@ -29,16 +30,13 @@ const AS_A_GPU_VARIABLE: &str = "NIGHTSPLAT_AS_A_GPU";
 #[track_caller]
 #[allow(clippy::explicit_write, reason = "`eprintln!` is what the harness swallows")]
 pub fn not_run(need: &str, why: impl Display) {
-    let (thread, place) = (std::thread::current(), Location::caller());
+    let (thread, location) = (std::thread::current(), Location::caller());
     let test = thread.name().unwrap_or("a test");
     // A closed standard error is no reason to fail.
-    let _ = writeln!(std::io::stderr(), "not run: {test} ({place}): {need}: {why}");
+    let _ = writeln!(std::io::stderr(), "not run: {test} ({location}): {need}: {why}");
     let required = std::env::var(REQUIRE_VARIABLE).unwrap_or_default();
-    assert!(!names(&required, need), "{REQUIRE_VARIABLE} names {need}");
-}
-
-fn names(required: &str, need: &str) -> bool {
-    required.split(',').any(|required| required.trim() == need)
+    let is_required = required.split(',').any(|required| required.trim() == need);
+    assert!(!is_required, "{REQUIRE_VARIABLE} names {need}");
 }
 
 /// The device that tests share, with validation and synchronization validation: any message fails the process at its
@@ -74,29 +72,6 @@ pub fn gpu_with(adapt: impl FnOnce(&mut Properties)) -> Gpu {
     open(|shared| adapt(&mut shared.properties))
 }
 
-/// Another device with validation, with this limit on the bytes of a buffer.
-///
-/// # Panics
-/// As [`gpu`].
-pub fn gpu_that_creates(bytes: u64) -> Gpu {
-    open(|shared| {
-        let Properties { max_storage_buffer_range, max_buffer_size, .. } = &mut shared.properties;
-        *max_buffer_size = bytes;
-        *max_storage_buffer_range = bytes.min(*max_storage_buffer_range);
-    })
-}
-
-/// Another device with validation, whose subgroups have another size than the kernels are compiled for.
-///
-/// # Panics
-/// As [`gpu`].
-pub fn gpu_that_misreports_its_subgroups() -> Gpu {
-    open(|shared| {
-        shared.properties.subgroup_size *= 2;
-        shared.properties.subgroup_size_is_selectable = false;
-    })
-}
-
 /// A kernel's module, frozen with these constants for subgroups of this size.
 pub fn frozen(
     interface: &Interface,
@@ -107,14 +82,6 @@ pub fn frozen(
     let subgroup_size = interface.subgroup_size_id.map(|id| (id, subgroup_size));
     let constants: Vec<_> = constants.into_iter().chain(subgroup_size).collect();
     Ok(super::spirv::frozen(&code, &constants))
-}
-
-/// Another device with validation, with this limit on the workgroups of a dispatch along either dimension.
-///
-/// # Panics
-/// As [`gpu`].
-pub fn gpu_that_launches(workgroups: u32) -> Gpu {
-    open(|shared| shared.properties.max_workgroups = workgroups)
 }
 
 #[expect(clippy::panic, reason = "a test without a device must fail")]
@@ -159,29 +126,9 @@ pub fn is_checked(gpu: &Gpu) -> bool {
     gpu.shared.checks.are_on()
 }
 
-/// Fails the allocation with this number, counted from 1 now on.
-pub fn fail_allocation(gpu: &Gpu, number: u64) {
-    gpu.shared.faults.fail_allocation(number);
-}
-
-/// The names of the buffers allocated since [`fail_allocation`], in order.
-pub fn allocations(gpu: &Gpu) -> Vec<String> {
-    gpu.shared.faults.allocations()
-}
-
-/// Loses the device at the submission with this number, counted from 1 now on.
-pub fn lose_at_submission(gpu: &Gpu, number: u64) {
-    gpu.shared.faults.lose_at_submission(number);
-}
-
-/// Lets this check of the self-test fail.
-pub fn plant_check(gpu: &Gpu, check: Option<u32>) {
-    gpu.shared.faults.plant_check(check);
-}
-
-/// The check of the self-test that is to fail.
-pub fn planted_check(gpu: &Gpu) -> Option<u32> {
-    gpu.shared.faults.planted_check()
+/// The faults injected into a device.
+pub fn faults(gpu: &Gpu) -> &Faults {
+    &gpu.shared.faults
 }
 
 /// While it lives, allocations and submissions are not counted, and none fails.
@@ -238,15 +185,4 @@ pub(super) fn with_defect_of(kernel: &str, params: &[u8]) -> Vec<u8> {
         bytes.zip(defect.bits.to_le_bytes()).for_each(|(byte, bits)| *byte ^= bits);
     }
     params
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_list_of_what_is_required_names_whole_words() {
-        assert!(names("lavapipe, radv", "radv") && names("radv", "radv"));
-        assert!(!names("", "radv") && !names("radv2,x", "radv"));
-    }
 }

@@ -48,7 +48,7 @@ impl TryFrom<Vec<u32>> for Tile {
         match numbers[..] {
             [width, height] => Ok([width, height].into()),
             [width, height, subgroups] => Ok(Self { size: [width, height], subgroups }),
-            _ => Err("a tile is its width and height in pixels, and how many subgroups own it"
+            _ => Err("a tile is its width and height in pixels, and how many subgroups share it"
                 .to_owned()),
         }
     }
@@ -164,9 +164,9 @@ fn tiles(bytes: &[u8], properties: &Properties) -> Result<Vec<TunedTile>, String
     let damaged = |problem: String| format!("is damaged ({problem})");
     let Tuning { device, driver, tiles } =
         serde_json::from_slice(bytes).map_err(|error| damaged(error.to_string()))?;
-    let Properties { name, driver: own, subgroup_size, .. } = properties;
-    if (&device, &driver) != (name, own) {
-        return Err(format!("was measured on {device}, {driver}; this is {name}, {own}"));
+    let Properties { name, driver: this_driver, subgroup_size, .. } = properties;
+    if (&device, &driver) != (name, this_driver) {
+        return Err(format!("was measured on {device}, {driver}; this is {name}, {this_driver}"));
     }
     let unsuitable = tiles.iter().find(|tuned| !properties.suits_tile(tuned.tile));
     unsuitable.map_or(Ok(()), |TunedTile { tile, .. }| {

@@ -5,7 +5,7 @@ use gpu_allocator::MemoryLocation;
 use super::allocated::DeviceMemory;
 use super::host::Upload;
 use super::{Bound, Buffer, Gpu, SliceMut};
-use crate::{Error, Result};
+use crate::Result;
 
 impl Gpu {
     /// A buffer of `len` zeroed elements.
@@ -44,11 +44,7 @@ impl Gpu {
         data: &[T],
     ) -> Result<()> {
         let buffer = buffer.into();
-        if data.len() > buffer.len() {
-            let (name, len) = (buffer.name(), buffer.len());
-            let n = data.len();
-            return Err(Error::Usage(format!("buffer `{name}` holds {len} elements, not {n}")));
-        }
+        buffer.as_slice().check_len(data.len())?;
         if data.is_empty() {
             return Ok(());
         }

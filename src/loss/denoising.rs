@@ -4,9 +4,7 @@
 use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
-use super::{
-    LossInputs, LossSpec, Term, TermOn, Weights, check_weight, holds, no_scratch, value_count,
-};
+use super::{LossInputs, LossSpec, Term, TermOn, Weights, check_weight, no_scratch, value_count};
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::denoising;
@@ -65,11 +63,8 @@ impl DenoisingLoss {
     /// Allocates scratch memory for views up to `size`; it never shrinks.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         let workgroups = self.workgroups(size) as usize;
-        if workgroups > self.mse_partials.len() {
-            self.mse_partials = self.gpu.uninit("mse_partials", workgroups)?;
-            self.tv_partials = self.gpu.uninit("tv_partials", workgroups)?;
-        }
-        Ok(())
+        self.mse_partials.grow(&self.gpu, workgroups)?;
+        self.tv_partials.grow(&self.gpu, workgroups)
     }
 
     /// Writes the gradients of the denoised image and of its target for the whole view, 0 outside the loss region, and
@@ -88,7 +83,7 @@ impl DenoisingLoss {
         }
         loss_region.check(size)?;
         for buffer in [denoised, target, &*d_denoised, &*d_target] {
-            holds(buffer, value_count(size) as usize)?;
+            buffer.check_len(value_count(size) as usize)?;
         }
         log.check()?;
         let UVec2 { x: columns, y: rows } = loss_region.size;

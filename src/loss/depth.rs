@@ -9,8 +9,7 @@ use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
-    LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, check_weight, holds, no_scratch,
-    pixel_count,
+    LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, check_weight, no_scratch, pixel_count,
 };
 use crate::base::random::Stream;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -134,16 +133,11 @@ impl DepthLoss {
     /// Allocates scratch memory for views up to `size`; it never shrinks.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         let chunks = self.chunks(size);
-        let regions = chunks.boxes.count as usize + 1;
-        if regions > self.regions.len() {
-            self.box_values = self.gpu.uninit("depth_box_values", regions - 1)?;
-            self.gradients = self.gpu.uninit("depth_gradients", regions)?;
-            self.regions = self.gpu.uninit("depth_regions", regions)?;
-        }
-        if chunks.total() as usize > self.chunk_moments.len() {
-            self.chunk_moments = self.gpu.uninit("depth_moments", chunks.total() as usize)?;
-        }
-        Ok(())
+        let boxes = chunks.boxes.count as usize;
+        self.box_values.grow(&self.gpu, boxes)?;
+        self.gradients.grow(&self.gpu, boxes + 1)?;
+        self.regions.grow(&self.gpu, boxes + 1)?;
+        self.chunk_moments.grow(&self.gpu, chunks.total() as usize)
     }
 
     /// P of every region and its gradient, from the moments of its chunks.
@@ -238,9 +232,9 @@ impl LossTerm for DepthLoss {
         if pixels == 0 || !fits {
             return Err(no_scratch("depth term", size));
         }
-        holds(&depth, pixels as usize)?;
+        depth.check_len(pixels as usize)?;
         for buffer in [render, &*d_render] {
-            holds(buffer, (plane as usize + 1) * pixels as usize)?;
+            buffer.check_len((plane as usize + 1) * pixels as usize)?;
         }
         log.check()?;
         pass.dispatch(

@@ -12,7 +12,7 @@ use glam::{UVec2, Vec2};
 
 pub use affine::Affine;
 
-use super::{holds, no_scratch, pixel_count};
+use super::{no_scratch, pixel_count};
 use crate::base::settings::{Rule, settings};
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::exposure::{BIAS_SCALE, EXPOSURE_WIDTH};
@@ -110,15 +110,9 @@ impl Exposures {
 
     /// Allocates for views up to `size`; it never shrinks.
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
-        let values = COLOR_CHANNELS * pixel_count(size) as usize;
-        if values > self.exposed.len() {
-            self.exposed = self.gpu.uninit("exposed", values)?;
-        }
+        self.exposed.grow(&self.gpu, COLOR_CHANNELS * pixel_count(size) as usize)?;
         let partials = COLOR_CHANNELS * self.chunks(size) as usize;
-        if partials > self.partials.len() {
-            self.partials = self.gpu.uninit("exposure_partials", partials)?;
-        }
-        Ok(())
+        self.partials.grow(&self.gpu, partials)
     }
 
     /// Records `view`'s exposure of a render, (3 or more, H, W), to [`Exposures::exposed`]; at most the target, (3, H,
@@ -250,7 +244,7 @@ impl Exposures {
         if !fits {
             return Err(no_scratch("exposure", size));
         }
-        holds(planes, values)
+        planes.check_len(values)
     }
 }
 

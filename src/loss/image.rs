@@ -12,8 +12,8 @@ use ssim::Ssim;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
-    Gradient, LossRegion, LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, holds,
-    no_scratch, value_count,
+    Gradient, LossRegion, LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, no_scratch,
+    value_count,
 };
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::l1;
@@ -119,10 +119,8 @@ impl Loss {
     pub fn reserve(&mut self, size: UVec2) -> Result<()> {
         self.max_values = self.max_values.max(value_count(size));
         let workgroups = self.kernels.workgroups(size) as usize;
-        if workgroups > self.l1_partials.len() {
-            self.l1_partials = self.gpu.uninit("l1_partials", workgroups)?;
-            self.ssim_partials = self.gpu.uninit("ssim_partials", workgroups)?;
-        }
+        self.l1_partials.grow(&self.gpu, workgroups)?;
+        self.ssim_partials.grow(&self.gpu, workgroups)?;
         match &mut self.kernels {
             Kernels::Ssim(ssim) => ssim.reserve(&self.gpu, self.max_values),
             Kernels::L1 { .. } => Ok(()),
@@ -199,7 +197,7 @@ impl Loss {
         }
         inputs.loss_region.check(inputs.size)?;
         for buffer in [inputs.render, inputs.target, d_render] {
-            holds(buffer, values as usize)?;
+            buffer.check_len(values as usize)?;
         }
         log.check()
     }

@@ -107,14 +107,11 @@ impl ParameterTerms {
         let padded = |batch: &Batch| (workgroups(batch) as usize).next_multiple_of(PART);
         let total: usize = batches.iter().map(|batch| padded(&batch)).sum();
         let all: u32 = batches.iter().map(|batch| batch.gaussian_count()).sum();
-        if self.opacity_partials.len() < total {
-            self.opacity_partials = self.gpu.uninit("opacity_partials", total)?;
-            self.scale_partials = self.gpu.uninit("scale_partials", total)?;
-            self.ratio_partials = self.gpu.uninit("ratio_partials", total)?;
+        let Self { opacity_partials, scale_partials, ratio_partials, .. } = self;
+        for partials in [opacity_partials, scale_partials, ratio_partials] {
+            partials.grow(&self.gpu, total)?;
+            pass.fill(partials, 0);
         }
-        pass.fill(&mut self.opacity_partials, 0);
-        pass.fill(&mut self.scale_partials, 0);
-        pass.fill(&mut self.ratio_partials, 0);
         let scale = |weight: f64, each: f64| (weight / (each * f64::from(all.max(1)))) as f32;
         let mut first = 0;
         for batch in batches.iter() {

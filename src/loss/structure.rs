@@ -4,8 +4,7 @@ use glam::UVec2;
 
 use super::log::{LogSlot, PartialSums};
 use super::{
-    LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, check_weight, holds, no_scratch,
-    pixel_count,
+    LossSpec, LossTerm, Term, TermInputs, TermOn, ViewSource, check_weight, no_scratch, pixel_count,
 };
 use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -56,9 +55,7 @@ impl StructureLoss {
     /// Adds a view of this size by the structure of its target, (H, W), and allocates scratch memory for it.
     pub fn add(&mut self, size: UVec2, structure: Buffer<f32>) -> Result<()> {
         let workgroups = pixel_count(size).div_ceil(self.values_per_workgroup) as usize;
-        if workgroups > self.partials.len() {
-            self.partials = self.gpu.uninit("structure_partials", workgroups)?;
-        }
+        self.partials.grow(&self.gpu, workgroups)?;
         self.structures.push(structure);
         Ok(())
     }
@@ -93,9 +90,9 @@ impl LossTerm for StructureLoss {
         if pixels == 0 || workgroups as usize > self.partials.len() {
             return Err(no_scratch("structure term", size));
         }
-        holds(structure, pixels as usize)?;
+        structure.check_len(pixels as usize)?;
         for buffer in [render, &*d_render] {
-            holds(buffer, (plane as usize + 1) * pixels as usize)?;
+            buffer.check_len((plane as usize + 1) * pixels as usize)?;
         }
         log.check()?;
         pass.dispatch(

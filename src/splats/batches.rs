@@ -154,9 +154,9 @@ impl Batches {
         let mut planes = vec![0.0; self.planes.total()];
         let mut rest = batched.as_slice();
         for Part { range, columns } in self.parts() {
-            let (own, others) = rest.split_at(range.len());
+            let (part, others) = rest.split_at(range.len());
             let count = (range.len() / columns).max(1);
-            for (k, column) in own.chunks(count).enumerate() {
+            for (k, column) in part.chunks(count).enumerate() {
                 let rows = planes[range.clone()].iter_mut().skip(k).step_by(columns);
                 rows.zip(column).for_each(|(to, value)| *to = *value);
             }
@@ -169,9 +169,9 @@ impl Batches {
     pub fn index_of(&self, float: usize) -> usize {
         let mut before = 0;
         for Part { range, columns } in self.parts() {
-            let (own, count) = (float - before, range.len() / columns);
-            if own < range.len() {
-                return range.start + own % count * columns + own / count;
+            let (offset, count) = (float - before, range.len() / columns);
+            if offset < range.len() {
+                return range.start + offset % count * columns + offset / count;
             }
             before += range.len();
         }

@@ -9,7 +9,6 @@
 //! the other into the spare buffer, at first that of the last step's gradients: a round needs no additional memory.
 //! Buffers grow with headroom, so most rounds allocate nothing.
 
-use std::iter;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
@@ -288,8 +287,7 @@ impl Densifier {
         let batches = layout.batches(&self.gpu);
         let Self { scratch, sort, scan, cameras, .. } = self;
         self.gpu.write(&mut scratch.count, &[count])?;
-        let mut download = None;
-        self.gpu.run("densify_decide", |pass| {
+        let counters = self.gpu.run("densify_decide", |pass| {
             pass.fill(&mut scratch.counters, 0);
             for batch in batches.iter() {
                 let buffers = densify_score::Buffers {
@@ -320,10 +318,9 @@ impl Densifier {
             }
             let Scratch { child_counts, offsets, total, .. } = scratch;
             scan.record(pass, counted, child_counts, offsets, total)?;
-            download = Some(pass.download(&scratch.counters)?);
-            Ok(())
+            pass.download(&scratch.counters)
         })?;
-        download.map_or_else(|| Ok(vec![]), |counters| counters.wait())
+        counters.wait()
     }
 
     /// Writes the new parameters to the words of `spare_buffers`, or over the gradients.
@@ -483,7 +480,7 @@ pub(crate) fn capacity(count: usize, limit: usize) -> usize {
 }
 
 fn report(count: usize, counters: &[u32]) -> DensifyReport {
-    let counters = |place: u32| counters.get(place as usize).map_or(0, |&count| count as usize);
+    let counters = |index: u32| counters.get(index as usize).map_or(0, |&count| count as usize);
     let (cloned, split, pruned) =
         (counters(COUNTER_CLONED), counters(COUNTER_SPLIT), counters(COUNTER_PRUNED));
     DensifyReport {
@@ -500,16 +497,8 @@ fn check(gaussians: &DeviceGaussians, inputs: &DensifyInputs<'_>) -> Result<()> 
     let DeviceGaussians { layout, parameters, .. } = gaussians;
     let DensifyInputs { moments, grad_norm_sums, visit_counts, .. } = inputs;
     let (count, floats) = (layout.count, layout.floats().total());
-    let parameters = iter::once((parameters.name(), parameters.len(), count * layout.words()));
-    let moments = moments.planes().into_iter().map(|(name, plane)| (name, plane.len(), floats));
-    let per_gaussian = [
-        (grad_norm_sums.name(), grad_norm_sums.len(), count),
-        (visit_counts.name(), visit_counts.len(), count),
-    ];
-    match parameters.chain(moments).chain(per_gaussian).find(|(_, len, needed)| len < needed) {
-        Some((name, len, needed)) => Err(Error::Usage(format!(
-            "buffer `{name}` holds {len} elements, density control needs {needed}"
-        ))),
-        None => Ok(()),
-    }
+    parameters.check_len(count * layout.words())?;
+    moments.planes().into_iter().try_for_each(|(_, plane)| plane.check_len(floats))?;
+    grad_norm_sums.check_len(count)?;
+    visit_counts.check_len(count)
 }

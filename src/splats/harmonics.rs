@@ -69,12 +69,12 @@ impl HarmonicRotation {
     pub(crate) fn new(rotation: DMat3) -> Self {
         let mut parts = [[0.0; 15]; 15];
         for (direction, weight) in quadrature() {
-            let (turned, own) = (sh_basis(3, rotation * direction), sh_basis(3, direction));
+            let (turned, basis) = (sh_basis(3, rotation * direction), sh_basis(3, direction));
             for degree in 1..=3 {
                 let own_degree = sh_count(degree - 1)..sh_count(degree);
                 for k in own_degree.clone() {
                     for j in own_degree.clone() {
-                        parts[k - 1][j - 1] += weight * turned[k] * own[j];
+                        parts[k - 1][j - 1] += weight * turned[k] * basis[j];
                     }
                 }
             }
@@ -86,8 +86,12 @@ impl HarmonicRotation {
     pub(crate) fn turn(&self, rest: &mut [glam::Vec3]) {
         let before: Vec<DVec3> = rest.iter().map(|value| value.as_dvec3()).collect();
         for (value, parts) in rest.iter_mut().zip(&self.0) {
-            *value =
-                before.iter().zip(parts).map(|(own, part)| *own * *part).sum::<DVec3>().as_vec3();
+            *value = before
+                .iter()
+                .zip(parts)
+                .map(|(value, part)| *value * *part)
+                .sum::<DVec3>()
+                .as_vec3();
         }
     }
 }
@@ -112,10 +116,10 @@ mod tests {
                 DVec3::new(ring * cos, ring * sin, z)
             })
             .collect();
-        let own: Vec<f64> = (0..15).map(|k| ((k * k % 7) as f64 - 3.0) / 5.0).collect();
+        let coefficients: Vec<f64> = (0..15).map(|k| ((k * k % 7) as f64 - 3.0) / 5.0).collect();
         let color = |direction: &DVec3| {
             let basis = sh_basis(3, rotation.inverse() * *direction);
-            own.iter().zip(&basis[1..]).map(|(c, b)| c * b).sum::<f64>()
+            coefficients.iter().zip(&basis[1..]).map(|(c, b)| c * b).sum::<f64>()
         };
         let colors = DVector::from_iterator(60, directions.iter().map(color));
         let basis = |row: usize, column: usize| sh_basis(3, directions[row])[column + 1];
@@ -123,7 +127,7 @@ mod tests {
         let expected = matrix.svd(true, true).solve(&colors, 1e-12).unwrap();
 
         let mut turned: Vec<glam::Vec3> =
-            own.iter().map(|value| glam::Vec3::splat(*value as f32)).collect();
+            coefficients.iter().map(|value| glam::Vec3::splat(*value as f32)).collect();
         HarmonicRotation::new(DMat3::from_quat(rotation)).turn(&mut turned);
         for (turned, expected) in turned.iter().zip(&expected) {
             assert!((f64::from(turned.x) - expected).abs() < 2e-7, "{turned} {expected}");

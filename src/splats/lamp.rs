@@ -97,8 +97,9 @@ impl Lamp {
     #[cfg(feature = "io")]
     pub(crate) fn unlit(&self, color: Vec3, point: DVec3) -> Vec3 {
         let factor = self.factor(point);
-        let own = color.to_array().map(|value| self.tone(self.tone_inverse(value.into()) / factor));
-        Vec3::from_array(own.map(|value| value as f32))
+        let unlit =
+            color.to_array().map(|value| self.tone(self.tone_inverse(value.into()) / factor));
+        Vec3::from_array(unlit.map(|value| value as f32))
     }
 
     /// The colour of the tone law's argument `x`, which is in proportion to light^slope.
@@ -248,33 +249,33 @@ mod tests {
 
     #[test]
     fn the_light_is_1_on_the_axis_at_the_reference_distance() {
-        let own = lamp();
+        let lamp = lamp();
         let axis = DVec3::new(0.1, 0.2, 1.0).normalize();
-        let at = |distance: f64| own.light(DVec3::from(own.position) + distance * axis);
+        let at = |distance: f64| lamp.light(DVec3::from(lamp.position) + distance * axis);
         assert!((at(1.5) - 1.0).abs() < 1e-12);
         assert!((at(3.0) - (0.1 + 0.9 * 0.5_f64.powf(1.7))).abs() < 1e-12);
     }
 
     #[test]
     fn the_light_is_finite_and_positive_at_the_lamp_and_far_away() {
-        let own =
+        let lamp =
             Lamp { ambient: LAMP_LEAST_AMBIENT, exponent: 4.0, falloffs: [50.0; 2], ..lamp() };
-        let position = DVec3::from(own.position);
+        let position = DVec3::from(lamp.position);
         for point in [position, position - 1e-30, DVec3::NEG_Z, DVec3::splat(1e25), DVec3::Z * 1e30]
         {
-            let light = own.light(point);
+            let light = lamp.light(point);
             assert!(light >= LAMP_LEAST_AMBIENT && light <= 16_f64.powi(4), "{point}: {light}");
         }
     }
 
     #[test]
     fn the_numbers_of_the_device_are_those_of_the_lamp() {
-        let own = lamp();
-        let back = Lamp::of_numbers(&own.numbers());
+        let lamp = lamp();
+        let back = Lamp::of_numbers(&lamp.numbers());
         for point in [DVec3::Z, DVec3::new(0.5, -0.3, 2.0), DVec3::new(-1.0, 0.3, 0.4)] {
-            assert!((back.light(point) / own.light(point) - 1.0).abs() < 1e-5);
+            assert!((back.light(point) / lamp.light(point) - 1.0).abs() < 1e-5);
         }
-        let bounds = Lamp { ambient: 0.0, exponent: 0.0, falloffs: [0.0; 2], ..own };
+        let bounds = Lamp { ambient: 0.0, exponent: 0.0, falloffs: [0.0; 2], ..lamp };
         let back = Lamp::of_numbers(&bounds.numbers());
         back.check().unwrap();
         assert!(back.exponent < 1e-4 && back.ambient < 2e-4 && back.falloffs[0] < 1e-4);
@@ -296,9 +297,9 @@ mod tests {
     #[cfg(feature = "io")]
     fn the_tone_law_has_an_inverse_on_both_sides_of_black_and_of_its_knee() {
         for reach in [0.0, 0.5, 0.9] {
-            let own = Lamp { black: 0.07, reach, ..lamp() };
+            let lamp = Lamp { black: 0.07, reach, ..lamp() };
             for value in [-0.3, 0.07, 0.08, 0.4, 0.53, 0.95, 1.5] {
-                let back = own.tone(own.tone_inverse(value));
+                let back = lamp.tone(lamp.tone_inverse(value));
                 assert!((back - value).abs() < 1e-6, "reach {reach}: {value} became {back}");
             }
         }

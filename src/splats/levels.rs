@@ -124,12 +124,13 @@ pub fn level(gaussians: &Gaussians, tiles: &[usize], most: usize, level: usize) 
     let (mut places, mut start): (Vec<Vec<u32>>, usize) = (vec![], 0);
     for &count in tiles.iter().filter(|count| **count > 0) {
         let Cells { order, cells } = Cells::new(&gaussians.means()[start..][..count], most);
-        let of_cell = |cell: Range<usize>| order[cell].iter().map(move |own| own + start as u32);
+        let of_cell =
+            |cell: Range<usize>| order[cell].iter().map(move |index| index + start as u32);
         places.extend(cells.into_iter().map(|cell| of_cell(cell).collect()));
         start += count;
     }
     let of_cell =
-        |cell: &Vec<u32>| (0..level).fold(gaussians.select(cell), |own, _| coarser(&own).0);
+        |cell: &Vec<u32>| (0..level).fold(gaussians.select(cell), |index, _| coarser(&index).0);
     let cells: Vec<Gaussians> = places.par_iter().map(of_cell).collect();
     Gaussians::concatenated(&cells.iter().collect::<Vec<_>>())
 }
@@ -208,9 +209,9 @@ impl Merging {
             versions: vec![0; count],
             candidates: BinaryHeap::new(),
         };
-        for (own, nearest) in (0..).zip(neighbours) {
-            for other in nearest.into_iter().filter(|&other| other != own) {
-                merging.connect(own, other);
+        for (index, nearest) in (0..).zip(neighbours) {
+            for other in nearest.into_iter().filter(|&other| other != index) {
+                merging.connect(index, other);
             }
         }
         merging
@@ -218,8 +219,8 @@ impl Merging {
 
     /// Makes two Gaussians neighbours, unless they are or one has enough of them.
     fn connect(&mut self, a: u32, b: u32) {
-        let [own, its] = [a, b].map(|index| &self.neighbours[index as usize]);
-        if own.len() >= MAX_NEIGHBOURS || its.len() >= MAX_NEIGHBOURS || own.contains(&b) {
+        let [of_a, of_b] = [a, b].map(|index| &self.neighbours[index as usize]);
+        if of_a.len() >= MAX_NEIGHBOURS || of_b.len() >= MAX_NEIGHBOURS || of_a.contains(&b) {
             return;
         }
         self.neighbours[a as usize].push(b);
@@ -260,8 +261,11 @@ impl Merging {
         for &other in &inherited {
             self.neighbours[other as usize].retain(|&its| its != gone);
         }
-        let own = self.neighbours[a].clone();
-        own.iter().filter(|&&other| other != gone).for_each(|&other| self.consider(kept, other));
+        let neighbours = self.neighbours[a].clone();
+        neighbours
+            .iter()
+            .filter(|&&other| other != gone)
+            .for_each(|&other| self.consider(kept, other));
         for other in inherited.into_iter().filter(|&other| other != kept) {
             self.connect(kept, other);
         }
@@ -295,8 +299,8 @@ impl Merging {
             let width = plane.len() / left.len().max(1);
             let rows = level.parameters[plane].chunks_exact_mut(width.max(1));
             for (to, index) in rows.zip(&left) {
-                let own = &self.rows[index * self.width + column..][..width];
-                to.iter_mut().zip(own).for_each(|(to, own)| *to = *own as f32);
+                let row = &self.rows[index * self.width + column..][..width];
+                to.iter_mut().zip(row).for_each(|(to, row)| *to = *row as f32);
             }
             column += width;
         }
@@ -346,8 +350,8 @@ fn merged(a: &Part, b: &Part) -> (Part, f64) {
         + weight_b * (b.covariance + outer(offset - mean))
         - weight_ab * (product + outer(between - mean)))
         * weight.recip();
-    let own = areas(covariance);
-    let opacity = weight / own.element_sum();
+    let merged_areas = areas(covariance);
+    let opacity = weight / merged_areas.element_sum();
     let growth = (opacity / MAX_OPACITY).max(1.0);
     let share = (weight_a - 0.5 * weight_ab) / weight;
     let part = Part {
@@ -355,7 +359,7 @@ fn merged(a: &Part, b: &Part) -> (Part, f64) {
         covariance: covariance * growth,
         opacity: opacity.min(MAX_OPACITY),
         color: a.color * share + b.color * (1.0 - share),
-        areas: own * growth,
+        areas: merged_areas * growth,
     };
     (part, share)
 }

@@ -114,21 +114,15 @@ impl Model {
                 return refuse("has other colours, alpha limit or antialiasing than the first");
             }
             let shown = part.gaussians.with_features(Features::NONE);
-            let moved = shown
+            let mut moved = shown
                 .with_sh_degree(joined.shape.sh_degree)
                 .rotated(DQuat::from_mat3(&pose.matrix3));
             let offset = moved.origin + pose.translation;
-            let range = at..at + moved.count;
-            for (to, from) in joined.means_mut()[range.clone()].iter_mut().zip(moved.means()) {
-                *to = (from.as_dvec3() + offset).as_vec3();
+            for mean in moved.means_mut() {
+                *mean = (mean.as_dvec3() + offset).as_vec3();
             }
-            joined.quats_mut()[range.clone()].copy_from_slice(moved.quats());
-            joined.log_scales_mut()[range.clone()].copy_from_slice(moved.log_scales());
-            joined.raw_opacities_mut()[range.clone()].copy_from_slice(moved.raw_opacities());
-            joined.dc_mut()[range.clone()].copy_from_slice(moved.dc());
-            let rest = moved.rest().len() / moved.count.max(1);
-            joined.rest_mut()[rest * range.start..rest * range.end].copy_from_slice(moved.rest());
-            at = range.end;
+            joined.replace(at, &moved);
+            at += moved.count;
         }
         let is_one = parts.iter().all(|(part, _)| part.law == first.law);
         let law = first.law.filter(|_| is_one);

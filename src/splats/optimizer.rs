@@ -402,11 +402,7 @@ fn check(
 ) -> Result<()> {
     let moments = moments.planes().into_iter().map(|(_, plane)| (plane.as_slice(), gradients.1));
     let mut planes = [parameters, gradients].into_iter().chain(moments);
-    if let Some((short, needed)) = planes.find(|(plane, needed)| plane.len() < *needed) {
-        let (name, has) = (short.name(), short.len());
-        let what = format!("buffer `{name}` holds {has} floats, Adam needs {needed}");
-        return Err(Error::Usage(what));
-    }
+    planes.try_for_each(|(plane, needed)| plane.check_len(needed))?;
     if step == 0 || status.is_empty() {
         let what = "Adam counts steps from 1 and needs a status word";
         return Err(Error::Usage(what.to_owned()));

@@ -34,18 +34,18 @@ pub(crate) struct PackedSh {
     /// Words per Gaussian before the packed ones.
     before: usize,
     /// SH coefficients above degree 0 per Gaussian.
-    own: usize,
+    rest: usize,
 }
 
 impl PackedSh {
     /// The packed form of planes of floats.
     pub(crate) fn new(planes: PlaneCounts) -> Self {
-        Self { count: planes.gaussians, before: planes.before_rest(), own: planes.rest() }
+        Self { count: planes.gaussians, before: planes.before_rest(), rest: planes.rest() }
     }
 
     /// Words per Gaussian.
     pub(crate) fn columns(self) -> usize {
-        self.before + self.own.div_ceil(2)
+        self.before + self.rest.div_ceil(2)
     }
 
     /// Packs the coefficients of planes of floats, each rounded to nearest.
@@ -55,16 +55,16 @@ impl PackedSh {
             f32::from_bits(halves[0] | halves[1] << 16)
         };
         let (planes, rest) = floats.split_at(self.before * self.count);
-        let words = rest.chunks_exact(self.own.max(1)).flat_map(|own| own.chunks(2).map(word));
+        let words = rest.chunks_exact(self.rest.max(1)).flat_map(|row| row.chunks(2).map(word));
         planes.iter().copied().chain(words).collect()
     }
 
     /// Unpacks planes to floats.
     pub(crate) fn unpack(self, words: &[f32]) -> Vec<f32> {
         let (planes, rest) = words.split_at(self.before * self.count);
-        let floats = rest.chunks_exact(self.own.div_ceil(2).max(1)).flat_map(|own| {
-            let bits = own.iter().map(|word| word.to_bits());
-            bits.flat_map(|bits| [bits, bits >> 16].map(|half| value(half as u16))).take(self.own)
+        let floats = rest.chunks_exact(self.rest.div_ceil(2).max(1)).flat_map(|row| {
+            let bits = row.iter().map(|word| word.to_bits());
+            bits.flat_map(|bits| [bits, bits >> 16].map(|half| value(half as u16))).take(self.rest)
         });
         planes.iter().copied().chain(floats).collect()
     }

@@ -244,8 +244,8 @@ impl Renderer {
                 size: view.size,
                 tile_columns: view.tiles.x,
                 longest_run: self.longest_run,
-                has_limits: depths.is_some_and(|own| own.has_limits).into(),
-                takes_median: depths.is_some_and(|own| own.takes_median).into(),
+                has_limits: depths.is_some_and(|depths| depths.has_limits).into(),
+                takes_median: depths.is_some_and(|depths| depths.takes_median).into(),
                 background,
             },
             blend_forward::Buffers {
@@ -360,8 +360,8 @@ impl Renderer {
         let color_floats = color_floats(view.channels);
         let project = &projections[&view.kind].forward;
         let context = context.as_ref().map(DeviceGaussians::slice);
-        let own = (gaussians, context.map_or(0, |context| context.layout.count));
-        let all = context.into_iter().map(|context| (context, 0)).chain([own]);
+        let of_view = (gaussians, context.map_or(0, |context| context.layout.count));
+        let all = context.into_iter().map(|context| (context, 0)).chain([of_view]);
         for (GaussianSlice { layout, parameters }, first) in all {
             for batch in layout.batches(gpu).iter() {
                 let rendered = batch.after(first);
@@ -407,12 +407,12 @@ impl Renderer {
     fn check_layout(&self, layout: &Layout) -> Result<()> {
         let RenderSettings { shape, rest, .. } = self.settings;
         let problem = if layout.shape != shape {
-            let [own, made_for] = [layout.shape, shape];
-            format!("Gaussians of {own} cannot be rendered by a renderer made for {made_for}")
+            let [given, made_for] = [layout.shape, shape];
+            format!("Gaussians of {given} cannot be rendered by a renderer made for {made_for}")
         } else if layout.sh_rest != rest {
-            let [own, made_for] = [layout.sh_rest, rest];
+            let [given, made_for] = [layout.sh_rest, rest];
             format!(
-                "Gaussians with SH coefficients as {own:?} cannot be rendered by a renderer made for {made_for:?}"
+                "Gaussians with SH coefficients as {given:?} cannot be rendered by a renderer made for {made_for:?}"
             )
         } else {
             return Ok(());

@@ -3,8 +3,10 @@
 use std::fmt;
 use std::ops::Range;
 
-use glam::{DQuat, DVec3, Vec3};
+use glam::{DMat3, DQuat, DVec3, Vec3};
+use rayon::prelude::*;
 
+#[cfg(feature = "io")]
 mod change;
 mod device;
 mod facts;
@@ -19,6 +21,7 @@ pub mod ply;
 use crate::camera::TrainingFrame;
 pub use crate::splats::attributes::{ATTRIBUTES, Attribute, PlaneCounts, rest_coefficients};
 use crate::splats::attributes::{AttributePlane, column_count, planes};
+use crate::splats::harmonics::HarmonicRotation;
 #[cfg(feature = "io")]
 pub(crate) use change::{Lengths, is_far};
 pub use device::{DeviceGaussians, GaussianSlice, Layout};
@@ -131,10 +134,10 @@ impl Gaussians {
         other.origin = self.origin;
         let before = self.plane(Attribute::Rest).start;
         other.parameters[..before].copy_from_slice(&self.parameters[..before]);
-        let [own, new] = [self.shape.sh_degree, sh_degree].map(rest_coefficients);
-        let kept = own.min(new);
-        let pairs = other.rest_mut().chunks_mut(new.max(1)).zip(self.rest().chunks(own.max(1)));
-        pairs.for_each(|(new, own)| new[..kept].copy_from_slice(&own[..kept]));
+        let [old, new] = [self.shape.sh_degree, sh_degree].map(rest_coefficients);
+        let kept = old.min(new);
+        let pairs = other.rest_mut().chunks_mut(new.max(1)).zip(self.rest().chunks(old.max(1)));
+        pairs.for_each(|(new, old)| new[..kept].copy_from_slice(&old[..kept]));
         other
     }
 
@@ -148,14 +151,14 @@ impl Gaussians {
             let plane = other.plane(attribute);
             other.parameters[plane].copy_from_slice(&self.parameters[self.plane(attribute)]);
         }
-        let [own, new] = [self.shape.features, features].map(Features::width);
+        let [old, new] = [self.shape.features, features].map(Features::width);
         for feature in FEATURES.iter().map(|spec| spec.feature) {
             let channels = [self.shape.features, features].map(|all| all.channels_of(feature));
             let [Some(from), Some(to)] = channels else { continue };
             let [from, to] = [from, to].map(|c| c.start - COLOR_CHANNELS..c.end - COLOR_CHANNELS);
             let rows = other.features_mut().chunks_exact_mut(new);
-            rows.zip(self.features().chunks_exact(own)).for_each(|(new, own)| {
-                new[to.clone()].copy_from_slice(&own[from.clone()]);
+            rows.zip(self.features().chunks_exact(old)).for_each(|(new, old)| {
+                new[to.clone()].copy_from_slice(&old[from.clone()]);
             });
         }
         other
@@ -163,9 +166,9 @@ impl Gaussians {
 
     /// The lowest SH degree that includes all nonzero coefficients.
     pub(crate) fn sh_degree_in_use(&self) -> u32 {
-        let own = rest_coefficients(self.shape.sh_degree);
+        let stored = rest_coefficients(self.shape.sh_degree);
         let used = |rest: &[Vec3]| rest.iter().rposition(|c| *c != Vec3::ZERO).map_or(0, |k| k + 1);
-        let used = self.rest().chunks(own.max(1)).map(used).max().unwrap_or_default();
+        let used = self.rest().chunks(stored.max(1)).map(used).max().unwrap_or_default();
         (0..=self.shape.sh_degree)
             .find(|&degree| rest_coefficients(degree) >= used)
             .unwrap_or_default()
@@ -190,6 +193,37 @@ impl Gaussians {
         let mut rotated = self.clone();
         rotated.rotate(rotation);
         rotated
+    }
+
+    /// Rotates the world about its origin: direction `d` becomes `rotation * d`.
+    pub(crate) fn rotate(&mut self, rotation: DQuat) {
+        self.origin = rotation * self.origin;
+        for mean in self.means_mut() {
+            *mean = (rotation * mean.as_dvec3()).as_vec3();
+        }
+        for quat in self.quats_mut() {
+            let [w, x, y, z] = quat.map(f64::from);
+            let DQuat { x, y, z, w } = rotation * DQuat::from_xyzw(x, y, z, w);
+            *quat = [w, x, y, z].map(|part| part as f32);
+        }
+        let coefficients = rest_coefficients(self.shape.sh_degree);
+        if coefficients > 0 {
+            let harmonics = HarmonicRotation::new(DMat3::from_quat(rotation));
+            self.rest_mut()
+                .par_chunks_exact_mut(coefficients)
+                .for_each(|rest| harmonics.turn(rest));
+        }
+    }
+
+    /// Replaces the Gaussians from `first` on by others of the same shape.
+    #[cfg(any(feature = "io", feature = "capi"))]
+    pub(crate) fn replace(&mut self, first: usize, by: &Self) {
+        for spec in &ATTRIBUTES {
+            let width = self.columns(spec.attribute).width;
+            let start = self.plane(spec.attribute).start + first * width;
+            self.parameters[start..start + by.count * width]
+                .copy_from_slice(&by.parameters[by.plane(spec.attribute)]);
+        }
     }
 
     /// Adds a constant to the colour from every direction.

@@ -73,13 +73,11 @@ impl Networks {
     /// Reserves memory for crops up to `size`.
     pub(super) fn reserve(&mut self, size: UVec2) -> Result<()> {
         let values = COLOR_CHANNELS * size.x as usize * size.y as usize;
-        if self.colors.len() < values {
-            self.colors = self.gpu.uninit("crop_colors", values)?;
-        }
+        self.colors.grow(&self.gpu, values)?;
         if let Some(denoiser) = &mut self.denoiser {
             denoiser.reserve(size)?;
-            if self.features.noise && self.noise.len() < values {
-                self.noise = self.gpu.uninit("crop_noise", values)?;
+            if self.features.noise {
+                self.noise.grow(&self.gpu, values)?;
             }
         }
         match &mut self.tonemapper {

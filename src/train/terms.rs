@@ -161,10 +161,7 @@ impl NetworkTerms {
             &mut self.d_illumination,
             &mut self.d_output,
         ] {
-            if buffer.len() < values {
-                let name = buffer.name().to_owned();
-                *buffer = gpu.uninit(&name, values)?;
-            }
+            buffer.grow(gpu, values)?;
         }
         Ok(())
     }

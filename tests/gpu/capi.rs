@@ -27,7 +27,7 @@ use nightsplat::capi::model::*;
 use nightsplat::capi::render::*;
 use nightsplat::capi::train::*;
 use nightsplat::gpu::ImageFormat;
-use nightsplat::gpu::testing::{allocations, fail_allocation, gpu, lose_at_submission, not_run};
+use nightsplat::gpu::testing::{faults, gpu, not_run};
 use nightsplat::photographs::dataset::synthetic::{SyntheticOptions, write};
 use nightsplat::photographs::image::linear_from_srgb;
 use nightsplat::photographs::tone::InverseTone;

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use glam::UVec2;
 use nightsplat::Error;
-use nightsplat::gpu::testing::{allocations, fail_allocation, lose_at_submission};
+use nightsplat::gpu::testing::faults;
 use nightsplat::gpu::{DeviceChoice, Gpu};
 use nightsplat::networks::Denoiser;
 use nightsplat::photographs::dataset::Dataset;
@@ -66,9 +66,9 @@ fn a_lack_of_memory_anywhere_leaves_a_checkpoint_and_no_finished_run() {
     let (gpu, dataset, config) = (gpu(), dataset(5, [24, 20]), config());
     let folder = tempfile::tempdir().unwrap();
     let straight = folder.path().join("straight");
-    fail_allocation(&gpu, 0);
+    faults(&gpu).fail_allocation(0);
     assert!(train(&gpu, &config, &dataset, &straight, IfExists::Refuse).0.is_none());
-    let names = allocations(&gpu);
+    let names = faults(&gpu).allocations();
     let expected = std::fs::read(straight.join("model.ply")).unwrap();
     // The first and the last of every name.
     let mut sites = BTreeMap::<&str, [usize; 2]>::new();
@@ -87,10 +87,10 @@ fn a_lack_of_memory_anywhere_leaves_a_checkpoint_and_no_finished_run() {
     let mut resumed = 0;
     for index in numbers {
         let (name, out) = (&names[index], folder.path().join(format!("run{index}")));
-        fail_allocation(&gpu, index as u64 + 1);
+        faults(&gpu).fail_allocation(index as u64 + 1);
         let (error, last) = train(&gpu, &config, &dataset, &out, IfExists::Refuse);
-        let asked = allocations(&gpu).len();
-        fail_allocation(&gpu, 0);
+        let asked = faults(&gpu).allocations().len();
+        faults(&gpu).fail_allocation(0);
         let Some(error) = error else {
             // The steps may be in fewer submissions than before.
             assert!(asked <= index, "{name} ({index}): the run says it is done");
@@ -124,7 +124,7 @@ fn a_device_lost_anywhere_leaves_the_last_checkpoint_to_resume_from() {
     for number in [1, 40, 80, 95, 105, 115, 125] {
         let out = folder.path().join(format!("run{number}"));
         let lost = gpu();
-        lose_at_submission(&lost, number);
+        faults(&lost).lose_at_submission(number);
         let (error, _) = train(&lost, &config, &dataset, &out, IfExists::Refuse);
         drop(lost);
         let Some(error) = error else { continue };

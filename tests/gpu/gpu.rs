@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use glam::UVec2;
 use nightsplat::Error;
-use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_that_launches, misuse, not_run};
+use nightsplat::gpu::testing::{gpu, gpu_that_binds, gpu_with, misuse, not_run};
 use nightsplat::gpu::{Buffer, DeviceChoice, Gpu, Pipeline, Recorder, Threads, devices};
 use nightsplat::kernels::{blend_forward, relu_backward};
 use nightsplat::splats::render::{RenderSettings, Renderer};
@@ -186,7 +186,7 @@ fn objects_dropped_by_a_failed_recording_are_safe() {
         pass.fill(&mut kept, 9);
         pass.copy(&kept, &mut dropped);
         drop(dropped);
-        Err(Error::Usage("enough".to_owned()))
+        Err::<(), _>(Error::Usage("enough".to_owned()))
     });
     assert_eq!(failed.unwrap_err().to_string(), "enough");
     assert_eq!(gpu.read(&kept).unwrap(), [1, 2, 3]);
@@ -220,7 +220,7 @@ fn a_submission_is_refused_within_a_recording_and_works_after_it() {
     assert_eq!(gpu.read(&outer).unwrap(), [1, 2, 3]);
     renderer.reserve(100, []).unwrap();
     // A failed recording leaves no state either.
-    gpu.run("fails", |_| Err(Error::Usage("enough".to_owned()))).unwrap_err();
+    gpu.run("fails", |_| Err::<(), _>(Error::Usage("enough".to_owned()))).unwrap_err();
     gpu.write(&mut inner, &[9; 3]).unwrap();
     assert_eq!(gpu.read(&inner).unwrap(), [9; 3]);
 }
@@ -277,7 +277,7 @@ fn workgroups_beyond_the_limit_along_x_are_folded_and_none_is_lost() {
     // Tiles of one subgroup without splats, since a workgroup then costs almost nothing.
     const COLUMNS: u32 = 9;
     const ROWS: u32 = 5;
-    let gpu = gpu_that_launches(7);
+    let gpu = gpu_with(|own| own.max_workgroups = 7);
     let lanes = gpu.properties().subgroup_size;
     let size = UVec2::new(lanes * COLUMNS, ROWS);
     let constants = blend_forward::Constants {

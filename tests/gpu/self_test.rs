@@ -2,7 +2,7 @@
 
 use nightsplat::Error;
 use nightsplat::gpu::Gpu;
-use nightsplat::gpu::testing::{gpu, gpu_that_misreports_its_subgroups, plant_check};
+use nightsplat::gpu::testing::{faults, gpu, gpu_with};
 use nightsplat::kernels::self_test::{
     CHECK_BALLOT, CHECK_EXP, CHECK_HALF, CHECK_LANE, CHECK_LAST, CHECK_LOG, CHECK_SHUFFLE,
     CHECK_SIZE, CHECK_SQRT, CHECK_SUBGROUP, CHECK_SUM, CHECK_WORD, CHECKS,
@@ -45,18 +45,21 @@ fn each_defect_is_found_and_named() {
         (CHECK_LOG, "log is"),
         (CHECK_SQRT, "sqrt is"),
     ] {
-        plant_check(&gpu, Some(check));
+        faults(&gpu).plant_check(Some(check));
         let message = refusal(&gpu);
         assert!(message.contains(name), "{check}: {message}");
     }
-    plant_check(&gpu, Some(CHECKS));
+    faults(&gpu).plant_check(Some(CHECKS));
     gpu.self_test().unwrap();
 }
 
 /// As layers over another API do: they name one size, and the GPU runs another.
 #[test]
 fn a_device_whose_subgroups_are_smaller_than_it_reports_is_refused_with_the_size_to_set() {
-    let gpu = gpu_that_misreports_its_subgroups();
+    let gpu = gpu_with(|own| {
+        own.subgroup_size *= 2;
+        own.subgroup_size_is_selectable = false;
+    });
     let lanes = gpu.properties().subgroup_size;
     let message = refusal(&gpu);
     let [what, remedy] = [

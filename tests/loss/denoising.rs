@@ -220,8 +220,8 @@ fn buffers_and_views_that_do_not_fit_are_refused() {
     // Buffers of 8 x 8 pixels, and some that are longer than the scratch memory, which wide subgroups need less of.
     for (len, (size, loss_region), why) in [
         (192, whole([0, 8]), "0 x 8"),
-        (192, whole([9, 8]), if is_narrow { "9 x 8" } else { "the view has 216" }),
-        (190, whole([8, 8]), "holds 190 values, the view has 192"),
+        (192, whole([9, 8]), if is_narrow { "9 x 8" } else { "not 216" }),
+        (190, whole([8, 8]), "holds 190 elements, not 192"),
         (30_000, whole([100, 100]), "100 x 100"),
         (192, (UVec2::splat(8), outside), "loss region"),
     ] {

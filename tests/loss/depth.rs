@@ -337,8 +337,8 @@ fn buffers_and_views_that_do_not_fit_are_refused() {
         assert!(refused.contains(why), "{size:?}: {refused}");
     };
     refuses(4 * 256, [0, 8], "no scratch memory for a view of 0 x 8");
-    refuses(3 * 256, [16, 16], "holds 768 values, the view has 1024");
-    let wide = if is_narrow { "no scratch memory for a view of 17 x 16" } else { "has 1088" };
+    refuses(3 * 256, [16, 16], "holds 768 elements, not 1024");
+    let wide = if is_narrow { "no scratch memory for a view of 17 x 16" } else { "not 1088" };
     refuses(4 * 256, [17, 16], wide);
     refuses(long, [256, 256], "no scratch memory for a view of 256 x 256");
     refuses(long, strip, "no scratch memory for a view of 3 x");

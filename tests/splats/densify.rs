@@ -281,7 +281,7 @@ fn invalid_settings_are_refused() {
 fn a_buffer_that_is_too_short_is_refused() {
     let gpu = gpu();
     let mut densifier = Densifier::new(&gpu, SETTINGS, &[]).unwrap();
-    let needs = |has, needed| format!("holds {has} elements, density control needs {needed}");
+    let needs = |has, needed| format!("holds {has} elements, not {needed}");
     for (short, why) in [
         (0, needs(27, 28)),
         (1, needs(27, 28)),

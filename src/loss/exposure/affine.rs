@@ -72,9 +72,12 @@ impl Affine {
         let bias = [0, 1, 2].map(|c| {
             gain[c] * mean(&|exposure| exposure.bias[c]) / mean(&|exposure| exposure.gain[c])
         });
-        let about = |own: &Self| {
-            let relative = [0, 1, 2].map(|c| own.gain[c] / gain[c]);
-            Self { gain: relative, bias: [0, 1, 2].map(|c| own.bias[c] - relative[c] * bias[c]) }
+        let about = |exposure: &Self| {
+            let relative = [0, 1, 2].map(|c| exposure.gain[c] / gain[c]);
+            Self {
+                gain: relative,
+                bias: [0, 1, 2].map(|c| exposure.bias[c] - relative[c] * bias[c]),
+            }
         };
         exposures.iter().map(about).collect()
     }

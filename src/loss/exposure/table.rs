@@ -89,7 +89,7 @@ fn parsed(columns: &[&str], line: &str) -> Result<KnownExposure, String> {
         return Err(format!("`{line}` has {} cells, not {}", cells.len(), columns.len()));
     }
     let number = |column: &str| -> Result<Option<f64>, String> {
-        let cell = columns.iter().position(|own| *own == column).map_or("", |at| cells[at]);
+        let cell = columns.iter().position(|name| *name == column).map_or("", |at| cells[at]);
         if cell.is_empty() {
             return Ok(None);
         }

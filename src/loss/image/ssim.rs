@@ -109,10 +109,7 @@ impl Ssim {
     /// Allocates scratch memory for views of up to `values` values; it never shrinks.
     pub(super) fn reserve(&mut self, gpu: &Gpu, values: u32) -> Result<()> {
         let Kernels::Two { derivatives, .. } = &mut self.kernels else { return Ok(()) };
-        for buffer in derivatives.iter_mut().filter(|buffer| buffer.len() < values as usize) {
-            *buffer = gpu.uninit(buffer.name(), values as usize)?;
-        }
-        Ok(())
+        derivatives.iter_mut().try_for_each(|buffer| buffer.grow(gpu, values as usize))
     }
 
     /// Subgroups, one per workgroup, and so the partial sums of a view.

@@ -1,8 +1,8 @@
 //! Detection of non-finite parameters.
 
+use crate::Result;
 use crate::gpu::{Buffer, Gpu, Pipeline, Slice, Threads};
 use crate::kernels::first_not_finite;
-use crate::{Error, Result};
 
 /// Finds NaN and infinity on the device, in a small fraction of a step's time.
 #[derive(Debug)]
@@ -29,10 +29,7 @@ impl FiniteCheck {
         count: usize,
     ) -> Result<Option<usize>> {
         let values = values.into();
-        if values.len() < count {
-            let (name, has) = (values.name(), values.len());
-            return Err(Error::Usage(format!("buffer `{name}` holds {has} values, not {count}")));
-        }
+        values.check_len(count)?;
         gpu.run("first_not_finite", |pass| {
             pass.fill(&mut self.first, NONE);
             let params = first_not_finite::Params { value_count: count as u32 };

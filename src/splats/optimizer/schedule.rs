@@ -289,11 +289,11 @@ mod tests {
         for (step, factor) in [(400, 0.25), (1_000, 1.0), (2_500, 0.1)] {
             let rest = whole.after_step(step, factor);
             for later in [0_u32, 200, 1_000] {
-                let own = rest.learning_rates((f64::from(later) * factor) as u64, 3.0);
+                let rates = rest.learning_rates((f64::from(later) * factor) as u64, 3.0);
                 let expected = whole.learning_rates(step + u64::from(later), 3.0);
-                for (own, expected) in own.0.into_iter().zip(expected.0) {
+                for (rate, expected) in rates.0.into_iter().zip(expected.0) {
                     let by = factor.sqrt().recip();
-                    assert!((own / expected / by - 1.0).abs() < 1e-9, "{step} {factor} {later}");
+                    assert!((rate / expected / by - 1.0).abs() < 1e-9, "{step} {factor} {later}");
                 }
             }
             assert_eq!(rest.sh_degree(0, 3), whole.sh_degree(step, 3));

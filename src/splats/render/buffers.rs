@@ -133,10 +133,7 @@ impl RenderBuffers {
             return Ok(());
         }
         let pixels = self.render.len() / self.channels;
-        let colors = color_floats(channels) * self.splats.len();
-        if self.colors.len() < colors {
-            self.colors = gpu.uninit("colors", colors)?;
-        }
+        self.colors.grow(gpu, color_floats(channels) * self.splats.len())?;
         self.render = gpu.uninit("render", channels * pixels)?;
         self.channels = channels;
         Ok(())
@@ -165,13 +162,9 @@ impl RenderBuffers {
             // Its length says that the others are there.
             self.splats = gpu.uninit("splats", count)?;
         }
-        if self.render.len() < self.channels * pixels {
-            self.transmittances = gpu.uninit("transmittances", pixels)?;
-            self.render = gpu.uninit("render", self.channels * pixels)?;
-        }
-        if self.tile_ranges.len() < tiles {
-            self.tile_ranges = gpu.uninit("tile_ranges", tiles)?;
-        }
+        self.transmittances.grow(gpu, pixels)?;
+        self.render.grow(gpu, self.channels * pixels)?;
+        self.tile_ranges.grow(gpu, tiles)?;
         if self.tiles.is_empty() {
             let count = count.max(1024) as u32;
             let guess = match self.purpose {
@@ -301,8 +294,8 @@ mod tests {
             ]
         };
         let all = [STATUS_OVERFLOWED, STATUS_NOT_FINITE, STATUS_GRADIENT, STATUS_TILE_LIMIT];
-        for (own, flag) in all.into_iter().enumerate() {
-            assert_eq!(flags(read(flag)), [0, 1, 2, 3].map(|at| at == own));
+        for (index, flag) in all.into_iter().enumerate() {
+            assert_eq!(flags(read(flag)), [0, 1, 2, 3].map(|at| at == index));
         }
         assert_eq!((flags(read(0)), read(0).intersections), ([false; 4], 5));
     }

@@ -111,9 +111,9 @@ impl Renderer {
 
 #[cfg(all(test, feature = "io"))]
 mod tests {
-    use glam::{DAffine3, DVec2};
+    use glam::DAffine3;
 
-    use crate::camera::{Camera, CameraModel};
+    use crate::camera::Camera;
     use crate::gpu::{DeviceChoice, Gpu};
     use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
     use crate::splats::scene::Gaussians;
@@ -123,16 +123,7 @@ mod tests {
     fn a_render_takes_the_bytes_that_are_foreseen() {
         let gpu = Gpu::new(&DeviceChoice::Best).unwrap();
         let (gaussians, intersections) = (200_000, 300_000);
-        let (principal_point, view_from_world) = (DVec2::new(8.0, 4.0), DAffine3::IDENTITY);
-        let focal = DVec2::splat(16.0);
-        let camera = Camera {
-            width: 16,
-            height: 8,
-            focal,
-            principal_point,
-            model: CameraModel::Pinhole,
-            view_from_world,
-        };
+        let camera = Camera::perspective(DAffine3::IDENTITY, 0.5, [16, 8]);
         let settings = RenderSettings::default();
         let model = Gaussians::zeros(gaussians, settings.shape).upload(&gpu).unwrap();
         let mut renderer = Renderer::new(&gpu, settings).unwrap();

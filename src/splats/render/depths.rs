@@ -33,13 +33,13 @@ impl Renderer {
                 continue;
             }
             let planes = self.gpu.read(&self.frame.render)?;
-            let own = &planes[self.settings.channels() * patch.pixel_count()..];
+            let plane = &planes[self.settings.channels() * patch.pixel_count()..];
             let is_seen = |depth: f32| f64::from(depth) < NOTHING_SEEN;
-            let own: Vec<f32> = own[..patch.pixel_count()]
+            let plane: Vec<f32> = plane[..patch.pixel_count()]
                 .iter()
                 .map(|&depth| if is_seen(depth) { depth } else { f32::INFINITY })
                 .collect();
-            patch.paste(&patch, &own, &whole, &mut depths);
+            patch.paste(&patch, &plane, &whole, &mut depths);
         }
         Ok(depths)
     }

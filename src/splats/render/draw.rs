@@ -67,18 +67,11 @@ impl HostTargets {
     fn reserve(&mut self, gpu: &Gpu, pixels: usize, target: &Target<'_>) -> Result<()> {
         let words = |image: &HostImage| (pixels * image.format.bytes()).div_ceil(4);
         let color = target.color.map_or(0, words);
-        grow(gpu, &mut self.pixels, color)?;
-        grow(gpu, &mut self.under, if target.is_over { color } else { 0 })?;
-        grow(gpu, &mut self.depths, target.depth.map_or(0, |_| pixels))?;
-        grow(gpu, &mut self.scene_words, target.scene.map_or(0, |scene| words(scene.image)))
+        self.pixels.grow(gpu, color)?;
+        self.under.grow(gpu, if target.is_over { color } else { 0 })?;
+        self.depths.grow(gpu, target.depth.map_or(0, |_| pixels))?;
+        self.scene_words.grow(gpu, target.scene.map_or(0, |scene| words(scene.image)))
     }
-}
-
-fn grow<T: bytemuck::Pod>(gpu: &Gpu, buffer: &mut Buffer<T>, len: usize) -> Result<()> {
-    if buffer.len() < len {
-        *buffer = gpu.uninit(buffer.name(), len)?;
-    }
-    Ok(())
 }
 
 impl Renderer {
@@ -105,8 +98,8 @@ impl Renderer {
         }
         let capacity = self.drawn_capacity(target);
         let Self { frame, host_targets, .. } = self;
-        if let Some(own) = host_targets {
-            pass.copy_to_ring(&frame.status, &mut own.ring, capacity);
+        if let Some(targets) = host_targets {
+            pass.copy_to_ring(&frame.status, &mut targets.ring, capacity);
         }
         Ok(())
     }
@@ -150,17 +143,17 @@ impl Renderer {
             self.build_projections(ProjectionKind { camera_model, view_depths })?;
         }
         self.build_blending(target.needs_depths())?;
-        if target.scene.is_some() && self.limits.len() < pixels {
-            self.limits = self.gpu.uninit("limits", pixels)?;
+        if target.scene.is_some() {
+            self.limits.grow(&self.gpu, pixels)?;
         }
         if self.host_targets.is_none() {
             self.host_targets = Some(HostTargets::new(&self.gpu)?);
         }
-        if let Some(own) = &mut self.host_targets {
-            own.reserve(&self.gpu, pixels, target)?;
-            if let (Some(law), None) = (law, &own.photograph) {
+        if let Some(targets) = &mut self.host_targets {
+            targets.reserve(&self.gpu, pixels, target)?;
+            if let (Some(law), None) = (law, &targets.photograph) {
                 let tone_curve = law.curve.constant();
-                own.photograph =
+                targets.photograph =
                     Some(self.gpu.pipeline(&photograph_light::Constants { tone_curve })?);
             }
         }
@@ -187,9 +180,9 @@ impl Renderer {
     /// Grows the memory where the newest draw that is done had more intersections. Where memory is out, draws go on
     /// with what there is.
     fn grow_as_drawn(&mut self) {
-        let Some(own) = &mut self.host_targets else { return };
-        let Some(newest) = own.ring.newest() else { return };
-        if own.grown_for.replace(newest.number) == Some(newest.number) {
+        let Some(targets) = &mut self.host_targets else { return };
+        let Some(newest) = targets.ring.newest() else { return };
+        if targets.grown_for.replace(newest.number) == Some(newest.number) {
             return;
         }
         let wanted = super::Status::from_words(&newest.words).intersections;
@@ -238,10 +231,10 @@ impl Renderer {
         }
         let plane = if target.depth.is_some() { self.settings.channels() as u32 } else { 0 };
         let Self { frame, host_targets, .. } = self;
-        let Some(own) = host_targets else { return Ok(()) };
+        let Some(targets) = host_targets else { return Ok(()) };
         if let Some(image) = color.as_ref().filter(|_| target.is_over) {
             let taken = HostImage { after: ImageState::TRANSFER_TARGET, ..*image };
-            pass.take_image(&taken, size, &mut own.under);
+            pass.take_image(&taken, size, &mut targets.under);
         }
         let (encoding, swaps) = target.encoding();
         let params = pack_pixels::Params {
@@ -256,14 +249,14 @@ impl Renderer {
             has_color: color.is_some().into(),
         };
         pass.dispatch(
-            &own.pack,
+            &targets.pack,
             &params,
             pack_pixels::Buffers {
                 render: frame.render.slice(),
                 transmittances: frame.transmittances.slice(),
-                under: own.under.slice(),
-                pixels: own.pixels.slice_mut(),
-                depths: own.depths.slice_mut(),
+                under: targets.under.slice(),
+                pixels: targets.pixels.slice_mut(),
+                depths: targets.depths.slice_mut(),
             },
             Threads::Exactly([pixel_count, 1, 1]),
         )?;
@@ -271,10 +264,10 @@ impl Renderer {
             if target.is_over {
                 image.before = ImageState::TRANSFER_TARGET;
             }
-            pass.give_image(&own.pixels, &image, size);
+            pass.give_image(&targets.pixels, &image, size);
         }
         if let Some(image) = depth {
-            pass.give_image(&own.depths, &image, size);
+            pass.give_image(&targets.depths, &image, size);
         }
         Ok(())
     }
@@ -282,7 +275,7 @@ impl Renderer {
     /// Records the inversion of the tone law in the render.
     fn record_photograph(&mut self, pass: &mut Recorder<'_>, pixel_count: u32) -> Result<()> {
         let Self { settings, frame, host_targets, .. } = self;
-        let kernel = host_targets.as_ref().and_then(|own| own.photograph.as_ref());
+        let kernel = host_targets.as_ref().and_then(|targets| targets.photograph.as_ref());
         let (Some(law), Some(kernel)) = (&settings.law, kernel) else { return Ok(()) };
         pass.dispatch(
             kernel,
@@ -304,12 +297,15 @@ impl Renderer {
         size: [u32; 2],
     ) -> Result<()> {
         let Self { limits, host_targets, .. } = self;
-        let Some(own) = host_targets else { return Ok(()) };
-        pass.take_image(image, size, &mut own.scene_words);
+        let Some(targets) = host_targets else { return Ok(()) };
+        pass.take_image(image, size, &mut targets.scene_words);
         pass.dispatch(
-            &own.limits,
+            &targets.limits,
             &params,
-            depth_limits::Buffers { words: own.scene_words.slice(), limits: limits.slice_mut() },
+            depth_limits::Buffers {
+                words: targets.scene_words.slice(),
+                limits: limits.slice_mut(),
+            },
             Threads::Exactly([params.pixel_count, 1, 1]),
         )
     }

@@ -88,8 +88,8 @@ impl Renderer {
     ) -> Result<Vec<f32>> {
         let mut data = vec![0.0; (self.settings.channels() + 1) * whole.pixel_count()];
         for part in parts {
-            let own = self.render_patch(gaussians, part, options)?;
-            part.paste(part, &own, whole, &mut data);
+            let planes = self.render_patch(gaussians, part, options)?;
+            part.paste(part, &planes, whole, &mut data);
         }
         Ok(data)
     }
@@ -112,15 +112,13 @@ impl Renderer {
         options: &RenderOptions,
         depths: Option<DepthChannel>,
     ) -> Result<Status> {
-        let (gpu, mut status) = (self.gpu.clone(), None);
-        gpu.run("render", |pass| {
+        let status = self.gpu.clone().run("render", |pass| {
             self.record_forward(pass, gaussians, *patch, options, depths, None)?;
-            status = Some(pass.download(&self.frame.status)?);
+            let status = pass.download(&self.frame.status)?;
             self.clear_status(pass);
-            Ok(())
+            Ok(status)
         })?;
-        let words = status.map_or_else(|| Ok(vec![]), |status| status.wait())?;
-        Ok(Status::from_words(&words))
+        Ok(Status::from_words(&status.wait()?))
     }
 
     /// Renders a patch on the device, and grows the memory as it needs. Returns the patch's halves instead where the

@@ -136,17 +136,17 @@ impl Renderer {
     ) -> Result<()> {
         let (first, channels) = (self.context_count(), self.settings.channels());
         let Self { gpu, frame, lamp, gradients: written, .. } = self;
-        let Some(DeviceLamp { numbers, gradients: to, backward: Some(own), .. }) = lamp else {
+        let Some(DeviceLamp { numbers, gradients: to, backward: Some(kernels), .. }) = lamp else {
             return Ok(());
         };
         let batches = layout.batches(gpu).without(written.frozen_columns);
-        let chunk_count = own.chunks(batches);
+        let chunk_count = kernels.chunks(batches);
         let mut first_chunk = 0;
         for batch in batches.iter() {
             let gaussian_count = batch.gaussian_count();
-            let chunks = gaussian_count.div_ceil(own.chunk);
+            let chunks = gaussian_count.div_ceil(kernels.chunk);
             pass.dispatch(
-                &own.backward,
+                &kernels.backward,
                 &lamp_backward::Params {
                     camera_index: view.camera_index,
                     gaussian_count,
@@ -158,29 +158,31 @@ impl Renderer {
                     lamp: numbers.slice(),
                     colors: batch.after(first).rows(&frame.colors, color_floats(channels))?,
                     gradients: batch.planes(gradients)?,
-                    partials: own.partials.slice_mut(),
+                    partials: kernels.partials.slice_mut(),
                 },
                 Threads::Workgroups([chunks.max(1), 1, 1]),
             )?;
             first_chunk += chunks;
         }
         pass.dispatch(
-            &own.gradient,
+            &kernels.gradient,
             &lamp_gradient::Params { chunk_count },
-            lamp_gradient::Buffers { partials: own.partials.slice(), gradients: to.slice_mut() },
+            lamp_gradient::Buffers {
+                partials: kernels.partials.slice(),
+                gradients: to.slice_mut(),
+            },
             Threads::Workgroups([LAMP_WIDTH, 1, 1]),
         )
     }
 
     /// Reserves the partial sums for as many Gaussians as the renderer has memory for.
     pub(super) fn reserve_lamp(&mut self) -> Result<()> {
-        let Some(DeviceLamp { backward: Some(own), .. }) = &mut self.lamp else { return Ok(()) };
+        let Some(DeviceLamp { backward: Some(kernels), .. }) = &mut self.lamp else {
+            return Ok(());
+        };
         // A batch ends where a chunk may not: one more for each.
-        let chunks = 2 * self.frame.splats.len().div_ceil(own.chunk as usize) + 1;
-        if own.partials.len() < WIDTH * chunks {
-            own.partials = self.gpu.uninit("lamp_partials", WIDTH * chunks)?;
-        }
-        Ok(())
+        let chunks = 2 * self.frame.splats.len().div_ceil(kernels.chunk as usize) + 1;
+        kernels.partials.grow(&self.gpu, WIDTH * chunks)
     }
 }
 

@@ -212,7 +212,7 @@ impl Projections {
         let half_rest = settings.rest == StorageFormat::Half;
         let rest_by_column = rest_by_column(gpu);
         macro_rules! pipeline {
-            ($kernel:ident $(, $own:ident)*) => {
+            ($kernel:ident $(, $extra:ident)*) => {
                 gpu.pipeline(&$kernel::Constants {
                     channels,
                     alpha_max,
@@ -225,7 +225,7 @@ impl Projections {
                     half_rest,
                     rest_by_column,
                     camera_model,
-                    $($own,)*
+                    $($extra,)*
                 })?
             };
         }

@@ -61,9 +61,9 @@ impl Default for Target<'_> {
 /// The depth of a pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DepthKind {
-    /// Where the transmittance passes 1/2.
+    /// The depth at which the transmittance falls below 1/2.
     Median,
-    /// The mean of what is seen, by its weights.
+    /// The mean of the splats' depths by their blending weights.
     Expected,
 }
 
@@ -176,7 +176,7 @@ fn check_image(
 }
 
 fn names<T: Debug>(all: &[T]) -> String {
-    all.iter().map(|own| format!("{own:?}")).collect::<Vec<_>>().join(", ")
+    all.iter().map(|format| format!("{format:?}")).collect::<Vec<_>>().join(", ")
 }
 
 fn check_camera(index: usize, camera: &Camera) -> Result<()> {

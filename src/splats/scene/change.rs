@@ -1,44 +1,16 @@
 //! Changes of a set of Gaussians in place: transforms, removal, and joining.
 
-#[cfg(feature = "io")]
 use glam::DVec3;
-use glam::{DMat3, DQuat};
 use rayon::prelude::*;
 
-use super::Gaussians;
-#[cfg(feature = "io")]
 use super::neighbours::Neighbours;
-#[cfg(feature = "io")]
-use super::{ATTRIBUTES, AttributePlane};
-use crate::splats::harmonics::HarmonicRotation;
-use crate::splats::scene::rest_coefficients;
+use super::{ATTRIBUTES, AttributePlane, Gaussians};
 
 /// A model is moved in its numbers up to this many times its size; farther, its origin is moved instead.
 const FAR: f64 = 64.0;
 
 impl Gaussians {
-    /// Rotates the world about its origin: direction `d` becomes `rotation * d`.
-    pub(crate) fn rotate(&mut self, rotation: DQuat) {
-        self.origin = rotation * self.origin;
-        for mean in self.means_mut() {
-            *mean = (rotation * mean.as_dvec3()).as_vec3();
-        }
-        for quat in self.quats_mut() {
-            let [w, x, y, z] = quat.map(f64::from);
-            let DQuat { x, y, z, w } = rotation * DQuat::from_xyzw(x, y, z, w);
-            *quat = [w, x, y, z].map(|part| part as f32);
-        }
-        let coefficients = rest_coefficients(self.shape.sh_degree);
-        if coefficients > 0 {
-            let harmonics = HarmonicRotation::new(DMat3::from_quat(rotation));
-            self.rest_mut()
-                .par_chunks_exact_mut(coefficients)
-                .for_each(|rest| harmonics.turn(rest));
-        }
-    }
-
     /// Scales the world about its origin by a factor above 0.
-    #[cfg(feature = "io")]
     pub(crate) fn scale(&mut self, factor: f64) {
         self.origin *= factor;
         for mean in self.means_mut() {
@@ -50,7 +22,6 @@ impl Gaussians {
     }
 
     /// Moves the world. `is_far`: by the origin, as the means, which are f32, would lose precision; [`is_far`] tells.
-    #[cfg(feature = "io")]
     pub(crate) fn translate(&mut self, by: DVec3, is_far: bool) {
         if is_far {
             self.origin += by;
@@ -62,7 +33,6 @@ impl Gaussians {
     }
 
     /// Removes the Gaussians whose `keep` is false; the others keep their order.
-    #[cfg(feature = "io")]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn retain(&mut self, keep: &[bool]) {
         let kept = keep.iter().filter(|keep| **keep).count();
@@ -83,7 +53,6 @@ impl Gaussians {
     }
 
     /// These Gaussians, in this order.
-    #[cfg(feature = "io")]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn select(&self, places: &[u32]) -> Self {
         let mut some = Self::zeros(places.len(), self.shape);
@@ -93,8 +62,8 @@ impl Gaussians {
             let width = from.len() / self.count.max(1);
             let plane = some.plane(spec.attribute);
             let rows = some.parameters[plane].chunks_exact_mut(width.max(1));
-            for (to, &place) in rows.zip(places) {
-                to.copy_from_slice(&from[width * place as usize..][..width]);
+            for (to, &index) in rows.zip(places) {
+                to.copy_from_slice(&from[width * index as usize..][..width]);
             }
         }
         some
@@ -102,7 +71,6 @@ impl Gaussians {
 
     /// Gaussians of one shape, one after the other, at least one set of them; the positions of all stay where they are
     /// in the world, relative to the first one's origin.
-    #[cfg(feature = "io")]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn concatenated(parts: &[&Self]) -> Self {
         let (shape, origin) = (parts[0].shape, parts[0].origin);
@@ -131,24 +99,11 @@ impl Gaussians {
     }
 
     /// Appends Gaussians of the same shape; the positions of both stay where they are in the world.
-    #[cfg(feature = "io")]
     pub(crate) fn append(&mut self, other: &Self) {
         *self = Self::concatenated(&[&*self, other]);
     }
 
-    /// Replaces the Gaussians from `first` on by others of the same shape.
-    #[cfg(feature = "io")]
-    pub(crate) fn replace(&mut self, first: usize, by: &Self) {
-        for spec in &ATTRIBUTES {
-            let width = self.columns(spec.attribute).width;
-            let start = self.plane(spec.attribute).start + first * width;
-            self.parameters[start..start + by.count * width]
-                .copy_from_slice(&by.parameters[by.plane(spec.attribute)]);
-        }
-    }
-
     /// The parameters of a Gaussian, attribute by attribute.
-    #[cfg(feature = "io")]
     pub(crate) fn row(&self, index: usize) -> impl Iterator<Item = &[f32]> {
         ATTRIBUTES.iter().map(move |spec| {
             let AttributePlane { column, width, .. } = self.columns(spec.attribute);
@@ -157,75 +112,66 @@ impl Gaussians {
     }
 
     /// Appends Gaussians of the same features to those that there are, if any; the higher SH degree is that of both.
-    #[cfg(feature = "io")]
     pub(crate) fn add(to: &mut Option<Self>, more: Self) {
         match to {
             _ if more.count == 0 => {}
             None => *to = Some(more),
-            Some(own) => {
-                let degree = own.shape.sh_degree.max(more.shape.sh_degree);
-                *own = own.with_sh_degree(degree);
-                own.append(&more.with_sh_degree(degree));
+            Some(sum) => {
+                let degree = sum.shape.sh_degree.max(more.shape.sh_degree);
+                *sum = sum.with_sh_degree(degree);
+                sum.append(&more.with_sh_degree(degree));
             }
         }
     }
 
     /// The position of a Gaussian in the world.
-    #[cfg(feature = "io")]
     pub(crate) fn position(&self, index: usize) -> DVec3 {
         self.means()[index].as_dvec3() + self.origin
     }
 
     /// The root mean squared distance of each Gaussian to the three nearest others; infinite if there are fewer.
-    #[cfg(feature = "io")]
     pub(crate) fn distances_to_nearest(&self) -> Vec<f64> {
         let positions: Vec<DVec3> = self.means().iter().map(|mean| mean.as_dvec3()).collect();
         let neighbours = Neighbours::new(positions.clone());
-        let distance = |place: &DVec3| {
+        let distance = |position: &DVec3| {
             // The nearest is the Gaussian itself.
-            let nearest = neighbours.nearest::<4>(*place);
+            let nearest = neighbours.nearest::<4>(*position);
             (nearest[1..].iter().map(|(squared, _)| squared).sum::<f64>() / 3.0).sqrt()
         };
         positions.par_iter().map(distance).collect()
     }
 
     /// The places of the `COUNT` Gaussians nearest to each, itself among them; there can be fewer.
-    #[cfg(feature = "io")]
     pub(crate) fn nearest_of_each<const COUNT: usize>(&self) -> Vec<Vec<u32>> {
         let positions: Vec<DVec3> = self.means().iter().map(|mean| mean.as_dvec3()).collect();
         let neighbours = Neighbours::new(positions.clone());
-        positions.iter().map(|place| neighbours.nearest_places::<COUNT>(*place)).collect()
+        positions.iter().map(|position| neighbours.nearest_places::<COUNT>(*position)).collect()
     }
 
     /// Opacities after the sigmoid.
-    #[cfg(feature = "io")]
     pub(crate) fn opacities(&self) -> impl Iterator<Item = f64> {
         self.raw_opacities().iter().map(|&raw| 1.0 / (1.0 + (-f64::from(raw)).exp()))
     }
 }
 
 /// Whether a move of a model, whose median distance to its origin is `size`, is left to the origin.
-#[cfg(feature = "io")]
 pub(crate) fn is_far(by: DVec3, origin: DVec3, size: f64) -> bool {
     origin != DVec3::ZERO || by.length() > FAR * size
 }
 
 /// The distribution of lengths, in memory that does not depend on how many they are.
-#[cfg(feature = "io")]
 #[derive(Clone, Debug)]
 pub(crate) struct Lengths {
     /// By the leading bits: exponent, and the next two.
     counts: [u64; 1 << Self::BITS],
 }
 
-#[cfg(feature = "io")]
 impl Default for Lengths {
     fn default() -> Self {
         Self { counts: [0; 1 << Self::BITS] }
     }
 }
 
-#[cfg(feature = "io")]
 impl Lengths {
     const BITS: u32 = 10;
     /// The bits of an f32 that follow the sign and the leading ones.
@@ -240,15 +186,15 @@ impl Lengths {
     pub(crate) fn median(&self) -> f64 {
         let middle = self.counts.iter().sum::<u64>() / 2;
         let mut sum = 0;
-        let place = (0..).zip(&self.counts).find(|(_, count)| {
+        let bits = (0..).zip(&self.counts).find(|(_, count)| {
             sum += **count;
             sum > middle
         });
-        place.map_or(0.0, |(place, _): (u32, _)| f32::from_bits(place << Self::REST).into())
+        bits.map_or(0.0, |(bits, _): (u32, _)| f32::from_bits(bits << Self::REST).into())
     }
 }
 
-#[cfg(all(test, feature = "io"))]
+#[cfg(test)]
 mod tests {
     use super::*;
     use crate::base::random::Stream;

@@ -192,8 +192,8 @@ pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
         let stream = Stream::new(seed, point);
         let position = |attempt: u64| {
             let uniform = |draw: u64| stream.uniform(attempt * DRAWS_PER_TRY + draw);
-            let place = (uniform(0) * cameras.len() as f64) as usize;
-            let camera = &cameras[place];
+            let index = (uniform(0) * cameras.len() as f64) as usize;
+            let camera = &cameras[index];
             let pixel = DVec2::new(
                 uniform(1) * f64::from(camera.width),
                 uniform(2) * f64::from(camera.height),
@@ -201,11 +201,11 @@ pub fn random(cameras: &[Camera], count: usize, seed: u64) -> Vec<DVec3> {
             let depth = near * (far / near).powf(uniform(3));
             // Outside of a fisheye's image circle, straight ahead.
             let in_view = camera.in_view(pixel, depth).unwrap_or(DVec3::Z * depth);
-            (place, camera.view_from_world.inverse().transform_point3(in_view))
+            (index, camera.view_from_world.inverse().transform_point3(in_view))
         };
         // Consecutive views overlap: the second camera is usually among the first ones tried.
-        let seen_twice = |(place, position): &(usize, DVec3)| {
-            let (before, from) = cameras.split_at(*place);
+        let seen_twice = |(index, position): &(usize, DVec3)| {
+            let (before, from) = cameras.split_at(*index);
             let seen = from.iter().chain(before.iter().rev()).take(MAX_VIEWS);
             seen.filter(|camera| camera.sees(*position).is_some()).nth(1).is_some()
         };
@@ -257,8 +257,8 @@ pub fn colors_from_views<I: Borrow<Image>>(
             Some((index, bilinear(target, pixel), factor(view, point)))
         };
         let [tracked, untracked] = candidates.of_view(index);
-        let own = tracked.par_iter().chain(untracked).filter_map(color);
-        for (point, color, factor) in own.collect::<Vec<_>>() {
+        let seen = tracked.par_iter().chain(untracked).filter_map(color);
+        for (point, color, factor) in seen.collect::<Vec<_>>() {
             colors[point as usize].add(color, factor);
         }
     }
@@ -298,27 +298,27 @@ impl Candidates {
             .filter(|&view| is_training(&&(view as u32)))
             .map(|view| (view, views[view].camera))
             .unzip();
-        let mut own = Self {
+        let mut candidates = Self {
             of_view: vec![vec![]; views.len()],
             untracked: vec![],
             covers: vec![false; views.len()],
         };
-        for place in Camera::covering(&cameras, MAX_VIEWS) {
-            own.covers[training[place]] = true;
+        for index in Camera::covering(&cameras, MAX_VIEWS) {
+            candidates.covers[training[index]] = true;
         }
         for (number, (point, is_tracked)) in (0..).zip(points.iter().zip(is_tracked)) {
             if !is_tracked {
-                own.untracked.push(number);
+                candidates.untracked.push(number);
                 continue;
             }
             for &view in point.views.iter().filter(is_training) {
-                let of_view = &mut own.of_view[view as usize];
+                let of_view = &mut candidates.of_view[view as usize];
                 if of_view.last() != Some(&number) {
                     of_view.push(number);
                 }
             }
         }
-        own
+        candidates
     }
 
     /// The points of a view: those with a track, and those without.
@@ -354,10 +354,10 @@ fn mean_grey(values: &[f32]) -> Vec3 {
 /// centres.
 fn bilinear(image: &Image, pixel: DVec2) -> Vec3 {
     let (width, height) = (image.width as usize, image.height as usize);
-    let axis = |place: f64, size: usize| {
-        let place = (place - 0.5).clamp(0.0, size.saturating_sub(1) as f64);
-        let low = place as usize;
-        (low, (low + 1).min(size.saturating_sub(1)), place.fract() as f32)
+    let axis = |at: f64, size: usize| {
+        let at = (at - 0.5).clamp(0.0, size.saturating_sub(1) as f64);
+        let low = at as usize;
+        (low, (low + 1).min(size.saturating_sub(1)), at.fract() as f32)
     };
     let ((x0, x1, tx), (y0, y1, ty)) = (axis(pixel.x, width), axis(pixel.y, height));
     let channel = |channel: usize| {
@@ -373,19 +373,12 @@ mod tests {
     use glam::DAffine3;
 
     use super::*;
-    use crate::camera::CameraModel;
 
     /// Views side by side that look along z, 10 wide at a distance of 1.
     fn views(count: usize) -> Vec<View> {
         let view = |i: usize| {
-            let camera = Camera {
-                width: 10,
-                height: 10,
-                focal: DVec2::splat(1.0),
-                principal_point: DVec2::splat(5.0),
-                model: CameraModel::Pinhole,
-                view_from_world: DAffine3::from_translation(DVec3::NEG_X * 0.01 * i as f64),
-            };
+            let view_from_world = DAffine3::from_translation(DVec3::NEG_X * 0.01 * i as f64);
+            let camera = Camera::perspective(view_from_world, 2.0 * 5_f64.atan(), [10, 10]);
             let image = Image::from_fn(10, 10, |_, _| [0.5; 3]);
             View::new(&i.to_string(), Split::Train, camera, Some(image))
         };

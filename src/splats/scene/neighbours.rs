@@ -23,45 +23,45 @@ impl Neighbours {
     }
 
     /// The nearest positions to `place`, sorted by squared distance; infinity where there are no more.
-    pub(super) fn nearest<const COUNT: usize>(&self, place: DVec3) -> [(f64, DVec3); COUNT] {
-        self.find(place).map(|(squared, slot)| {
+    pub(super) fn nearest<const COUNT: usize>(&self, point: DVec3) -> [(f64, DVec3); COUNT] {
+        self.find(point).map(|(squared, slot)| {
             (squared, self.positions.get(slot).map_or(DVec3::INFINITY, |(position, _)| *position))
         })
     }
 
     /// The places of the nearest positions in the list that was given; there can be fewer.
-    pub(super) fn nearest_places<const COUNT: usize>(&self, place: DVec3) -> Vec<u32> {
-        let found = self.find::<COUNT>(place).into_iter();
+    pub(super) fn nearest_places<const COUNT: usize>(&self, point: DVec3) -> Vec<u32> {
+        let found = self.find::<COUNT>(point).into_iter();
         found.filter_map(|(_, slot)| Some(self.positions.get(slot)?.1)).collect()
     }
 
     /// Squared distances and slots, sorted; beyond the last slot where there are no more.
-    fn find<const COUNT: usize>(&self, place: DVec3) -> [(f64, usize); COUNT] {
+    fn find<const COUNT: usize>(&self, point: DVec3) -> [(f64, usize); COUNT] {
         let mut found = [(f64::INFINITY, usize::MAX); COUNT];
-        self.search(0..self.positions.len(), place, &mut found);
+        self.search(0..self.positions.len(), point, &mut found);
         found
     }
 
-    fn search(&self, range: Range<usize>, place: DVec3, found: &mut [(f64, usize)]) {
+    fn search(&self, range: Range<usize>, point: DVec3, found: &mut [(f64, usize)]) {
         if range.is_empty() {
             return;
         }
         let middle = range.start + range.len() / 2;
         let (position, _) = self.positions[middle];
-        let mut candidate = (place.distance_squared(position), middle);
+        let mut candidate = (point.distance_squared(position), middle);
         for slot in found.iter_mut() {
             if candidate.0 < slot.0 {
                 std::mem::swap(slot, &mut candidate);
             }
         }
         let axis = self.axes[middle];
-        let beyond = place[axis] - position[axis];
+        let beyond = point[axis] - position[axis];
         let (below, above) = (range.start..middle, middle + 1..range.end);
         let (near, far) = if beyond < 0.0 { (below, above) } else { (above, below) };
-        self.search(near, place, found);
+        self.search(near, point, found);
         // Rounding is monotone: no squared distance is below that of its component along one axis.
         if found.last().is_some_and(|(farthest, _)| beyond * beyond < *farthest) {
-            self.search(far, place, found);
+            self.search(far, point, found);
         }
     }
 }
@@ -69,7 +69,7 @@ impl Neighbours {
 fn split(positions: &mut [(DVec3, u32)], axes: &mut [usize]) {
     let Some(&(first, _)) = positions.first() else { return };
     let bounds =
-        |(low, high): (DVec3, DVec3), &(place, _): &(DVec3, u32)| (low.min(place), high.max(place));
+        |(low, high): (DVec3, DVec3), &(point, _): &(DVec3, u32)| (low.min(point), high.max(point));
     let (low, high) = positions.iter().fold((first, first), bounds);
     let axis = (high - low).max_position();
     let middle = positions.len() / 2;
@@ -96,12 +96,12 @@ mod tests {
                 let position = |i: u64| DVec3::from_array([0, 1, 2].map(|k| axis(3 * i + k)));
                 let positions: Vec<DVec3> = (0..count).map(position).collect();
                 let tree = Neighbours::new(positions.clone());
-                for place in (count..count + 50).map(position).chain(positions.iter().copied()) {
-                    let squared = positions.iter().map(|other| place.distance_squared(*other));
+                for point in (count..count + 50).map(position).chain(positions.iter().copied()) {
+                    let squared = positions.iter().map(|other| point.distance_squared(*other));
                     let mut expected: Vec<f64> = squared.chain([f64::INFINITY; 4]).collect();
                     expected.sort_by(f64::total_cmp);
-                    let found = tree.nearest::<4>(place);
-                    let places = tree.nearest_places::<4>(place);
+                    let found = tree.nearest::<4>(point);
+                    let places = tree.nearest_places::<4>(point);
                     assert_eq!(places.len(), positions.len().min(4));
                     for (index, (_, position)) in places.into_iter().zip(found) {
                         assert_eq!(positions[index as usize], position, "{count}, {grid}");
@@ -109,7 +109,7 @@ mod tests {
                     assert_eq!(found.map(|(squared, _)| squared), expected[..4], "{count}, {grid}");
                     for (squared, position) in found.into_iter().filter(|found| found.0.is_finite())
                     {
-                        assert_eq!(place.distance_squared(position), squared, "{count}, {grid}");
+                        assert_eq!(point.distance_squared(position), squared, "{count}, {grid}");
                     }
                 }
             }

@@ -145,7 +145,8 @@ impl Writer {
 
     fn add(&mut self, gaussians: &Gaussians) -> std::io::Result<()> {
         let Self { file, properties } = self;
-        let addresses: Vec<_> = properties.iter().map(|own| own.address(gaussians)).collect();
+        let addresses: Vec<_> =
+            properties.iter().map(|property| property.address(gaussians)).collect();
         let (means, others) = addresses.split_at(MEANS);
         let value = |(begin, stride): (usize, usize), gaussian: usize| {
             gaussians.parameters[begin + stride * gaussian]
@@ -291,7 +292,8 @@ fn features(header: &Header) -> Features {
 
 /// The degree whose `f_rest_*` properties are all present.
 fn sh_degree(header: &Header) -> Result<u32, String> {
-    let found = header.properties.iter().filter(|own| own.name.starts_with("f_rest_")).count();
+    let found =
+        header.properties.iter().filter(|property| property.name.starts_with("f_rest_")).count();
     let degree = (0..=MAX_SH_DEGREE).find(|&degree| 3 * rest_coefficients(degree) == found);
     degree.ok_or_else(|| {
         format!("has {found} f_rest_* properties; 0, 9, 24 or 45 make an SH degree of 0 to 3")
@@ -301,8 +303,10 @@ fn sh_degree(header: &Header) -> Result<u32, String> {
 /// The byte offset of a float property in the vertex.
 fn offset(header: &Header, name: &str) -> Result<usize, String> {
     match header.property(name) {
-        Some((_, own)) if own.kind == Kind::Float(4) => Ok(own.at),
-        Some((_, own)) => Err(format!("property `{name}` is of type {}, not float", own.type_name)),
+        Some((_, property)) if property.kind == Kind::Float(4) => Ok(property.at),
+        Some((_, property)) => {
+            Err(format!("property `{name}` is of type {}, not float", property.type_name))
+        }
         None => Err(format!("has no property `{name}`; is it a point cloud without Gaussians?")),
     }
 }

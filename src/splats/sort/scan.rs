@@ -50,9 +50,7 @@ impl Scan {
         }
         count.check()?;
         let partitions = capacity.div_ceil(self.partition_size).max(1);
-        if self.sums.len() < partitions as usize {
-            self.sums = self.gpu.uninit("scan_sums", partitions as usize)?;
-        }
+        self.sums.grow(&self.gpu, partitions as usize)?;
         let Count { counts, index: count_index } = count;
         let (sums, arrivals) = (&mut self.sums, &mut self.arrivals);
         pass.dispatch(

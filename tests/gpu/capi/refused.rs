@@ -235,11 +235,11 @@ fn memory_that_runs_out_anywhere_is_a_code_and_the_next_try_draws() {
     let mut session = Session::new(|_| {});
     // SAFETY: valid.
     let gpu = unsafe { &*session.device }.gpu();
-    fail_allocation(&gpu, 0);
+    faults(&gpu).fail_allocation(0);
     ok(session.load());
     ok(session.create());
     ok(session.frame(1));
-    let sites = allocations(&gpu);
+    let sites = faults(&gpu).allocations();
     assert!(sites.len() > 20, "{sites:?}");
     let expected = session.pixels();
     for number in 1..=sites.len() as u64 {
@@ -249,7 +249,7 @@ fn memory_that_runs_out_anywhere_is_a_code_and_the_next_try_draws() {
             nsp_renderer_destroy(std::mem::replace(&mut session.renderer, null_mut()));
             nsp_model_destroy(std::mem::replace(&mut session.model, null_mut()));
         }
-        fail_allocation(&gpu, number);
+        faults(&gpu).fail_allocation(number);
         let mut result = session.load();
         if result == NSP_OK {
             result = session.create();
@@ -259,7 +259,7 @@ fn memory_that_runs_out_anywhere_is_a_code_and_the_next_try_draws() {
         }
         let site = &sites[number as usize - 1];
         assert_eq!(result, NSP_ERROR_MEMORY, "{site} ({number}): {}", last_error());
-        fail_allocation(&gpu, 0);
+        faults(&gpu).fail_allocation(0);
         if session.model.is_null() {
             ok(session.load());
         }
@@ -386,7 +386,7 @@ fn a_lost_device_is_a_code_and_everything_can_be_destroyed() {
     write(&dataset, &SyntheticOptions { width: 24, height: 20, ..Default::default() }).unwrap();
     let dataset = c_path(&dataset);
     ok(session.load());
-    lose_at_submission(&gpu, 5);
+    faults(&gpu).lose_at_submission(5);
     let mut trainer = null_mut();
     // SAFETY: valid.
     unsafe {
