@@ -34,13 +34,13 @@ pub(super) struct ModelPoint {
 }
 
 /// The models in the subfolders of a folder, or the folder itself if there are none.
-pub(super) fn models_in(place: &Path, needed: &[&str]) -> Vec<PathBuf> {
-    let folders = tree::entries(place).unwrap_or_default();
+pub(super) fn models_in(folder: &Path, needed: &[&str]) -> Vec<PathBuf> {
+    let folders = tree::entries(folder).unwrap_or_default();
     let mut models: Vec<PathBuf> =
         folders.iter().filter_map(|folder| model_in(folder, needed)).collect();
     models.sort();
     if models.is_empty() {
-        models.extend(model_in(place, needed));
+        models.extend(model_in(folder, needed));
     }
     models
 }
@@ -65,8 +65,8 @@ pub(super) fn largest(
     };
     let counts = models.iter().map(count).collect::<Result<Vec<_>>>()?;
     // The first of the largest.
-    let place = (0..counts.len()).rev().max_by_key(|&place| counts[place]);
-    Ok(place.map(|place| (models[place].as_path(), counts)))
+    let largest = (0..counts.len()).rev().max_by_key(|&index| counts[index]);
+    Ok(largest.map(|index| (models[index].as_path(), counts)))
 }
 
 /// The lenses by camera id.

@@ -288,7 +288,7 @@ impl<'a> Reconstruction<'a> {
         report: &dyn Fn(Progress<'_>),
     ) -> Result<()> {
         for (_, name, value) in self.user_options.iter().filter(|(of, ..)| *of == command) {
-            options.retain(|(own, _)| own != name);
+            options.retain(|(option, _)| option != name);
             options.push((name.clone(), value.into()));
         }
         let options: Vec<[OsString; 2]> =
