@@ -8,6 +8,8 @@ mod text;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "cli")]
+pub(super) use binary::images_renamed;
 use glam::{DAffine3, DQuat, DVec2, DVec3};
 
 use crate::base::tree;
@@ -83,15 +85,6 @@ pub(super) fn read_images(folder: &Path) -> Result<Vec<ModelImage>> {
         Encoded::Binary(path) => binary::images(&path),
         Encoded::Text(path) => text::images(&path),
     }
-}
-
-/// The binary file of the images of a model, with those that `renamed` gives a name, under that name.
-#[cfg(feature = "cli")]
-pub(super) fn images_renamed(
-    folder: &Path,
-    renamed: impl Fn(&str) -> Option<String>,
-) -> Result<Vec<u8>> {
-    binary::images_renamed(&folder.join("images.bin"), renamed)
 }
 
 /// The points with finite positions, by id; both encodings give the same order.

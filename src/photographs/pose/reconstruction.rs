@@ -12,8 +12,7 @@ use crate::photographs::dataset::Dataset;
 use crate::{Error, Result};
 
 /// The pairs of photographs that COLMAP matches.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Matcher {
     /// Every pair
     Exhaustive,
@@ -31,8 +30,7 @@ impl Matcher {
 }
 
 /// The mapper that registers cameras.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Mapper {
     /// One by one (COLMAP's mapper)
     Incremental,
