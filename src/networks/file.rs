@@ -114,8 +114,11 @@ pub fn load(path: &Path, networks: &mut [&mut Parameters], gpu: &Gpu) -> Result<
             None => "use the settings it was made with".to_owned(),
         };
         let other = |problem: String| {
-            let own = parameters.settings();
-            Error::input(path, format!("{problem}; this network has the settings {own}, {remedy}"))
+            let settings = parameters.settings();
+            Error::input(
+                path,
+                format!("{problem}; this network has the settings {settings}, {remedy}"),
+            )
         };
         let read = |tensor: &Tensor| {
             let name = format!("{prefix}.{}", tensor.name);

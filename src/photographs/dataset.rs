@@ -216,14 +216,14 @@ impl Dataset {
         Ok(Some((model.to_owned(), names.collect())))
     }
 
-    /// The file of the images of a binary COLMAP model, with those that `renamed` gives a name, under that name. Points
+    /// A binary file of the images of a COLMAP model, with those that `renamed` gives a name, under that name. Points
     /// that only others see stay.
     #[cfg(feature = "cli")]
     pub(crate) fn images_renamed(
-        model: &Path,
+        images: &Path,
         renamed: impl Fn(&str) -> Option<String>,
     ) -> Result<Vec<u8>> {
-        colmap::images_renamed(model, renamed)
+        colmap::images_renamed(images, renamed)
     }
 
     /// The calibrated lenses of a COLMAP model.

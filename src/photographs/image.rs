@@ -27,25 +27,15 @@ mod raw;
 #[cfg(feature = "io")]
 mod source;
 
-#[cfg(feature = "io")]
-pub(crate) use codec::PictureFile;
 #[cfg(all(feature = "io", test))]
 pub(crate) use codec::openings;
-#[cfg(feature = "io")]
-pub(crate) use colour::ColourCounts;
-#[cfg(feature = "io")]
-pub use exif::exposure_value;
 #[cfg(feature = "cli")]
 pub(crate) use exif::lens_name;
-#[cfg(feature = "io")]
-pub use jpeg::exif_segment;
-#[cfg(feature = "io")]
-pub use mask::Mask;
-#[cfg(feature = "io")]
-pub(crate) use mask::MaskFile;
-#[cfg(feature = "io")]
-pub use orientation::Orientation;
 use rayon::prelude::*;
+#[cfg(feature = "io")]
+pub(crate) use {codec::PictureFile, colour::ColourCounts, mask::MaskFile};
+#[cfg(feature = "io")]
+pub use {exif::exposure_value, jpeg::exif_segment, mask::Mask, orientation::Orientation};
 
 /// A colour image: planes of red, green and blue, sRGB-encoded, in [0, 1]; values from EXR files may exceed 1.
 ///

@@ -196,7 +196,7 @@ fn warn_of(lenses: &[Lens], photographs: &[PathBuf], placed: &[String]) {
         }
     }
     let names = photographs.iter().filter_map(|path| path.file_name()?.to_str());
-    let is_placed = |name: &&str| placed.iter().any(|own| stem(own) == stem(name));
+    let is_placed = |name: &&str| placed.iter().any(|file| stem(file) == stem(name));
     let without: Vec<&str> = names.filter(|name| !is_placed(name)).collect();
     if !without.is_empty() {
         let (count, first) = (without.len(), without[..without.len().min(NAMED)].join(", "));
@@ -255,9 +255,9 @@ fn distinct_photographs(folder: &Path) -> Result<Vec<PathBuf>> {
     }
     let mut seen = BTreeMap::new();
     for path in &paths {
-        let own = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        if let Some(other) = seen.insert(stem(&own).to_owned(), own.clone()) {
-            let problem = format!("{other} and {own} have the same name; rename one");
+        let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        if let Some(other) = seen.insert(stem(&file).to_owned(), file.clone()) {
+            let problem = format!("{other} and {file} have the same name; rename one");
             return Err(Error::input(folder, problem));
         }
     }

@@ -360,9 +360,9 @@ mod tests {
             0.0557 * xyz[0] - 0.2040 + 1.0570 * xyz[2],
         ];
         let expected = [linear[1] / linear[0], linear[1] / linear[2]];
-        for (own, expected) in [red / green, blue / green].into_iter().zip(expected) {
+        for (found, expected) in [red / green, blue / green].into_iter().zip(expected) {
             // D65 is not on the Planckian locus.
-            assert!((own / expected - 1.0).abs() < 0.08, "{own} {expected}");
+            assert!((found / expected - 1.0).abs() < 0.08, "{found} {expected}");
         }
         assert!(of(10_000.0)[0] > 1.0 && of(10_000.0)[2] < 1.0);
     }

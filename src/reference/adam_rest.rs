@@ -24,15 +24,17 @@ impl Reference for Kernel {
         if status[0] != 0 {
             return;
         }
-        let (count, own) = (params.gaussian_count as usize, params.coefficient_count as usize);
+        let (count, coefficients) =
+            (params.gaussian_count as usize, params.coefficient_count as usize);
         let left_out = frozen_floats(constants.frozen_columns, count);
         let (attribute, column) = (Attribute::Rest, params.first_column as usize);
         let rest = |width, i, k| {
             let plane = AttributePlane { attribute, column, width };
             plane.index(constants.rest_by_column, count, i, k)
         };
-        for (i, k) in (0..count).flat_map(|i| (0..own).map(move |k| (i, k))) {
-            let (at, word) = (rest(own, i, k) - left_out, rest(own.div_ceil(2), i, k / 2));
+        for (i, k) in (0..count).flat_map(|i| (0..coefficients).map(move |k| (i, k))) {
+            let (at, word) =
+                (rest(coefficients, i, k) - left_out, rest(coefficients.div_ceil(2), i, k / 2));
             let [m, v] = match constants.half_moments {
                 true => from_halves(both_moments[at]),
                 false => [first_moments[at], second_moments[at]],
@@ -43,7 +45,7 @@ impl Reference for Kernel {
             let (moments, chance) = moments_after(params.step, before);
             let half = u32::from(rounded_by_chance(after as f32, chance));
             parameters[word] = parameters[word] & !(0xffff << shift) | half << shift;
-            if k + 1 == own && shift == 0 {
+            if k + 1 == coefficients && shift == 0 {
                 parameters[word] &= 0xffff;
             }
             if constants.half_moments {

@@ -119,12 +119,12 @@ fn add_bounds(constants: &Constants, list: &TileList, pixel: &Pixel, bounds: &mu
     let renders = if constants.segment == 0 { 2.0 } else { 3.0 };
     let head = RECORD_HEAD as usize;
     // Every sum is over the pixels of the tile.
-    let own = (chain(tile.element_product() as usize) + 64.0) * UNIT;
+    let summed = (chain(tile.element_product() as usize) + 64.0) * UNIT;
     for &(fragment, alpha_error) in &model.fragments {
         let bound = &mut bounds[(head + channels) * fragment.index..][..head + channels];
         let color = &list.colors[channels * fragment.index..][..channels];
         let share: f64 = (0..shaping).map(|c| fragment.before * color[c].abs() * d(c)).sum();
-        let rounded = 2.0 * alpha_error / (1.0 - fragment.alpha) + own;
+        let rounded = 2.0 * alpha_error / (1.0 - fragment.alpha) + summed;
         let relative = if model.is_fragile { 1.0 } else { rounded };
         let d_alpha = (renders * light_error + relative * (light + share)) / (1.0 - fragment.alpha);
         let d_sigma = fragment.alpha * d_alpha;

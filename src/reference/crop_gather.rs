@@ -4,7 +4,7 @@ use crate::gpu::Reference;
 use crate::kernels::crop_gather::{Kernel, Params, Slices};
 
 /// The index in the image of each value of a padded crop, in the crop's order.
-pub(super) fn places(
+pub(super) fn indices(
     size: UVec2,
     origin: UVec2,
     crop: UVec2,
@@ -20,7 +20,7 @@ pub(super) fn places(
 impl Reference for Kernel {
     fn run(params: &Params, _: &Self::Constants, Slices { image, content }: Slices<'_>) {
         let &Params { size, origin, crop, first_plane, plane_count } = params;
-        let places = places(size, origin, crop, first_plane..first_plane + plane_count);
-        content.iter_mut().zip(places).for_each(|(value, at)| *value = image[at]);
+        let indices = indices(size, origin, crop, first_plane..first_plane + plane_count);
+        content.iter_mut().zip(indices).for_each(|(value, at)| *value = image[at]);
     }
 }

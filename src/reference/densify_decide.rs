@@ -22,8 +22,8 @@ impl Reference for Kernel {
         } else {
             KEY_KEEP
         };
-        for place in 0..n {
-            let (i, key) = (slices.sorted_ids[place] as usize, slices.sorted_keys[place]);
+        for rank in 0..n {
+            let (i, key) = (slices.sorted_ids[rank] as usize, slices.sorted_keys[rank]);
             if !(first..first + of_batch).contains(&i) {
                 continue;
             }

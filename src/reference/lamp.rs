@@ -33,7 +33,7 @@ pub struct Lamp {
 struct LampPoint {
     axis: DVec3,
     towards: DVec3,
-    own: f64,
+    length: f64,
     distance: f64,
     away: f64,
     beam: f64,
@@ -63,8 +63,8 @@ impl Lamp {
 
     fn at(&self, point: DVec3) -> LampPoint {
         let offset = point - self.position;
-        let own = offset.length();
-        let bounded = (own / self.reference_distance).clamp(LAMP_NEAREST, LAMP_FARTHEST);
+        let length = offset.length();
+        let bounded = (length / self.reference_distance).clamp(LAMP_NEAREST, LAMP_FARTHEST);
         let distance = self.reference_distance * bounded;
         let axis = self.tangents.normalize();
         let towards = offset / distance;
@@ -72,7 +72,7 @@ impl Lamp {
         let [first, second] = self.falloffs;
         let beam = (-self.exponent * bounded.ln() - (first + second * away) * away).exp();
         let light = self.ambient + (1.0 - self.ambient) * beam;
-        LampPoint { axis, towards, own, distance, away, beam, light }
+        LampPoint { axis, towards, length, distance, away, beam, light }
     }
 
     /// light^slope at a point in view space: the factor on the argument of the tone law.
@@ -149,12 +149,12 @@ impl Lamp {
     /// The gradient of ln factor with respect to the point.
     pub fn point_gradient(&self, point: DVec3) -> DVec3 {
         let at = self.at(point);
-        if at.own > LAMP_FARTHEST * self.reference_distance {
+        if at.length > LAMP_FARTHEST * self.reference_distance {
             return DVec3::ZERO;
         }
         let turn = self.turn(&at);
         let mut gradient = turn * at.axis;
-        if at.own >= LAMP_NEAREST * self.reference_distance {
+        if at.length >= LAMP_NEAREST * self.reference_distance {
             gradient -= (self.exponent + turn * at.towards.dot(at.axis)) * at.towards;
         }
         self.slope * self.share(&at) / at.distance * gradient
@@ -173,7 +173,7 @@ impl Lamp {
         let at = self.at(point);
         let share = self.slope * self.share(&at);
         let d_position = -LAMP_STEP * self.reference_distance * self.point_gradient(point);
-        let is_far = at.own > LAMP_FARTHEST * self.reference_distance;
+        let is_far = at.length > LAMP_FARTHEST * self.reference_distance;
         let d_axis = if is_far { DVec3::ZERO } else { share * self.turn(&at) * at.towards };
         let d_tangents =
             LAMP_STEP * (d_axis - at.axis * at.axis.dot(d_axis)) / self.tangents.length();

@@ -14,13 +14,13 @@ use crate::splats::attributes::Attribute;
 use crate::splats::batches::frozen_floats;
 
 /// The numbers before the lamp's among the inputs of a Gaussian: its mean, its lit colour, and the gradient of its DC.
-const OWN: usize = 9;
+const BEFORE_LAMP: usize = 9;
 
 /// A Gaussian's share of the gradient of the numbers.
 fn share(camera: &Camera, inputs: &[f64]) -> Vec<f64> {
-    let (own, numbers) = inputs.split_at(OWN);
-    let (point, lamp) = (camera.view(DVec3::from_slice(own)), Lamp::of(numbers));
-    let [lit, d_dc] = [3, 6].map(|at| DVec3::from_slice(&own[at..]));
+    let (gaussian, numbers) = inputs.split_at(BEFORE_LAMP);
+    let (point, lamp) = (camera.view(DVec3::from_slice(gaussian)), Lamp::of(numbers));
+    let [lit, d_dc] = [3, 6].map(|at| DVec3::from_slice(&gaussian[at..]));
     let d = lamp.log_factor_gradient(lit, d_dc / SH_C0, point);
     lamp.gradient(point).map(|number| d * number).to_vec()
 }
@@ -46,29 +46,30 @@ fn shares(
     let color = vector(slices.colors, stored_color(constants.channels) * i);
     let mean = vector(slices.parameters, 3 * i);
     let lamp = Lamp::of(slices.lamp);
-    let mut inputs = [mean, color, d_dc].map(|own| own.to_array()).concat();
+    let mut inputs = [mean, color, d_dc].map(|vector| vector.to_array()).concat();
     let far = DVec3::splat(mean.length() + camera.center().length());
-    let mut errors =
-        [far, DVec3::ONE + color.abs(), d_dc.abs()].map(|own| (OFF * own).to_array()).concat();
+    let mut errors = [far, DVec3::ONE + color.abs(), d_dc.abs()]
+        .map(|vector| (OFF * vector).to_array())
+        .concat();
     for &number in &slices.lamp[..LAMP_NUMBERS as usize] {
         inputs.push(number.into());
         errors.push(OFF * (1.0 + f64::from(number.abs())));
     }
     let moved = sensitivity(&inputs, &errors, |inputs| share(&camera, inputs));
-    let own = OFF + lamp.factor_error(camera.view(mean));
+    let relative = OFF + lamp.factor_error(camera.view(mean));
     // A number whose terms cancel has the errors of these.
     let values = share(&camera, &inputs);
     let largest = values.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
-    let of = |(value, moved): (f64, f64)| Rounded { value, error: moved + own * largest };
+    let of = |(value, moved): (f64, f64)| Rounded { value, error: moved + relative * largest };
     Some(values.into_iter().zip(moved).map(of).collect())
 }
 
 fn sums(params: &Params, constants: &Constants, slices: &Slices<'_>) -> Vec<Rounded> {
     let (count, chunk) = (params.gaussian_count as usize, constants.chunk as usize);
     let of_chunk = |first: usize| {
-        let own = first..(first + chunk).min(count);
-        let all: Vec<_> = own.filter_map(|i| shares(params, constants, slices, i)).collect();
-        let sum = move |n| Rounded::sum(chain(chunk), all.iter().map(|own| own[n]));
+        let indices = first..(first + chunk).min(count);
+        let all: Vec<_> = indices.filter_map(|i| shares(params, constants, slices, i)).collect();
+        let sum = move |n| Rounded::sum(chain(chunk), all.iter().map(|shares| shares[n]));
         (0..WIDTH).map(sum).collect::<Vec<_>>()
     };
     (0..count).step_by(chunk).flat_map(of_chunk).collect()

@@ -9,7 +9,7 @@ use crate::kernels::pack_map::{Constants, Kernel, Params, Slices, Tolerances};
 impl Reference for Kernel {
     fn run(params: &Params, _: &Constants, Slices { largest, source, packed }: Slices<'_>) {
         let Params { size, channels: count } = *params;
-        let (extent, own, scale) = (extent(size), channels(count), scale(largest[0]));
+        let (extent, padded, scale) = (extent(size), channels(count), scale(largest[0]));
         let value = |x: u32, y: u32, channel: u32| {
             let at = UVec2::new(x, y).wrapping_sub(UVec2::ONE);
             if at.x >= size.x || at.y >= size.y || channel >= count {
@@ -17,8 +17,8 @@ impl Reference for Kernel {
             }
             scale * f64::from(source[((channel * size.y + at.y) * size.x + at.x) as usize])
         };
-        for i in 0..extent.element_product() * own / 8 {
-            let (first, pixel) = (8 * i % own, 8 * i / own);
+        for i in 0..extent.element_product() * padded / 8 {
+            let (first, pixel) = (8 * i % padded, 8 * i / padded);
             let of = |channel| value(pixel % extent.x, pixel / extent.x, first + channel);
             packed[i as usize] = eight(of);
         }

@@ -11,7 +11,7 @@ impl Reference for Kernel {
         let (is_transposed, scale) = (constants.transposed, scale(largest[0]));
         let [from, to] =
             if is_transposed { [out_channels, in_channels] } else { [in_channels, out_channels] };
-        let [own_from, own_to] = [from, to].map(channels);
+        let [from_padded, to_padded] = [from, to].map(channels);
         let weight = |tap: u32, o: u32, i: u32| {
             if o >= to || i >= from {
                 return 0.0;
@@ -22,9 +22,10 @@ impl Reference for Kernel {
             };
             scale * f64::from(values[(offset + at) as usize])
         };
-        for i in 0..9 * own_to * own_from / 8 {
-            let (first, row) = (8 * i % own_from, 8 * i / own_from);
-            packed[i as usize] = eight(|from| weight(row / own_to, row % own_to, first + from));
+        for i in 0..9 * to_padded * from_padded / 8 {
+            let (first, row) = (8 * i % from_padded, 8 * i / from_padded);
+            packed[i as usize] =
+                eight(|from| weight(row / to_padded, row % to_padded, first + from));
         }
     }
 

@@ -43,17 +43,19 @@ fn at(packed: &[Eight], index: u32) -> f64 {
 
 /// The values of a packed map, as planes (C, H, W): halves, which single precision represents exactly.
 pub(super) fn map(size: UVec2, count: u32, packed: &[Eight]) -> Vec<f32> {
-    let (columns, own) = (extent(size).x, channels(count));
+    let (columns, padded) = (extent(size).x, channels(count));
     let pixel = |i: u32| (i / size.x + 1) * columns + i % size.x + 1;
-    let plane = |c: u32| (0..size.element_product()).map(move |i| at(packed, pixel(i) * own + c));
+    let plane =
+        |c: u32| (0..size.element_product()).map(move |i| at(packed, pixel(i) * padded + c));
     (0..count).flat_map(plane).map(|value| value as f32).collect()
 }
 
 /// The values of a layer's packed weights, as (to, from, tap).
 pub(super) fn weights([from, to]: [u32; 2], packed: &[Eight]) -> Vec<f32> {
-    let [own_from, own_to] = [from, to].map(channels);
-    let taps =
-        |i: u32| (0..9).map(move |tap| at(packed, (tap * own_to + i / from) * own_from + i % from));
+    let [from_padded, to_padded] = [from, to].map(channels);
+    let taps = |i: u32| {
+        (0..9).map(move |tap| at(packed, (tap * to_padded + i / from) * from_padded + i % from))
+    };
     (0..to * from).flat_map(taps).map(|value| value as f32).collect()
 }
 
@@ -80,9 +82,9 @@ mod tests {
     fn every_half_is_nearest_to_its_value_and_to_close_values() {
         let value = |half: u32| f16::from_bits(half as u16).to_f64();
         for half in (0..0x1_0000).filter(|half| !value(*half).is_nan()) {
-            let own = value(half);
-            assert_eq!(nearest(own), half, "{own}");
-            assert_eq!(nearest(own * (1.0 + f64::exp2(-14.0))), half, "{own}");
+            let value = value(half);
+            assert_eq!(nearest(value), half, "{value}");
+            assert_eq!(nearest(value * (1.0 + f64::exp2(-14.0))), half, "{value}");
         }
         assert_eq!(nearest(1.0 + f64::exp2(-11.0)), nearest(1.0), "of two the even one");
         assert_eq!(nearest(-f64::exp2(-25.0)), 0x8000);

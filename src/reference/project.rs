@@ -230,7 +230,7 @@ impl<'a> ProjectionInputs<'a> {
         let level = f64::from(splat_level(opacity as f32));
         let extent =
             projection.half_extent * (extent_error(opacity as f32) / UNIT + dimmed / level);
-        let own = [
+        let rounded = [
             16.0 * center.x,
             16.0 * center.y,
             extent.x,
@@ -244,7 +244,7 @@ impl<'a> ProjectionInputs<'a> {
             color,
             16.0 * far,
         ];
-        Some(std::array::from_fn(|k| moved[k] + UNIT * own[k]))
+        Some(std::array::from_fn(|k| moved[k] + UNIT * rounded[k]))
     }
 
     /// The fewest and the most tiles of a splat whose numbers are off by `errors`.

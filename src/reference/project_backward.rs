@@ -108,8 +108,8 @@ fn rows_backward(
     let [a, b, c] = conic.to_array();
     let normal = u0.cross(u1);
     let trace = u0.dot(u0) + u1.dot(u1);
-    let own = normal.dot(normal);
-    let det = own + DILATION * trace + DILATION * DILATION;
+    let undilated = normal.dot(normal);
+    let det = undilated + DILATION * trace + DILATION * DILATION;
     let w0 = (u1.cross(normal) + DILATION * u0) / det;
     let w1 = (normal.cross(u0) + DILATION * u1) / det;
     let g0 = d_conic.x * w0 + 0.5 * d_conic.y * w1;
@@ -117,7 +117,7 @@ fn rows_backward(
     let (mut d_u0, mut d_u1) = (-2.0 * (a * g0 + b * g1), -2.0 * (b * g0 + c * g1));
     let mut d_log_scale = -2.0 * (w0 * g0 + w1 * g1);
     if d_dimming != 0.0 {
-        let by = [u1.cross(normal) / own - w0, normal.cross(u0) / own - w1];
+        let by = [u1.cross(normal) / undilated - w0, normal.cross(u0) / undilated - w1];
         let [by_u0, by_u1] = by.map(|by| d_dimming * by);
         (d_u0, d_u1) = (d_u0 + by_u0, d_u1 + by_u1);
         d_log_scale += u0 * by_u0 + u1 * by_u1;
@@ -377,10 +377,10 @@ impl Reference for Kernel {
             let of_record = errors[attributes + 3..].iter_mut().zip(&record);
             of_record.for_each(|(error, sum)| *error += sum.error);
             let bounds = sensitivity(&inputs, &errors, |inputs| {
-                let (own, rest) = inputs.split_at(attributes);
+                let (gaussian, rest) = inputs.split_at(attributes);
                 let splat = Splat { conic: DVec3::from_slice(rest), ..splat };
                 let (gaussian, d_splat) =
-                    (one.load(own, 0), scene.d_splat(&splat, slices.colors, &rest[3..], i));
+                    (one.load(gaussian, 0), scene.d_splat(&splat, slices.colors, &rest[3..], i));
                 let gradient = scene.backward(&gaussian, &splat, color, &d_splat);
                 let mut numbers = vec![0.0; attributes + 1];
                 one.store(&gradient, 0, |at, value| numbers[at] = value);

@@ -16,8 +16,8 @@ fn sampling(params: &Params, slices: &Slices<'_>, mean: DVec3, margin: f64) -> O
         let point = camera.view(mean);
         let depth = camera.depth(point);
         let is_ahead = depth > params.near.into();
-        let place = if is_ahead { camera.project(point) / camera.size } else { DVec2::INFINITY };
-        let is_seen = (place - 0.5).abs().max_element() <= 0.5 + margin;
+        let in_image = if is_ahead { camera.project(point) / camera.size } else { DVec2::INFINITY };
+        let is_seen = (in_image - 0.5).abs().max_element() <= 0.5 + margin;
         is_seen.then(|| depth / camera.focal.max_element())
     };
     let cameras = slices.cameras.iter().take(params.camera_count as usize);

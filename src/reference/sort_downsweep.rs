@@ -22,10 +22,10 @@ impl Reference for Kernel {
                 digit_begins.iter().zip(sums).take(digit_count).map(|(a, b)| a + b).collect();
             for i in workgroup * per_workgroup..count.min((workgroup + 1) * per_workgroup) {
                 let digit = (keys[i] >> params.shift) as usize % digit_count;
-                let place = next_place[digit] as usize;
+                let to = next_place[digit] as usize;
                 next_place[digit] += 1;
-                sorted_keys[place] = keys[i];
-                sorted_values[place] = values[i];
+                sorted_keys[to] = keys[i];
+                sorted_values[to] = values[i];
             }
         }
         if counts_next {

@@ -39,8 +39,8 @@ impl Cell {
 
     /// Whether a position is in it.
     pub(crate) fn contains(&self, position: DVec3) -> bool {
-        let own = position.to_array();
-        (0..3).all(|axis| (self.from[axis]..self.to[axis]).contains(&own[axis]))
+        let position = position.to_array();
+        (0..3).all(|axis| (self.from[axis]..self.to[axis]).contains(&position[axis]))
     }
 }
 
@@ -122,13 +122,13 @@ impl Block {
 
     /// Keeps the views of the block, with their splits in the dataset.
     pub(super) fn restrict(&self, frames: &mut Vec<ListedView>) -> Result<()> {
-        let own: BTreeSet<&str> = self.views.iter().map(String::as_str).collect();
-        frames.retain(|frame| own.contains(frame.name.as_str()));
-        if frames.len() == own.len() {
+        let wanted: BTreeSet<&str> = self.views.iter().map(String::as_str).collect();
+        frames.retain(|frame| wanted.contains(frame.name.as_str()));
+        if frames.len() == wanted.len() {
             return Ok(());
         }
         let kept: BTreeSet<&str> = frames.iter().map(|frame| frame.name.as_str()).collect();
-        let missing = own.difference(&kept).next().copied().unwrap_or_default();
+        let missing = wanted.difference(&kept).next().copied().unwrap_or_default();
         let problem = format!("lacks the view {missing} of block {}; plan anew", self.id);
         Err(Error::input(&self.dataset, problem))
     }
@@ -141,9 +141,9 @@ impl Block {
                 format!("has {count} points, fewer than for block {}; plan anew", self.id);
             return Err(Error::input(&self.dataset, problem));
         }
-        let mut own = self.points.iter().peekable();
-        let is_own = |(index, _): &(u32, Point)| own.next_if_eq(&index).is_some();
-        Ok((0..).zip(all).filter(is_own).map(|(_, point)| point).collect())
+        let mut wanted = self.points.iter().peekable();
+        let is_wanted = |(index, _): &(u32, Point)| wanted.next_if_eq(&index).is_some();
+        Ok((0..).zip(all).filter(is_wanted).map(|(_, point)| point).collect())
     }
 }
 

@@ -8,6 +8,8 @@ mod text;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "cli")]
+pub(super) use binary::images_renamed;
 use glam::{DAffine3, DQuat, DVec2, DVec3};
 
 use crate::base::tree;
@@ -34,13 +36,13 @@ pub(super) struct ModelPoint {
 }
 
 /// The models in the subfolders of a folder, or the folder itself if there are none.
-pub(super) fn models_in(place: &Path, needed: &[&str]) -> Vec<PathBuf> {
-    let folders = tree::entries(place).unwrap_or_default();
+pub(super) fn models_in(folder: &Path, needed: &[&str]) -> Vec<PathBuf> {
+    let folders = tree::entries(folder).unwrap_or_default();
     let mut models: Vec<PathBuf> =
         folders.iter().filter_map(|folder| model_in(folder, needed)).collect();
     models.sort();
     if models.is_empty() {
-        models.extend(model_in(place, needed));
+        models.extend(model_in(folder, needed));
     }
     models
 }
@@ -65,8 +67,8 @@ pub(super) fn largest(
     };
     let counts = models.iter().map(count).collect::<Result<Vec<_>>>()?;
     // The first of the largest.
-    let place = (0..counts.len()).rev().max_by_key(|&place| counts[place]);
-    Ok(place.map(|place| (models[place].as_path(), counts)))
+    let largest = (0..counts.len()).rev().max_by_key(|&index| counts[index]);
+    Ok(largest.map(|index| (models[index].as_path(), counts)))
 }
 
 /// The lenses by camera id.
@@ -83,15 +85,6 @@ pub(super) fn read_images(folder: &Path) -> Result<Vec<ModelImage>> {
         Encoded::Binary(path) => binary::images(&path),
         Encoded::Text(path) => text::images(&path),
     }
-}
-
-/// The binary file of the images of a model, with those that `renamed` gives a name, under that name.
-#[cfg(feature = "cli")]
-pub(super) fn images_renamed(
-    folder: &Path,
-    renamed: impl Fn(&str) -> Option<String>,
-) -> Result<Vec<u8>> {
-    binary::images_renamed(&folder.join("images.bin"), renamed)
 }
 
 /// The points with finite positions, by id; both encodings give the same order.

@@ -11,9 +11,9 @@ const BRIGHTER: f32 = 1.3;
 /// Turns reference images that are as dark as the photographs into photographs, with a warning.
 pub(super) fn drop_from(loaded: &mut [Loaded], options: &LoadOptions) {
     let is_trained_on =
-        |own: &&Loaded| own.view.as_ref().is_some_and(|view| view.split == Split::Train);
-    let photographs = loaded.iter().filter(is_trained_on).filter_map(|own| own.brightness[0]);
-    let references = loaded.iter().filter_map(|own| own.brightness[1]);
+        |loaded: &&Loaded| loaded.view.as_ref().is_some_and(|view| view.split == Split::Train);
+    let photographs = loaded.iter().filter(is_trained_on).filter_map(|loaded| loaded.brightness[0]);
+    let references = loaded.iter().filter_map(|loaded| loaded.brightness[1]);
     let (photographs, references) = (median(photographs.collect()), median(references.collect()));
     let Some((photograph, reference)) = photographs.zip(references) else { return };
     if photograph > DARK || reference > BRIGHTER * photograph {

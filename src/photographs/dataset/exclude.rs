@@ -43,7 +43,9 @@ pub(super) fn exclude(
         let matches = |frame: &ListedView| {
             let listed = frame.listed.replace('\\', "/");
             let file = listed.rsplit('/').next().unwrap_or_default();
-            [frame.name.as_str(), stem(file), file, &listed].iter().any(|own| pattern.matches(own))
+            [frame.name.as_str(), stem(file), file, &listed]
+                .iter()
+                .any(|name| pattern.matches(name))
         };
         let before = frames.len();
         frames.retain(|frame| !matches(frame));

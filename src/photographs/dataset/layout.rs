@@ -57,9 +57,9 @@ impl Layout {
             };
             return Err(Error::input(given, problem));
         }
-        let own = Self { root: given.to_owned(), named: None, block: None };
-        if own.has_listing() {
-            return Ok(own.above_model().unwrap_or(own));
+        let layout = Self { root: given.to_owned(), named: None, block: None };
+        if layout.has_listing() {
+            return Ok(layout.above_model().unwrap_or(layout));
         }
         // An archive often contains a single folder, which is the dataset.
         if tree::archive_of(given) == Some(given)
@@ -67,7 +67,7 @@ impl Layout {
         {
             return Self::of(only);
         }
-        Ok(own.above_model().unwrap_or(own))
+        Ok(layout.above_model().unwrap_or(layout))
     }
 
     /// The files of a NeRF-style listing with their splits.
@@ -77,12 +77,12 @@ impl Layout {
 
     /// The COLMAP models that have all `needed` files, from the first location with any, by name.
     pub(super) fn models(&self, needed: &[&str]) -> Vec<PathBuf> {
-        if let Some(place) = &self.named {
-            return colmap::models_in(place, needed);
+        if let Some(folder) = &self.named {
+            return colmap::models_in(folder, needed);
         }
-        let known = MODEL_FOLDERS.iter().map(|place| match *place {
+        let known = MODEL_FOLDERS.iter().map(|folder| match *folder {
             "" => colmap::model_in(&self.root, needed).into_iter().collect(),
-            place => colmap::models_in(&self.root.join(place), needed),
+            folder => colmap::models_in(&self.root.join(folder), needed),
         });
         let mut known = known.filter(|models: &Vec<PathBuf>| !models.is_empty());
         known.next().unwrap_or_else(|| {

@@ -120,7 +120,7 @@ fn list_colmap(
     let placed = colmap::read_images(folder)?;
     let wanted = placed.iter().map(|image| Wanted {
         path: image.name.replace('\\', "/"),
-        places: folders.to_vec(),
+        folders: folders.to_vec(),
         is_test: false,
     });
     let found = locate::photographs(root, images, wanted.collect(), files, listing);

@@ -16,7 +16,7 @@ pub(super) struct Wanted {
     /// With slashes.
     pub(super) path: String,
     /// The folders that the path may be relative to.
-    pub(super) places: Vec<PathBuf>,
+    pub(super) folders: Vec<PathBuf>,
     /// Missing test photographs do not indicate that the listing is from another machine: some datasets withhold them.
     pub(super) is_test: bool,
 }
@@ -108,11 +108,11 @@ pub(super) fn beside(root: &Path, files: &Files, listing: &mut Listing) {
         let listed = listed.to_string_lossy();
         let name = listed.rsplit('/').next().unwrap_or(&listed);
         let beside = photograph.and_then(|file| file.parent()).map(Path::to_owned);
-        let own = folders.iter().filter(|folder| {
+        let of_kind = folders.iter().filter(|folder| {
             let name = folder.file_name().unwrap_or_default().to_string_lossy();
             name.to_ascii_lowercase().contains(kind)
         });
-        let elsewhere = own.cloned().chain(beside).find_map(|folder| files.find(&folder, name));
+        let elsewhere = of_kind.cloned().chain(beside).find_map(|folder| files.find(&folder, name));
         // A name without a distinct ending is also that of the photograph.
         files.find(root, &listed).or(elsewhere).filter(|file| Some(file) != photograph)
     };
@@ -143,9 +143,9 @@ pub(super) fn beside(root: &Path, files: &Files, listing: &mut Listing) {
 
 /// At the listed path.
 fn at_path(root: &Path, wanted: &Wanted, files: &Files) -> Found {
-    for place in &wanted.places {
-        if let Some(file) = files.find(place, &wanted.path) {
-            let folder = relative(root, place);
+    for folder in &wanted.folders {
+        if let Some(file) = files.find(folder, &wanted.path) {
+            let folder = relative(root, folder);
             let listed = if folder == "." {
                 wanted.path.clone()
             } else {
@@ -155,7 +155,7 @@ fn at_path(root: &Path, wanted: &Wanted, files: &Files) -> Found {
         }
     }
     let is_elsewhere = wanted.path.starts_with('/') || wanted.path.contains(':');
-    let listed = match wanted.places.get(1) {
+    let listed = match wanted.folders.get(1) {
         Some(folder) if !is_elsewhere => format!("{}/{}", relative(root, folder), wanted.path),
         _ => wanted.path.clone(),
     };
@@ -164,7 +164,7 @@ fn at_path(root: &Path, wanted: &Wanted, files: &Files) -> Found {
 
 /// The part of a listed path below the folder of all photographs: listings of several locations use it as a name.
 fn below(wanted: &Wanted) -> String {
-    let is_from_root = wanted.places.len() < 2;
+    let is_from_root = wanted.folders.len() < 2;
     if is_from_root { below_first(&wanted.path) } else { &wanted.path }.to_owned()
 }
 
@@ -182,10 +182,10 @@ fn in_folder(root: &Path, folder: &Path, wanted: &Wanted, files: &Files) -> Foun
 }
 
 fn moved(root: &Path, folder: &Path, rest: &str, file: PathBuf) -> Found {
-    let place = relative(root, folder);
-    let (listed, below) = match place.as_str() {
+    let below_root = relative(root, folder);
+    let (listed, below) = match below_root.as_str() {
         "." => (rest.to_owned(), below_first(rest).to_owned()),
-        place => (format!("{place}/{rest}"), rest.to_owned()),
+        below_root => (format!("{below_root}/{rest}"), rest.to_owned()),
     };
     Found { listed, below, file: Some(file) }
 }
@@ -214,8 +214,8 @@ fn elsewhere(root: &Path, paths: &[&str], used: &HashSet<PathBuf>, files: &Files
     let rank = |folder: &Path| {
         let name = folder.file_name().unwrap_or_default().to_string_lossy();
         let dark = DARK_FOLDERS.contains(&&*name);
-        let place = PREFERRED.iter().position(|preferred| *preferred == name);
-        place.filter(|_| folder != root).unwrap_or(if dark { 0 } else { PREFERRED.len() })
+        let rank = PREFERRED.iter().position(|preferred| *preferred == name);
+        rank.filter(|_| folder != root).unwrap_or(if dark { 0 } else { PREFERRED.len() })
     };
     candidates.sort_by_key(|(folder, _)| rank(folder));
     let ranks: Vec<usize> = candidates.iter().map(|(folder, _)| rank(folder)).collect();
@@ -288,15 +288,15 @@ fn folders_below(root: &Path, without: &[&str]) -> Vec<PathBuf> {
     for _ in 0..MOST_DEEP {
         let mut next: Vec<PathBuf> = vec![];
         for folder in &level {
-            let mut own = tree::entries(folder).unwrap_or_default();
-            own.retain(|path| {
+            let mut below = tree::entries(folder).unwrap_or_default();
+            below.retain(|path| {
                 let name =
                     path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
                 let is_other = without.iter().any(|beginning| name.starts_with(beginning));
                 !is_hidden(path) && !is_other && tree::is_dir(path)
             });
-            own.sort();
-            next.extend(own);
+            below.sort();
+            next.extend(below);
         }
         next.truncate(MOST_FOLDERS.saturating_sub(found.len()));
         found.extend(next.iter().cloned());

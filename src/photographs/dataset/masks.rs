@@ -21,8 +21,8 @@ pub(super) fn find(root: &Path, frame: &ListedView, files: &Files) -> Option<Mas
     let file = frame.file.as_ref().and_then(|file| file.file_name()?.to_str());
     let names = [frame.below.clone(), frame.below.clone() + ".png"];
     let of_file = file.map(|file| format!("{file}.png"));
-    let own = names.into_iter().chain(of_file).find_map(|name| files.find(&folder, &name));
-    own.map(MaskFile::shown).or_else(|| moving(frame, files))
+    let file = names.into_iter().chain(of_file).find_map(|name| files.find(&folder, &name));
+    file.map(MaskFile::shown).or_else(|| moving(frame, files))
 }
 
 /// The mask of moving objects.

@@ -20,11 +20,11 @@ impl Dataset {
     pub fn leave_out(&mut self, names: &[String]) {
         let names: HashSet<&str> = names.iter().map(String::as_str).collect();
         let stays = |view: &View| !names.contains(view.name.as_str());
-        let mut places = 0..;
-        let of_view = self.views.iter().map(|view| if stays(view) { places.next() } else { None });
-        let places: Vec<Option<u32>> = of_view.collect();
+        let mut indices = 0..;
+        let of_view = self.views.iter().map(|view| if stays(view) { indices.next() } else { None });
+        let indices: Vec<Option<u32>> = of_view.collect();
         for point in &mut self.points {
-            point.views = point.views.iter().filter_map(|&view| places[view as usize]).collect();
+            point.views = point.views.iter().filter_map(|&view| indices[view as usize]).collect();
         }
         self.views.retain(stays);
     }
@@ -36,8 +36,8 @@ pub(super) fn with_held_out(mut views: Vec<View>, count: usize) -> Vec<View> {
     const MOST: usize = 8;
     let mut training: Vec<&mut View> = views.iter_mut().filter(|view| view.is_train()).collect();
     let cameras: Vec<Camera> = training.iter().map(|view| view.camera).collect();
-    for place in Camera::covering(&cameras, count.min(training.len() / MOST)) {
-        training[place].split = Split::HeldOut;
+    for index in Camera::covering(&cameras, count.min(training.len() / MOST)) {
+        training[index].split = Split::HeldOut;
     }
     views
 }

@@ -31,13 +31,13 @@ pub(super) fn possible(path: &str) -> [String; 3] {
 pub(super) fn disambiguate(frames: &mut [ListedView]) {
     let are_distinct =
         |names: &[String]| names.iter().collect::<BTreeSet<_>>().len() == names.len();
-    let own: Vec<String> = frames.iter().map(|frame| frame.name.clone()).collect();
+    let names: Vec<String> = frames.iter().map(|frame| frame.name.clone()).collect();
     let mut views = BTreeSet::new();
     let mut view = |frame: &ListedView| {
         let pose = frame.view_from_world.to_cols_array().map(f64::to_bits);
         views.insert((frame.name.clone(), pose))
     };
-    if are_distinct(&own) || !frames.iter().all(&mut view) {
+    if are_distinct(&names) || !frames.iter().all(&mut view) {
         return;
     }
     for path in [|frame: &ListedView| flat(&frame.below), |frame: &ListedView| flat(&frame.listed)]

@@ -82,7 +82,10 @@ impl Original {
 
     /// The statistics at a size, if they were measured while the photograph was decoded.
     pub(crate) fn measured(&self, size: MeasuredSize) -> Option<&MeasuredPhotograph> {
-        self.measured.as_ref().filter(|(own, _)| *own == size).map(|(_, measured)| measured)
+        self.measured
+            .as_ref()
+            .filter(|(measured_size, _)| *measured_size == size)
+            .map(|(_, measured)| measured)
     }
 
     /// The checksum of the pixels as loaded, if they are not kept.

@@ -49,7 +49,8 @@ pub(super) fn load(
     let memory = Allowance::new(MAX_READ);
     let headers: Vec<[Option<Header>; 2]> =
         sources.par_iter_mut().map(|source| source.headers(&memory)).collect();
-    let of_photographs: Vec<Option<Header>> = headers.iter().map(|[own, _]| *own).collect();
+    let of_photographs: Vec<Option<Header>> =
+        headers.iter().map(|[photograph, _]| *photograph).collect();
     let points = || points::of_sources(layout, &sources);
     let pixels = tracked::pixels(&sources, &of_photographs, options.orientation, points)?;
     let fitted = sources.into_par_iter().zip(headers).map(|(mut source, headers)| {

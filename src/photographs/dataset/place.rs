@@ -28,7 +28,8 @@ impl Dataset {
         const MIN_COSINE: f64 = 0.7;
         let cameras: Vec<Camera> = self.train_views().map(View::upright_camera).collect();
         let up = upwards(&cameras);
-        let has_convention = Layout::of(&self.root).is_ok_and(|own| !own.listings().is_empty());
+        let has_convention =
+            Layout::of(&self.root).is_ok_and(|layout| !layout.listings().is_empty());
         if has_convention && up.z > MIN_COSINE { DVec3::Z } else { up }
     }
 
@@ -70,12 +71,12 @@ impl Dataset {
     pub(super) fn warn_of_other_worlds(&self) {
         let (center, extent) = self.place();
         for view in self.train_views() {
-            let own = view.camera.center();
-            if frame::stands_elsewhere(own, center, extent) {
+            let camera = view.camera.center();
+            if frame::stands_elsewhere(camera, center, extent) {
                 tracing::warn!(
                     "view {} stands {:.0e} extents of the other cameras away from them; check its pose",
                     view.name,
-                    own.distance(center) / extent
+                    camera.distance(center) / extent
                 );
             }
         }

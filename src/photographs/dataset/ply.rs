@@ -22,7 +22,7 @@ pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
     let no_points =
         |problem: &str| Error::input(path, format!("{problem}; its points are not read"));
     let header = Header::parse(&bytes).map_err(|problem| no_points(&problem))?;
-    if header.properties.iter().any(|own| own.name.starts_with("f_dc_")) {
+    if header.properties.iter().any(|property| property.name.starts_with("f_dc_")) {
         return Err(no_points("is a model of Gaussians, not of points"));
     }
     let body = &bytes[header.length..];
@@ -30,9 +30,9 @@ pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
     let [Some(x), Some(y), Some(z)] = axes else { return Err(no_points("has no x, y and z")) };
     let points = match header.encoding {
         Encoding::Text => {
-            of_text(&String::from_utf8_lossy(body), &header, [x, y, z].map(|(place, _)| place))
+            of_text(&String::from_utf8_lossy(body), &header, [x, y, z].map(|(field, _)| field))
         }
-        _ => of_bytes(body, &header, [x, y, z].map(|(_, own)| own)),
+        _ => of_bytes(body, &header, [x, y, z].map(|(_, property)| property)),
     };
     let mut points = points.ok_or_else(|| no_points("is cut short or damaged"))?;
     points.retain(|point| point.is_finite());
@@ -41,16 +41,16 @@ pub(super) fn points(path: &Path) -> Result<Vec<DVec3>> {
 
 fn of_bytes(body: &[u8], header: &Header, axes: [&Property; 3]) -> Option<Vec<DVec3>> {
     let body = body.get(..header.count.checked_mul(header.stride)?)?;
-    let number = |vertex: &[u8], own: &Property| {
+    let number = |vertex: &[u8], property: &Property| {
         let mut bytes = [0; 8];
-        let size = own.kind.size();
-        bytes[..size].copy_from_slice(&vertex[own.at..own.at + size]);
+        let size = property.kind.size();
+        bytes[..size].copy_from_slice(&vertex[property.at..property.at + size]);
         if header.encoding == Encoding::Big {
             bytes[..size].reverse();
         }
-        value(own.kind, bytes)
+        value(property.kind, bytes)
     };
-    let point = |vertex: &[u8]| DVec3::from_array(axes.map(|own| number(vertex, own)));
+    let point = |vertex: &[u8]| DVec3::from_array(axes.map(|property| number(vertex, property)));
     Some(body.chunks_exact(header.stride.max(1)).map(point).collect())
 }
 
@@ -74,8 +74,8 @@ fn of_text(body: &str, header: &Header, axes: [usize; 3]) -> Option<Vec<DVec3>> 
     let point = |line: &str| {
         let fields: Vec<&str> = line.split_whitespace().collect();
         let mut point = DVec3::ZERO;
-        for (axis, place) in axes.into_iter().enumerate() {
-            point[axis] = fields.get(place)?.parse().ok()?;
+        for (axis, field) in axes.into_iter().enumerate() {
+            point[axis] = fields.get(field)?.parse().ok()?;
         }
         Some(point)
     };

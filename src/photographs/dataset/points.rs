@@ -142,8 +142,8 @@ impl Shared {
         let images = colmap::read_images(folder)?;
         let shared = images.iter().filter_map(|image| {
             let view = view_named(&image.name)?;
-            let own = image.view_from_world?.inverse().translation;
-            Some((image.id, view, [own, views[view as usize].center]))
+            let center = image.view_from_world?.inverse().translation;
+            Some((image.id, view, [center, views[view as usize].center]))
         });
         Ok(Self { images: shared.collect() })
     }

@@ -14,8 +14,8 @@ pub(super) const TEST_EVERY: usize = 8;
 
 /// The list of test photographs, next to the photographs or in the model, as in 3DGS.
 pub(super) fn test_list(root: &Path) -> Option<PathBuf> {
-    let places = ["test.txt", "sparse/0/test.txt"].map(|place| root.join(place));
-    places.into_iter().find(|path| tree::is_file(path))
+    let paths = ["test.txt", "sparse/0/test.txt"].map(|path| root.join(path));
+    paths.into_iter().find(|path| tree::is_file(path))
 }
 
 /// Assigns the frames, sorted by name, that the listing did not assign: by `test.txt` (a name per line), else every
@@ -64,14 +64,14 @@ pub(super) fn split(
 
 /// Warns if the dataset has a split that another one replaces.
 pub(super) fn log_split(root: &Path, has_split: bool, options: &LoadOptions) {
-    let own = if has_split {
+    let source = if has_split {
         Some("its transforms files")
     } else {
         Some("its test.txt").filter(|_| test_list(root).is_some())
     };
-    if let Some((own, every)) = own.zip(options.test_every) {
+    if let Some((source, every)) = source.zip(options.test_every) {
         tracing::warn!(
-            "{}: {own} split the views, which gives way to test_every = {every}; scores do not compare with \
+            "{}: {source} split the views, which gives way to test_every = {every}; scores do not compare with \
              those of its own split",
             root.display()
         );
@@ -84,16 +84,16 @@ fn split_anew(root: &Path, frames: &mut [ListedView], every: usize, files: &File
     let training = frames.iter().filter(|frame| frame.split == Some(Split::Train));
     let training_folders: BTreeSet<String> =
         training.map(|frame| frame.folder().to_owned()).collect();
-    let mut place = 0;
+    let mut index = 0;
     for frame in frames {
         let lists_input =
             frame.split != Some(Split::Test) || training_folders.contains(frame.folder());
         let is_posed_only =
             frame.split == Some(Split::Test) && frame.input(root, lists_input, files).is_none();
         if !is_posed_only {
-            let is_test = every > 0 && place % every == 0;
+            let is_test = every > 0 && index % every == 0;
             frame.split = Some(if is_test { Split::Test } else { Split::Train });
-            place += 1;
+            index += 1;
         }
     }
 }

@@ -303,7 +303,7 @@ fn render(scene: &dyn Scene, camera: &Camera, lamp: Option<&CameraLamp>) -> [Vec
         let rays = OFFSETS.iter().filter_map(|&offset| ray(camera, corner + offset));
         let sums = rays
             .map(|ray| scene.radiance(center, ray, lamp))
-            .fold([DVec3::ZERO; 2], |sums, own| [sums[0] + own[0], sums[1] + own[1]]);
+            .fold([DVec3::ZERO; 2], |sums, pair| [sums[0] + pair[0], sums[1] + pair[1]]);
         (sums[0] / 4.0, sums[1] / 4.0)
     };
     let (even, dim) = (0..camera.width * camera.height).into_par_iter().map(radiance).unzip();

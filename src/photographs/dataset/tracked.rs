@@ -35,7 +35,8 @@ pub(super) fn pixels(
         .filter(|(_, header)| header.orientation != Orientation::UPRIGHT)
         .collect();
     let by_size = |(index, header): &(usize, Header)| header.by_size(&sources[*index].lens);
-    let (told, open): (Vec<_>, Vec<_>) = turned.into_iter().partition(|own| by_size(own).is_some());
+    let (told, open): (Vec<_>, Vec<_>) =
+        turned.into_iter().partition(|image| by_size(image).is_some());
     let Some(first) = open.first() else { return Ok(Pixels::Stored) };
     match choice {
         PixelOrientation::Stored => return Ok(Pixels::Stored),
@@ -78,14 +79,14 @@ fn by_points(
     let sampled = chosen.par_iter().map(|&view| {
         let image = sources[view].picture()?;
         let orientation = headers[view]?.orientation;
-        let own: Vec<(usize, &Point)> =
+        let seen: Vec<(usize, &Point)> =
             points.iter().enumerate().filter(|(_, point)| sees(point, view)).collect();
         let turned = image.clone().turned(orientation);
-        Some([image, turned].map(|image| samples(&image, &sources[view], &own)))
+        Some([image, turned].map(|image| samples(&image, &sources[view], &seen)))
     });
     let sampled: Vec<[Vec<(usize, f64)>; 2]> = sampled.flatten().collect();
     let [stored, exif] =
-        [0, 1].map(|which| agreement(sampled.iter().map(|own| &own[which]), points.len()));
+        [0, 1].map(|which| agreement(sampled.iter().map(|sample| &sample[which]), points.len()));
     let ((stored, pairs), (exif, others)) = (stored?, exif?);
     let pairs = pairs.min(others);
     let clear = CLEAR.max(STANDARD_ERRORS / (pairs as f64).sqrt());
@@ -106,7 +107,7 @@ fn sees(point: &Point, view: usize) -> bool {
 fn neighbours(count: usize, open: &[(usize, Header)], points: &[Point]) -> Option<Vec<usize>> {
     let mut seen = vec![0; count];
     points.iter().flat_map(|point| &point.views).for_each(|&view| seen[view as usize] += 1);
-    let first = open.iter().map(|own| own.0).max_by_key(|&view| seen[view])?;
+    let first = open.iter().map(|image| image.0).max_by_key(|&view| seen[view])?;
     let mut shared = vec![0; count];
     for point in points.iter().filter(|point| sees(point, first)) {
         point.views.iter().for_each(|&view| shared[view as usize] += 1);
@@ -157,21 +158,21 @@ fn agreement<'a>(
     let mut by_point = vec![(0.0, 0.0, 0.0); points];
     for view in views {
         let count = view.len().max(1) as f64;
-        let mean = view.iter().map(|own| own.1).sum::<f64>() / count;
-        let variance = view.iter().map(|own| (own.1 - mean).powi(2)).sum::<f64>() / count;
+        let mean = view.iter().map(|sample| sample.1).sum::<f64>() / count;
+        let variance = view.iter().map(|sample| (sample.1 - mean).powi(2)).sum::<f64>() / count;
         if variance <= 0.0 {
             continue;
         }
         for (point, value) in view {
-            let own = (value - mean) / variance.sqrt();
+            let standard = (value - mean) / variance.sqrt();
             let (sum, squares, count) = &mut by_point[*point];
-            *sum += own;
-            *squares += own * own;
+            *sum += standard;
+            *squares += standard * standard;
             *count += 1.0;
         }
     }
     let (mut products, mut pairs, mut independent) = (0.0, 0.0, 0.0);
-    for (sum, squares, count) in by_point.into_iter().filter(|own| own.2 > 1.0) {
+    for (sum, squares, count) in by_point.into_iter().filter(|sums| sums.2 > 1.0) {
         products += sum * sum - squares;
         pairs += count * (count - 1.0);
         independent += count - 1.0;

@@ -56,7 +56,7 @@ struct ListedFrame {
     #[serde(deserialize_with = "matrix::rows")]
     transform_matrix: Rows,
     #[serde(flatten)]
-    own: Intrinsics,
+    intrinsics: Intrinsics,
     mask_path: Option<String>,
     #[serde(alias = "depth_path")]
     depth_file_path: Option<String>,
@@ -103,13 +103,13 @@ pub(super) fn read(
     let wanted = frames.iter().map(|(_, frame)| Wanted {
         is_test: frame.split == Some(Split::Test),
         path: listed_path(&frame.listed.file_path),
-        places: vec![root.to_owned()],
+        folders: vec![root.to_owned()],
     });
     let found = locate::photographs(root, images, wanted.collect(), files, listing);
     for ((file, frame), found) in frames.into_iter().zip(found) {
         let Read { path, transforms } = &read[file];
         let listed = frame.listed;
-        let intrinsics = listed.own.over(&transforms.shared);
+        let intrinsics = listed.intrinsics.over(&transforms.shared);
         let Some(size) = intrinsics.size(found.file.as_deref()) else {
             listing.skipped.push(format!(
                 "{}: neither w and h nor a readable file says how large it is",
@@ -175,10 +175,10 @@ fn usable_frames(
     let mut unsupported = Unsupported::default();
     unsupported.add(&transforms.others);
     let held_out = std::mem::take(&mut transforms.test_frames);
-    let own = std::mem::take(&mut transforms.frames).into_iter();
-    let own_split = if held_out.is_empty() { split } else { Some(Split::Train) };
-    let all: Vec<(ListedFrame, Option<Split>)> = own
-        .map(|frame| (frame, own_split))
+    let frames = std::mem::take(&mut transforms.frames).into_iter();
+    let split_of_training = if held_out.is_empty() { split } else { Some(Split::Train) };
+    let all: Vec<(ListedFrame, Option<Split>)> = frames
+        .map(|frame| (frame, split_of_training))
         .chain(held_out.into_iter().map(|frame| (frame, Some(Split::Test))))
         .collect();
     let is_transposed =
@@ -299,8 +299,8 @@ fn cloud(
 ) -> Option<Cloud> {
     let named = listed_path(transforms.ply_file_path.as_ref()?);
     let name = named.rsplit('/').next().unwrap_or(&named);
-    let places = [root.join(&named), path.with_file_name(name)];
-    let Some(file) = places.into_iter().find(|place| tree::is_file(place)) else {
+    let files = [root.join(&named), path.with_file_name(name)];
+    let Some(file) = files.into_iter().find(|file| tree::is_file(file)) else {
         remarks.push(format!("{}: {named}, its ply_file_path, is absent", path.display()));
         return None;
     };

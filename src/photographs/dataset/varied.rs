@@ -60,9 +60,9 @@ impl Variation {
     }
 
     /// The numbers of the photograph at this place in the order of names.
-    pub fn of(&self, place: usize) -> Varied {
+    pub fn of(&self, index: usize) -> Varied {
         let stream = Stream::new(self.seed, 0);
-        let draw = |which| stream.uniform(2 * place as u64 + which);
+        let draw = |which| stream.uniform(2 * index as u64 + which);
         let [low, high] = self.gamma.map(f64::ln);
         Varied {
             stops: self.stops * (2.0 * draw(0) - 1.0),
@@ -101,10 +101,10 @@ pub fn write(dir: &Path, dataset: &Dataset, variation: &Variation) -> Result<usi
     }
     let (mut table, mut tests) = ("name,stops,gamma\n".to_owned(), String::new());
     let mut luminances = vec![];
-    for (place, view) in views.iter().enumerate() {
+    for (index, view) in views.iter().enumerate() {
         let Some(image) = view.loaded()? else { continue };
         luminances.push(LuminanceHistogram::of(&view.counted(&image)));
-        let (name, varied) = (file_name(view), variation.of(place));
+        let (name, varied) = (file_name(view), variation.of(index));
         image.save_png8(dir.join(CLEAN).join(&name))?;
         varied.applied(&image).save_png8(dir.join(VARIED).join(&name))?;
         let _ = writeln!(table, "{},{:.6},{:.6}", view.name, varied.stops, varied.gamma);
@@ -112,7 +112,9 @@ pub fn write(dir: &Path, dataset: &Dataset, variation: &Variation) -> Result<usi
             let _ = writeln!(tests, "{name}");
         }
     }
-    if let Some(exposure) = Exposure::of(&luminances, None).filter(|own| own.weight() > 0.0) {
+    if let Some(exposure) =
+        Exposure::of(&luminances, None).filter(|exposure| exposure.weight() > 0.0)
+    {
         tracing::warn!(
             "{}: the {} photographs are dark (mean luminance {:.3}): varied exposures of dark photographs have no \
              clean reference",

@@ -30,7 +30,7 @@ const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
 #[derive(Clone, Debug)]
 pub(super) struct Model {
     pub(super) family: &'static Family,
-    places: Vec<SettingSlot>,
+    slots: Vec<SettingSlot>,
     /// In the order of every vector of values.
     pub(super) free: Vec<Constant>,
 }
@@ -67,43 +67,43 @@ impl Exposure {
 
 impl Model {
     pub(super) fn new(family: &'static Family, options: &FitOptions) -> Result<Self> {
-        let mut places: Vec<SettingSlot> =
+        let mut slots: Vec<SettingSlot> =
             (0..family.constants.len()).map(SettingSlot::Shape).collect();
         match family.white {
             White::One => {}
             White::P90 if options.adapt || family.alpha > 0.0 || family.gain_c > 0.0 => {
-                places.extend([SettingSlot::Alpha, SettingSlot::GainC]);
+                slots.extend([SettingSlot::Alpha, SettingSlot::GainC]);
                 if family.law == OffsetMode::Rescaled {
-                    places.push(SettingSlot::BaseGain);
+                    slots.push(SettingSlot::BaseGain);
                 }
             }
             White::P90 => {}
             White::Mean | White::P80 | White::MeanLuminance | White::ChannelMeans => {
-                places.push(SettingSlot::Theta);
+                slots.push(SettingSlot::Theta);
             }
         }
-        if places.is_empty() {
+        if slots.is_empty() {
             return Err(Error::Usage(format!(
                 "the curve `{}` has no constants to fit",
                 family.name
             )));
         }
         let settings = ToneSettings::new(family.curve);
-        let own =
+        let starting_at =
             |constant: Constant, value: f64| Constant { default: value, start: value, ..constant };
-        let free = places.iter().map(|&place| match place {
+        let free = slots.iter().map(|&slot| match slot {
             SettingSlot::Shape(index) => family.constants[index],
-            SettingSlot::Theta => own(THETA, settings.theta),
-            SettingSlot::Alpha => own(ALPHA, settings.alpha),
-            SettingSlot::GainC => own(GAIN_C, settings.gain_c),
-            SettingSlot::BaseGain => own(BASE_GAIN, settings.base_gain),
+            SettingSlot::Theta => starting_at(THETA, settings.theta),
+            SettingSlot::Alpha => starting_at(ALPHA, settings.alpha),
+            SettingSlot::GainC => starting_at(GAIN_C, settings.gain_c),
+            SettingSlot::BaseGain => starting_at(BASE_GAIN, settings.base_gain),
         });
-        Ok(Self { free: free.collect(), family, places })
+        Ok(Self { free: free.collect(), family, slots })
     }
 
     /// Whether photographs with different statistics have different curves of t.
     pub(super) fn differs_by_photograph(&self) -> bool {
-        self.places.iter().any(|place| !matches!(place, SettingSlot::Shape(_)))
+        self.slots.iter().any(|slot| !matches!(slot, SettingSlot::Shape(_)))
     }
 
     /// Whether the channels of a photograph have different curves.
@@ -119,8 +119,8 @@ impl Model {
     /// The curve with these values.
     pub(super) fn settings(&self, values: &[f64]) -> ToneSettings {
         let mut settings = ToneSettings::new(self.family.curve);
-        for (&place, &value) in self.places.iter().zip(values) {
-            match place {
+        for (&slot, &value) in self.slots.iter().zip(values) {
+            match slot {
                 SettingSlot::Shape(index) => settings.constants[index] = value,
                 SettingSlot::Theta => settings.theta = value,
                 SettingSlot::Alpha => settings.alpha = value,
@@ -139,9 +139,9 @@ impl Model {
     /// [`Self::curve`] with its derivatives with respect to every value.
     pub(super) fn slopes(&self, values: &[f64], exposure: &Exposure) -> Slopes {
         let numbers = CurveInputs::<Dual>::from(&self.settings(values));
-        let by = |&place: &SettingSlot| {
+        let by = |&slot: &SettingSlot| {
             let mut numbers = numbers;
-            let variable = match place {
+            let variable = match slot {
                 SettingSlot::Shape(index) => &mut numbers.constants[index],
                 SettingSlot::Theta => &mut numbers.theta,
                 SettingSlot::Alpha => &mut numbers.alpha,
@@ -151,7 +151,7 @@ impl Model {
             variable.derivative = 1.0;
             self.curve_of(&numbers, exposure)
         };
-        Slopes(self.places.iter().map(by).collect())
+        Slopes(self.slots.iter().map(by).collect())
     }
 
     fn curve_of<T: Real>(&self, numbers: &CurveInputs<T>, exposure: &Exposure) -> Curve<T> {
@@ -210,7 +210,7 @@ fn counted(number: Dual) -> f64 {
 
 /// The PSNR over all pixels and channels of the dark photograph tone-mapped with `settings`, dB.
 pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
-    let model = Model { family: settings.curve.family(), places: vec![], free: vec![] };
+    let model = Model { family: settings.curve.family(), slots: vec![], free: vec![] };
     let numbers = CurveInputs::<f64>::from(settings);
     let [mut count, mut squares] = [0.0; 2];
     for (channel, histogram) in pair.channels.iter().enumerate() {
@@ -240,7 +240,7 @@ mod tests {
         for family in &FAMILIES {
             let settings = ToneSettings::new(family.curve);
             let parameters = settings.parameters(&statistics);
-            let model = Model { family, places: vec![], free: vec![] };
+            let model = Model { family, slots: vec![], free: vec![] };
             let numbers = CurveInputs::<f64>::from(&settings);
             for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
                 for channel in 0..3 {

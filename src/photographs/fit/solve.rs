@@ -232,12 +232,12 @@ impl<'a> Solver<'a> {
         }
         let total: f64 = rows.iter().map(|row| row.weight).sum();
         let start: Vec<f64> = self.model.free.iter().map(|constant| constant.start).collect();
-        let own = self.curves(&start);
+        let curves = self.curves(&start);
         let prior = self.options.prior / self.pairs.len() as f64;
         for row in &mut rows {
             row.weight /= total;
             if prior > 0.0 {
-                row.y = (row.y + prior * own[row.group].at(row.t)) / (1.0 + prior);
+                row.y = (row.y + prior * curves[row.group].at(row.t)) / (1.0 + prior);
             }
         }
         rows
@@ -248,21 +248,21 @@ impl<'a> Solver<'a> {
         let free = &self.model.free;
         let start: Vec<f64> = free.iter().map(|constant| constant.start).collect();
         let stream = Stream::new(u64::from(self.model.family.curve.constant()), 0);
-        let jittered = |place: usize| -> Vec<f64> {
+        let jittered = |draw: usize| -> Vec<f64> {
             let value = |(index, constant)| {
-                let normal = stream.normal((place * free.len() + index) as u64);
+                let normal = stream.normal((draw * free.len() + index) as u64);
                 within(constant, place_of(constant, constant_start(constant)) + 1.5 * normal)
             };
             free.iter().enumerate().map(value).collect()
         };
         let with_cost =
             |values: Vec<f64>| (self.problem(rows, &values, STRENGTHS[0]).cost(), values);
-        let mut places: Vec<(f64, Vec<f64>)> =
-            (0..PLACES).map(|place| with_cost(jittered(place))).collect();
-        places.push(with_cost(free.iter().map(|constant| constant.default).collect()));
-        places.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let tried = std::iter::once(start).chain(places.into_iter().map(|(_, place)| place));
-        let found = tried.take(1 + STARTS).map(|place| with_cost(self.minimize(rows, &place)));
+        let mut starts: Vec<(f64, Vec<f64>)> =
+            (0..PLACES).map(|draw| with_cost(jittered(draw))).collect();
+        starts.push(with_cost(free.iter().map(|constant| constant.default).collect()));
+        starts.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let tried = std::iter::once(start).chain(starts.into_iter().map(|(_, start)| start));
+        let found = tried.take(1 + STARTS).map(|start| with_cost(self.minimize(rows, &start)));
         found.min_by(|a, b| a.0.total_cmp(&b.0)).map_or_else(Vec::new, |(_, values)| values)
     }
 
@@ -328,9 +328,9 @@ fn place_of(constant: &Constant, value: f64) -> f64 {
 }
 
 /// Inverse of [`place_of`].
-fn within(constant: &Constant, place: f64) -> f64 {
+fn within(constant: &Constant, position: f64) -> f64 {
     let [low, high] = constant.bounds;
-    low + (high - low) / (1.0 + (-place).exp())
+    low + (high - low) / (1.0 + (-position).exp())
 }
 
 /// The value below which `share` of the counts are, from (value, count); 0 if empty.
@@ -384,8 +384,11 @@ impl LeastSquaresProblem<f64, Dyn, Dyn> for Problem<'_> {
 
     fn set_params(&mut self, position: &DVector<f64>) {
         let free = &self.solver.model.free;
-        self.values =
-            free.iter().zip(position).map(|(constant, &place)| within(constant, place)).collect();
+        self.values = free
+            .iter()
+            .zip(position)
+            .map(|(constant, &position)| within(constant, position))
+            .collect();
         self.position.clone_from(position);
     }
 

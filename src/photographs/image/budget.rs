@@ -83,8 +83,8 @@ mod tests {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/jpeg/420.jpg");
         let mut bytes = std::fs::read(path).unwrap();
         let at = bytes.windows(2).position(|marker| marker == [0xFF, 0xC1]).unwrap();
-        for place in [at + 5, at + 7] {
-            bytes[place..place + 2].copy_from_slice(&side.to_be_bytes());
+        for side_at in [at + 5, at + 7] {
+            bytes[side_at..side_at + 2].copy_from_slice(&side.to_be_bytes());
         }
         bytes
     }

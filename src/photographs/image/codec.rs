@@ -117,8 +117,8 @@ pub(crate) mod openings {
     /// The counts of the files below a folder.
     pub(crate) fn below(folder: &Path) -> Vec<(PathBuf, usize)> {
         let counts = COUNTS.lock().unwrap();
-        let own = counts.iter().filter(|(path, _)| path.starts_with(folder));
-        own.map(|(path, count)| (path.clone(), *count)).collect()
+        let within = counts.iter().filter(|(path, _)| path.starts_with(folder));
+        within.map(|(path, count)| (path.clone(), *count)).collect()
     }
 }
 

@@ -341,6 +341,8 @@ fn known_name(matrix: DMat3) -> Option<&'static str> {
         ];
         profiles.map(|(name, profile)| (name, from_d50(colorants(&profile))))
     });
-    let is_near = |own: Option<DMat3>| own.is_some_and(|own| own.abs_diff_eq(matrix, 0.01));
-    known.iter().find(|(_, own)| is_near(*own)).map(|(name, _)| *name)
+    let is_near = |primaries: Option<DMat3>| {
+        primaries.is_some_and(|primaries| primaries.abs_diff_eq(matrix, 0.01))
+    };
+    known.iter().find(|(_, primaries)| is_near(*primaries)).map(|(name, _)| *name)
 }

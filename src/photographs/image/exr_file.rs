@@ -69,7 +69,7 @@ fn decoded(path: &Path, bytes: Vec<u8>) -> Result<(Image, Option<Chromaticities>
         .from_buffered(bytes)
         .map_err(|error| not_an_image(path, &error))?;
     let chromaticities = image.attributes.chromaticities.map(|of| {
-        [of.white, of.red, of.green, of.blue].map(|place| [place.0, place.1].map(f64::from))
+        [of.white, of.red, of.green, of.blue].map(|pair| [pair.0, pair.1].map(f64::from))
     });
     let layer = image.layer_data;
     let pixels = layer.size.width() * layer.size.height();

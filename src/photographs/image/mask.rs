@@ -71,13 +71,13 @@ impl Mask {
         let inverted = inverted != *is_inverted;
         let mut mask = Image::load_as_stored(file)?;
         let size = (image.width, image.height);
-        let (own, upright) = ((mask.width, mask.height), Orientation::of(photograph).size(size));
+        let (shape, upright) = ((mask.width, mask.height), Orientation::of(photograph).size(size));
         let is_of_shape = |(width, height): (u32, u32)| {
-            let [a, b] = [own.0 * height, own.1 * width].map(f64::from);
-            (a - b).abs() <= f64::from(width.max(height).max(own.0).max(own.1))
+            let [a, b] = [shape.0 * height, shape.1 * width].map(f64::from);
+            (a - b).abs() <= f64::from(width.max(height).max(shape.0).max(shape.1))
         };
         if !is_of_shape(size) {
-            let ((w, h), (width, height)) = (own, size);
+            let ((w, h), (width, height)) = (shape, size);
             let problem = if upright != size && is_of_shape(upright) {
                 format!(
                     "is {w}x{h}, its photograph {width}x{height} as stored; save the mask in the stored orientation"
@@ -164,10 +164,10 @@ impl Mask {
 
     /// The planes of an image without the masked pixels.
     pub(crate) fn counted(&self, image: &Image) -> Vec<f32> {
-        let own = self.resized(image.width, image.height);
+        let mask = self.resized(image.width, image.height);
         let pixels = image.pixel_count().max(1);
         let values = image.data.iter().enumerate();
-        values.filter(|(at, _)| own.weights[at % pixels] >= 0.5).map(|(_, &value)| value).collect()
+        values.filter(|(at, _)| mask.weights[at % pixels] >= 0.5).map(|(_, &value)| value).collect()
     }
 }
 

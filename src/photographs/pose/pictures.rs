@@ -24,7 +24,7 @@ impl Pictures {
     /// The name of a photograph's copy, relative to the folder of all.
     pub(super) fn name(&self, photograph: &Path) -> String {
         let name = tone_mapped::name(photograph);
-        let is_bright = self.bright.iter().any(|own| own == photograph);
+        let is_bright = self.bright.iter().any(|bright| bright == photograph);
         if is_bright { format!("{BRIGHT}/{name}") } else { name }
     }
 }

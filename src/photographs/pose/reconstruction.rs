@@ -12,8 +12,7 @@ use crate::photographs::dataset::Dataset;
 use crate::{Error, Result};
 
 /// The pairs of photographs that COLMAP matches.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Matcher {
     /// Every pair
     Exhaustive,
@@ -31,8 +30,7 @@ impl Matcher {
 }
 
 /// The mapper that registers cameras.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Mapper {
     /// One by one (COLMAP's mapper)
     Incremental,
@@ -288,7 +286,7 @@ impl<'a> Reconstruction<'a> {
         report: &dyn Fn(Progress<'_>),
     ) -> Result<()> {
         for (_, name, value) in self.user_options.iter().filter(|(of, ..)| *of == command) {
-            options.retain(|(own, _)| own != name);
+            options.retain(|(option, _)| option != name);
             options.push((name.clone(), value.into()));
         }
         let options: Vec<[OsString; 2]> =

@@ -111,10 +111,11 @@ impl Unfinished {
         for file in ["cameras.bin", "points3D.bin"] {
             link_or_copy(&model.join(file), &sparse)?;
         }
+        let images = model.join("images.bin");
         match renamed {
-            None => link_or_copy(&model.join("images.bin"), &sparse)?,
+            None => link_or_copy(&images, &sparse)?,
             Some(renamed) => {
-                let images = Dataset::images_renamed(model, renamed)?;
+                let images = Dataset::images_renamed(&images, renamed)?;
                 write_whole(&sparse.join("images.bin"), &images)?;
             }
         }

@@ -31,7 +31,7 @@ impl Freeze {
     /// Whether the shape of a Gaussian is frozen, or its place: then none is added, moved or pruned.
     pub(crate) fn has_geometry(&self) -> bool {
         use Attribute::{LogScales, Means, Quats, RawOpacities};
-        [Means, Quats, LogScales, RawOpacities].iter().any(|own| self.has(*own))
+        [Means, Quats, LogScales, RawOpacities].iter().any(|attribute| self.has(*attribute))
     }
 
     /// The columns of the attributes, from the first, that are frozen without a gap: no pass touches their gradients
@@ -49,11 +49,11 @@ impl FromStr for Freeze {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self, Error> {
-        let attribute = |own: &str| {
-            let is_own = |spec: &&AttributeSpec| own == name(spec) || own == spec.name;
-            ATTRIBUTES.iter().find(is_own).map(|spec| spec.attribute)
+        let attribute = |text: &str| {
+            let is_named = |spec: &&AttributeSpec| text == name(spec) || text == spec.name;
+            ATTRIBUTES.iter().find(is_named).map(|spec| spec.attribute)
         };
-        let named: Option<Vec<_>> = text.split(',').map(|own| attribute(own.trim())).collect();
+        let named: Option<Vec<_>> = text.split(',').map(|text| attribute(text.trim())).collect();
         let frozen =
             named.filter(|named| ATTRIBUTES.iter().any(|spec| !named.contains(&spec.attribute)));
         frozen.map(Self).ok_or_else(|| Error::Setting {

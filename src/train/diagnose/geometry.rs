@@ -173,7 +173,7 @@ pub(in crate::train) fn exposures_at_points(dataset: &Dataset) -> Result<BTreeMa
         dataset.views.iter().enumerate().filter(|(_, view)| view.is_for_training()).collect();
     let shared = Shared::of(dataset, &views)?;
     let named = views.iter().zip(shared.exposures);
-    Ok(named.filter_map(|((_, view), own)| Some((view.name.clone(), own?))).collect())
+    Ok(named.filter_map(|((_, view), value)| Some((view.name.clone(), value?))).collect())
 }
 
 /// Alternating medians: a point's brightness over its views, a view's exposure over its points. Only the brighter half

@@ -134,8 +134,8 @@ impl Left {
     fn of(rows: &Rows) -> Self {
         let left = |terms, with_exposures| {
             let of_fold = |fold: usize| {
-                let fit = rows.part(|place| place % FOLDS != fold).fit(terms, with_exposures);
-                rows.part(|place| place % FOLDS == fold).residuals(&fit)
+                let fit = rows.part(|group| group % FOLDS != fold).fit(terms, with_exposures);
+                rows.part(|group| group % FOLDS == fold).residuals(&fit)
             };
             trimmed_variance((0..FOLDS).into_par_iter().flat_map_iter(of_fold).collect())
         };

@@ -64,14 +64,14 @@ pub(super) fn patches(plane: &[f32], width: usize, step: f64) -> Vec<Patch> {
     const MOST: usize = 12_000;
     let (columns, rows) = (width / SIDE, plane.len() / width.max(1) / SIDE);
     let stride = (columns * rows).div_ceil(MOST).max(1);
-    let places = (0..columns * rows).step_by(stride);
-    let patch = |place: usize| {
-        let first = place / columns * SIDE * width + place % columns * SIDE;
+    let indices = (0..columns * rows).step_by(stride);
+    let patch = |index: usize| {
+        let first = index / columns * SIDE * width + index % columns * SIDE;
         let row = |y: usize| &plane[first + y * width..][..SIDE];
         patch(std::array::from_fn(row), step)
     };
     // A patch that reaches white is clipped.
-    places.map(patch).filter(|patch| patch.signal.is_finite()).collect()
+    indices.map(patch).filter(|patch| patch.signal.is_finite()).collect()
 }
 
 fn patch(rows: [&[f32]; SIDE], step: f64) -> Patch {

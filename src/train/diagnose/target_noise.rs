@@ -43,9 +43,9 @@ impl TargetNoise {
 pub(super) fn target_noise(image: &Image, exposure: &Exposure) -> Option<TargetNoise> {
     let (columns, rows) = (image.width / SIDE, image.height / SIDE);
     let step = (columns * rows).div_ceil(MOST).max(1) as usize;
-    let places = (0..columns * rows).step_by(step);
-    let mut patches: Vec<Patch> = places
-        .map(|place| Patch::of(image, [place % columns * SIDE, place / columns * SIDE], exposure))
+    let indices = (0..columns * rows).step_by(step);
+    let mut patches: Vec<Patch> = indices
+        .map(|index| Patch::of(image, [index % columns * SIDE, index / columns * SIDE], exposure))
         .collect();
     patches.sort_unstable_by(|a, b| a.brightness.total_cmp(&b.brightness));
     let quarter = patches.len() / 4;
@@ -162,7 +162,7 @@ mod tests {
         // In the middle of the flat half; the curve is nearly linear over the noise.
         let slope = (soft(0.051, gain) - soft(0.049, gain)) / 0.002;
         let kept = (soft(0.05, gain) - soft(0.0, gain)) / 0.05;
-        let own = 2.0 / 3.0 * slope + kept / 3.0;
+        let kept_slope = 2.0 / 3.0 * slope + kept / 3.0;
         let weights = [0.299, 0.587, 0.114];
         let squares = |of: [f64; 3]| of.iter().map(|weight| weight * weight).sum::<f64>().sqrt();
         let chroma = |channel: usize| {
@@ -173,7 +173,7 @@ mod tests {
         let chroma = (0.5 * (chroma(0).powi(2) + chroma(2).powi(2))).sqrt();
         let found = found(&image);
         assert!((found.luma / (0.002 * slope * squares(weights)) - 1.0).abs() < 0.15, "{found:?}");
-        assert!((found.chroma / (0.002 * own * chroma) - 1.0).abs() < 0.15, "{found:?}");
+        assert!((found.chroma / (0.002 * kept_slope * chroma) - 1.0).abs() < 0.15, "{found:?}");
     }
 
     #[test]

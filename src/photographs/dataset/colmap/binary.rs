@@ -44,7 +44,7 @@ pub(super) fn images(path: &Path) -> Result<Vec<ModelImage>> {
 
 /// The file of images with those that `renamed` gives a name, under that name.
 #[cfg(feature = "cli")]
-pub(super) fn images_renamed(
+pub(in crate::photographs::dataset) fn images_renamed(
     path: &Path,
     renamed: impl Fn(&str) -> Option<String>,
 ) -> Result<Vec<u8>> {

@@ -51,9 +51,10 @@ pub(super) fn is_marked_bad(frame: &Map<String, Value>) -> bool {
     let says = |keys: &[&str], value: bool| {
         let mut is_marked = false;
         for key in keys {
-            let own =
-                frame.get(*key).and_then(|own| own.as_bool().or(own.as_u64().map(|own| own != 0)));
-            is_marked |= own == Some(value);
+            let mark = frame
+                .get(*key)
+                .and_then(|mark| mark.as_bool().or(mark.as_u64().map(|mark| mark != 0)));
+            is_marked |= mark == Some(value);
         }
         is_marked
     };

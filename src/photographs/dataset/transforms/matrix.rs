@@ -115,8 +115,8 @@ mod tests {
 
     fn rows(matrix: DMat3, translation: DVec3) -> Rows {
         let row = |row: usize| {
-            let own = matrix.row(row);
-            [own.x, own.y, own.z, translation[row]].map(Some).to_vec()
+            let [x, y, z] = matrix.row(row).to_array();
+            [x, y, z, translation[row]].map(Some).to_vec()
         };
         vec![row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0].map(Some).to_vec()]
     }

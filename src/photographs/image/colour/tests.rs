@@ -279,8 +279,8 @@ fn an_exr_of_other_primaries_is_converted_unless_it_contains_numbers() {
         (red, green, blue)
     });
     let mut image = exr::image::Image::from_channels((COLOURS.len(), 1), channels);
-    let place = |[x, y]: [f64; 2]| Vec2(x as f32, y as f32);
-    let [white, red, green, blue] = P3.map(place);
+    let pair = |[x, y]: [f64; 2]| Vec2(x as f32, y as f32);
+    let [white, red, green, blue] = P3.map(pair);
     image.attributes.chromaticities =
         Some(exr::meta::attribute::Chromaticities { red, green, blue, white });
     image.write().to_file(&path).unwrap();

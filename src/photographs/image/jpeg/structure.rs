@@ -68,20 +68,20 @@ impl Definitions {
 
     /// DQT.
     fn define_quantization(&mut self, mut segment: &[u8]) -> Option<()> {
-        while let [place, rest @ ..] = segment {
-            *self.quantization.get_mut(usize::from(place & 15))? = true;
-            segment = rest.get(if place >> 4 == 0 { 64 } else { 128 }..)?;
+        while let [number, rest @ ..] = segment {
+            *self.quantization.get_mut(usize::from(number & 15))? = true;
+            segment = rest.get(if number >> 4 == 0 { 64 } else { 128 }..)?;
         }
         Some(())
     }
 
     /// DHT.
     fn define_codes(&mut self, mut segment: &[u8]) -> Option<()> {
-        while let [place, rest @ ..] = segment {
+        while let [number, rest @ ..] = segment {
             let (counts, rest) = rest.split_first_chunk::<16>()?;
             let count = counts.iter().map(|&count| usize::from(count)).sum();
             let (symbols, rest) = rest.split_at_checked(count)?;
-            let class = usize::from(place >> 4);
+            let class = usize::from(number >> 4);
             // The codes of one length follow those of shorter ones; the code of all ones is reserved.
             let mut next = 0;
             for (length, &count) in (1..).zip(counts) {
@@ -94,7 +94,7 @@ impl Definitions {
             if count > 256 || class == 0 && symbols.iter().any(|&bits| bits > 11) {
                 return None;
             }
-            *self.codes.get_mut(class)?.get_mut(usize::from(place & 15))? = true;
+            *self.codes.get_mut(class)?.get_mut(usize::from(number & 15))? = true;
             segment = rest;
         }
         Some(())
@@ -117,7 +117,8 @@ impl Definitions {
         let most = |axis: usize| components.iter().map(|c| c.sampling[axis]).max();
         let sampling = [most(0)?, most(1)?];
         // Upsampling factors are whole numbers.
-        let is_whole = |own: usize, most: usize| (1..=4).contains(&own) && most.is_multiple_of(own);
+        let is_whole =
+            |factor: usize, most: usize| (1..=4).contains(&factor) && most.is_multiple_of(factor);
         let has_own_id = |(i, c): (usize, &Component)| components[..i].iter().all(|o| o.id != c.id);
         if self.frame.is_some()
             || components.len() != usize::from(*count)
@@ -163,12 +164,12 @@ impl Definitions {
         for &[id, codes] in selected.as_chunks().0 {
             // In the order of the frame.
             let component = after.find(|component| component.id == id)?;
-            let places = [codes >> 4, codes & 15].map(usize::from);
+            let numbers = [codes >> 4, codes & 15].map(usize::from);
             let is_quantized = self.quantization.get(usize::from(component.quantization));
             if !*is_progressive && component.has_scan
                 || is_quantized != Some(&true)
                 || (0..2).any(|class| {
-                    reads[class] && self.codes[class].get(places[class]) != Some(&true)
+                    reads[class] && self.codes[class].get(numbers[class]) != Some(&true)
                 })
             {
                 return None;

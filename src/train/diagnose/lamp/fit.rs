@@ -96,10 +96,10 @@ impl Rows {
         Self { view, light, distance, off_axis, groups, views, d_ref }
     }
 
-    /// The points at the places that a predicate takes.
+    /// The points of the groups whose indices a predicate takes.
     pub(super) fn part(&self, takes: impl Fn(usize) -> bool) -> Self {
         let mut part = Self::empty(self.views, self.d_ref);
-        for (_, rows) in self.groups.iter().enumerate().filter(|(place, _)| takes(*place)) {
+        for (_, rows) in self.groups.iter().enumerate().filter(|(group, _)| takes(*group)) {
             let start = part.view.len();
             part.view.extend_from_slice(&self.view[rows.clone()]);
             part.light.extend_from_slice(&self.light[rows.clone()]);
@@ -127,14 +127,15 @@ impl Rows {
         for round in 0..rounds {
             // The linear terms come first, so that the others start close to their values.
             let is_on = |term: usize| terms[term] && (LOG_LINEAR[term] || round >= LINEAR_ROUNDS);
-            let (own, _) = left(coefficients, &weights);
+            let (residuals, _) = left(coefficients, &weights);
             let mut slopes = self.slopes(coefficients);
             for (_, slope) in slopes.iter_mut().enumerate().filter(|(term, _)| is_on(*term)) {
                 self.project(slope, &weights, with_exposures);
             }
-            let next = minimum(&slopes, &own, &weights, coefficients, is_on);
-            let loss =
-                |own: &[f64]| -> f64 { own.iter().zip(&weights).map(|(r, w)| w * r * r).sum() };
+            let next = minimum(&slopes, &residuals, &weights, coefficients, is_on);
+            let loss = |residuals: &[f64]| -> f64 {
+                residuals.iter().zip(&weights).map(|(r, w)| w * r * r).sum()
+            };
             // The first of ever shorter steps that gains.
             let steps = (0..6).map(|halvings| {
                 let step = 0.5_f64.powi(halvings);
@@ -142,15 +143,15 @@ impl Rows {
                 let shorter = std::array::from_fn(between);
                 (shorter, left(shorter, &weights).0)
             });
-            let before = loss(&own);
-            let gained = steps.into_iter().find(|(_, own)| loss(own) < before);
-            let own = gained.map_or(own, |(shorter, own)| {
+            let before = loss(&residuals);
+            let gained = steps.into_iter().find(|(_, residuals)| loss(residuals) < before);
+            let residuals = gained.map_or(residuals, |(shorter, residuals)| {
                 coefficients = shorter;
-                own
+                residuals
             });
-            let scale = 1.4826 * median(own.iter().map(|r| r.abs()).collect()).unwrap_or(0.0);
-            for (weight, own) in weights.iter_mut().zip(&own) {
-                *weight = (HUBER * scale / own.abs().max(1e-9)).clamp(1e-6, 1.0);
+            let scale = 1.4826 * median(residuals.iter().map(|r| r.abs()).collect()).unwrap_or(0.0);
+            for (weight, residual) in weights.iter_mut().zip(&residuals) {
+                *weight = (HUBER * scale / residual.abs().max(1e-9)).clamp(1e-6, 1.0);
             }
         }
         Fit { coefficients, exposures: left(coefficients, &weights).1 }
@@ -172,9 +173,9 @@ impl Rows {
     /// A column about the median of each point.
     fn less_point(&self, column: Vec<f64>) -> Vec<f64> {
         let of_point = |rows: &Range<usize>| {
-            let own = &column[rows.clone()];
-            let middle = median(own.to_vec()).unwrap_or(0.0);
-            own.iter().map(move |one| one - middle).collect::<Vec<_>>()
+            let group = &column[rows.clone()];
+            let middle = median(group.to_vec()).unwrap_or(0.0);
+            group.iter().map(move |one| one - middle).collect::<Vec<_>>()
         };
         self.groups.iter().flat_map(of_point).collect()
     }
@@ -213,8 +214,8 @@ impl Rows {
         let unseen = |view: usize| with_views && total[view] <= 0.0;
         for _ in 0..ROUNDS {
             for rows in &self.groups {
-                let own = column[rows.clone()].iter().zip(&weights[rows.clone()]);
-                let [sum, weight] = own
+                let weighted = column[rows.clone()].iter().zip(&weights[rows.clone()]);
+                let [sum, weight] = weighted
                     .fold([0.0; 2], |[sum, all], (one, weight)| [sum + weight * one, all + weight]);
                 column[rows.clone()].iter_mut().for_each(|one| *one -= sum / weight);
             }

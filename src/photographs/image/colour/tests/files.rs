@@ -54,8 +54,8 @@ pub(super) fn to_d50([white, red, green, blue]: [[f64; 2]; 4]) -> DMat3 {
 
 /// A linear sRGB colour encoded in another space.
 pub(super) fn encoded(linear: [f64; 3], space: [[f64; 2]; 4], curve: Encoding) -> [f64; 3] {
-    let own = to_d50(space).inverse() * to_d50(SRGB) * DVec3::from_array(linear);
-    own.to_array().map(|value| curve.encode(value))
+    let seen = to_d50(space).inverse() * to_d50(SRGB) * DVec3::from_array(linear);
+    seen.to_array().map(|value| curve.encode(value))
 }
 
 fn fixed(value: f64) -> [u8; 4] {
@@ -279,11 +279,11 @@ pub(super) fn exif(space: Option<u16>, index: Option<&[u8; 4]>) -> (u8, Vec<u8>)
         [bytes, vec![0; 4]].concat()
     };
     // IFD 0, at 8, has one entry and 18 bytes; the Exif IFD follows, then the interoperability IFD.
-    let mut own = vec![];
+    let mut below = vec![];
     let at = 26 + 6 + 12 * (u32::from(space.is_some()) + u32::from(index.is_some()));
-    own.extend(space.map(|space| (0xA001, 3, 1, u32::from(space).to_le_bytes())));
-    own.extend(index.map(|_| (0xA005, 4, 1, at.to_le_bytes())));
+    below.extend(space.map(|space| (0xA001, 3, 1, u32::from(space).to_le_bytes())));
+    below.extend(index.map(|_| (0xA005, 4, 1, at.to_le_bytes())));
     let first = directory(&[(0x8769, 4, 1, 26_u32.to_le_bytes())]);
     let inter = index.map(|index| directory(&[(1, 2, 4, *index)])).unwrap_or_default();
-    (0xE1, [b"Exif\0\0II*\0\x08\0\0\0".to_vec(), first, directory(&own), inter].concat())
+    (0xE1, [b"Exif\0\0II*\0\x08\0\0\0".to_vec(), first, directory(&below), inter].concat())
 }
