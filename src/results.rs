@@ -16,6 +16,7 @@
 //! - [`view_exposures`]: renders at the exposure of their targets
 //! - [`video`]: frames as a video
 //! - [`export`]: a model in other formats
+//! - [`run_export`]: the export of a run
 //! - [`edit`]: changes of a model
 
 pub mod colour_map;
@@ -30,6 +31,7 @@ pub mod linear_light;
 pub mod models;
 pub mod report;
 pub mod run;
+pub mod run_export;
 pub mod run_facts;
 pub mod video;
 pub mod view_exposures;

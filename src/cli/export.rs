@@ -9,11 +9,11 @@ use crate::Error;
 use crate::base::output::check_writable;
 use crate::camera::frame::relative_to;
 use crate::gpu::DeviceChoice;
-use crate::results::export::run::{ExportOptions, Exported};
 use crate::results::export::streamed::{self, Division, MAX_LEVELS, Written};
-use crate::results::export::up::{Turn, Up};
 use crate::results::export::{Format, spz};
 use crate::results::finished_run::is_model;
+use crate::results::run_export::up::{Turn, Up};
+use crate::results::run_export::{ExportOptions, Exported};
 
 /// Write a run's model in the format of a viewer, as bright as it was trained to be.
 #[derive(Clone, Debug, clap::Args)]

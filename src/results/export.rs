@@ -7,15 +7,9 @@
 pub mod glb;
 pub mod page;
 mod palette;
-#[cfg(feature = "cli")]
-pub(crate) mod run;
-#[cfg(feature = "cli")]
-mod run_page;
 pub mod sog;
 pub mod spz;
 pub mod streamed;
-#[cfg(feature = "cli")]
-pub(crate) mod up;
 
 use std::io::Write as _;
 use std::path::Path;

@@ -7,7 +7,7 @@ use clap::{Arg, ArgAction, ArgMatches, Args, Command, Error, FromArgMatches};
 use glam::DVec3;
 
 use crate::results::edit::{Operation, Region, Scale};
-use crate::results::export::up::Up;
+use crate::results::run_export::up::Up;
 
 /// Operations in the order of the command line.
 #[derive(Clone, Debug)]

@@ -18,9 +18,9 @@ pub(super) struct Shot {
     pub(super) orientation: Orientation,
 }
 
-/// Frames of a path that says no number.
+/// The number of frames, unless the path states it.
 const FRAMES: usize = 120;
-/// Frames per second of a path that says none.
+/// Frames per second, unless the path states them.
 const FPS: u16 = 30;
 
 /// The images to render, and the frames per second of their video.

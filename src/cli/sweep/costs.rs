@@ -6,7 +6,7 @@ use serde_json::{Map, Value, json};
 
 use super::rows::{Row, Rows};
 use super::runner::Failure;
-use super::table::{DEVICE, HOST, JOULES, PROCESSOR, PSNR, Quantity, SECONDS, SSIM, Statistic};
+use super::table::{KEYS, Quantity, Statistic};
 use crate::Result;
 use crate::base::output::write_whole;
 use crate::results::report::{Chart, Mark, Report, Series, Table};
@@ -21,21 +21,21 @@ const SHOWN_DECIBELS: f64 = 3.0;
 /// More rows than this are numbered in plots, where their names would not fit.
 const MAX_NAMES: usize = 8;
 
-/// The plots: cost and score.
-const FRONTS: [(Quantity, Quantity); 8] = [
-    (SECONDS, PSNR),
-    (SECONDS, SSIM),
-    (PROCESSOR, PSNR),
-    (PROCESSOR, SSIM),
-    (JOULES, PSNR),
-    (JOULES, SSIM),
-    (DEVICE, PSNR),
-    (HOST, PSNR),
+/// The charts: the keys of cost and score.
+const FRONTS: [[&str; 2]; 8] = [
+    ["seconds", "psnr"],
+    ["seconds", "ssim"],
+    ["processor_seconds", "psnr"],
+    ["processor_seconds", "ssim"],
+    ["joules", "psnr"],
+    ["joules", "ssim"],
+    ["device_bytes", "psnr"],
+    ["host_bytes", "psnr"],
 ];
 
-/// The fronts in CSV and JSON.
-const NAMED_FRONTS: [(&str, Quantity); 2] =
-    [("on_front", SECONDS), ("on_processor_front", PROCESSOR)];
+/// The fronts of PSNR in CSV and JSON, with the keys of their costs.
+const NAMED_FRONTS: [[&str; 2]; 2] =
+    [["on_front", "seconds"], ["on_processor_front", "processor_seconds"]];
 
 /// Indices of the Pareto-optimal points (cost, gain), cheapest first. Of equal points, the first is taken.
 fn front(points: &[(f64, f64)]) -> Vec<usize> {
@@ -67,7 +67,7 @@ impl Rows {
         let time = "Time is that of the steps, without loading and scoring. The dotted line is the Pareto \
          front: the best score for each cost. Discs are points on it, rings are not.";
         let mut intro = vec![format!("{time} {energy}")];
-        let on_front = self.front_of(&SECONDS, &PSNR);
+        let on_front = self.front_of(["seconds", "psnr"]);
         let names = on_front.into_iter().map(|index| self.label(&self.rows[index], None));
         let names = names.collect::<Vec<_>>().join("; ");
         if !names.is_empty() {
@@ -86,16 +86,18 @@ impl Rows {
         write_whole(&html, report.html_charts_first().as_bytes())
     }
 
-    fn front_of(&self, cost: &Quantity, gain: &Quantity) -> Vec<usize> {
-        let value = |row: &Row, of: &Quantity| row.mean(&of.pointer).unwrap_or(f64::NAN);
-        let points = self.rows.iter().map(|row| (value(row, cost), value(row, gain)));
+    /// The Pareto front of the keys of a cost and a score.
+    fn front_of(&self, keys: [&str; 2]) -> Vec<usize> {
+        let [cost, gain] = keys.map(Quantity::new);
+        let value = |row: &Row, of: &Quantity| of.mean(row).unwrap_or(f64::NAN);
+        let points = self.rows.iter().map(|row| (value(row, &cost), value(row, &gain)));
         front(&points.collect::<Vec<_>>())
     }
 
     /// The quantities that any row has.
     fn quantities(&self, statistic: Statistic) -> Vec<(Quantity, Statistic)> {
         let has = |of: &Quantity| self.rows.iter().any(|row| of.mean(row).is_some());
-        Quantity::all().into_iter().filter(has).map(|of| (of, statistic)).collect()
+        KEYS.map(Quantity::new).into_iter().filter(has).map(|of| (of, statistic)).collect()
     }
 
     /// All rows with all quantities.
@@ -113,7 +115,7 @@ impl Rows {
         let quantities = self.quantities(Statistic::Gain);
         let mut table = self.table(&format!("The difference to {name}"), &quantities);
         for (column, (quantity, _)) in table.columns.iter_mut().zip(&quantities) {
-            column.name = quantity.name.to_string();
+            column.name.clone_from(&quantity.name);
         }
         let mut rows = self.rows.iter();
         table.rows.retain(|_| rows.next().is_some_and(|row| row.point != base.point));
@@ -121,14 +123,15 @@ impl Rows {
     }
 
     fn cost_charts(&self) -> Vec<Chart> {
-        let fronts = FRONTS.into_iter().filter_map(|(cost, gain)| self.front_chart(&cost, &gain));
+        let fronts = FRONTS.into_iter().filter_map(|keys| self.front_chart(keys));
         fronts.chain(self.on_the_way()).collect()
     }
 
     /// Final score against cost; `None` unless two rows have both.
-    fn front_chart(&self, cost: &Quantity, gain: &Quantity) -> Option<Chart> {
+    fn front_chart(&self, keys: [&str; 2]) -> Option<Chart> {
+        let [cost, gain] = keys.map(Quantity::new);
         let point = |row: &Row| Some((cost.mean(row)?, gain.mean(row)?));
-        let front = self.front_of(cost, gain);
+        let front = self.front_of(keys);
         let series = |(index, row): (usize, &Row)| Series {
             points: point(row).into_iter().collect(),
             mark: if front.contains(&index) { Mark::Disc } else { Mark::Ring },
@@ -154,9 +157,8 @@ impl Rows {
             Series { points, mark: Mark::Disc, ..self.series(index) }
         };
         let drawn: Vec<Series> = self.rows.iter().enumerate().take(MAX_NAMES).map(series).collect();
-        let y_name = format!("{} during training", PSNR.name);
         let has_lines = drawn.iter().any(|series| series.points.len() > 1);
-        let chart = Chart::new(&SECONDS.name, &y_name, drawn);
+        let chart = Chart::new("time, s", "PSNR, dB during training", drawn);
         has_lines.then_some(Chart { is_logarithmic: true, ..chart })
     }
 
@@ -172,9 +174,9 @@ impl Rows {
     /// against wall time and processor time.
     fn costs_csv(&self) -> String {
         let mut columns = vec![self.csv_column("runs", |_, row| row.metrics.len().to_string())];
-        columns.extend(Quantity::all().iter().flat_map(|of| self.csv_numbers(of, true)));
-        for (name, cost) in NAMED_FRONTS {
-            let front = self.front_of(&cost, &PSNR);
+        columns.extend(KEYS.iter().flat_map(|key| self.csv_numbers(key, true)));
+        for [name, cost] in NAMED_FRONTS {
+            let front = self.front_of([cost, "psnr"]);
             columns.push(self.csv_column(name, |index, _| front.contains(&index).to_string()));
         }
         self.csv(columns)
@@ -182,13 +184,13 @@ impl Rows {
 
     /// All quantities as JSON, with the differences to the baseline.
     pub(super) fn json(&self, dataset: &Path, failures: &[Failure]) -> Value {
-        let scores = self.scores.iter().map(|score| Quantity::score(score));
-        let quantities: Vec<Quantity> = Quantity::all().into_iter().chain(scores).collect();
+        let keys = KEYS.into_iter().chain(self.scores.iter().map(String::as_str));
+        let quantities: Vec<Quantity> = keys.map(Quantity::new).collect();
         let of = |value: &dyn Fn(&str) -> Option<f64>| {
-            let entry = |of: &Quantity| (of.key.to_string(), json!(value(&of.pointer)));
+            let entry = |of: &Quantity| (of.key.clone(), json!(value(&of.pointer)));
             quantities.iter().map(entry).collect::<Map<_, _>>()
         };
-        let fronts = NAMED_FRONTS.map(|(name, cost)| (name, self.front_of(&cost, &PSNR)));
+        let fronts = NAMED_FRONTS.map(|[name, cost]| (name, self.front_of([cost, "psnr"])));
         let baseline = self.baseline();
         let point = |(index, row): (usize, &Row)| {
             let mut entry = json!({

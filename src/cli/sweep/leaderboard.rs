@@ -6,7 +6,7 @@ use super::point::{ADAPTIVE, OFFSET};
 use super::rows::{Row, Rows};
 use super::run::Run;
 use super::runner::Failure;
-use super::table::{CsvColumn, GAUSSIANS, PSNR, Quantity, Statistic};
+use super::table::{CsvColumn, Quantity, Statistic};
 use crate::Result;
 use crate::base::output::{csv_field, write_whole};
 use crate::gpu::Gpu;
@@ -18,6 +18,9 @@ use crate::results::report::{Chart, Column, Comparison, Mark, Picture, Report, S
 
 /// The files of a leaderboard.
 pub(super) const FILES: [&str; 3] = ["leaderboard.csv", "leaderboard.md", "index.html"];
+
+/// The heading of the charted score.
+const PSNR: &str = "PSNR, dB";
 
 /// Lines in a plot beyond which they cannot be told apart.
 const MAX_LINES: usize = 8;
@@ -53,13 +56,13 @@ impl Leaderboard<'_> {
         let Rows { keys, rows, scores, .. } = self.rows;
         let has_seeds = self.rows.has_seeds();
         let mut columns = vec![];
-        for quantity in scores.iter().map(|score| Quantity::score(score)) {
+        for quantity in scores.iter().map(|score| Quantity::new(score)) {
             columns.push((quantity.clone(), Statistic::Mean));
             columns.extend(has_seeds.then(|| (quantity.clone(), Statistic::Deviation)));
             let gain = self.rows.baseline().map(|_| (quantity, Statistic::Gain));
             columns.extend(gain);
         }
-        columns.push((GAUSSIANS, Statistic::Mean));
+        columns.push((Quantity::new("gaussians"), Statistic::Mean));
         let mut table = self.rows.table("Means over the test views", &columns);
         if let [key] = &keys[..] {
             table.label.clone_from(key);
@@ -76,10 +79,9 @@ impl Leaderboard<'_> {
     fn csv(&self) -> String {
         let Rows { rows, scores, .. } = self.rows;
         let has_seeds = self.rows.has_seeds();
-        let scores = scores.iter().map(|score| Quantity::score(score));
-        let mut columns: Vec<CsvColumn> =
-            scores.flat_map(|score| self.rows.csv_numbers(&score, has_seeds)).collect();
-        columns.extend(self.rows.csv_numbers(&GAUSSIANS, false));
+        let numbers = scores.iter().flat_map(|score| self.rows.csv_numbers(score, has_seeds));
+        let mut columns: Vec<CsvColumn> = numbers.collect();
+        columns.extend(self.rows.csv_numbers("gaussians", false));
         columns.push(self.rows.csv_column("runs", |_, row| row.metrics.len().to_string()));
         if rows.iter().any(Row::knows_references) {
             let cell = |_, row: &Row| row.knows_references().to_string();
@@ -189,8 +191,7 @@ impl Leaderboard<'_> {
     fn charts(&self) -> Vec<Chart> {
         // A line keeps its colour in every plot.
         let mut lines = vec![];
-        let numeric =
-            self.rows.keys.iter().filter_map(|key| self.against(key, &PSNR.name, &mut lines));
+        let numeric = self.rows.keys.iter().filter_map(|key| self.against(key, PSNR, &mut lines));
         let charts: Vec<Chart> = numeric.collect();
         let has_scores = self.rows.rows.iter().any(|row| row.score("psnr").is_some());
         if !charts.is_empty() || !has_scores {
@@ -208,7 +209,7 @@ impl Leaderboard<'_> {
                 ..Series::default()
             }
         };
-        vec![Chart::new("", &PSNR.name, self.rows.rows.iter().enumerate().map(bar).collect())]
+        vec![Chart::new("", PSNR, self.rows.rows.iter().enumerate().map(bar).collect())]
     }
 
     /// A line for each combination of the other settings; `None` if `key` is not numeric, or there are too many lines.

@@ -1,96 +1,69 @@
 //! The table of a sweep: a row per point, columns of the numbers of its runs. The leaderboard and the costs are tables
 //! of different columns.
 
-use std::borrow::Cow;
-
 use super::rows::{Row, Rows, number};
 use crate::base::output::csv_field;
 use crate::networks::lpips::Measure;
 use crate::results::report::{Best, Column, Table};
 
 /// A number in `metrics.json` of a run.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub(super) struct Quantity {
     /// Its key in CSV and JSON.
-    pub(super) key: Cow<'static, str>,
+    pub(super) key: String,
     /// Its JSON pointer in `metrics.json`.
-    pub(super) pointer: Cow<'static, str>,
+    pub(super) pointer: String,
     /// Its heading, with the unit.
-    pub(super) name: Cow<'static, str>,
+    pub(super) name: String,
     digits: usize,
     /// The displayed unit.
     unit: f64,
     best: Best,
 }
 
-const MIB: f64 = 1_048_576.0;
-
-pub(super) const PSNR: Quantity = score(["psnr", "/mean/psnr", "PSNR, dB"], 2);
-pub(super) const SSIM: Quantity = score(["ssim", "/mean/ssim", "SSIM"], 3);
-pub(super) const SECONDS: Quantity = cost(["seconds", "/seconds", "time, s"], 1, 1.0);
-pub(super) const PROCESSOR: Quantity =
-    cost(["processor_seconds", "/spent/processor_seconds", "processor time, s"], 1, 1.0);
-pub(super) const JOULES: Quantity = cost(["joules", "/spent/joules", "energy, J"], 0, 1.0);
-pub(super) const GAUSSIANS: Quantity = cost(["gaussians", "/gaussians", "Gaussians"], 0, 1.0);
-pub(super) const DEVICE: Quantity =
-    cost(["device_bytes", "/spent/device_bytes", "device, MiB"], 1, MIB);
-pub(super) const HOST: Quantity = cost(["host_bytes", "/spent/host_bytes", "host, MiB"], 0, MIB);
-
-/// Key, pointer and heading of a score, of which the greatest is best.
-const fn score(names: [&'static str; 3], digits: usize) -> Quantity {
-    quantity(names, digits, 1.0, Best::Greatest)
-}
-
-/// Key, pointer and heading of a cost.
-const fn cost(names: [&'static str; 3], digits: usize, unit: f64) -> Quantity {
-    quantity(names, digits, unit, Best::Unmarked)
-}
-
-const fn quantity(
-    [key, pointer, name]: [&'static str; 3],
-    digits: usize,
-    unit: f64,
-    best: Best,
-) -> Quantity {
-    Quantity {
-        key: Cow::Borrowed(key),
-        pointer: Cow::Borrowed(pointer),
-        name: Cow::Borrowed(name),
-        digits,
-        unit,
-        best,
-    }
-}
+/// The keys of the scores and costs of every run.
+pub(super) const KEYS: [&str; 9] = [
+    "psnr",
+    "ssim",
+    "seconds",
+    "processor_seconds",
+    "joules",
+    "steps",
+    "gaussians",
+    "device_bytes",
+    "host_bytes",
+];
 
 impl Quantity {
-    /// The scores and costs of every run.
-    pub(super) fn all() -> [Self; 9] {
-        let steps = cost(["steps", "/steps", "steps"], 0, 1.0);
-        [PSNR, SSIM, SECONDS, PROCESSOR, JOULES, steps, GAUSSIANS, DEVICE, HOST]
-    }
-
-    /// A score by its name in `metrics.json`: `psnr`, or `r0/psnr` for R_0.
-    pub(super) fn score(name: &str) -> Self {
-        let (key, pointer) = (Cow::Owned(name.to_owned()), Cow::Owned(format!("/mean/{name}")));
-        if let Some(measure) = Measure::all().find(|measure| measure.key() == name) {
-            let name = Cow::Owned(measure.title());
-            return Self { key, pointer, name, digits: 3, unit: 1.0, best: Best::Least };
+    /// By its key: one of [`KEYS`], or the name of a score in `metrics.json`, such as `r0/psnr` for R_0.
+    pub(super) fn new(key: &str) -> Self {
+        const MIB: f64 = 1_048_576.0;
+        let cost = |pointer: &str, name: &str, digits, unit| {
+            let [key, pointer, name] = [key, pointer, name].map(str::to_owned);
+            Self { key, pointer, name, digits, unit, best: Best::Unmarked }
+        };
+        let score = |name: &str, digits, best| Self {
+            best,
+            ..cost(&format!("/mean/{key}"), name, digits, 1.0)
+        };
+        if let Some(measure) = Measure::all().find(|measure| measure.key() == key) {
+            return score(&measure.title(), 3, Best::Least);
         }
-        if let Some(of_final) = name.strip_prefix("r0/") {
-            let of_final = Self::score(of_final);
-            let name = Cow::Owned(format!("{} of R_0", of_final.name));
-            return Self { key, pointer, name, ..of_final };
+        if let Some(of_final) = key.strip_prefix("r0/").map(Self::new) {
+            return score(&format!("{} of R_0", of_final.name), of_final.digits, of_final.best);
         }
-        match name {
-            "psnr" => PSNR,
-            "ssim" => SSIM,
-            "psnr_channel_mean" => {
-                score(["psnr_channel_mean", "/mean/psnr_channel_mean", "channel-mean PSNR, dB"], 2)
-            }
-            other => {
-                let name = Cow::Owned(other.to_owned());
-                Self { key, pointer, name, digits: 4, unit: 1.0, best: Best::Unmarked }
-            }
+        match key {
+            "psnr" => score("PSNR, dB", 2, Best::Greatest),
+            "psnr_channel_mean" => score("channel-mean PSNR, dB", 2, Best::Greatest),
+            "ssim" => score("SSIM", 3, Best::Greatest),
+            "seconds" => cost("/seconds", "time, s", 1, 1.0),
+            "processor_seconds" => cost("/spent/processor_seconds", "processor time, s", 1, 1.0),
+            "joules" => cost("/spent/joules", "energy, J", 0, 1.0),
+            "steps" => cost("/steps", "steps", 0, 1.0),
+            "gaussians" => cost("/gaussians", "Gaussians", 0, 1.0),
+            "device_bytes" => cost("/spent/device_bytes", "device, MiB", 1, MIB),
+            "host_bytes" => cost("/spent/host_bytes", "host, MiB", 0, MIB),
+            other => score(other, 4, Best::Unmarked),
         }
     }
 
@@ -123,7 +96,7 @@ impl Rows {
         let column = |(quantity, statistic): &(Quantity, Statistic)| {
             let Quantity { name, digits, best, .. } = quantity;
             let (name, best) = match statistic {
-                Statistic::Mean => (name.as_ref(), *best),
+                Statistic::Mean => (name.as_str(), *best),
                 Statistic::Deviation => ("sd", Best::Unmarked),
                 Statistic::Gain => ("gain", Best::Unmarked),
             };
@@ -172,11 +145,11 @@ impl Rows {
 
     /// The columns of CSV of a quantity, with all digits and in the unit of `metrics.json`: the mean and, if requested,
     /// the standard deviation.
-    pub(super) fn csv_numbers(&self, quantity: &Quantity, with_deviation: bool) -> Vec<CsvColumn> {
-        let Quantity { key, pointer, .. } = quantity;
-        let mut columns = vec![self.csv_column(key, |_, row| number(row.mean(pointer)))];
+    pub(super) fn csv_numbers(&self, key: &str, with_deviation: bool) -> Vec<CsvColumn> {
+        let pointer = Quantity::new(key).pointer;
+        let mut columns = vec![self.csv_column(key, |_, row| number(row.mean(&pointer)))];
         if with_deviation {
-            let cell = |_, row: &Row| number(row.deviation(pointer));
+            let cell = |_, row: &Row| number(row.deviation(&pointer));
             columns.push(self.csv_column(&format!("{key}_sd"), cell));
         }
         columns
@@ -190,7 +163,7 @@ mod tests {
     #[test]
     fn of_every_lpips_the_least_is_best() {
         for measure in Measure::all() {
-            let Quantity { name, best, .. } = Quantity::score(&measure.key());
+            let Quantity { name, best, .. } = Quantity::new(&measure.key());
             assert!(matches!(best, Best::Least) && name == measure.title(), "{name}");
         }
     }

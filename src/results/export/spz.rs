@@ -358,9 +358,9 @@ mod tests {
     #[test]
     fn a_rotation_is_decoded_within_the_precision_of_ten_bits() {
         for quat in drawn(200, 0).quats() {
-            let quat = unit(*quat);
+            let expected = unit(*quat);
             let back = of_smallest_three(smallest_three(*quat));
-            let dot: f32 = quat.iter().zip(back).map(|(a, b)| a * b).sum();
+            let dot: f32 = expected.iter().zip(back).map(|(a, b)| a * b).sum();
             assert!(dot.abs() > 1.0 - 5e-6, "{quat:?}: {dot}");
         }
         let back = of_first_three([127.5, 255.0, 127.5]);

@@ -1,4 +1,4 @@
-//! The axes of the plots.
+//! The axes of the charts.
 
 /// A range of values and its position in the drawing.
 pub(super) struct Axis {
@@ -46,6 +46,10 @@ impl Axis {
     /// The axis of rows from `from` to `to`, each of length 1.
     pub(super) fn rows(count: usize, from: f64, to: f64) -> Self {
         Self { low: 0.0, high: count as f64, step: Some(1.0), from, to }
+    }
+
+    pub(super) fn is_logarithmic(&self) -> bool {
+        self.step.is_none()
     }
 
     /// Whether a value lies on the axis.

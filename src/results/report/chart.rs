@@ -6,7 +6,7 @@ use glam::{DVec2, dvec2};
 
 use super::axis::Axis;
 use super::escape;
-use super::labels::{Labels, letters};
+use super::labels::{Labels, letters, text};
 
 /// How the points of a series are drawn.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -32,10 +32,6 @@ pub enum Mark {
 impl Mark {
     fn has_legend(self) -> bool {
         matches!(self, Self::Line | Self::Dots)
-    }
-
-    fn has_label(self) -> bool {
-        matches!(self, Self::Star | Self::Disc | Self::Ring)
     }
 }
 
@@ -118,12 +114,11 @@ impl Chart {
     pub fn svg(&self) -> String {
         let frame = Frame::new(self);
         let (mut panels, mut height) = (String::new(), 0.0);
-        let size = self.panel.unwrap_or(self.series.len()).max(1);
-        for first in (0..self.series.len().max(1)).step_by(size) {
-            let series = &self.series[first.min(self.series.len())..];
-            let series = &series[..size.min(series.len())];
+        let size = self.panel.unwrap_or(usize::MAX);
+        let groups = self.series.chunks(size).chain(self.series.is_empty().then_some(&[][..]));
+        for series in groups {
             let (legend, above) = legend_places(series);
-            height += if first > 0 { GAP + above } else { above };
+            height += if height > 0.0 { GAP + above } else { above };
             let panel = frame.axes(self) + &frame.series(series, &legend);
             let _ = writeln!(
                 panels,
@@ -161,7 +156,6 @@ struct Frame {
     height: f64,
     /// Whether x is down, in rows, and y to the right.
     has_bars: bool,
-    is_logarithmic: bool,
 }
 
 impl Frame {
@@ -179,7 +173,7 @@ impl Frame {
         let is_half =
             !chart.series.is_empty() && !chart.series.iter().any(|one| one.mark.has_legend());
         let (width, rows) = (if is_half { HALF_WIDTH } else { WIDTH }, bars.clone().count());
-        let (is_logarithmic, has_bars) = (chart.is_logarithmic, rows > 0);
+        let has_bars = rows > 0;
         if has_bars {
             let names = bars.map(|bar| letters(&bar.name)).max().unwrap_or(0);
             // Names take at most half of the width.
@@ -189,14 +183,14 @@ impl Frame {
                 Axis::rows(rows, TOP, height),
                 Axis::around(ys().chain([0.0]), left, width - VALUE),
             );
-            return Self { x, y, width, height, has_bars, is_logarithmic };
+            return Self { x, y, width, height, has_bars };
         }
-        let x = match is_logarithmic {
+        let x = match chart.is_logarithmic {
             true => Axis::logarithmic(xs(), LEFT, width - RIGHT),
             false => Axis::around(xs(), LEFT, width - RIGHT),
         };
         let y = Axis::around(ys(), HEIGHT - BOTTOM, TOP);
-        Self { x, y, width, height: HEIGHT, has_bars, is_logarithmic }
+        Self { x, y, width, height: HEIGHT, has_bars }
     }
 
     fn position(&self, x: f64, y: f64) -> DVec2 {
@@ -208,7 +202,7 @@ impl Frame {
 
     /// The positions of the drawable points.
     fn positions(&self, points: &[(f64, f64)]) -> Vec<DVec2> {
-        let drawn = points.iter().filter(|&&(x, y)| is_drawable(x, y, self.is_logarithmic));
+        let drawn = points.iter().filter(|&&(x, y)| is_drawable(x, y, self.x.is_logarithmic()));
         drawn.map(|&(x, y)| self.position(x, y)).collect()
     }
 
@@ -240,56 +234,53 @@ impl Frame {
     }
 
     fn series(&self, series: &[Series], legend: &[DVec2]) -> String {
-        let labelled = series.iter().filter(|one| one.mark.has_label());
+        let has_label = |mark| matches!(mark, Mark::Star | Mark::Disc | Mark::Ring);
+        let labelled = series.iter().filter(|one| has_label(one.mark));
         let ends = labelled.filter_map(|one| self.positions(&one.points).last().copied());
-        let area = dvec2(self.width, HEIGHT - BOTTOM);
-        let mut labels = Labels::around(ends, area);
+        let mut labels = Labels::around(ends, dvec2(self.width, HEIGHT - BOTTOM));
         let (mut svg, mut legend) = (String::new(), legend.iter());
         for (index, one) in series.iter().enumerate() {
-            let line = one.color.unwrap_or(index);
-            let color = format!("var(--series-{})", line % COLORS);
-            let title = if one.title.is_empty() { &one.name } else { &one.title };
-            let dashes = DASHES[line / COLORS % DASHES.len()];
+            let Series { name, title, mark, .. } = one;
+            let number = one.color.unwrap_or(index);
+            let color = format!("var(--series-{})", number % COLORS);
+            let dashes = DASHES[number / COLORS % DASHES.len()];
             let points = self.positions(&one.points);
-            let drawn = match one.mark {
-                Mark::Line | Mark::Dots => {
-                    let Some(&sample) = legend.next() else { continue };
-                    let dot = if one.mark == Mark::Dots { 3.5 } else { 0.0 };
-                    polyline(&points, &color, 2.0, dashes)
-                        + &legend_entry(sample, &one.name, &color, dashes)
-                        + &self.spreads(one, &color)
-                        + &points
-                            .iter()
-                            .filter(|_| dot > 0.0)
-                            .map(|&at| circle(at, dot, &color, &color))
-                            .collect::<String>()
+            let is_minor = *mark == Mark::Ring;
+            let is_line = points.len() > 1 && matches!(mark, Mark::Disc | Mark::Ring);
+            let mut drawn = String::new();
+            if is_line || mark.has_legend() {
+                drawn += &polyline(&points, &color, if is_minor { 1.2 } else { 2.0 }, dashes);
+            }
+            match mark {
+                Mark::Line => {}
+                Mark::Dots => {
+                    drawn.extend(points.iter().map(|&at| circle(at, 3.5, &color, &color)))
                 }
-                Mark::Star => points
-                    .iter()
-                    .map(|&at| {
-                        star(at) + &labels.label(at, &one.name, " fill=\"var(--best)\"", false)
-                    })
-                    .collect(),
+                Mark::Star => {
+                    for &at in &points {
+                        drawn += &star(at);
+                        drawn += &labels.label(at, name, " fill=\"var(--best)\"", false);
+                    }
+                }
                 Mark::Disc | Mark::Ring => {
                     let Some(&end) = points.last() else { continue };
-                    let is_minor = one.mark == Mark::Ring;
-                    let (width, radius) = if is_minor { (1.2, 3.5) } else { (2.0, 5.0) };
-                    let weight = if is_minor { "" } else { " font-weight=\"600\"" };
-                    let style = format!(" fill=\"{color}\"{weight}");
-                    let fill = if is_minor { "var(--ground)" } else { color.as_str() };
-                    let is_line = points.len() > 1;
-                    let path = if is_line {
-                        polyline(&points, &color, width, dashes)
-                    } else {
-                        String::new()
+                    let (radius, fill, weight) = match is_minor {
+                        true => (3.5, "var(--ground)", ""),
+                        false => (5.0, color.as_str(), " font-weight=\"600\""),
                     };
-                    path + &circle(end, radius, fill, &color)
-                        + &labels.label(end, &one.name, &style, is_line)
+                    drawn += &circle(end, radius, fill, &color);
+                    let style = format!(" fill=\"{color}\"{weight}");
+                    drawn += &labels.label(end, name, &style, is_line);
                 }
-                Mark::Steps => self.steps(&points),
-                Mark::Bar => self.bar(one, &points, &color),
-            };
-            let title = escape(title);
+                Mark::Steps => drawn += &self.steps(&points),
+                Mark::Bar => drawn += &self.bar(one, &points, &color),
+            }
+            if mark.has_legend() {
+                let entry = |&at: &DVec2| legend_entry(at, name, &color, dashes);
+                drawn.extend(legend.next().map(entry));
+            }
+            drawn += &self.spreads(one, if *mark == Mark::Bar { "var(--text)" } else { &color });
+            let title = escape(if title.is_empty() { name } else { title });
             let _ = writeln!(svg, "<g class=\"series\"><title>{title}</title>{drawn}</g>");
         }
         svg
@@ -318,29 +309,28 @@ impl Frame {
         )
     }
 
+    /// Names, bars and values; `ends` are the positions of the drawable points.
     fn bar(&self, series: &Series, ends: &[DVec2], color: &str) -> String {
-        let mut svg = String::new();
         let zero = self.position(0.0, 0.0).x;
-        let left = self.y.from;
-        let name = |x: f64| {
-            let at = dvec2(left - 8.0, self.x.position(x + 0.5) + 4.0);
+        let rows = series.points.iter().filter(|(x, _)| is_drawable(*x, 0.0, false));
+        let name = |&(x, _): &(f64, f64)| {
+            let at = dvec2(self.y.from - 8.0, self.x.position(x + 0.5) + 4.0);
             text(at, " text-anchor=\"end\"", &series.name)
         };
-        svg.extend(series.points.iter().map(|&(x, _)| name(x)));
+        let mut svg: String = rows.map(name).collect();
         let values = series.points.iter().filter(|&&(x, y)| is_drawable(x, y, false));
         for (&(_, value), end) in values.zip(ends) {
-            let farthest = series.spreads.iter().map(|&(x, _, high)| self.position(x, high).x);
-            let farthest = farthest.chain([end.x, zero]).filter(|x| x.is_finite());
-            let farthest = farthest.fold(f64::MIN, f64::max);
+            let highest = series.spreads.iter().map(|&(x, _, high)| self.position(x, high).x);
+            let highest = highest.filter(|x| x.is_finite()).fold(end.x.max(zero), f64::max);
             let (x, y, width) = (end.x.min(zero), end.y - ROW / 2.0 + 2.0, (end.x - zero).abs());
+            let height = ROW - 5.0;
             let _ = write!(
                 svg,
-                "<rect x=\"{x:.1}\" y=\"{y:.1}\" width=\"{width:.1}\" height=\"{}\" rx=\"2\" fill=\"{color}\"/>",
-                ROW - 5.0
+                "<rect x=\"{x:.1}\" y=\"{y:.1}\" width=\"{width:.1}\" height=\"{height}\" rx=\"2\" fill=\"{color}\"/>"
             );
-            svg += &text(dvec2(farthest + 6.0, end.y + 4.0), "", &format!("{value:.2}"));
+            svg += &text(dvec2(highest + 6.0, end.y + 4.0), "", &format!("{value:.2}"));
         }
-        svg + &self.spreads(series, "var(--text)")
+        svg
     }
 }
 
@@ -374,11 +364,6 @@ fn legend_entry(at: DVec2, name: &str, color: &str, dashes: &str) -> String {
     let from = at - dvec2(0.0, 4.0);
     line(from, from + dvec2(SAMPLE, 0.0), &style)
         + &text(at + dvec2(SAMPLE + 6.0, 0.0), " fill=\"var(--text)\"", name)
-}
-
-pub(super) fn text(at: DVec2, style: &str, content: &str) -> String {
-    let DVec2 { x, y } = at;
-    format!("<text x=\"{x:.1}\" y=\"{y:.1}\"{style}>{}</text>", escape(content))
 }
 
 fn line(from: DVec2, to: DVec2, style: &str) -> String {

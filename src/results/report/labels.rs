@@ -1,8 +1,14 @@
-//! Labels beside the points of a chart, which do not overlap.
+//! Text in a chart: labels beside points, which do not overlap.
 
 use glam::{DVec2, dvec2};
 
-use super::chart::text;
+use super::escape;
+
+/// A text as an SVG element.
+pub(super) fn text(at: DVec2, style: &str, content: &str) -> String {
+    let DVec2 { x, y } = at;
+    format!("<text x=\"{x:.1}\" y=\"{y:.1}\"{style}>{}</text>", escape(content))
+}
 
 /// The number of letters of a name.
 pub(super) fn letters(name: &str) -> usize {

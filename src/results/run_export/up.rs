@@ -4,8 +4,8 @@ use std::str::FromStr;
 
 use glam::{DQuat, DVec3};
 
-use super::Format;
-use super::run::ExportOptions;
+use super::ExportOptions;
+use crate::results::export::Format;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 

@@ -2,9 +2,7 @@
 
 use glam::DVec3;
 
-use super::Provenance;
-use super::page::{Bookmark, Page, Picture, moved};
-use super::run::{ExportOptions, has_networks};
+use super::{ExportOptions, has_networks};
 use crate::Result;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, View};
@@ -12,6 +10,8 @@ use crate::photographs::image::Image;
 use crate::photographs::tone::ToneCurve;
 use crate::results::edit::fingerprint;
 use crate::results::eval::ModelRenderer;
+use crate::results::export::Provenance;
+use crate::results::export::page::{Bookmark, Page, Picture, moved};
 use crate::results::finished_run::{FinishedRun, is_model};
 use crate::results::run;
 use crate::splats::render::RenderSettings;

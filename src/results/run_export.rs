@@ -1,15 +1,18 @@
 //! The export of a run or of a model file.
 
+mod page;
+pub(crate) mod up;
+
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use glam::{DQuat, DVec3};
 
-use super::streamed::{self, Division, Tile, Written};
-use super::up::{Turn, Up};
-use super::{Format, Provenance};
+use self::up::{Turn, Up};
 use crate::base::output::{is_same_file, write_whole};
 use crate::photographs::dataset::Dataset;
+use crate::results::export::streamed::{self, Division, Tile, Written};
+use crate::results::export::{Format, Provenance};
 use crate::results::finished_run::{Opener, config_of_file, is_model, needs_photographs};
 use crate::results::linear_light::linear_gaussians;
 use crate::results::{models, run};
@@ -173,7 +176,7 @@ impl ExportOptions<'_> {
     }
 
     /// The settings with the dataset where it is now.
-    pub(super) fn with_dataset(&self, config: &TrainConfig) -> TrainConfig {
+    fn with_dataset(&self, config: &TrainConfig) -> TrainConfig {
         let mut config = config.clone();
         if let Some(dataset) = self.dataset {
             config.move_dataset(dataset);
@@ -208,7 +211,7 @@ impl ExportOptions<'_> {
 }
 
 /// Whether the model of a run has networks, which no file format holds.
-pub(super) fn has_networks(config: &TrainConfig) -> bool {
+fn has_networks(config: &TrainConfig) -> bool {
     config.model.denoiser || config.model.tonemapper
 }
 
