@@ -7,11 +7,10 @@ use std::path::{Path, PathBuf};
 use crate::architecture::{ROOT, files};
 
 /// The limits of documents, in bytes.
-const MAX_BYTES: [(&str, usize); 5] = [
+const MAX_BYTES: [(&str, usize); 4] = [
     ("README.md", 8 << 10),
     ("docs/guide.md", 30 << 10),
-    ("docs/benchmarks.md", 20 << 10),
-    ("docs/parts.md", 12 << 10),
+    ("docs/measurements.md", 42 << 10),
     ("docs/embedding.md", 12 << 10),
 ];
 
