@@ -393,8 +393,8 @@ fn man_pages_keep_the_lines_of_their_examples() {
 
 #[test]
 fn help_fits_a_screen_and_help_all_has_every_option_in_lines_that_fit() {
-    let commands = "\
-        ,train,diagnose,pose,eval,render,export,view,tone,tone list,tone apply,tone fit,sweep,synth,demo,doctor,bench,check";
+    let commands = ",train,diagnose,pose,eval,render,export,view,tone,tone list,tone apply,tone fit,\
+        sweep,synth,demo,doctor,bench,check";
     for command in commands.split(',') {
         let (short, all) =
             (succeed(&format!("{command} -h")), succeed(&format!("{command} --help-all")));
