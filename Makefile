@@ -8,9 +8,9 @@ demo: vulkan
 
 # Every test, on whatever Vulkan device is best; a software device will do.
 test: vulkan
-	cargo test
+	scripts/test.sh
 
-# What takes hours: hostile inputs, long runs, kills, fuzzing. docs/extremes.md has what it found.
+# What takes hours: hostile inputs, long runs, kills, fuzzing. docs/measurements.md has what it found.
 stress: vulkan
 	scripts/stress.py
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Measures the tables of docs/benchmarks.md and docs/parts.md and prints them as Markdown.
+# Measures the tables of docs/measurements.md and prints them as Markdown.
 #
 #     scripts/benchmarks.sh [SECTION...] > tables.md
 #

@@ -1,9 +1,12 @@
 #!/usr/bin/env bash
 # Runs every command of README.md's `sh` blocks, in order, in a copy of this checkout; `cargo install` goes first. A
 # command to skip is named in a comment of the README, `<!-- follow: ... -->`, and printed as `not run`.
+#
+#     scripts/follow-readme.sh [NIGHTSPLAT]      with a program, nothing is installed, and the demo runs with it
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
+program=${1:+$(realpath "$1")}
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
 git ls-files -z --cached --others --exclude-standard | xargs -0 -I {} sh -c '[ -e "$1" ] && echo "$1"' sh {} |
@@ -13,6 +16,10 @@ cd "$scratch"
 # Installs into the copy, with the dependencies that are already built.
 export CARGO_INSTALL_ROOT=$scratch/installed CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-$root/target}
 export PATH=$scratch/installed/bin:$PATH
+if [ -n "$program" ]; then
+    mkdir -p installed/bin
+    ln -s "$program" installed/bin/nightsplat
+fi
 # This profile builds in half of the time, and runs a little slower than the user's.
 export CARGO_PROFILE_RELEASE_OPT_LEVEL=1 CARGO_PROFILE_RELEASE_LTO=off CARGO_PROFILE_RELEASE_INCREMENTAL=false
 
@@ -26,6 +33,10 @@ photograph() {
 }
 
 follow() {
+    case ${program:+with }$1 in
+    "with cargo install"*) return ;;
+    "with make demo"*) set -- "nightsplat demo --out demo" ;;
+    esac
     case $1 in
     "make test"* | podman*)
         "$root/scripts/not-run.sh" readme "$1"

@@ -97,7 +97,7 @@ DEFECTS = [
      "--test splats densify::"),
     ("a repeated round makes as many splits", "shaders-glsl/splats/densify/densify_decide.comp",
      "return min(max_added, ", "return min(max_added | ~0u, ", "--test splats densify::"),
-    # The guards of the kernels, each removed: docs/extremes.md is their table.
+    # The guards of the kernels, each removed: docs/measurements.md is their table.
     ("guard: Gaussians behind the near plane are culled", "shaders-glsl/splats/render/project.comp",
      "if (!(depth > near && opacity > ALPHA_MIN)) return;", "if (!(opacity > ALPHA_MIN)) return;",
      "--test splats gaussians"),

@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Trains a small street in four blocks: one after another, then with each of the files in examples/schedulers, while
-# trainings, Snakemake and a node of Slurm are killed. Every joined model must have the bytes of the first. Then joins
-# that must be refused.
+# Trains a small street in four blocks: one after another, then with files in examples/schedulers, while trainings,
+# Snakemake and a node of Slurm are killed. Every joined model must have the bytes of the first. Then joins that must be
+# refused.
 #
 #     scripts/test-blocks.sh [NIGHTSPLAT]      (default: $NIGHTSPLAT, or target/debug/nightsplat)
 #
-# Snakemake and HyperQueue come from the Python registry into target/schedulers; Slurm from Debian's packages. One that
-# cannot be installed is not run.
+# ENGINES lists the engines (default: hyperqueue; all: hyperqueue,snakemake,slurm). Snakemake and HyperQueue come from
+# the Python registry into target/schedulers; Slurm from Debian's packages. One that cannot be installed is not run.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
@@ -111,12 +111,13 @@ cp -r plan serial
 "$program" blocks run serial > "$log" 2>&1 || fail "blocks run"
 echo "blocks run: $(wc -l < serial/tasks.jsonl) tasks, joined at $SECONDS s"
 
-# Whether Python's registry has brought the engines.
-if ! "$venv/bin/python" -c 'import hyperqueue, snakemake' 2> "$log"; then
-    { python3 -m venv "$venv" && "$venv/bin/pip" install -q snakemake==9.27.0 hyperqueue==0.27.0; } > "$log" 2>&1 ||
-        true
-fi
-has() { "$venv/bin/python" -c "import $1" 2> /dev/null; }
+is_wanted() { [[ ,${ENGINES:-hyperqueue}, = *,$1,* ]]; }
+
+# has MODULE VERSION: whether Python's registry has brought it.
+has() {
+    "$venv/bin/python" -c "import $1" 2> "$log" ||
+        { python3 -m venv "$venv" && "$venv/bin/pip" install -q "$1==$2"; } > "$log" 2>&1
+}
 
 # snakemake PLAN WORKERS [OPTIONS]
 snakemake() {
@@ -153,12 +154,16 @@ on_hyperqueue() {
     same queue "HyperQueue, 2 workers, a training killed"
 }
 
-if has snakemake; then
+if ! is_wanted snakemake; then
+    :
+elif has snakemake 9.27.0; then
     on_snakemake
 else
     "$root/scripts/not-run.sh" snakemake 'blocks on Snakemake: the Python registry did not bring it'
 fi
-if has hyperqueue; then
+if ! is_wanted hyperqueue; then
+    :
+elif has hyperqueue 0.27.0; then
     on_hyperqueue
 else
     "$root/scripts/not-run.sh" hyperqueue 'blocks on HyperQueue: the Python registry did not bring it'
@@ -268,7 +273,9 @@ on_slurm() {
     same nodes "Slurm, 3 nodes, $killed killed and job $job queued again"
 }
 
-if has_slurm; then
+if ! is_wanted slurm; then
+    :
+elif has_slurm; then
     on_slurm
 else
     "$root/scripts/not-run.sh" slurm "blocks on Slurm: Debian's packages could not be installed"

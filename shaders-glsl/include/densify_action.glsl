@@ -28,7 +28,7 @@ const float PAPER_LOG_SPLIT_FACTOR = 0.47000362924573558;  // ln 1.6
 
 // The conserving split along the longest axis, for opacity o and in standard deviations of the parent: centres at
 // +-OFFSET; scales and opacity are constants + slopes times o, the opacity as a fraction of o. Fitted by least squares
-// of the composited alpha over all viewing directions (docs/benchmarks.md).
+// of the composited alpha over all viewing directions (docs/measurements.md).
 const float SPLIT_OFFSET        = 0.5;
 const float SPLIT_ALONG         = 0.866;  // sqrt(1 - OFFSET^2): the pair keeps the parent's variance for small o
 const float SPLIT_ALONG_SLOPE   = -0.105;

@@ -37,7 +37,7 @@ const STREAM: u64 = 5;
 settings! {
 "model.network."
 /// The size of a denoiser, and its initialisation. By default it is the smallest that is worth its time on noisy
-/// photographs (docs/parts.md).
+/// photographs (docs/measurements.md).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DenoiserSettings {
     /// Stages of the denoiser, each with its own weights.

@@ -103,7 +103,7 @@ const TRIALS: usize = 5;
 
 /// The largest mean squared change of a camera's view by one split, in units of the squared contrast of what the
 /// Gaussian covers, as `view_change` in `densify_score.comp` estimates it. It prevents a split from changing a view of
-/// 30 dB by 0.1 dB at a contrast of 0.3 (docs/benchmarks.md).
+/// 30 dB by 0.1 dB at a contrast of 0.3 (docs/measurements.md).
 pub const LARGEST_CHANGE: f32 = 2e-4;
 
 /// The result of a round.

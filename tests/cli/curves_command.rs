@@ -1,6 +1,4 @@
 //! `nightsplat tone list`, in process.
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
 
 use clap::Parser;
 use nightsplat::cli::tone::list::{ListArgs, text};

@@ -1,6 +1,4 @@
 //! `nightsplat doctor` in scripts, and on machines that lack something.
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use nightsplat::gpu::REQUIREMENTS;
 use serde_json::Value;

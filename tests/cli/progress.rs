@@ -1,6 +1,4 @@
 //! Progress output of `train`, for people, logs and schedulers.
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use serde_json::Value;
 

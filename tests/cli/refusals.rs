@@ -3,6 +3,10 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use nightsplat::photographs::image::Image;
+use serde_json::Value;
+use tempfile::TempDir;
+
 use crate::common::command::{command, refused, refused_with, run};
 use crate::{copied_set, fixture};
 
@@ -15,11 +19,11 @@ fn refuses_to_train(root: &Path, options: &str, code: i32, parts: &[&str]) {
     }
 }
 
-/// Training on `root` must succeed and print all of `parts` on standard error.
-fn trains_and_says(root: &Path, parts: &[&str]) {
+/// A step of training on `root` must succeed and print all of `parts` on standard error.
+fn trains_and_says(root: &Path, options: &str, parts: &[&str]) {
     let out = root.join("run");
-    let (_, stderr) =
-        run(&format!("train {} --out {} --steps 1", root.display(), out.display()), 0);
+    let train = format!("train {} --out {} --steps 1 {options}", root.display(), out.display());
+    let (_, stderr) = run(&train, 0);
     assert!(out.join("metrics.json").exists(), "{stderr}");
     for part in parts {
         assert!(stderr.contains(part), "no `{part}` in: {stderr}");
@@ -29,6 +33,14 @@ fn trains_and_says(root: &Path, parts: &[&str]) {
 fn edit(path: PathBuf, change: impl FnOnce(String) -> String) {
     let text = fs::read_to_string(&path).unwrap();
     fs::write(path, change(text)).unwrap();
+}
+
+fn edit_listing(set: &TempDir, change: impl FnOnce(&mut Value)) {
+    edit(set.path().join("transforms_train.json"), |text| {
+        let mut listing = serde_json::from_str(&text).unwrap();
+        change(&mut listing);
+        listing.to_string()
+    });
 }
 
 #[test]
@@ -49,83 +61,48 @@ fn a_missing_dataset_and_one_without_photographs_are_named() {
 }
 
 #[test]
-fn a_truncated_listing_is_named() {
-    let set = copied_set();
-    edit(set.path().join("transforms_train.json"), |text| text[..text.len() / 2].to_owned());
-    refuses_to_train(set.path(), "", 3, &["transforms_train.json", "cut short"]);
-}
-
-#[test]
 fn absent_and_broken_photographs_are_left_out_by_name() {
     let set = copied_set();
     fs::remove_file(set.path().join("low/003.png")).unwrap();
     fs::write(set.path().join("low/004.png"), "no image").unwrap();
-    trains_and_says(set.path(), &["low/003.png", "absent", "low/004.png", "not a readable"]);
+    trains_and_says(set.path(), "", &["low/003.png", "absent", "low/004.png", "not a readable"]);
 }
 
 #[test]
-fn two_views_with_one_name_are_refused() {
+fn points_that_no_device_represents_and_views_that_show_nothing_are_reported() {
     let set = copied_set();
-    edit(set.path().join("transforms_train.json"), |text| {
-        text.replace("low/002.png", "low/001.png")
+    edit(set.path().join("colmap_sparse/0/points3D.txt"), |text| {
+        text + "900001 1e39 0 0 1 2 3 0.5\n900002 0 -1e300 0 1 2 3 0.5\n900003 1e9 0 0 1 2 3 0.5\n"
     });
-    refuses_to_train(set.path(), "", 3, &["two views are named 001"]);
-}
+    trains_and_says(set.path(), "--plan none", &["3 of ", "points", "left out"]);
 
-/// The fixture's dataset as a COLMAP model, after a change of its cameras and images.
-fn colmap_set(
-    cameras: impl FnOnce(String) -> String,
-    images: impl FnOnce(String) -> String,
-) -> tempfile::TempDir {
     let set = copied_set();
-    let model = set.path().join("sparse/0");
-    fs::create_dir(set.path().join("sparse")).unwrap();
-    fs::rename(set.path().join("colmap_sparse/0"), &model).unwrap();
-    fs::rename(set.path().join("low"), set.path().join("images")).unwrap();
-    for split in ["train", "test", "val"] {
-        fs::remove_file(set.path().join(format!("transforms_{split}.json"))).unwrap();
-    }
-    edit(model.join("cameras.txt"), cameras);
-    edit(model.join("images.txt"), images);
-    set
+    edit_listing(&set, |listing| {
+        // The second view looks the opposite way: the x and z axes are negated. The third is far away.
+        let matrix = listing["frames"][1]["transform_matrix"].as_array_mut().unwrap();
+        for (row, column) in (0..3).flat_map(|row| [(row, 0), (row, 2)]) {
+            matrix[row][column] = Value::from(-matrix[row][column].as_f64().unwrap());
+        }
+        listing["frames"][2]["transform_matrix"][0][3] = Value::from(1e300);
+    });
+    let parts = ["view 002 contains none", "view 003 stands", "check its pose"];
+    trains_and_says(set.path(), "--plan none", &parts);
 }
 
 #[test]
-fn a_colmap_model_trains_and_a_damaged_one_is_named() {
-    let same = |text: String| text;
-    trains_and_says(colmap_set(same, same).path(), &[]);
-
-    let set = colmap_set(|text| text.replace(" PINHOLE ", " EUCM "), same);
-    refuses_to_train(set.path(), "", 3, &["EUCM"]);
-
-    // With every pose damaged, no view is left. With one, the others are used.
-    let spoil = |count: usize| {
-        move |text: String| {
-            let mut left = count;
-            let line = |line: &str| {
-                let mut fields: Vec<&str> = line.split(' ').collect();
-                if line.ends_with(".png") && left > 0 {
-                    left -= 1;
-                    fields[5] = "NaN";
-                }
-                fields.join(" ") + "\n"
-            };
-            text.lines().map(line).collect()
-        }
+fn images_far_larger_than_their_views_are_refused_before_they_are_decoded_or_left_out() {
+    let bomb = |set: &TempDir, path: &str| {
+        let path = set.path().join(path);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        Image::from_fn(1200, 900, |x, y| [(x + y) as f32 / 2100.0; 3]).save_png8(path).unwrap();
     };
-    refuses_to_train(colmap_set(same, spoil(9)).path(), "", 3, &["pose is not finite"]);
-    trains_and_says(colmap_set(same, spoil(1)).path(), &["000.png", "pose is not finite"]);
-
-    let set = colmap_set(|text| text.replace(" 64 48 ", " 64 64 "), same);
-    refuses_to_train(set.path(), "", 3, &["is 64x48 but its camera is 64x64"]);
-
-    let set = colmap_set(same, same);
-    // A count of ten thousand points, without points.
-    let mut points = 10_000_u64.to_le_bytes().to_vec();
-    points.extend([0; 20]);
-    fs::remove_file(set.path().join("sparse/0/points3D.txt")).unwrap();
-    fs::write(set.path().join("sparse/0/points3D.bin"), points).unwrap();
-    refuses_to_train(set.path(), "", 3, &["points3D.bin", "cut short"]);
+    let set = copied_set();
+    bomb(&set, "high/000.png");
+    refuses_to_train(set.path(), "", 3, &["high/000.png", "1200x900", "64 times"]);
+    let set = copied_set();
+    bomb(&set, "depth/001.png");
+    let parts = ["depth of view 001 is not used", "64 times"];
+    trains_and_says(set.path(), "--plan none --parts depth", &parts);
 }
 
 #[test]
@@ -159,6 +136,9 @@ fn misuse_is_one_line_with_exit_code_2() {
     train("--stepz 3", &["--stepz"]);
     train("--steps many", &["steps (--steps) is \"many\"; it must be a whole number, at least 1"]);
     train("--set stop.not_finite=skip", &["stop.not_finite is", "stop or skip-view"]);
+    train("--set schedule.initial_rates.quats=nan", &["schedule.initial_rates.quats is nan"]);
+    train("--max-vram 4", &["--max-vram", "4G or 1.5G"]);
+    train("--set max_ram=100", &["max_ram", "with its unit"]);
     train("--set density.gradient=1", &["`density.gradient`", "`density.gradient_threshold`"]);
     train(
         "--exposure on --parts tonemapper",
@@ -186,13 +166,6 @@ fn options_of_other_trainers_get_a_hint() {
     ] {
         refused(&format!("train {options}"), 2, &["there is no `-", ours]);
     }
-}
-
-#[test]
-fn a_memory_limit_without_a_unit_is_refused() {
-    let set = fixture().set();
-    refuses_to_train(Path::new(&set), "--max-vram 4", 2, &["--max-vram", "4G or 1.5G"]);
-    refuses_to_train(Path::new(&set), "--set max_ram=100", 2, &["max_ram", "with its unit"]);
 }
 
 #[test]
@@ -225,17 +198,18 @@ fn the_number_of_steps_has_short_forms_and_the_alias_iterations() {
 }
 
 #[test]
-fn a_configuration_with_an_unknown_key_names_it() {
+fn a_configuration_with_an_unknown_key_or_a_value_of_nan_names_it_and_its_file() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("config.toml");
-    fs::write(&config, "steps = 3\nstepz = 4\n").unwrap();
     let arguments = format!("--config {}", config.display());
-    refuses_to_train(
-        Path::new(&fixture().set()),
-        &arguments,
-        3,
-        &["config.toml", "stepz", "(line 2)"],
-    );
+    let set = fixture().set();
+    for (text, parts) in [
+        ("steps = 3\nstepz = 4\n", ["stepz", "(line 2)"]),
+        ("[schedule.initial_rates]\nquats = nan\n", ["schedule.initial_rates.quats is nan", ""]),
+    ] {
+        fs::write(&config, text).unwrap();
+        refuses_to_train(Path::new(&set), &arguments, 3, &[&["config.toml"][..], &parts].concat());
+    }
 }
 
 #[test]

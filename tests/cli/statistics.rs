@@ -1,8 +1,5 @@
 //! The file of `NIGHTSPLAT_STATISTICS`: a line for every pipeline.
 
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use serde_json::Value;
 
 use crate::common::command::{command, refused_with};

@@ -95,7 +95,7 @@ struct Row {
 }
 
 impl Row {
-    /// The row in the format of docs/extremes.md.
+    /// The row in the format of docs/measurements.md.
     fn line(&self) -> String {
         let number =
             |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.1e}"));

@@ -1,6 +1,4 @@
 //! A sweep trains every point once, survives being killed, and always ranks its points in the same way.
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -1,8 +1,5 @@
 //! `bench --tune`, its file, and the tiles that training takes from it.
 
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::fs;
 use std::path::{Path, PathBuf};
 

@@ -2,12 +2,9 @@
 //! run.
 
 #![allow(dead_code, unused_macros, reason = "no test binary uses everything")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 pub(crate) mod chain;
-#[cfg(feature = "cli")]
 pub(crate) mod command;
-#[cfg(feature = "cli")]
 pub(crate) mod log;
 pub(crate) mod lpips;
 pub(crate) mod place;
@@ -16,7 +13,7 @@ pub(crate) mod safetensors;
 pub(crate) mod setup;
 pub(crate) mod train;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::Gpu;
@@ -127,4 +124,17 @@ pub(crate) fn shared(name: &str) -> Option<PathBuf> {
 /// A file or folder that is committed with the tests.
 pub(crate) fn fixture(name: &str) -> PathBuf {
     PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures")).join(name)
+}
+
+/// Copies a folder.
+pub(crate) fn copy(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).unwrap();
+    for entry in std::fs::read_dir(from).unwrap() {
+        let (path, target) = entry.map(|e| (e.path(), to.join(e.file_name()))).unwrap();
+        if path.is_dir() {
+            copy(&path, &target);
+        } else {
+            std::fs::copy(path, target).unwrap();
+        }
+    }
 }

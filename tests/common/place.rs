@@ -1,9 +1,11 @@
 //! A folder for runs on a small dataset.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic;
+
+use super::train::small_set;
 
 /// A folder with a dataset of nine small views in `set`, and runs next to it.
 pub(crate) struct Place(pub(crate) tempfile::TempDir);
@@ -11,13 +13,7 @@ pub(crate) struct Place(pub(crate) tempfile::TempDir);
 impl Place {
     pub(crate) fn new() -> Self {
         let place = Self(tempfile::tempdir().unwrap());
-        let options = SyntheticOptions {
-            views: 9,
-            width: 40,
-            height: 30,
-            seed: 2,
-            ..SyntheticOptions::default()
-        };
+        let options = small_set(9, [40, 30], 2);
         synthetic::write(place.path("set"), &options).unwrap();
         place
     }
@@ -43,4 +39,10 @@ impl Place {
     pub(crate) fn model(&self, name: &str) -> Vec<u8> {
         self.read(&format!("{name}/model.ply"))
     }
+}
+
+/// The log of a run without the column of times.
+pub(crate) fn log(run: &Path) -> Vec<String> {
+    let text = fs::read_to_string(run.join("train.csv")).unwrap();
+    text.lines().map(|line| line.rsplit_once(',').unwrap().0.to_owned()).collect()
 }

@@ -6,14 +6,15 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{StepReport, TrainConfig, Trainer};
 
+/// A synthetic set of this many views of a size.
+pub(crate) fn small_set(views: usize, [width, height]: [u32; 2], seed: u64) -> SyntheticOptions {
+    SyntheticOptions { views, width, height, seed, ..SyntheticOptions::default() }
+}
+
 /// A dataset of this many synthetic views of a size, loaded with default options.
-pub(crate) fn dataset(views: usize, [width, height]: [u32; 2]) -> Dataset {
+pub(crate) fn dataset(views: usize, size: [u32; 2]) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
-    synthetic::write(
-        folder.path(),
-        &SyntheticOptions { views, width, height, seed: 1, ..SyntheticOptions::default() },
-    )
-    .unwrap();
+    synthetic::write(folder.path(), &small_set(views, size, 1)).unwrap();
     Dataset::load(folder.path(), &TrainConfig::bare().load_options()).unwrap()
 }
 

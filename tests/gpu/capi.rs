@@ -26,8 +26,8 @@ use nightsplat::capi::error::*;
 use nightsplat::capi::model::*;
 use nightsplat::capi::render::*;
 use nightsplat::capi::train::*;
-use nightsplat::gpu::ImageFormat;
 use nightsplat::gpu::testing::{faults, gpu, not_run};
+use nightsplat::gpu::{ImageFormat, ImageState};
 use nightsplat::photographs::dataset::synthetic::{SyntheticOptions, write};
 use nightsplat::photographs::image::linear_from_srgb;
 use nightsplat::photographs::tone::InverseTone;
@@ -147,27 +147,19 @@ fn lend(host: &Host, flags: u32) -> NspHostDevice {
 }
 
 fn image(picture: &Picture) -> NspImage {
-    let state = |layout, stages, access| NspImageState {
-        layout,
+    let state = |own: ImageState| NspImageState {
+        layout: vk::ImageLayout::from_raw(own.layout),
         family: vk::QUEUE_FAMILY_IGNORED,
-        stages,
-        access,
+        stages: vk::PipelineStageFlags2::from_raw(own.stages),
+        access: vk::AccessFlags2::from_raw(own.access),
     };
     NspImage {
         image: picture.image,
         format: vk::Format::R8G8B8A8_UNORM,
         extent: vk::Extent2D { width: picture.size[0], height: picture.size[1] },
         layer: 0,
-        before: state(
-            vk::ImageLayout::UNDEFINED,
-            vk::PipelineStageFlags2::NONE,
-            vk::AccessFlags2::NONE,
-        ),
-        after: state(
-            vk::ImageLayout::TRANSFER_SRC_OPTIMAL,
-            vk::PipelineStageFlags2::COPY,
-            vk::AccessFlags2::TRANSFER_READ,
-        ),
+        before: state(ImageState::UNDEFINED),
+        after: state(ImageState::TRANSFER_SOURCE),
     }
 }
 
@@ -231,6 +223,43 @@ impl Session {
         session
     }
 
+    /// With its model and a renderer.
+    fn ready(change: impl FnOnce(&mut NspHostDevice)) -> Self {
+        let mut session = Self::new(change);
+        session.prepare();
+        session
+    }
+
+    fn prepare(&mut self) {
+        ok(self.load());
+        ok(self.create());
+    }
+
+    /// Draws a frame, which must be our own render of the model.
+    #[track_caller]
+    fn assert_draws(&mut self, number: u64, model: &Model) {
+        ok(self.frame(number));
+        assert_close(&self.pixels(), &own_render(model));
+    }
+
+    fn info(&self) -> NspModelInfo {
+        // SAFETY: a struct of numbers.
+        let mut info: NspModelInfo = unsafe { std::mem::zeroed() };
+        info.struct_size = size_of::<NspModelInfo>();
+        // SAFETY: the model is valid, the struct is ours.
+        ok(unsafe { nsp_model_info(self.model, &mut info) });
+        info
+    }
+
+    /// Destroys renderer and model, whose frames are done.
+    fn clear(&mut self) {
+        // SAFETY: every frame is done; NULL is taken too.
+        unsafe {
+            nsp_renderer_destroy(std::mem::replace(&mut self.renderer, null_mut()));
+            nsp_model_destroy(std::mem::replace(&mut self.model, null_mut()));
+        }
+    }
+
     fn path(&self) -> CString {
         c_path(&self.folder.path().join("model.ply"))
     }
@@ -262,22 +291,18 @@ impl Session {
 
     /// The bytes of the image, RGB.
     fn pixels(&self) -> Vec<u8> {
-        let [pixels, _] = self.host.read_first_layer(self.picture.as_ref().unwrap(), PIXELS);
+        let pixels = self.host.read_layer(self.picture.as_ref().unwrap(), 0, PIXELS);
         pixels.iter().flat_map(|pixel| pixel.to_le_bytes()[..3].to_vec()).collect()
     }
 
     fn end(mut self) {
-        // SAFETY: every frame is done; NULL is taken too.
-        unsafe {
-            nsp_renderer_destroy(self.renderer);
-            nsp_model_destroy(self.model);
-            nsp_device_destroy(self.device);
-        }
+        self.clear();
+        // SAFETY: what it made is destroyed; NULL is taken too.
+        unsafe { nsp_device_destroy(self.device) };
         if let Some(picture) = self.picture.take() {
             self.host.free_picture(picture);
         }
-        let messages = self.host.destroy();
-        assert!(messages.is_empty(), "validation: {messages:#?}");
+        self.host.destroy();
     }
 }
 
@@ -290,11 +315,8 @@ fn c_path(path: &Path) -> CString {
 
 #[test]
 fn a_record_only_host_gets_our_own_render_without_a_submission_or_a_wait() {
-    let mut session = Session::new(|_| {});
-    ok(session.load());
-    ok(session.create());
-    ok(session.frame(1));
-    assert_close(&session.pixels(), &own_render(&Model::from(gaussians(2))));
+    let mut session = Session::ready(|_| {});
+    session.assert_draws(1, &Model::from(gaussians(2)));
     // SAFETY: the renderer is valid, the struct is ours.
     let mut status: NspStatus = unsafe { std::mem::zeroed() };
     status.struct_size = size_of::<NspStatus>();
@@ -304,11 +326,7 @@ fn a_record_only_host_gets_our_own_render_without_a_submission_or_a_wait() {
     assert!(status.device_bytes > 0);
     // SAFETY: the model is valid.
     assert_eq!(unsafe { nsp_model_count(session.model) }, 400);
-    // SAFETY: as above.
-    let mut info: NspModelInfo = unsafe { std::mem::zeroed() };
-    info.struct_size = size_of::<NspModelInfo>();
-    // SAFETY: as above.
-    ok(unsafe { nsp_model_info(session.model, &mut info) });
+    let info = session.info();
     assert_eq!((info.count, info.sh_degree, info.raw_colors), (400, 2, 0));
     session.end();
 }
@@ -328,8 +346,7 @@ fn a_model_of_arrays_is_that_of_the_file_and_joined_models_are_sorted_together()
     // SAFETY: six arrays of the right lengths.
     ok(unsafe { nsp_model_create(device, 400, 2, planes.as_ptr(), &mut session.model) });
     ok(session.create());
-    ok(session.frame(1));
-    assert_close(&session.pixels(), &own_render(&Model::from(own.clone())));
+    session.assert_draws(1, &Model::from(own.clone()));
 
     // Turned and moved, and turned and moved back.
     let pose = DAffine3::from_rotation_translation(
@@ -353,8 +370,7 @@ fn a_model_of_arrays_is_that_of_the_file_and_joined_models_are_sorted_together()
         nsp_model_destroy(there);
         nsp_model_destroy(std::mem::replace(&mut session.model, back));
     }
-    ok(session.frame(2));
-    assert_close(&session.pixels(), &own_render(&Model::from(own.clone())));
+    session.assert_draws(2, &Model::from(own.clone()));
 
     // Two copies, one farther away.
     let mut both = null_mut();
@@ -382,14 +398,8 @@ fn a_model_that_states_its_law_is_drawn_as_its_dark_photographs_or_in_their_line
     let law = law();
     let own = Model { law: Some(law), ..gaussians(2).into() };
     own.save(session.folder.path().join("model.ply")).unwrap();
-    ok(session.load());
-    ok(session.create());
-    // SAFETY: a struct of numbers.
-    let mut info: NspModelInfo = unsafe { std::mem::zeroed() };
-    info.struct_size = size_of::<NspModelInfo>();
-    // SAFETY: the model is valid, the struct is ours.
-    ok(unsafe { nsp_model_info(session.model, &mut info) });
-    assert_eq!(info.law_stops, law.stops());
+    session.prepare();
+    assert_eq!(session.info().law_stops, law.stops());
     let inverse = InverseTone::of_law(&law);
     let planes = own_planes(&own);
     let drawn = |number, exposure, format: ImageFormat| {
@@ -403,7 +413,7 @@ fn a_model_that_states_its_law_is_drawn_as_its_dark_photographs_or_in_their_line
         session.host.submit_frame(commands, number);
         session.host.wait_frame(number);
         let words = if format == ImageFormat::Rgba16Float { 2 * PIXELS } else { PIXELS };
-        let [pixels, _] = session.host.read_first_layer(&picture, words);
+        let pixels = session.host.read_layer(&picture, 0, words);
         session.host.free_picture(picture);
         pixels
     };

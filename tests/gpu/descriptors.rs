@@ -1,6 +1,4 @@
 //! Devices without push descriptors bind sets, with the same results.
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use nightsplat::gpu::testing::gpu_that_binds_sets;
 use nightsplat::gpu::{PUSH_VARIABLE, Threads};

@@ -1,22 +1,18 @@
 //! A host application with its own Vulkan lends its device, and gets it back unchanged.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 #![expect(unsafe_code, reason = "plays a host application, which calls Vulkan itself")]
 
 use std::ffi::CStr;
 
 use ash::vk::Handle as _;
 use ash::{khr, vk};
-use glam::{DAffine3, DVec2};
-use nightsplat::base::random::Stream;
-use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::gpu::testing::gpu;
 use nightsplat::gpu::{Gpu, HostDevice, HostFrame};
 use nightsplat::photographs::image::Image;
-use nightsplat::splats::render::{RenderOptions, RenderSettings, Renderer};
-use nightsplat::splats::scene::Gaussians;
+use nightsplat::splats::render::{RenderSettings, Renderer};
 
 use crate::host::{Host, Memory};
+use crate::images::{OPTIONS, cameras, gaussians};
 
 #[test]
 fn a_borrowed_device_renders_the_same_and_is_returned_unchanged() {
@@ -48,8 +44,7 @@ fn lend_and_take_back(extensions: &[&CStr]) {
     assert_eq!(memory.read(), vec![0x1234_5678; own.data.len()], "the device is not alive");
     host.free(memory);
     // Objects that the library did not destroy would be reported when the host destroys its device.
-    let messages = host.destroy();
-    assert!(messages.is_empty(), "validation: {messages:#?}");
+    host.destroy();
 }
 
 #[test]
@@ -70,46 +65,16 @@ fn assert_same(what: &str, actual: &Image, expected: &Image) {
 // ---------------------------------------------------------------------------
 // The scene
 
-const OPTIONS: RenderOptions = RenderOptions { sh_degree: 0, background: [0.1, 0.2, 0.3] };
-
-fn camera() -> Camera {
-    Camera {
-        width: 48,
-        height: 40,
-        focal: DVec2::splat(40.0),
-        principal_point: DVec2::new(24.0, 20.0),
-        model: CameraModel::Pinhole,
-        view_from_world: DAffine3::IDENTITY,
-    }
-}
-
-/// About two hundred in front of the camera.
-fn gaussians() -> Gaussians {
-    let mut gaussians = Gaussians::zeros(200, 0);
-    let count = gaussians.count;
-    for (i, value) in gaussians.parameters.iter_mut().enumerate() {
-        let uniform = Stream::new(1, 0).uniform(i as u64) as f32;
-        *value = match i / count {
-            0 | 1 => 2.0 * uniform - 1.0,
-            2 => 2.0 + uniform,
-            3..7 => uniform + 0.1,
-            7..10 => -3.0 + uniform,
-            _ => 2.0 * uniform,
-        };
-    }
-    gaussians
-}
-
 fn renderer(gpu: &Gpu) -> Renderer {
     let settings = RenderSettings { shape: 0.into(), ..RenderSettings::default() };
     let mut renderer = Renderer::new(gpu, settings).unwrap();
-    renderer.reserve(gaussians().count, [&camera()]).unwrap();
+    renderer.reserve(gaussians().count, [&cameras()[0]]).unwrap();
     renderer
 }
 
 fn render(gpu: &Gpu) -> Image {
     let on_device = gaussians().upload(gpu).unwrap();
-    renderer(gpu).render_image(&on_device, &camera(), &OPTIONS).unwrap()
+    renderer(gpu).render_image(&on_device, &cameras()[0], &OPTIONS).unwrap()
 }
 
 /// Renders within a command buffer that the host begins, continues with a copy to its memory, and submits.
@@ -126,7 +91,7 @@ fn render_into(host: &Host, gpu: &Gpu, memory: &mut Memory) {
                 // The library cannot tell when the copy is done.
                 let message = pass.download(&on_device.parameters).unwrap_err().to_string();
                 assert!(message.contains("`parameters`"), "{message}");
-                renderer.forward(pass, &on_device, &camera(), &OPTIONS)
+                renderer.forward(pass, &on_device, &cameras()[0], &OPTIONS)
             })
         };
         recorded.unwrap();

@@ -1,7 +1,5 @@
 //! Memory that runs out and devices that are lost, at every possible place: saved work is not lost, and no run claims
 //! to be finished unless it is.
-#![cfg(feature = "io")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use std::collections::BTreeMap;
 use std::path::Path;

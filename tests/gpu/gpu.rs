@@ -1,7 +1,5 @@
 //! The device layer: choosing a device, buffers at their limits, and all ways to launch work.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::time::Duration;
 
 use glam::UVec2;

@@ -8,7 +8,9 @@ use std::sync::Mutex;
 use ash::vk::Handle as _;
 use ash::{ext, khr, vk};
 use nightsplat::gpu::testing::gpu;
-use nightsplat::gpu::{HostDevice, HostImage, ImageFormat, ImageState, required_device_features};
+use nightsplat::gpu::{
+    Gpu, HostDevice, HostImage, ImageFormat, ImageState, required_device_features,
+};
 
 /// The host: instance, device and queue with validation, synchronization validation and best practices.
 pub(crate) struct Host {
@@ -304,22 +306,15 @@ impl Host {
 
     /// The words of both layers of a picture that is in the state of a transfer's source.
     pub(crate) fn read_picture(&self, picture: &Picture, words: usize) -> [Vec<u32>; 2] {
-        [0, 1].map(|layer| {
-            let memory = self.memory(words);
-            self.submit(|commands| self.copy(commands, picture, layer, &memory, false));
-            let words = memory.read();
-            self.free(memory);
-            words
-        })
+        [0, 1].map(|layer| self.read_layer(picture, layer, words))
     }
 
-    /// The same of the first layer alone; the other was never drawn.
-    pub(crate) fn read_first_layer(&self, picture: &Picture, words: usize) -> [Vec<u32>; 2] {
+    pub(crate) fn read_layer(&self, picture: &Picture, layer: u32, words: usize) -> Vec<u32> {
         let memory = self.memory(words);
-        self.submit(|commands| self.copy(commands, picture, 0, &memory, false));
+        self.submit(|commands| self.copy(commands, picture, layer, &memory, false));
         let words = memory.read();
         self.free(memory);
-        [words, vec![]]
+        words
     }
 
     /// Submits nothing, by `submit_within`, and waits.
@@ -420,8 +415,8 @@ impl Host {
         }
     }
 
-    /// Takes everything down; what validation reported, to the very end.
-    pub(crate) fn destroy(self) -> Vec<String> {
+    /// Takes everything down, and fails on any message of validation, to the very end.
+    pub(crate) fn destroy(self) {
         // SAFETY: nothing is in flight, and the host's own objects are destroyed before their parents.
         unsafe {
             self.device.destroy_semaphore(self.timeline, None);
@@ -430,8 +425,20 @@ impl Host {
             self.debug.destroy_debug_utils_messenger(self.messenger, None);
             self.instance.destroy_instance(None);
         }
-        self.messages.into_inner().unwrap()
+        let messages = self.messages.into_inner().unwrap();
+        assert!(messages.is_empty(), "validation: {messages:#?}");
     }
+}
+
+/// Runs `test` on a host and its record-only device, and fails on any validation message.
+pub(crate) fn with_host(test: impl FnOnce(&Host, &Gpu)) {
+    let host = Host::new(usual_extensions());
+    {
+        // SAFETY: the handles are the host's own and outlive `gpu`.
+        let gpu = unsafe { Gpu::from_host(host.lend_to_record()) }.unwrap();
+        test(&host, &gpu);
+    }
+    host.destroy();
 }
 
 /// The aspects of images of a format.

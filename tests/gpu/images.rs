@@ -24,18 +24,19 @@ use nightsplat::splats::render::{
 use nightsplat::splats::scene::{DeviceGaussians, Gaussians};
 
 use crate::common::{Random, not_run};
-use crate::host::{Host, Picture, usual_extensions};
+use crate::host::{Host, Picture, usual_extensions, with_host};
 use kernels::halves;
 
-const SIZE: [u32; 2] = [48, 40];
+pub(crate) const SIZE: [u32; 2] = [48, 40];
 const PIXELS: usize = 48 * 40;
-const OPTIONS: RenderOptions = RenderOptions { sh_degree: 0, background: [0.1, 0.2, 0.3] };
+pub(crate) const OPTIONS: RenderOptions =
+    RenderOptions { sh_degree: 0, background: [0.1, 0.2, 0.3] };
 
 // ---------------------------------------------------------------------------
 // What is drawn
 
 /// Two views, one for each layer.
-fn cameras() -> [Camera; 2] {
+pub(crate) fn cameras() -> [Camera; 2] {
     [0.0, 0.3].map(|shift| Camera {
         width: SIZE[0],
         height: SIZE[1],
@@ -184,18 +185,6 @@ fn levels(a: &[u32], b: &[u32], is_half: bool) -> u32 {
     a.iter().zip(b).filter_map(of).max().unwrap_or_default()
 }
 
-/// Runs `test` on a host and its record-only device, and fails on any validation message.
-fn with_host(test: impl FnOnce(&Host, &Gpu)) {
-    let host = Host::new(usual_extensions());
-    {
-        // SAFETY: the handles are the host's own and outlive `gpu`.
-        let gpu = unsafe { Gpu::from_host(host.lend_to_record()) }.unwrap();
-        test(&host, &gpu);
-    }
-    let messages = host.destroy();
-    assert!(messages.is_empty(), "validation: {messages:#?}");
-}
-
 fn words(format: ImageFormat) -> usize {
     if format == ImageFormat::Rgba16Float { 2 * PIXELS } else { PIXELS }
 }
@@ -209,50 +198,29 @@ const COLOR_FORMATS: [(ImageFormat, u32, u32); 5] = [
 ];
 
 #[test]
-fn every_colour_format_gets_our_own_render_to_a_level_in_each_layer() {
+fn every_colour_format_gets_our_own_render_to_a_level_in_each_layer_over_what_it_has_or_not() {
     with_host(|host, gpu| {
         let mut shown = Shown::new(host, gpu);
-        for (frame, (format, encoding, swaps)) in (1..).zip(COLOR_FORMATS) {
+        let all = COLOR_FORMATS.into_iter().flat_map(|format| [(format, false), (format, true)]);
+        for (frame, ((format, encoding, swaps), is_over)) in (1..).zip(all) {
+            let mut random = Random::new(frame);
+            let mut word = || match format {
+                ImageFormat::Rgba16Float => halves(&mut random),
+                _ => random.between(0.0, 4e9) as u32,
+            };
+            let under = [0, 1].map(|_| (0..words(format)).map(|_| word()).collect::<Vec<_>>());
             let picture = host.picture(format, SIZE).unwrap();
-            let image = picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE);
-            let target = Target { color: Some(&image), exposure: 1.5, ..Target::default() };
-            draw(&mut shown, frame, &target);
+            host.fill_picture(&picture, [&under[0], &under[1]], ImageState::SAMPLED);
+            let image = picture.lent(ImageState::SAMPLED, ImageState::TRANSFER_SOURCE);
+            let color = Some(&image);
+            draw(&mut shown, frame, &Target { color, is_over, exposure: 1.5, ..Target::default() });
             let layers = host.read_picture(&picture, words(format));
-            for (camera, pixels) in cameras().iter().zip(&layers) {
-                let own = expected(camera, encoding, swaps, None);
+            for ((camera, pixels), under) in cameras().iter().zip(&layers).zip(&under) {
+                let own = expected(camera, encoding, swaps, is_over.then_some(under));
                 let off = levels(pixels, &own, encoding == pixels::PIXELS_LINEAR_HALF);
                 assert!(off <= 1, "{format:?}: {off} levels");
             }
             assert_ne!(layers[0], layers[1], "both layers show one view");
-            host.free_picture(picture);
-        }
-    });
-}
-
-#[test]
-fn a_picture_is_blended_over_and_keeps_what_is_not_covered() {
-    with_host(|host, gpu| {
-        let mut shown = Shown::new(host, gpu);
-        for (frame, (format, encoding, swaps)) in (1..).zip(COLOR_FORMATS) {
-            let mut random = Random::new(frame);
-            let word = |random: &mut Random| match format {
-                ImageFormat::Rgba16Float => halves(random),
-                _ => random.between(0.0, 4e9) as u32,
-            };
-            let under =
-                [0, 1].map(|_| (0..words(format)).map(|_| word(&mut random)).collect::<Vec<_>>());
-            let picture = host.picture(format, SIZE).unwrap();
-            host.fill_picture(&picture, [&under[0], &under[1]], ImageState::SAMPLED);
-            let image = picture.lent(ImageState::SAMPLED, ImageState::TRANSFER_SOURCE);
-            let target =
-                Target { color: Some(&image), is_over: true, exposure: 1.5, ..Target::default() };
-            draw(&mut shown, frame, &target);
-            let layers = host.read_picture(&picture, words(format));
-            for ((camera, pixels), under) in cameras().iter().zip(&layers).zip(&under) {
-                let own = expected(camera, encoding, swaps, Some(under));
-                let off = levels(pixels, &own, encoding == pixels::PIXELS_LINEAR_HALF);
-                assert!(off <= 1, "{format:?}: {off} levels");
-            }
             host.free_picture(picture);
         }
     });
@@ -421,6 +389,5 @@ fn a_draw_with_depths_agrees_with_the_references_and_with_a_composite() {
         }
         host.free_picture(wall);
     }
-    let messages = host.destroy();
-    assert!(messages.is_empty(), "validation: {messages:#?}");
+    host.destroy();
 }

@@ -1,18 +1,18 @@
 //! House rules that the compiler does not check, asserted on the sources.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const ROOT: &str = env!("CARGO_MANIFEST_DIR");
+use crate::circles;
+
+pub(crate) const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
 /// The longest file, in lines, that is still easy to read.
 const MAX_LINES: usize = 600;
 
-/// Every file below `folder` with the extension, as paths relative to the repository, with their text.
-pub(crate) fn files(folder: &str, extension: &str) -> Vec<(PathBuf, String)> {
+/// The paths of all files below `folder`, relative to the repository.
+pub(crate) fn paths(folder: &str) -> Vec<PathBuf> {
     let mut folders = vec![Path::new(ROOT).join(folder)];
     let mut found = vec![];
     while let Some(folder) = folders.pop() {
@@ -20,15 +20,22 @@ pub(crate) fn files(folder: &str, extension: &str) -> Vec<(PathBuf, String)> {
             let path = entry.unwrap().path();
             if path.is_dir() {
                 folders.push(path);
-            } else if path.extension().is_some_and(|found| found == extension) {
-                let text = fs::read_to_string(&path).unwrap();
-                found.push((path.strip_prefix(ROOT).unwrap().to_owned(), text));
+            } else {
+                found.push(path.strip_prefix(ROOT).unwrap().to_owned());
             }
         }
     }
     found.sort();
-    assert!(!found.is_empty(), "no {folder}/**/*.{extension}");
     found
+}
+
+/// Every file below `folder` with the extension, with its text.
+pub(crate) fn files(folder: &str, extension: &str) -> Vec<(PathBuf, String)> {
+    let mut paths = paths(folder);
+    paths.retain(|path| path.extension().is_some_and(|found| found == extension));
+    assert!(!paths.is_empty(), "no {folder}/**/*.{extension}");
+    let text = |path: &PathBuf| fs::read_to_string(Path::new(ROOT).join(path)).unwrap();
+    paths.into_iter().map(|path| (path.clone(), text(&path))).collect()
 }
 
 fn stem(path: &Path) -> &str {
@@ -52,49 +59,6 @@ fn layers(lib: &str) -> Vec<&str> {
 /// The code of a line, without its comment. Strings may remain; they name no modules.
 pub(crate) fn code(line: &str) -> &str {
     line.split("//").next().unwrap()
-}
-
-/// The names that follow `crate::` in the text: `a` of `crate::a::B`, `a` and `B` of `crate::{a, B}`.
-fn crate_paths(text: &str) -> BTreeSet<String> {
-    let code: Vec<&str> = text.lines().map(code).collect();
-    let code = code.join("\n");
-    let mut names = BTreeSet::new();
-    for (_, path) in
-        code.match_indices("crate::").map(|(at, found)| (at, &code[at + found.len()..]))
-    {
-        if let Some(group) = path.strip_prefix('{') {
-            // The first segment of each entry of the group, at depth one.
-            let mut depth = 1;
-            let mut entry = String::new();
-            for character in group.chars() {
-                match character {
-                    '{' => depth += 1,
-                    '}' => depth -= 1,
-                    _ if depth == 1 => entry.push(character),
-                    _ => {}
-                }
-                if depth == 0 {
-                    break;
-                }
-            }
-            names.extend(entry.split(',').map(first_segment));
-        } else {
-            names.insert(first_segment(path));
-        }
-    }
-    names
-}
-
-fn first_segment(path: &str) -> String {
-    path.trim_start().chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect()
-}
-
-#[test]
-fn paths_into_the_crate_are_found_in_every_notation() {
-    let text =
-        "use crate::a::B;\nuse crate::{c, d::{E, f}, G}; // crate::comment\nlet x = crate::h::i();";
-    let names: Vec<String> = crate_paths(text).into_iter().collect();
-    assert_eq!(names, ["G", "a", "c", "d", "h"]);
 }
 
 #[test]
@@ -131,10 +95,9 @@ fn a_module_uses_only_modules_above_it() {
     for (path, text) in files("src", "rs") {
         // `main` is above all modules, and `lib` only lists them.
         let Some(own) = layer(module(&path)) else { continue };
-        for used in crate_paths(&text) {
-            if layer(&used).is_some_and(|used| used > own) {
-                broken.push(format!("{} uses {used}", path.display()));
-            }
+        for used in circles::paths(&text).iter().filter(|used| used[0] == "crate") {
+            let used = used.get(1).filter(|used| layer(used).is_some_and(|used| used > own));
+            broken.extend(used.map(|used| format!("{} uses {used}", path.display())));
         }
     }
     assert!(broken.is_empty(), "{broken:#?}");

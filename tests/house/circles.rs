@@ -52,8 +52,9 @@ fn tree<'a>(mut text: &'a str, before: &Module, found: &mut Vec<Module>) -> &'a 
     }
 }
 
-/// Every path that begins with `crate`, `super` or, after `use`, with one of the module's own names.
-fn paths(text: &str) -> Vec<Module> {
+/// Every path of code that begins with `crate`, `super` or, after `use`, with one of the module's own names.
+pub(crate) fn paths(text: &str) -> Vec<Module> {
+    let text = text.lines().map(code).collect::<Vec<_>>().join("\n");
     let mut found = vec![];
     for root in ["crate::", "super::", "use "] {
         for (at, _) in text.match_indices(root) {
@@ -70,8 +71,7 @@ fn paths(text: &str) -> Vec<Module> {
 
 fn read(path: &Path, text: &str) -> Source {
     let shipped = text.split("#[cfg(test)]\nmod ").next().unwrap();
-    let lines: Vec<&str> = shipped.lines().map(code).collect();
-    let paths = paths(&lines.join("\n"));
+    let paths = paths(shipped);
     let imports = paths
         .iter()
         .filter(|path| path.len() > 1 && !["crate", "super"].contains(&path[0].as_str()));

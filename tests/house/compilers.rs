@@ -1,7 +1,5 @@
 //! The list of what the compilers of GPUs make of the kernels, compared as `scripts/test-on-gpu-compilers.sh` does it.
 
-#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
-
 use std::fs;
 use std::path::Path;
 use std::process::Command;

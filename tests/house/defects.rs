@@ -3,9 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::architecture::files;
-
-const ROOT: &str = env!("CARGO_MANIFEST_DIR");
+use crate::architecture::{ROOT, files};
 
 /// The string literals of a piece of Python, with escapes of quotes and line breaks resolved.
 fn literals(code: &str) -> Vec<String> {

@@ -1,6 +1,4 @@
 //! Installed files other than the program: completions, man pages, and the package itself.
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use std::process::Command;
 use std::{fs, str};

@@ -6,6 +6,7 @@
 mod common;
 
 mod architecture;
+mod budget;
 mod circles;
 mod compilers;
 mod defects;

@@ -1,7 +1,5 @@
 //! A test or check that is not run names what it lacks, so that a run which must have it fails.
 
-#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
-
 use std::path::Path;
 use std::process::Command;
 

@@ -1,33 +1,25 @@
 //! Trainings on photographs of different exposure.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::path::Path;
 
 use nightsplat::gpu::testing::gpu;
 use nightsplat::kernels::exposure::BIAS_SCALE;
 use nightsplat::loss::exposure::{Affine, table};
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic;
 use nightsplat::photographs::dataset::{Dataset, Split, View};
 use nightsplat::photographs::image::{linear_from_srgb, srgb_from_linear};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::results::run::{self, IfExists};
 use nightsplat::train::{Part, TrainConfig, Trainer};
 
-use crate::common::train::advance;
+use crate::common::train::{advance, small_set};
 
 /// The factors of the views' light, in groups of four.
 const FACTORS: [f32; 4] = [1.0, 0.5, 0.25, 2.0];
 
 /// Synthetic views, each darkened or brightened, under one curve.
 fn varied(folder: &Path) -> (TrainConfig, Dataset) {
-    let options = SyntheticOptions {
-        views: 14,
-        width: 40,
-        height: 30,
-        seed: 3,
-        ..SyntheticOptions::default()
-    };
+    let options = small_set(14, [40, 30], 3);
     synthetic::write(folder, &options).unwrap();
     let mut tone = ToneSettings::new(ToneCurve::Ase);
     tone.scene_statistics = true;

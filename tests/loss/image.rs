@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use glam::UVec2;
 use nightsplat::Result;
 use nightsplat::gpu::testing::{gpu, gpu_with};
-use nightsplat::gpu::{Gpu, Reference, Threads};
+use nightsplat::gpu::{Gpu, Threads};
 use nightsplat::kernels::{l1, ssim};
 use nightsplat::loss::{Gradient, Loss, LossInputs, LossRegion, Term};
 use nightsplat::reference::ssim::{gradient, ssim};
@@ -156,34 +156,29 @@ fn whole_vectors_store_the_same_as_single_values() {
     }
 }
 
+fn check_l1(with_loss_region: bool, size: [u32; 2], loss_region: LossRegion) {
+    let [render, target] = images(size);
+    let params = l1::Params {
+        value_count: render.len() as u32,
+        l1_scale: 1.0 / (3 * loss_region.size.element_product()) as f32,
+        width: size[0],
+        height: size[1],
+        loss_begin: loss_region.origin,
+        loss_end: loss_region.origin + loss_region.size,
+    };
+    let constants = l1::Constants { with_loss_region, ..Default::default() };
+    let (d_render, partials) = (vec![0.0f32; render.len()], vec![0.0f32]);
+    let (expected, sum) =
+        run_reference!(l1, constants, params, [render, target], [d_render, partials]);
+    let outcome = evaluate_loss_region(&gpu(), 0.0, size, loss_region, &[render, target]);
+    assert_close("d_render", &outcome.d_render, &expected, 0.0);
+    assert!((outcome.l1 - sum[0] * params.l1_scale).abs() < 1e-6);
+    assert_eq!(outcome.ssim, 0.0, "SSIM is not modelled at weight 0");
+}
+
 #[test]
 fn l1_matches_its_reference() {
-    let gpu = gpu();
-    for size in SIZES {
-        let [render, target] = images(size);
-        let count = render.len() as u32;
-        let params = l1::Params {
-            value_count: count,
-            l1_scale: 1.0 / count as f32,
-            width: size[0],
-            height: size[1],
-            loss_begin: UVec2::ZERO,
-            loss_end: size.into(),
-        };
-        let constants = l1::Constants::default();
-        let (mut expected, mut sum) = (vec![0.0; count as usize], [0.0]);
-        let slices = l1::Slices {
-            render: &render,
-            target: &target,
-            d_render: &mut expected,
-            partials: &mut sum,
-        };
-        l1::Kernel::run(&params, &constants, slices);
-        let outcome = evaluate(&gpu, 0.0, size, &[render, target]);
-        assert_close("d_render", &outcome.d_render, &expected, 0.0);
-        assert!((outcome.l1 - sum[0] / count as f32).abs() < 1e-6);
-        assert_eq!(outcome.ssim, 0.0, "SSIM is not modelled at weight 0");
-    }
+    SIZES.into_iter().for_each(|size| check_l1(false, size, LossRegion::whole(size.into())));
 }
 
 /// (1 - w) mean|a - b| + w (1 - mean SSIM) of one channel, with means over the loss region.
@@ -257,26 +252,10 @@ fn the_reference_gradient_agrees_with_finite_differences() {
 
 #[test]
 fn the_kernels_match_their_references_with_a_loss_region() {
-    let gpu = gpu();
     for (size, loss_region) in loss_regions() {
         check_ssim([16, 64, 1], size, loss_region);
         check_ssim([2, 32, 1], size, loss_region);
-        let [render, target] = images(size);
-        let constants = l1::Constants { with_loss_region: true, ..Default::default() };
-        let params = l1::Params {
-            value_count: render.len() as u32,
-            l1_scale: 1.0 / (3 * loss_region.size.element_product()) as f32,
-            width: size[0],
-            height: size[1],
-            loss_begin: loss_region.origin,
-            loss_end: loss_region.origin + loss_region.size,
-        };
-        let (d_render, partials) = (vec![0.0f32; render.len()], vec![0.0f32]);
-        let (expected, sum) =
-            run_reference!(l1, constants, params, [render, target], [d_render, partials]);
-        let outcome = evaluate_loss_region(&gpu, 0.0, size, loss_region, &[render, target]);
-        assert_close("d_render", &outcome.d_render, &expected, 0.0);
-        assert!((outcome.l1 - sum[0] * params.l1_scale).abs() < 1e-6);
+        check_l1(true, size, loss_region);
     }
 }
 

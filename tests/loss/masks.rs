@@ -1,7 +1,5 @@
 //! Masked pixels do not affect statistics, losses, gradients, density control or scores.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use nightsplat::gpu::testing::gpu;
 use nightsplat::networks::{DenoiserSettings, NetworkVariant};
 use nightsplat::photographs::dataset::Dataset;

@@ -1,8 +1,6 @@
 //! Exposures: kernels against their references, gradients against central differences, and the mean that stays the
 //! identity.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use glam::{UVec2, Vec2};
 use nightsplat::gpu::Threads;
 use nightsplat::gpu::testing::gpu;

@@ -1,7 +1,5 @@
 //! Curves from files: TOML settings, CSV and .cube tables, and errors in them.
 
-#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
-
 use std::path::PathBuf;
 
 use nightsplat::Error;

@@ -1,7 +1,5 @@
 //! The brightness of automatic targets: the rule against a slow one over pixels, and unusual datasets.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use glam::{DAffine3, DVec2, DVec3};
 use nightsplat::camera::{Camera, CameraModel};
 use nightsplat::photographs::tone::{Exposure, LuminanceHistogram, Statistics, exposed_anew, soft};

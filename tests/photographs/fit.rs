@@ -1,9 +1,6 @@
 //! Fits of tone curves: constants are recovered from synthetic pairs, fits to real pairs are better than the published
 //! constants, and bad input is named.
 
-#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
-
-#[cfg(feature = "cli")]
 mod command;
 mod profile;
 

@@ -1,7 +1,5 @@
 //! Datasets: every layout is recognised and read equally, and bad input is refused in one line.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 mod as_it_is;
 mod bad_input;
 mod colours;
@@ -9,13 +7,13 @@ mod keys;
 mod layouts;
 mod models;
 mod photographs;
-#[cfg(feature = "cli")]
+#[cfg(unix)]
 mod pose;
-#[cfg(all(unix, feature = "cli"))]
+#[cfg(unix)]
 mod pose_bright;
-#[cfg(all(unix, feature = "cli"))]
+#[cfg(unix)]
 mod pose_cameras;
-#[cfg(all(feature = "cli", feature = "raw"))]
+#[cfg(feature = "raw")]
 mod raw;
 mod real;
 pub(crate) mod synthetic;
@@ -26,11 +24,26 @@ use std::path::Path;
 use glam::{DQuat, DVec2, DVec3};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split, View};
 use nightsplat::photographs::image::Image;
-use serde_json::json;
+use serde_json::{Value, json};
 use synthetic::*;
 
 fn load(root: &Path) -> Dataset {
     Dataset::load(root, &LoadOptions::default()).unwrap()
+}
+
+/// The dataset must be refused in one line that contains all of `parts`.
+fn refuses(root: &Path, parts: &[&str]) {
+    refuses_with(root, &LoadOptions::default(), 3, parts);
+}
+
+fn refuses_with(root: &Path, options: &LoadOptions, exit_code: u8, parts: &[&str]) {
+    let error = Dataset::load(root, options).expect_err("this should be refused");
+    let message = error.to_string();
+    assert_eq!(error.exit_code(), exit_code, "{message}");
+    assert!(!message.contains('\n'), "more than a line: {message}");
+    for part in parts {
+        assert!(message.contains(part), "no `{part}` in: {message}");
+    }
 }
 
 fn names(dataset: &Dataset, split: Split) -> Vec<&str> {
@@ -65,9 +78,8 @@ fn assert_camera_is_view(view: &View, index: usize) {
 
 #[test]
 fn the_lom_layout_trains_on_low_and_scores_against_high() {
-    let folder = tempfile::tempdir().unwrap();
-    lom(folder.path(), 10, &[2, 5]);
-    let dataset = load(folder.path());
+    let folder = Folder::lom();
+    let dataset = load(&folder);
     assert_eq!(dataset.views.len(), 10);
     assert_eq!(names(&dataset, Split::Test), ["v02", "v05"]);
     for (index, view) in dataset.views.iter().enumerate() {
@@ -79,22 +91,20 @@ fn the_lom_layout_trains_on_low_and_scores_against_high() {
     assert!(dataset.points.is_empty() && dataset.skipped.is_empty(), "{:?}", dataset.skipped);
 
     let options = LoadOptions { load_low_test: false, ..LoadOptions::default() };
-    let dataset = Dataset::load(folder.path(), &options).unwrap();
+    let dataset = Dataset::load(&folder, &options).unwrap();
     assert!(dataset.test_views().all(|view| view.image.is_none() && view.reference.is_some()));
 }
 
 #[test]
 fn a_validation_listing_replaces_a_missing_test_listing() {
-    let folder = tempfile::tempdir().unwrap();
-    lom(folder.path(), 10, &[2, 5]);
-    std::fs::remove_file(folder.path().join("transforms_test.json")).unwrap();
-    assert_eq!(names(&load(folder.path()), Split::Test), ["v02"]);
+    let folder = Folder::lom();
+    std::fs::remove_file(folder.join("transforms_test.json")).unwrap();
+    assert_eq!(names(&load(&folder), Split::Test), ["v02"]);
 }
 
 #[test]
 fn the_realx3d_layout_keeps_test_poses_without_photographs_and_finds_files_without_extension() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     photographs(root, "train", 0..4, 1.0);
     let listed = |split: &str, views: std::ops::Range<usize>| {
         transforms(views.map(|index| frame(index, &format!("{split}/{}", name(index)))).collect())
@@ -118,27 +128,18 @@ fn the_realx3d_layout_keeps_test_poses_without_photographs_and_finds_files_witho
 
 #[test]
 fn in_a_single_listing_every_eighth_view_by_name_is_a_test_view() {
-    let folder = tempfile::tempdir().unwrap();
-    photographs(folder.path(), "images", 0..18, 1.0);
-    let frames =
-        (0..18).rev().map(|index| frame(index, &format!("./images/{}.png", name(index)))).collect();
-    write_json(folder.path().join("transforms.json"), &transforms(frames));
-    let dataset = load(folder.path());
+    let reverse = |listing: &mut Value| listing["frames"].as_array_mut().unwrap().reverse();
+    let dataset = load(&Folder::with_listing(18, reverse));
     assert_eq!(names(&dataset, Split::Test), ["v00", "v08", "v16"]);
     assert!(dataset.views.iter().all(|view| view.image.is_some() && view.reference.is_none()));
 }
 
 #[test]
 fn a_frames_own_intrinsics_override_and_views_may_differ_in_size() {
-    let folder = tempfile::tempdir().unwrap();
-    photographs(folder.path(), "images", 0..4, 1.0);
-    photograph(&folder.path().join("images/v01.png"), (64, 50), 0.1);
-    let mut frames: Vec<_> =
-        (0..4).map(|index| frame(index, &format!("images/{}.png", name(index)))).collect();
     let own = json!({ "w": 64, "h": 50.0, "camera_angle_x": 1.0, "cx": 30.0 });
-    frames[1].as_object_mut().unwrap().extend(own.as_object().unwrap().clone());
-    write_json(folder.path().join("transforms.json"), &transforms(frames));
-    let dataset = load(folder.path());
+    let folder = Folder::with_listing(4, |listing| extend(&mut listing["frames"][1], &own));
+    photograph(&folder.join("images/v01.png"), (64, 50), 0.1);
+    let dataset = load(&folder);
     let camera = view(&dataset, "v01").camera;
     assert_eq!((camera.width, camera.height), (64, 50));
     assert!(camera.focal.abs_diff_eq(DVec2::splat(32.0 / 0.5_f64.tan()), 1e-9), "{}", camera.focal);
@@ -148,15 +149,10 @@ fn a_frames_own_intrinsics_override_and_views_may_differ_in_size() {
 
 #[test]
 fn an_angle_of_view_gives_a_centred_camera_of_the_photographs_size() {
-    let folder = tempfile::tempdir().unwrap();
-    photographs(folder.path(), "images", 0..3, 1.0);
-    let frames: Vec<_> =
-        (0..3).map(|index| frame(index, &format!("images/{}", name(index)))).collect();
-    write_json(
-        folder.path().join("transforms.json"),
-        &json!({ "camera_angle_x": 0.8, "frames": frames }),
-    );
-    let camera = load(folder.path()).views[1].camera;
+    let folder = Folder::with_listing(3, |listing| {
+        *listing = json!({ "camera_angle_x": 0.8, "frames": listing["frames"] });
+    });
+    let camera = load(&folder).views[1].camera;
     assert_eq!((camera.width, camera.height), SIZE);
     assert!(camera.focal.abs_diff_eq(DVec2::splat(20.0 / 0.4_f64.tan()), 1e-9));
     assert_eq!(camera.principal_point, DVec2::new(20.0, 15.0));
@@ -164,14 +160,12 @@ fn an_angle_of_view_gives_a_centred_camera_of_the_photographs_size() {
 
 #[test]
 fn backslashes_and_frames_of_unknown_size_are_handled() {
-    let folder = tempfile::tempdir().unwrap();
-    photographs(folder.path(), "images", 0..3, 1.0);
-    let frames = (0..4)
-        .map(|index| frame(index, &format!(".\\images\\{}.png", name(index))))
-        .collect::<Vec<_>>();
-    let listing = json!({ "fl_x": 35.0, "frames": frames });
-    write_json(folder.path().join("transforms.json"), &listing);
-    let dataset = load(folder.path());
+    let path = |index: usize| format!(".\\images\\{}.png", name(index));
+    let frames: Vec<_> = (0..4).map(|index| frame(index, &path(index))).collect();
+    let folder = Folder::with_listing(3, |listing| {
+        *listing = json!({ "fl_x": 35.0, "frames": frames });
+    });
+    let dataset = load(&folder);
     assert_eq!(dataset.views.len(), 3);
     assert!(
         dataset.skipped[0].contains("images/v03.png: neither w and h"),
@@ -182,27 +176,22 @@ fn backslashes_and_frames_of_unknown_size_are_handled() {
 
 #[test]
 fn a_model_without_points_loads_without_points() {
-    let folder = tempfile::tempdir().unwrap();
-    photographs(folder.path(), "images", 0..9, 1.0);
-    model(9).write_binary(&folder.path().join("sparse/0"));
-    std::fs::remove_file(folder.path().join("sparse/0/points3D.bin")).unwrap();
-    let dataset = load(folder.path());
+    let folder = Folder::with_model(&model(9));
+    std::fs::remove_file(folder.join("sparse/0/points3D.bin")).unwrap();
+    let dataset = load(&folder);
     assert_eq!((dataset.views.len(), dataset.points.len()), (9, 0));
 }
 
 #[test]
 fn both_colmap_encodings_and_folders_give_the_same_dataset() {
     let load_written = |folder: &str, text: bool| {
-        let root = tempfile::tempdir().unwrap();
-        photographs(root.path(), "images", 0..10, 1.0);
-        let model = model(10);
-        let folder = root.path().join(folder);
-        if text {
-            model.write_text(&folder);
-        } else {
-            model.write_binary(&folder);
+        let root = Folder::empty();
+        photographs(&root, "images", 0..10, 1.0);
+        match text {
+            true => model(10).write_text(&root.join(folder)),
+            false => model(10).write_binary(&root.join(folder)),
         }
-        load(root.path())
+        load(&root)
     };
     let binary = load_written("sparse/0", false);
     assert_eq!(names(&binary, Split::Test), ["v00", "v08"]);
@@ -239,11 +228,9 @@ fn every_supported_camera_model_is_read_and_undistorted() {
         ("OPENCV", 4, &[f, f, cx, cy, 0.1, -0.02, 0.001, 0.002]),
     ];
     for (name, number, parameters) in models {
-        let folder = tempfile::tempdir().unwrap();
-        photographs(folder.path(), "images", 0..3, 1.0);
         let cameras = vec![(3, name, number, parameters.to_vec())];
-        Model { cameras, ..model(3) }.write_binary(&folder.path().join("sparse/0"));
-        let camera = load(folder.path()).views[0].camera;
+        let folder = Folder::with_model(&Model { cameras, ..model(3) });
+        let camera = load(&folder).views[0].camera;
         assert_eq!(camera.principal_point, DVec2::new(cx, cy), "{name}");
         let distorted = number >= 2;
         // The zoom that leaves no blank pixel is the same factor for both axes.
@@ -254,8 +241,7 @@ fn every_supported_camera_model_is_read_and_undistorted() {
 
 #[test]
 fn photographs_and_references_are_undistorted_equally() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let pattern = |gain: f32| {
         move |x: u32, y: u32| {
             [(x as f32 / 40.0) * gain, (y as f32 / 30.0) * gain, ((x * y) % 7) as f32 / 7.0 * gain]
@@ -292,11 +278,11 @@ fn low_folders_are_the_input_and_normal_light_folders_the_reference() {
     for (dark_folder, normal) in
         [("low", "images"), ("images_low", "images"), ("low", "high"), ("low", "val")]
     {
-        let folder = tempfile::tempdir().unwrap();
-        photographs(folder.path(), dark_folder, 0..9, 1.0);
-        photographs(folder.path(), normal, 0..9, 4.0);
-        model(9).write_binary(&folder.path().join("sparse/0"));
-        let dataset = load(folder.path());
+        let folder = Folder::empty();
+        photographs(&folder, dark_folder, 0..9, 1.0);
+        photographs(&folder, normal, 0..9, 4.0);
+        model(9).write_binary(&folder.join("sparse/0"));
+        let dataset = load(&folder);
         assert_eq!(dataset.views.len(), 9);
         for (index, view) in dataset.views.iter().enumerate() {
             assert_eq!(
@@ -312,23 +298,20 @@ fn low_folders_are_the_input_and_normal_light_folders_the_reference() {
 
 #[test]
 fn a_list_of_test_names_decides_the_split() {
-    let folder = tempfile::tempdir().unwrap();
-    photographs(folder.path(), "images", 0..9, 1.0);
-    model(9).write_binary(&folder.path().join("sparse/0"));
-    std::fs::write(folder.path().join("test.txt"), "v03.png\n\n v05 \r\nunknown.png\n").unwrap();
-    assert_eq!(names(&load(folder.path()), Split::Test), ["v03", "v05"]);
-    std::fs::rename(folder.path().join("test.txt"), folder.path().join("sparse/0/test.txt"))
-        .unwrap();
-    assert_eq!(names(&load(folder.path()), Split::Test), ["v03", "v05"]);
+    let folder = Folder::with_model(&model(9));
+    std::fs::write(folder.join("test.txt"), "v03.png\n\n v05 \r\nunknown.png\n").unwrap();
+    assert_eq!(names(&load(&folder), Split::Test), ["v03", "v05"]);
+    std::fs::rename(folder.join("test.txt"), folder.join("sparse/0/test.txt")).unwrap();
+    assert_eq!(names(&load(&folder), Split::Test), ["v03", "v05"]);
 }
 
 #[test]
 fn a_given_reference_folder_overrides_and_may_have_another_resolution() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path().join("set");
+    let folder = Folder::empty();
+    let root = folder.join("set");
     lom(&root, 10, &[2, 5]);
-    photograph(&folder.path().join("mine/v05.png"), (2 * SIZE.0, 2 * SIZE.1), 0.8);
-    let reference = Some(folder.path().join("mine"));
+    photograph(&folder.join("mine/v05.png"), (2 * SIZE.0, 2 * SIZE.1), 0.8);
+    let reference = Some(folder.join("mine"));
     let dataset =
         Dataset::load(&root, &LoadOptions { reference, ..LoadOptions::default() }).unwrap();
     assert_eq!(level(view(&dataset, "v05").reference.as_ref()), Some(204.0));
@@ -338,8 +321,7 @@ fn a_given_reference_folder_overrides_and_may_have_another_resolution() {
 
 #[test]
 fn points_of_another_world_are_transformed_into_the_views() {
-    let folder = tempfile::tempdir().unwrap();
-    lom(folder.path(), 10, &[2, 5]);
+    let folder = Folder::lom();
     let rotation = DQuat::from_axis_angle(DVec3::new(1.0, 2.0, -1.0).normalize(), 2.0);
     let elsewhere = |point: DVec3| 0.3 * (rotation * point) + DVec3::new(5.0, -6.0, 7.0);
     let mut moved = model(10);
@@ -349,8 +331,8 @@ fn points_of_another_world_are_transformed_into_the_views() {
         pose.translation = -(pose.matrix3 * elsewhere(center));
     }
     moved.points.iter_mut().for_each(|(_, position, _)| *position = elsewhere(*position));
-    moved.write_binary(&folder.path().join("colmap_sparse/0"));
-    let dataset = load(folder.path());
+    moved.write_binary(&folder.join("colmap_sparse/0"));
+    let dataset = load(&folder);
     assert_eq!(dataset.points.len(), 20);
     for (ours, (_, position, _)) in dataset.points.iter().zip(&model(10).points) {
         assert!(ours.position.distance(*position) < 1e-9, "{} is not {position}", ours.position);
@@ -359,17 +341,16 @@ fn points_of_another_world_are_transformed_into_the_views() {
 
     // One camera is displaced by a third of the ring: the worlds do not match.
     moved.images[4].1.translation += DVec3::splat(0.3);
-    moved.write_binary(&folder.path().join("colmap_sparse/0"));
-    assert!(load(folder.path()).points.is_empty());
+    moved.write_binary(&folder.join("colmap_sparse/0"));
+    assert!(load(&folder).points.is_empty());
 }
 
 #[test]
 fn downscaling_shrinks_cameras_and_photographs_together() {
-    let folder = tempfile::tempdir().unwrap();
-    lom(folder.path(), 10, &[2, 5]);
-    let full = load(folder.path());
+    let folder = Folder::lom();
+    let full = load(&folder);
     let options = LoadOptions { downscale: 1.6, ..LoadOptions::default() };
-    let small = Dataset::load(folder.path(), &options).unwrap();
+    let small = Dataset::load(&folder, &options).unwrap();
     for (full, small) in full.views.iter().zip(&small.views) {
         assert_eq!((small.camera.width, small.camera.height), (25, 19));
         let (a, b) =
@@ -383,29 +364,20 @@ fn downscaling_shrinks_cameras_and_photographs_together() {
 
 #[test]
 fn a_smaller_copy_of_the_photographs_rescales_their_cameras() {
-    let folder = tempfile::tempdir().unwrap();
+    let size = json!({ "w": 80.0, "h": 63.0 });
+    let folder = Folder::with_listing(3, |listing| extend(listing, &size));
     for index in 0..3 {
-        photograph(
-            &folder.path().join("images").join(name(index)).with_extension("png"),
-            (20, 15 + 1),
-            0.1,
-        );
+        photograph(&folder.join(format!("images/{}.png", name(index))), (20, 16), 0.1);
     }
-    let frames: Vec<_> =
-        (0..3).map(|index| frame(index, &format!("images/{}", name(index)))).collect();
-    let mut listing = transforms(frames);
-    (listing["w"], listing["h"]) = (json!(80.0), json!(63.0));
-    write_json(folder.path().join("transforms.json"), &listing);
-    let camera = load(folder.path()).views[0].camera;
+    let camera = load(&folder).views[0].camera;
     assert_eq!((camera.width, camera.height), (20, 16));
     assert!((camera.focal.x - FOCAL.x / 4.0).abs() < 1e-9);
 }
 
 #[test]
 fn the_extent_is_that_of_the_training_cameras() {
-    let folder = tempfile::tempdir().unwrap();
-    lom(folder.path(), 10, &[2, 5]);
-    let mut dataset = load(folder.path());
+    let folder = Folder::lom();
+    let mut dataset = load(&folder);
     let centers: Vec<DVec3> =
         [0, 1, 3, 4, 6, 7, 8, 9].iter().map(|index| pose(*index).inverse().translation).collect();
     let mean = centers.iter().sum::<DVec3>() / 8.0;

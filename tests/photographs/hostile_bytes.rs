@@ -2,8 +2,6 @@
 //!
 //! The parsers and seeds are those of the fuzz targets; here, seeds are mutated by a fixed stream of random numbers,
 //! the same in every run. `NIGHTSPLAT_ROUNDS` sets the number of rounds; findings of fuzzing are among the seeds.
-#![cfg(feature = "io")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use std::fs;
 use std::panic::catch_unwind;

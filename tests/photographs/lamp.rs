@@ -1,7 +1,5 @@
 //! The synthetic sets whose cameras carry a lamp.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::path::Path;
 
 use nightsplat::photographs::dataset::synthetic::{self, Capture, SyntheticOptions};

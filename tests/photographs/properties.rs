@@ -1,6 +1,4 @@
 //! Properties for arbitrary input: curves, cameras, lenses, sort and scan, and files that are written and read back.
-#![cfg(feature = "io")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use std::path::Path;
 

@@ -1,7 +1,5 @@
 //! The synthetic street: its light falls along it, and a view sees a part of it.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::path::Path;
 
 use nightsplat::photographs::dataset::synthetic::{self, DARKENING, SyntheticOptions};

@@ -1,7 +1,5 @@
 //! The synthetic dataset has its documented layout, loads, and depends only on its options, byte for byte.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -12,6 +10,7 @@ use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
 use nightsplat::photographs::image::{Image, linear_from_srgb};
 
 use crate::common::command::run;
+use crate::common::train::small_set;
 
 const SMALL: SyntheticOptions = SyntheticOptions {
     views: 10,
@@ -190,13 +189,7 @@ fn a_folder_that_cannot_be_created_is_named() {
 
 #[test]
 fn every_eighth_view_is_a_test_view() {
-    let dir = written(&SyntheticOptions {
-        views: 17,
-        width: 16,
-        height: 16,
-        seed: 0,
-        ..SyntheticOptions::default()
-    });
+    let dir = written(&small_set(17, [16, 16], 0));
     let dataset = Dataset::load(dir.path(), &LoadOptions::default()).unwrap();
     let is_test = |(index, view): (usize, &nightsplat::photographs::dataset::View)| {
         (view.split == Split::Test) == (index % 8 == 0)
@@ -204,7 +197,6 @@ fn every_eighth_view_is_a_test_view() {
     assert!(dataset.views.iter().enumerate().all(is_test));
 }
 
-#[cfg(feature = "cli")]
 mod command {
     use super::*;
     use nightsplat::cli::synth::{SynthArgs, run};

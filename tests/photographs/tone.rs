@@ -1,7 +1,5 @@
 //! Tone curves and their statistics, against the paper and by their properties.
 
-#![allow(clippy::unwrap_used, reason = "what fails in a helper fails the test")]
-
 use std::path::{Path, PathBuf};
 
 use nightsplat::Error;

@@ -1,7 +1,5 @@
 //! The same command gives the same bits: under any load, for any submission, inspection and interruption of the steps,
 //! and according to the ledger of this driver.
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,12 +8,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic;
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{Background, TrainConfig, Trainer};
 
 use crate::common::command::succeed;
-use crate::common::train::{advance, dataset};
+use crate::common::train::{advance, dataset, small_set};
 use crate::common::{fixture, not_run};
 
 const REPETITIONS: usize = 25;
@@ -134,13 +132,7 @@ fn keep_first_points(path: &Path, count: usize) {
 fn tiny_run() -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let [set, run] = ["set", "run"].map(|name| folder.path().join(name));
-    let options = SyntheticOptions {
-        views: 8,
-        width: 32,
-        height: 24,
-        seed: 1,
-        ..SyntheticOptions::default()
-    };
+    let options = small_set(8, [32, 24], 1);
     synthetic::write(&set, &options).unwrap();
     keep_first_points(&set.join("colmap_sparse/0/points3D.txt"), 2000);
     succeed(&format!(

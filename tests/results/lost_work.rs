@@ -1,6 +1,5 @@
 //! Runs that are interrupted, doubled, damaged or given another dataset: nothing is lost, nothing is mixed.
-#![cfg(all(unix, feature = "cli"))]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
+#![cfg(unix)]
 
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader};
@@ -9,7 +8,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
 use crate::common::command::{command, refused, run, succeed};
-use crate::common::place::Place;
+use crate::common::place::{Place, log};
 
 /// A training that has started and has thousands of steps to go.
 fn begun(arguments: &str) -> Child {
@@ -41,12 +40,6 @@ fn wait_for(path: &Path) {
         assert!(begin.elapsed() < Duration::from_secs(120), "{} does not come", path.display());
         std::thread::sleep(Duration::from_millis(10));
     }
-}
-
-/// The log without the column of times.
-fn log(run: &Path) -> Vec<String> {
-    let text = fs::read_to_string(run.join("train.csv")).unwrap();
-    text.lines().map(|line| line.rsplit_once(',').unwrap().0.to_owned()).collect()
 }
 
 #[test]
@@ -280,28 +273,6 @@ fn hostile_names_break_no_table_and_reach_no_terminal() {
     assert_eq!(log.lines().count(), 10);
     assert!(log.contains("\"a,_[31mb\""), "{log}");
     refused("eval /nowhere\u{1b}[2J", 3, &[r"/nowhere\u{1b}[2J"]);
-}
-
-#[test]
-fn a_closed_output_ends_a_command_quietly() {
-    for arguments in ["tone list --table", "tone list"] {
-        let mut child =
-            command(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-        drop(child.stdout.take());
-        let (code, stderr) = ended(child);
-        assert_eq!((code, stderr.as_str()), (0, ""), "{arguments}");
-    }
-}
-
-#[test]
-fn the_exit_code_depends_on_the_remedy() {
-    let place = Place::new();
-    succeed(&place.train("done", "--steps 1"));
-    refused(&place.train("done", "--steps 1"), 1, &["already contains a run"]);
-    refused(&place.train("new", "--steps 0"), 2, &["--steps"]);
-    refused(&format!("eval {}", place.0.path().display()), 3, &["no config.toml"]);
-    refused(&place.train("new", "--steps 1 --device voodoo"), 4, &["voodoo"]);
-    assert!(!place.path("new").exists());
 }
 
 #[test]

@@ -1,6 +1,4 @@
 //! A camera profile end to end: fitted, used, and named with all its results.
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use std::fs;
 use std::path::Path;

@@ -1,7 +1,5 @@
 //! Runs from the user's view: without references, with another split, interrupted, opened elsewhere, rendered along a
 //! path, logged to `TensorBoard`.
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,6 +9,7 @@ use nightsplat::results::run::{load_progress, stopped_at};
 use serde_json::Value;
 
 use crate::common::command::{command, refused, refused_with, run, succeed};
+use crate::common::copy;
 
 /// A folder with a small dataset in `set`.
 fn folder() -> tempfile::TempDir {
@@ -230,18 +229,6 @@ fn a_model_is_written_with_every_checkpoint() {
     assert!(stopped_at(&out).unwrap() >= 5);
     let (_, message) = run(&format!("eval {}", out.display()), 0);
     assert!(message.contains("incomplete, at step"), "{message}");
-}
-
-fn copy(from: &Path, to: &Path) {
-    fs::create_dir_all(to).unwrap();
-    for entry in fs::read_dir(from).unwrap() {
-        let (path, target) = entry.map(|e| (e.path(), to.join(e.file_name()))).unwrap();
-        if path.is_dir() {
-            copy(&path, &target);
-        } else {
-            fs::copy(path, target).unwrap();
-        }
-    }
 }
 
 #[test]

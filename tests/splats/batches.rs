@@ -1,7 +1,5 @@
 //! More Gaussians than one binding can hold: passes in batches, with the same bits.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use glam::{DVec3, Vec3};
 
 use nightsplat::gpu::Gpu;

@@ -1,8 +1,6 @@
 //! The code that ships is the code that is checked: every pass of rendering, training, density control and pseudo-GT,
 //! as the library records it, against its CPU reference.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -13,7 +11,7 @@ use nightsplat::gpu::testing::{Defect, gpu, gpu_with, is_checked, with_defect};
 use nightsplat::gpu::{CheckReport, Gpu};
 use nightsplat::networks::NetworkVariant;
 use nightsplat::photographs::dataset::Dataset;
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic;
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
 use nightsplat::photographs::tone::{Statistics, ToneCurve, ToneSettings};
@@ -25,17 +23,12 @@ use nightsplat::train::{Background, Part, TrainConfig, Trainer};
 
 use crate::common::Random;
 use crate::common::setup::{Gradients, Setup, tile_of, variants};
+use crate::common::train::small_set;
 
 /// Six views of 40 x 30 pixels with depth maps, as the model requires.
 fn dataset(config: &TrainConfig) -> Dataset {
     let folder = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions {
-        views: 6,
-        width: 40,
-        height: 30,
-        seed: 1,
-        ..SyntheticOptions::default()
-    };
+    let options = small_set(6, [40, 30], 1);
     synthetic::write(folder.path(), &options).unwrap();
     let depth = folder.path().join("depth");
     std::fs::create_dir(&depth).unwrap();
@@ -397,13 +390,7 @@ fn data_that_is_not_finite_gives_no_difference_and_no_panic() {
 fn the_command_checks_a_dataset_and_names_the_buffer_that_differs() {
     use clap::Parser as _;
     let folder = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions {
-        views: 3,
-        width: 24,
-        height: 18,
-        seed: 1,
-        ..SyntheticOptions::default()
-    };
+    let options = small_set(3, [24, 18], 1);
     synthetic::write(folder.path(), &options).unwrap();
     let check = |path: &Path| {
         let arguments = ["nightsplat", "check", path.to_str().unwrap(), "--steps", "1", "--json"];

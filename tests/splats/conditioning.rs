@@ -1,8 +1,6 @@
 //! How errors grow: blending with its layers, Adam with its steps, percentiles and means with their pixels; each
 //! against f64, with the promised bound.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::ops::Range;
 
 use glam::{DVec2, DVec3};

@@ -1,8 +1,6 @@
 //! Density control: the kernels against their references, the outcome for each kind of Gaussian, the limit, the edge
 //! cases.
 
-#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
-
 mod host;
 
 use glam::{DVec3, Quat, Vec3};

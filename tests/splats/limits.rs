@@ -1,8 +1,6 @@
 //! The renderer's passes at their limits: counts that wrap around, slots without a tile, Gaussians that cover
 //! everything, many Gaussians on one pixel, and unsuitable tiles.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::array;
 use std::collections::HashSet;
 
@@ -21,6 +19,30 @@ use nightsplat::splats::scene::Shape;
 use crate::common::setup::{Setup, features};
 use crate::common::{Random, not_run};
 
+/// The total and the status after `order_counts` for this much memory.
+fn counted(
+    tile_counts: Vec<u32>,
+    capacity: u32,
+    truncates: u32,
+    before: [u32; 2],
+) -> (u32, Vec<u32>) {
+    let constants = order_counts::Constants { partition_size: 2 };
+    let gaussian_count = tile_counts.len() as u32;
+    let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
+    let (intersection_offsets, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
+    let (counts, status) = (vec![7], vec![before[0], before[1], 0, 9]);
+    let (_, _, counts, status, arrivals) = run_kernel!(
+        order_counts,
+        constants,
+        order_counts::Params { gaussian_count, capacity, truncates },
+        Threads::Workgroups([3, 1, 1]),
+        [sorted_ids, tile_counts],
+        [intersection_offsets, sums, counts, status, arrivals]
+    );
+    assert_eq!(arrivals, [0]);
+    (counts[0], status)
+}
+
 #[test]
 fn more_intersections_than_can_be_counted_are_an_overflow() {
     // The last sum wraps around.
@@ -33,70 +55,44 @@ fn more_intersections_than_can_be_counted_are_an_overflow() {
     ] {
         let total: u64 = tile_counts.iter().map(|&count| u64::from(count)).sum();
         let total = u32::try_from(total).unwrap_or(u32::MAX);
-        let gaussian_count = tile_counts.len() as u32;
-        let constants = order_counts::Constants { partition_size: 2 };
-        let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
-        let (intersection_offsets, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
-        let (counts, status) = (vec![7], vec![before[0], before[1], 0, 9]);
-        let (_, _, counts, after, arrivals) = run_kernel!(
-            order_counts,
-            constants,
-            order_counts::Params { gaussian_count, capacity: 5, truncates: 0 },
-            Threads::Workgroups([3, 1, 1]),
-            [sorted_ids, tile_counts],
-            [intersection_offsets, sums, counts, status, arrivals]
-        );
-        assert_eq!(counts[0], if flag == 0 { total } else { 0 });
+        let (count, after) = counted(tile_counts, 5, 0, before);
+        assert_eq!(count, if flag == 0 { total } else { 0 });
         let flags = before[0] | flag;
         assert_eq!(after, [flags, before[1].max(total), 0, flags]);
-        assert_eq!(arrivals, [0]);
     }
-}
-
-/// The number of intersections that `order_counts` keeps where it truncates, and the status.
-fn truncated(tile_counts: Vec<u32>, capacity: u32) -> (u32, Vec<u32>) {
-    let constants = order_counts::Constants { partition_size: 2 };
-    let gaussian_count = tile_counts.len() as u32;
-    let sorted_ids: Vec<u32> = (0..gaussian_count).rev().collect();
-    let (intersection_offsets, sums, arrivals) = (vec![7; 5], vec![7; 3], vec![0]);
-    let (counts, status) = (vec![7], vec![0, 1, 0, 9]);
-    let (_, _, counts, status, _) = run_kernel!(
-        order_counts,
-        constants,
-        order_counts::Params { gaussian_count, capacity, truncates: 1 },
-        Threads::Workgroups([2, 1, 1]),
-        [sorted_ids, tile_counts],
-        [intersection_offsets, sums, counts, status, arrivals]
-    );
-    (counts[0], status)
 }
 
 #[test]
 fn what_exceeds_the_memory_is_left_out_without_a_flag() {
     for (capacity, kept) in [(5, 5), (9, 9), (12, 9)] {
-        assert_eq!(truncated(vec![4, 3, 2], capacity), (kept, vec![0, 9, 0, 0]));
+        assert_eq!(counted(vec![4, 3, 2], capacity, 1, [0, 1]), (kept, vec![0, 9, 0, 0]));
     }
     // Where the sum wraps around, so do the offsets.
-    let (kept, status) = truncated(vec![1 << 31, 1 << 31, 3], 5);
+    let (kept, status) = counted(vec![1 << 31, 1 << 31, 3], 5, 1, [0, 1]);
     assert_eq!((kept, status[1]), (0, u32::MAX));
 }
 
-#[test]
-fn the_gaussian_across_the_end_of_the_memory_covers_no_tile() {
+/// What `emit` writes for three Gaussians in a view of four tiles: tiles, intersections, Gaussians, ranges.
+fn emitted(count: u32, tile_counts: Vec<u32>) -> (Vec<u32>, Vec<u32>, Vec<u32>, Vec<UVec2>) {
     let setup = Setup::new(3, [32, 32], 0, 1);
     let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
-    let (counts, sorted_ids, tile_counts) = (vec![6], vec![0, 1, 2], vec![4, 4, 4]);
+    let (counts, sorted_ids) = (vec![count], vec![0, 1, 2]);
     let (sums, intersection_offsets) = (vec![0], vec![0, 4, 8]);
     let [tiles, intersection_ids, gaussian_ids] = [0; 3].map(|_| vec![7u32; 16]);
     let intersection_ranges = vec![UVec2::splat(7); 3];
-    let (tiles, ids, _, ranges) = run_kernel!(
+    run_kernel!(
         emit,
         emit::Constants { partition_size: 256, ..Default::default() },
         emit::Params { size: UVec2::new(32, 32), gaussian_count: 3, tile_columns: 2 },
         Threads::Exactly([3, 1, 1]),
         [counts, sorted_ids, intersection_offsets, sums, splats, tile_counts],
         [tiles, intersection_ids, gaussian_ids, intersection_ranges]
-    );
+    )
+}
+
+#[test]
+fn the_gaussian_across_the_end_of_the_memory_covers_no_tile() {
+    let (tiles, ids, _, ranges) = emitted(6, vec![4, 4, 4]);
     assert!(tiles[4..6].iter().all(|&tile| tile == u32::MAX), "{tiles:?}");
     assert_eq!(ids[..6], [0, 1, 2, 3, 4, 5]);
     assert!(ids[6..].iter().chain(&tiles[6..]).all(|&slot| slot == 7));
@@ -172,24 +168,11 @@ fn every_tile_finds_its_run_among_any_number_of_intersections() {
 
 #[test]
 fn a_count_that_wrapped_around_writes_no_slot_beyond_the_count() {
-    let setup = Setup::new(3, [32, 32], 0, 1);
-    let splats = gpu().read(&setup.render().renderer.frame().splats).unwrap();
     // As if the offsets of later ranks had exceeded the total.
-    let (counts, sorted_ids, tile_counts) = (vec![2], vec![0, 1, 2], vec![4, 4, u32::MAX - 5]);
-    let (sums, intersection_offsets) = (vec![0], vec![0, 4, 8]);
-    let [tiles, intersection_ids, gaussian_ids] = [0; 3].map(|_| vec![7u32; 16]);
-    let intersection_ranges = vec![UVec2::splat(7); 3];
-    let (tiles, intersection_ids, gaussian_ids, intersection_ranges) = run_kernel!(
-        emit,
-        emit::Constants { partition_size: 256, ..Default::default() },
-        emit::Params { size: UVec2::new(32, 32), gaussian_count: 3, tile_columns: 2 },
-        Threads::Exactly([3, 1, 1]),
-        [counts, sorted_ids, intersection_offsets, sums, splats, tile_counts],
-        [tiles, intersection_ids, gaussian_ids, intersection_ranges]
-    );
-    let untouched = |intersection_ids: &[u32]| intersection_ids[2..].iter().all(|&slot| slot == 7);
-    assert!(untouched(&tiles) && untouched(&intersection_ids) && untouched(&gaussian_ids));
-    assert!(intersection_ranges.iter().all(|range| range.x == range.y));
+    let (tiles, ids, gaussians, ranges) = emitted(2, vec![4, 4, u32::MAX - 5]);
+    let untouched = |slots: &[u32]| slots[2..].iter().all(|&slot| slot == 7);
+    assert!(untouched(&tiles) && untouched(&ids) && untouched(&gaussians));
+    assert!(ranges.iter().all(|range| range.x == range.y));
 }
 
 /// Splats that cover an image entirely, with `extra` slots more reserved than they need, and the output of `emit`.

@@ -1,7 +1,5 @@
 //! NaN where none is allowed: it is caught in the step in which it arises, named, and changes nothing.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use nightsplat::Error;
 use nightsplat::gpu::testing::{Defect, gpu, with_defect};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};

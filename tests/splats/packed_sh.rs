@@ -1,7 +1,5 @@
 //! Moments and SH coefficients in 16 bits: the kernels against their references, unbiased rounding, and runs.
 
-#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
-
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use nightsplat::gpu::testing::{gpu, gpu_that_binds};

@@ -1,7 +1,5 @@
 //! The renderer's forward pass: its limits, its invariances, and golden renders.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::collections::HashSet;
 use std::path::Path;
 

@@ -1,7 +1,5 @@
 //! Scan and radix sort: each kernel against its reference, the whole against the standard library.
 
-#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
-
 use nightsplat::gpu::testing::{gpu, gpu_with};
 use nightsplat::gpu::{Buffer, Gpu, Threads};
 use nightsplat::kernels::digit::MAX_DIGITS;

@@ -1,8 +1,6 @@
 //! Training with every kind of curve: evaluated in the loss, baked at upload, fitted to the scene; and from a run's
 //! recorded configuration.
 
-#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
-
 use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions};
@@ -12,6 +10,8 @@ use nightsplat::photographs::tone::{
     GainChoice, MeasuredPhotograph, Table, ToneCurve, ToneSettings,
 };
 use nightsplat::train::{TargetExposure, TrainConfig, Trainer};
+
+use crate::common::train::small_set;
 
 /// The losses of the first steps and the resulting parameters.
 fn train(config: &TrainConfig, dataset: &Dataset) -> (Vec<f64>, Vec<f32>) {
@@ -137,13 +137,7 @@ fn unusual_datasets_have_a_defined_brightness_or_a_clear_error() {
 #[test]
 fn photographs_are_tone_mapped_before_they_are_downscaled() {
     let folder = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions {
-        views: 5,
-        width: 96,
-        height: 72,
-        seed: 1,
-        ..SyntheticOptions::default()
-    };
+    let options = small_set(5, [96, 72], 1);
     synthetic::write(folder.path(), &options).unwrap();
     let load = || {
         let options = LoadOptions { downscale: 3.0, ..LoadOptions::default() };

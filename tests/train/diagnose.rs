@@ -1,8 +1,5 @@
 //! The diagnosis finds the defects injected into a capture, and the plan follows from them.
 
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
@@ -269,6 +266,10 @@ fn a_plan_survives_its_file_and_applies_only_to_its_dataset() {
     fs::write(&path, "[curve]\non = maybe\n").unwrap();
     let refusal = Plan::load(&path, &dataset).unwrap_err().to_string();
     assert!(refusal.contains("is not a plan") && refusal.contains("line 2"), "{refusal}");
+    let (root, out) = (set.path().display(), set.path().join("run"));
+    let absent = format!("train {root} --out {} --plan {root}/absent.toml", out.display());
+    refused(&absent, 3, &["absent.toml", "cannot be read"]);
+    assert!(!out.exists());
 }
 
 // ---------------------------------------------------------------------------
@@ -478,21 +479,6 @@ fn datasets_of_any_kind_have_a_plan_or_one_clear_error() {
         let told = found.remarks.join("; ").contains("one photograph gives no depth");
         assert_eq!(told, count == 1);
     }
-}
-
-#[test]
-fn an_invalid_plan_or_one_of_another_dataset_is_refused_in_one_line() {
-    let set = written(&Capture::default());
-    let (root, out) = (set.path().display(), set.path().join("run"));
-    let plan = set.path().join("plan.toml");
-    succeed(&format!("diagnose {root} --plan {} --downscale 2", plan.display()));
-    let train = format!("train {root} --out {} --steps 1 --plan {}", out.display(), plan.display());
-    refused(&train, 3, &["plan.toml", "another dataset"]);
-    fs::write(&plan, "steps = 4\n").unwrap();
-    refused(&train, 3, &["plan.toml", "is not a plan"]);
-    fs::remove_file(&plan).unwrap();
-    refused(&train, 3, &["plan.toml", "cannot be read"]);
-    assert!(!out.exists());
 }
 
 #[test]

@@ -1,7 +1,5 @@
 //! Datasets with few points: random points are added, and Gaussians at the depths that the first steps found.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::fs;
 
 use glam::DVec3;

@@ -1,8 +1,5 @@
 //! Holes that black hides: a dark object in a dark room needs no Gaussians over a black background.
 
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::fs;
 use std::path::Path;
 

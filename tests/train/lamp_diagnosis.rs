@@ -1,8 +1,5 @@
 //! A lamp that moves with the camera is told apart from everything else that makes a point differ between its views.
 
-#![cfg(feature = "cli")]
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::fs;
 use std::path::Path;
 

@@ -5,7 +5,6 @@
 #[path = "../common/mod.rs"]
 mod common;
 
-mod bad_data;
 mod curve_training;
 mod diagnose;
 mod few_points;

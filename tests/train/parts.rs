@@ -1,14 +1,12 @@
 //! The parts of LITA-GS: each alone and all together, trained, saved, and rendered.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::path::Path;
 
 use nightsplat::gpu::testing::gpu;
 use nightsplat::loss::Term;
 use nightsplat::networks::{DenoiserSettings, NetworkVariant};
 use nightsplat::photographs::dataset::Dataset;
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic;
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::attributes::{ATTRIBUTES, Attribute, AttributeSpec};
@@ -17,17 +15,11 @@ use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::{Part, Rendered, StepReport, TrainConfig, Trainer};
 
 use crate::common::command::{refused, succeed};
-use crate::common::train::train;
+use crate::common::train::{small_set, train};
 
 /// Six views of 40 x 30 pixels, with depth maps if requested.
 fn make_set(folder: &Path, with_depth: bool) {
-    let options = SyntheticOptions {
-        views: 6,
-        width: 40,
-        height: 30,
-        seed: 1,
-        ..SyntheticOptions::default()
-    };
+    let options = small_set(6, [40, 30], 1);
     synthetic::write(folder, &options).unwrap();
     if with_depth {
         let depth = folder.join("depth");

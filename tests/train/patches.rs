@@ -1,7 +1,5 @@
 //! Views too large for one pass are rendered and trained on in patches, with the same result.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::fs;
 
 use glam::DVec3;

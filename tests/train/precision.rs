@@ -1,7 +1,5 @@
 //! Runs that store data in fewer bits: exact formats give the same run, the others a close one.
 
-#![allow(clippy::unwrap_used, reason = "what fails here fails the test")]
-
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use nightsplat::gpu::Gpu;

@@ -1,7 +1,5 @@
 //! Interrupted runs that are resumed.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -9,7 +7,7 @@ use std::time::Duration;
 
 use glam::Vec3;
 use nightsplat::gpu::testing::gpu;
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic;
 use nightsplat::photographs::dataset::{Dataset, Split, View};
 use nightsplat::photographs::image::Image;
 use nightsplat::results::run::{self, Event, IfExists};
@@ -18,17 +16,12 @@ use nightsplat::train::{Background, EndReason, Part, StepReport, TrainConfig, Tr
 use safetensors::SafeTensors;
 
 use crate::common::command::{command, refused, succeed};
-use crate::common::train::advance;
+use crate::common::place::log;
+use crate::common::train::{advance, small_set};
 
 /// A dataset of nine small views.
 fn make_set(folder: &Path) {
-    let options = SyntheticOptions {
-        views: 9,
-        width: 40,
-        height: 30,
-        seed: 2,
-        ..SyntheticOptions::default()
-    };
+    let options = small_set(9, [40, 30], 2);
     synthetic::write(folder, &options).unwrap();
 }
 
@@ -90,13 +83,7 @@ fn a_restored_run_continues_bit_for_bit() {
 fn growth_and_the_sh_degree_stop_if_held_out_views_gain_too_little_and_stay_so_after_a_resume() {
     let folder = tempfile::tempdir().unwrap();
     // Enough views to hold one out.
-    let options = SyntheticOptions {
-        views: 12,
-        width: 40,
-        height: 30,
-        seed: 2,
-        ..SyntheticOptions::default()
-    };
+    let options = small_set(12, [40, 30], 2);
     synthetic::write(folder.path(), &options).unwrap();
     let gpu = gpu();
     let mut free = config(&[]);
@@ -131,13 +118,7 @@ fn growth_and_the_sh_degree_stop_if_held_out_views_gain_too_little_and_stay_so_a
 
 /// A dataset with one held-out view, and a run on it that converges as early as possible: no gain is enough.
 fn early(folder: &Path) -> (Dataset, TrainConfig) {
-    let options = SyntheticOptions {
-        views: 12,
-        width: 40,
-        height: 30,
-        seed: 2,
-        ..SyntheticOptions::default()
-    };
+    let options = small_set(12, [40, 30], 2);
     synthetic::write(folder, &options).unwrap();
     let mut config = config(&[]);
     config.steps = 60;
@@ -303,12 +284,6 @@ fn a_run_reports_every_event_to_its_observer_in_order() {
     assert!(refused.unwrap_err().to_string().contains("already contains a run") && told.is_empty());
     let (steps, told) = train(&TrainConfig { steps: 33, ..config }, IfExists::Resume);
     assert_eq!((steps.unwrap(), told[0].as_str()), (3, "started 30 of 33"));
-}
-
-/// The log without the column of times.
-fn log(run: &Path) -> Vec<String> {
-    let text = fs::read_to_string(run.join("train.csv")).unwrap();
-    text.lines().map(|line| line.rsplit_once(',').unwrap().0.to_owned()).collect()
 }
 
 #[test]

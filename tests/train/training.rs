@@ -1,7 +1,5 @@
 //! Training end to end on a small synthetic set.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use std::time::Duration;
 
 use glam::{DVec2, UVec2, Vec3};

@@ -1,7 +1,5 @@
 //! The world's origin and unit make no difference to a model.
 
-#![allow(clippy::unwrap_used, reason = "a failed unwrap is a failed test")]
-
 use glam::{DAffine3, DVec3};
 use nightsplat::camera::TrainingFrame;
 use nightsplat::gpu::testing::gpu;

@@ -11,7 +11,7 @@ use crate::photographs::dataset::{Dataset, View};
 use crate::train::{Background, Rendered};
 
 /// A view with a higher mean has a hole. No view of a model of a real scene exceeds 0.095 after 400 to 3 500 steps over
-/// black (docs/parts.md).
+/// black (docs/measurements.md).
 pub const MAX_RESIDUAL_TRANSMITTANCE: f64 = 0.1;
 
 /// The residual transmittance of a view: 0 if the model is opaque, 1 if it is empty.

@@ -21,7 +21,7 @@ settings! {
 /// The initialization of the Gaussians; points give positions and colours.
 ///
 /// The defaults are more opaque and smaller than those of 3DGS. They score higher after the same steps in less time,
-/// since opaque Gaussians hide those behind a surface (docs/benchmarks.md). Even more opaque ones score higher still,
+/// since opaque Gaussians hide those behind a surface (docs/measurements.md). Even more opaque ones score higher still,
 /// but lose more when they are split. Discs score like round ones, with more Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Initialization {

@@ -19,7 +19,8 @@ const MIN_BRIGHTENING: f64 = 1.5;
 /// Exposures are learned from this spread of the targets, in stops. On a set with 1.2 stops between its photographs and
 /// 0.02 between its targets, learning lost 0.4 dB.
 const MIN_SPREAD: f64 = 0.3;
-/// A denoiser is worth its time from this noise in the average over the views, in encoded values (docs/parts.md).
+/// A denoiser is worth its time from this noise in the average over the views, in encoded values
+/// (docs/measurements.md).
 const MIN_NOISE: f64 = 0.01;
 /// An illumination is learned from this variation of light between large regions, in stops. A hall with one bright
 /// window has 2.6; up to 1, the network gained at most 0.2 dB for two to four times the time.

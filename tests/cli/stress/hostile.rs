@@ -9,13 +9,15 @@ use nightsplat::base::random::Stream;
 use nightsplat::camera::{Camera, TrainingFrame};
 use nightsplat::cli::bench::scene;
 use nightsplat::loss::exposure::{Affine, table};
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic;
 use nightsplat::photographs::dataset::{Dataset, Point, Split, View};
 use nightsplat::photographs::image::{Image, linear_from_srgb};
 use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
 use nightsplat::splats::scene::Gaussians;
 use nightsplat::train::TrainConfig;
 use nightsplat::{Error, Result};
+
+use crate::common::train::small_set;
 
 /// A dataset, its first Gaussians unless they come from its points, and the indices of the hostile ones.
 pub(super) struct Hostile {
@@ -117,13 +119,7 @@ impl Hostile {
         let config = config();
         let files = tempfile::tempdir()
             .map_err(|error| Error::output(std::env::temp_dir(), error.to_string()))?;
-        let options = SyntheticOptions {
-            views: 4,
-            width: 32,
-            height: 24,
-            seed: 14,
-            ..SyntheticOptions::default()
-        };
+        let options = small_set(4, [32, 24], 14);
         synthetic::write(files.path(), &options)?;
         let low = files.path().join("low");
         for name in 0..options.views {

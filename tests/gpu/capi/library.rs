@@ -1,5 +1,7 @@
 //! The library as C sees it: header, exports, layouts, and a host.
 
+use std::process::Output;
+
 use super::*;
 
 /// The library and its header, laid out by `scripts/build-capi.sh`, once.
@@ -10,6 +12,8 @@ fn library() -> &'static Path {
         let out = Path::new(env!("CARGO_TARGET_TMPDIR")).join("capi");
         let mut command = Command::new(root.join("scripts/build-capi.sh"));
         command.arg(&out).env("NIGHTSPLAT_PROFILE", "dev").args(["--offline", "--quiet"]);
+        // Of scripts/test.sh; with it, cargo would build the dependencies again.
+        command.env_remove("RUSTC_BOOTSTRAP");
         let built = command.output().unwrap();
         assert!(built.status.success(), "{}", String::from_utf8_lossy(&built.stderr));
         out
@@ -30,15 +34,32 @@ fn compile(compiler: &str, standard: &str, source: &Path, more: &[&str]) -> Path
     out
 }
 
-fn linked() -> Vec<String> {
-    let lib = library().join("lib");
-    let lib = lib.to_str().unwrap();
-    vec![
-        format!("-L{lib}"),
-        "-lnightsplat".to_owned(),
-        "-lvulkan".to_owned(),
-        format!("-Wl,-rpath,{lib}"),
-    ]
+/// Compiles an example that links with the library.
+fn example(name: &str, more: &[&str]) -> PathBuf {
+    let lib = library().join("lib").display().to_string();
+    let [path, rpath] = [format!("-L{lib}"), format!("-Wl,-rpath,{lib}")];
+    let linked = [&path, "-lnightsplat", "-lvulkan", "-lm", &rpath];
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/c").join(name);
+    compile("cc", "-std=c99", &source, &[&linked, more].concat())
+}
+
+/// Our memory and the host's, checked by the sanitizers of the compiler.
+const SANITIZED: [&str; 2] = ["-g", "-fsanitize=address,undefined"];
+
+/// Runs a host in the folder under this layer, which writes its messages to standard output.
+fn run(program: &Path, folder: &Path, arguments: &[&str], layer: &str) -> Output {
+    let synchronization = "VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT";
+    let mut command = Command::new(program);
+    command.current_dir(folder).args(arguments);
+    command.env("VK_INSTANCE_LAYERS", layer).env("VK_LAYER_ENABLES", synchronization);
+    command.output().unwrap()
+}
+
+/// What it printed; it must succeed.
+fn printed(done: &Output) -> String {
+    let printed = String::from_utf8_lossy(&done.stdout).into_owned();
+    assert!(done.status.success(), "{printed} {}", String::from_utf8_lossy(&done.stderr));
+    printed
 }
 
 /// The Vulkan headers and the loader to link with; hosts have them.
@@ -57,42 +78,24 @@ fn the_c_host_draws_our_own_render_without_a_message() {
     if !has_vulkan_headers() {
         return;
     }
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let linked = linked();
-    let linked: Vec<&str> = linked.iter().map(String::as_str).collect();
-    let program = compile("cc", "-std=c99", &root.join("examples/c/embed.c"), &linked);
     let folder = tempfile::tempdir().unwrap();
     let model = Model::from(gaussians(2));
     model.save(folder.path().join("model.ply")).unwrap();
-    let run = |model: &str| {
-        let mut command = Command::new(&program);
-        command.current_dir(folder.path()).args([model, "out.ppm"]);
-        // The layer writes its messages to standard output.
-        command.env("VK_INSTANCE_LAYERS", "VK_LAYER_KHRONOS_validation");
-        command
-            .env("VK_LAYER_ENABLES", "VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT");
-        command.output().unwrap()
-    };
-    let done = run("model.ply");
-    let printed = String::from_utf8_lossy(&done.stdout).into_owned();
-    assert!(done.status.success(), "{printed} {}", String::from_utf8_lossy(&done.stderr));
-    assert!(!printed.contains("Validation"), "{printed}");
+    let layer = "VK_LAYER_KHRONOS_validation";
+    let program = example("embed.c", &[]);
+    let lines = printed(&run(&program, folder.path(), &["model.ply", "out.ppm"], layer));
+    assert!(!lines.contains("Validation"), "{lines}");
     let file = std::fs::read(folder.path().join("out.ppm")).unwrap();
     let pixels = &file[file.len() - 3 * PIXELS..];
     assert_close(pixels, &own_render(&model));
 
-    // Its own memory, and ours, by the sanitizers of the compiler.
-    let mut checked = linked.clone();
-    checked.extend(["-g", "-fsanitize=address,undefined"]);
-    let program = compile("cc", "-std=c99", &root.join("examples/c/embed.c"), &checked);
-    let mut command = Command::new(program);
-    let done = command.current_dir(folder.path()).args(["model.ply", "out.ppm"]).output().unwrap();
-    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let checked = example("embed.c", &SANITIZED);
+    printed(&run(&checked, folder.path(), &["model.ply", "out.ppm"], ""));
 
-    let failed = run("absent.ply");
-    let printed = String::from_utf8_lossy(&failed.stdout).into_owned();
-    assert!(!failed.status.success() && !printed.contains("Validation"), "{printed}");
-    let error = String::from_utf8_lossy(&failed.stderr);
+    let failed = run(&program, folder.path(), &["absent.ply", "out.ppm"], layer);
+    let [stdout, error] =
+        [&failed.stdout, &failed.stderr].map(|text| String::from_utf8_lossy(text));
+    assert!(!failed.status.success() && !stdout.contains("Validation"), "{stdout}");
     assert!(error.contains("nsp_model_load: absent.ply") && error.contains("(-3)"), "{error}");
 }
 
@@ -101,43 +104,25 @@ fn two_processes_share_images_and_one_goes_on_where_the_other_dies() {
     if !has_vulkan_headers() {
         return;
     }
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let linked = linked();
-    let mut linked: Vec<&str> = linked.iter().map(String::as_str).collect();
-    linked.push("-lm");
-    let source = root.join("examples/c/share.c");
     let folder = tempfile::tempdir().unwrap();
     Model::from(gaussians(1)).save(folder.path().join("model.ply")).unwrap();
-    let run = |program: &Path, frames: &[&str], layers: &str| {
-        let mut command = Command::new(program);
-        command.current_dir(folder.path()).arg("model.ply").args(frames);
-        command.env("VK_INSTANCE_LAYERS", layers);
-        command
-            .env("VK_LAYER_ENABLES", "VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT");
-        let done = command.output().unwrap();
-        let printed = String::from_utf8_lossy(&done.stdout).into_owned();
-        assert!(done.status.success(), "{printed} {}", String::from_utf8_lossy(&done.stderr));
-        printed
+    let share = |program: &Path, frames: &[&str], layer: &str| {
+        printed(&run(program, folder.path(), &[&["model.ply"], frames].concat(), layer))
     };
-    let program = compile("cc", "-std=c99", &source, &linked);
-    let printed = run(&program, &["7"], "VK_LAYER_KHRONOS_validation");
+    let lines = share(&example("share.c", &[]), &["7"], "VK_LAYER_KHRONOS_validation");
     // The layer of the reader does not know of the layout that the other process left its images in.
     let is_known = |line: &str| {
         line.contains("InvalidImageLayout") && line.ends_with("is VK_IMAGE_LAYOUT_UNDEFINED.")
     };
-    let messages = printed.lines().filter(|line| line.contains("Validation") && !is_known(line));
+    let messages = lines.lines().filter(|line| line.contains("Validation") && !is_known(line));
     assert_eq!(messages.collect::<Vec<_>>(), [""; 0]);
-    assert!(
-        printed.contains("7 frames of 7 were read by the other process, 0 differ"),
-        "{printed}"
-    );
+    assert!(lines.contains("7 frames of 7 were read by the other process, 0 differ"), "{lines}");
 
     // Layers have leaks of their own.
-    linked.extend(["-g", "-fsanitize=address,undefined"]);
-    let program = compile("cc", "-std=c99", &source, &linked);
-    run(&program, &["5"], "");
-    let printed = run(&program, &["9", "4"], "");
-    assert!(printed.contains("which is gone, 0 differ"), "{printed}");
+    let checked = example("share.c", &SANITIZED);
+    share(&checked, &["5"], "");
+    let lines = share(&checked, &["9", "4"], "");
+    assert!(lines.contains("which is gone, 0 differ"), "{lines}");
 }
 
 #[test]

@@ -78,11 +78,11 @@ fn a_trainer_and_its_host_submit_from_two_threads_under_the_hosts_lock() {
 }
 
 /// A pointer that another thread may use.
-struct Shared(*mut NspDevice);
-// SAFETY: any thread may use a device.
-unsafe impl Sync for Shared {}
-impl Shared {
-    fn get(&self) -> *mut NspDevice {
+struct Shared<T>(*mut T);
+// SAFETY: any thread may use a device; they only read a model, one at a time.
+unsafe impl<T> Sync for Shared<T> {}
+impl<T> Shared<T> {
+    fn get(&self) -> *mut T {
         self.0
     }
 }
@@ -90,9 +90,7 @@ impl Shared {
 #[test]
 fn two_devices_and_two_renderers_on_one_draw_from_threads_of_their_own() {
     let run = || {
-        let mut session = Session::new(|_| {});
-        ok(session.load());
-        ok(session.create());
+        let mut session = Session::ready(|_| {});
         for frame in 1..=3 {
             ok(session.frame(frame));
         }
@@ -110,8 +108,7 @@ fn two_devices_and_two_renderers_on_one_draw_from_threads_of_their_own() {
     let mut session = Session::new(|_| {});
     ok(session.load());
     let picture = session.host.picture(ImageFormat::Rgba8Unorm, SIZE).unwrap();
-    let (color, model, device) =
-        (image(&picture), SharedModel(session.model), Shared(session.device));
+    let (color, model, device) = (image(&picture), Shared(session.model), Shared(session.device));
     let turn = Mutex::new(0u64);
     let host = &session.host;
     std::thread::scope(|scope| {
@@ -136,18 +133,9 @@ fn two_devices_and_two_renderers_on_one_draw_from_threads_of_their_own() {
             });
         }
     });
-    let [pixels, _] = host.read_first_layer(&picture, PIXELS);
+    let pixels = host.read_layer(&picture, 0, PIXELS);
     let pixels: Vec<u8> = pixels.iter().flat_map(|p| p.to_le_bytes()[..3].to_vec()).collect();
     assert_close(&pixels, &expected);
     session.host.free_picture(picture);
     session.end();
-}
-
-struct SharedModel(*mut NspModel);
-// SAFETY: the threads only read it, one at a time.
-unsafe impl Sync for SharedModel {}
-impl SharedModel {
-    fn get(&self) -> *mut NspModel {
-        self.0
-    }
 }

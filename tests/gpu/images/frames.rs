@@ -8,18 +8,15 @@ fn a_view_beyond_the_memory_is_never_blank_and_soon_exact() {
         let picture = host.picture(ImageFormat::Rgba8Unorm, SIZE).unwrap();
         let image = picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE);
         let target = Target { color: Some(&image), exposure: 1.5, ..Target::default() };
-        let on_device = gaussians().upload(gpu).unwrap();
-        let mut renderer = Renderer::new(gpu, show_settings()).unwrap();
-        renderer.prepare_draw(&on_device.layout, &cameras(), &target).unwrap();
-        renderer.set_intersection_capacity(200).unwrap();
+        let mut shown = Shown::new(host, gpu);
+        let layout = shown.on_device.layout;
+        shown.renderer.prepare_draw(&layout, &cameras(), &target).unwrap();
+        shown.renderer.set_intersection_capacity(200).unwrap();
         let own = expected(&cameras()[0], pixels::PIXELS_UNORM, 0, None);
-        assert!(renderer.drawn().is_none());
+        assert!(shown.renderer.drawn().is_none());
         for frame in 1..=3 {
-            let commands = host.begin();
-            record(gpu, commands.as_raw(), frame, &mut renderer, &on_device, &target);
-            host.submit_frame(commands, frame);
-            host.wait_frame(frame);
-            let drawn = renderer.drawn().unwrap();
+            draw(&mut shown, frame, &target);
+            let drawn = shown.renderer.drawn().unwrap();
             let [pixels, _] = host.read_picture(&picture, PIXELS);
             assert_eq!(drawn.frame, frame);
             if frame == 1 {
@@ -31,12 +28,8 @@ fn a_view_beyond_the_memory_is_never_blank_and_soon_exact() {
             }
         }
         // A budget leaves out the farthest whatever the memory.
-        let commands = host.begin();
-        let thrifty = Target { budget: 150, ..target };
-        record(gpu, commands.as_raw(), 4, &mut renderer, &on_device, &thrifty);
-        host.submit_frame(commands, 4);
-        host.wait_frame(4);
-        assert_eq!(renderer.drawn().unwrap().capacity, 150);
+        draw(&mut shown, 4, &Target { budget: 150, ..target });
+        assert_eq!(shown.renderer.drawn().unwrap().capacity, 150);
         host.free_picture(picture);
     });
 }
@@ -158,24 +151,11 @@ fn no_gaussians_are_drawn_as_background() {
         let picture = host.picture(ImageFormat::Rgba8Unorm, SIZE).unwrap();
         let image = picture.lent(ImageState::UNDEFINED, ImageState::TRANSFER_SOURCE);
         let target = Target { color: Some(&image), ..Target::default() };
-        let none = Gaussians::zeros(0, 0).upload(gpu).unwrap();
-        let mut renderer = Renderer::new(gpu, show_settings()).unwrap();
-        let commands = host.begin();
-        record(gpu, commands.as_raw(), 1, &mut renderer, &none, &target);
-        host.submit_frame(commands, 1);
-        host.wait_frame(1);
+        let on_device = Gaussians::zeros(0, 0).upload(gpu).unwrap();
+        draw(&mut Shown { on_device, ..Shown::new(host, gpu) }, 1, &target);
         let [pixels, _] = host.read_picture(&picture, PIXELS);
-        let background = u32::from_le_bytes(
-            OPTIONS
-                .background
-                .map(|c| (c * 255.0).round() as u8)
-                .iter()
-                .copied()
-                .chain([0])
-                .collect::<Vec<_>>()
-                .try_into()
-                .unwrap(),
-        );
+        let [r, g, b] = OPTIONS.background.map(|c| (c * 255.0).round() as u8);
+        let background = u32::from_le_bytes([r, g, b, 0]);
         assert!(pixels.iter().all(|&pixel| levels(&[pixel], &[background], false) <= 1));
         host.free_picture(picture);
     });

@@ -9,7 +9,7 @@ use nightsplat::photographs::dataset::{Dataset, LoadOptions, Split};
 use serde_json::json;
 
 use super::synthetic::*;
-use super::{load, names, view};
+use super::{load, names, refuses, view};
 use crate::common::command::run;
 
 /// The standard error of `tone apply` for a dataset; one line for each remark.
@@ -19,8 +19,7 @@ fn message_of(root: &Path) -> String {
 
 #[test]
 fn of_several_models_the_one_with_the_most_photographs_is_used_and_named() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     photographs(root, "images", 0..9, 1.0);
     model(2).write_binary(&root.join("sparse/0"));
     model(9).write_binary(&root.join("sparse/1"));
@@ -41,8 +40,7 @@ fn of_several_models_the_one_with_the_most_photographs_is_used_and_named() {
 
 #[test]
 fn photographs_without_a_pose_and_files_that_are_not_read_are_counted() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     photographs(root, "images", 0..9, 1.0);
     model(3).write_text(&root.join("sparse/0"));
     fs::write(root.join("images/IMG_1.HEIC"), "").unwrap();
@@ -69,8 +67,7 @@ fn photographs_without_a_pose_and_files_that_are_not_read_are_counted() {
 
 #[test]
 fn the_cameras_of_a_rig_may_have_equal_file_names() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let mut rig = model(8);
     for (index, image) in rig.images.iter_mut().rev().enumerate() {
         image.3 = format!("{}/{:03}.png", ["a", "b"][index % 2], index / 2);
@@ -95,10 +92,7 @@ fn the_cameras_of_a_rig_may_have_equal_file_names() {
 
 #[test]
 fn a_byte_order_mark_changes_nothing() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
-    photographs(root, "images", 0..9, 1.0);
-    model(9).write_text(&root.join("sparse/0"));
+    let root = &Folder::with_text_model(&model(9));
     fs::write(root.join("test.txt"), "v03\n").unwrap();
     let plain = load(root);
     let files =
@@ -111,12 +105,8 @@ fn a_byte_order_mark_changes_nothing() {
     let big = |text: &str| {
         format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_be_bytes).collect::<Vec<u8>>()
     };
-    for encoding in 0..3 {
-        let encode = |text: &str| match encoding {
-            0 => utf8(text),
-            1 => little(text),
-            _ => big(text),
-        };
+    let encodings: [&dyn Fn(&str) -> Vec<u8>; 3] = [&utf8, &little, &big];
+    for encode in encodings {
         for (file, text) in files.iter().zip(&texts) {
             fs::write(root.join(file), encode(text)).unwrap();
         }
@@ -139,19 +129,14 @@ fn a_rational_lens_is_undistorted_on_load_and_a_fisheye_on_request() {
     for (name, number, coefficients) in lenses {
         let focal = if name.contains("OPENCV") { vec![22.0, 22.0] } else { vec![22.0] };
         let parameters = [focal, center.to_vec(), coefficients.clone()].concat();
-        let folder = tempfile::tempdir().unwrap();
-        photographs(folder.path(), "images", 0..9, 1.0);
         let lens = Model { cameras: vec![(3, name, number, parameters)], ..model(9) };
-        lens.write_binary(&folder.path().join("sparse/0"));
-        let binary = undistorted(folder.path());
+        let [binary, text] = Folder::with_either_model(&lens).map(|folder| undistorted(&folder));
         let camera = binary.views[0].camera;
         assert_eq!(camera.model, CameraModel::Pinhole, "{name}");
         assert!(camera.focal.is_finite() && camera.focal.x != 22.0, "{name}: {camera:?}");
         // No blank pixel: every photograph has a single colour.
         assert_eq!(super::level(view(&binary, "v04").image.as_ref()), Some(14.0), "{name}");
-        fs::remove_dir_all(folder.path().join("sparse")).unwrap();
-        lens.write_text(&folder.path().join("sparse/0"));
-        assert_eq!(undistorted(folder.path()).views[0].camera, camera, "{name}");
+        assert_eq!(text.views[0].camera, camera, "{name}");
     }
 }
 
@@ -163,30 +148,14 @@ fn undistorted(root: &Path) -> Dataset {
 fn a_fisheye_is_loaded_natively_from_every_listing_and_masked_outside_its_circle() {
     let [fx, fy, cx, cy, k1, k2, k3, k4] = [15.0, 15.5, 21.0, 14.0, 0.03, -0.01, 0.002, -0.0005];
     let coefficients = [k1, k2, k3, k4];
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
-    photographs(root, "images", 0..9, 1.0);
     let parameters = vec![fx, fy, cx, cy, k1, k2, k3, k4];
     let model = Model { cameras: vec![(3, "OPENCV_FISHEYE", 5, parameters)], ..model(9) };
-    let sparse = root.join("sparse");
-    model.write_binary(&sparse.join("0"));
-    let binary = load(root);
-    fs::remove_dir_all(&sparse).unwrap();
-    model.write_text(&sparse.join("0"));
-    let text = load(root);
-    fs::remove_dir_all(&sparse).unwrap();
-    let frames = (0..9).map(|index| frame(index, &format!("images/{}.png", name(index)))).collect();
-    let mut listing = transforms(frames);
-    for (key, value) in [("fl_x", fx), ("fl_y", fy), ("cx", cx), ("cy", cy)].into_iter().chain([
-        ("k1", k1),
-        ("k2", k2),
-        ("k3", k3),
-        ("k4", k4),
-    ]) {
-        listing[key] = json!(value);
-    }
-    listing["camera_model"] = json!("OPENCV_FISHEYE");
-    write_json(root.join("transforms.json"), &listing);
+    let [binary, text] = Folder::with_either_model(&model).map(|folder| load(&folder));
+    let lens = json!({
+        "camera_model": "OPENCV_FISHEYE", "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy,
+        "k1": k1, "k2": k2, "k3": k3, "k4": k4,
+    });
+    let root = &Folder::with_listing(9, |listing| extend(listing, &lens));
     let lens = KannalaBrandt { coefficients };
     let reach = lens.radius(lens.largest_angle());
     for dataset in [binary, text, load(root)] {
@@ -210,30 +179,17 @@ fn a_fisheye_is_loaded_natively_from_every_listing_and_masked_outside_its_circle
     assert_eq!((camera.focal.x, mask.width, mask.height), (0.8 * fx, 32, 24));
     assert_eq!(mask.hidden(), camera.unseen());
     // A polynomial that falls from 5 degrees on is not a lens.
-    listing["k1"] = json!(-40.0);
-    write_json(root.join("transforms.json"), &listing);
-    let refused = Dataset::load(root, &LoadOptions::default()).unwrap_err().to_string();
-    assert!(refused.contains("describe no lens"), "{refused}");
+    let keys = json!({ "camera_model": "OPENCV_FISHEYE", "k1": -40.0 });
+    let folder = Folder::with_listing(9, |listing| extend(listing, &keys));
+    refuses(&folder, &["describe no lens"]);
 }
 
 #[test]
 fn the_part_of_a_fisheye_beyond_a_pinhole_is_cropped_with_a_remark() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
-    photographs(root, "images", 0..9, 1.0);
-    let frames = (0..9).map(|index| frame(index, &format!("images/{}.png", name(index)))).collect();
-    let mut listing = transforms(frames);
-    for (key, value) in [
-        ("camera_model", json!("OPENCV_FISHEYE")),
-        ("fl_x", json!(16.0)),
-        ("fl_y", json!(16.0)),
-        ("cx", json!(20.0)),
-        ("cy", json!(15.0)),
-        ("k1", json!(0.01)),
-    ] {
-        listing[key] = value;
-    }
-    write_json(root.join("transforms.json"), &listing);
+    let lens = json!({
+        "camera_model": "OPENCV_FISHEYE", "fl_x": 16.0, "fl_y": 16.0, "cx": 20.0, "cy": 15.0, "k1": 0.01,
+    });
+    let root = &Folder::with_listing(9, |listing| extend(listing, &lens));
     let camera = undistorted(root).views[0].camera;
     let corner = (DVec2::new(0.5, 0.5) - camera.principal_point) / camera.focal;
     assert!((corner.length().atan().to_degrees() - 60.0).abs() < 0.01, "{camera:?}");

@@ -25,9 +25,7 @@ fn pixel(view: &View) -> [f32; 3] {
 
 #[test]
 fn photographs_and_references_become_srgb_and_masks_do_not() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
-    lom(root, 10, &[2, 5]);
+    let root = &Folder::lom();
     let before = load(root);
     mark_linear(&root.join("low"));
     mark_linear(&root.join("high"));
@@ -58,9 +56,7 @@ fn photographs_and_references_become_srgb_and_masks_do_not() {
 
 #[test]
 fn a_profile_that_cannot_be_used_is_named_once_for_the_dataset() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
-    lom(root, 10, &[2, 5]);
+    let root = &Folder::lom();
     for entry in fs::read_dir(root.join("low")).unwrap() {
         put_chunk(&entry.unwrap().path(), b"iCCP", b"name\0\0damaged");
     }
@@ -83,8 +79,7 @@ fn lamp_lit(root: &Path) {
 
 #[test]
 fn one_grey_card_balances_every_photograph_cached_or_not() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     lamp_lit(root);
     let balanced = |keep: Option<u64>, white: &str| {
         let white_balance = Some(white.parse().unwrap());
@@ -107,8 +102,7 @@ fn one_grey_card_balances_every_photograph_cached_or_not() {
 
 #[test]
 fn an_invalid_white_balance_is_refused_in_one_line() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     lamp_lit(root);
     let out = root.join("run");
     for (white, code, part) in [

@@ -7,23 +7,12 @@ use std::path::Path;
 use glam::{DMat3, DVec3};
 use nightsplat::photographs::dataset::{Dataset, DepthOptions, LoadOptions, Split};
 use nightsplat::photographs::image::Image;
-use serde_json::{Value, json};
+use serde::Serialize;
+use serde_json::json;
 
 use super::synthetic::*;
-use super::{assert_camera_is_view, load, names, view};
+use super::{assert_camera_is_view, load, names, refuses, view};
 use crate::common::log::warnings;
-
-fn frames(count: usize) -> Vec<Value> {
-    (0..count).map(|index| frame(index, &format!("images/{}.png", name(index)))).collect()
-}
-
-/// A single listing of nine views, changed by `edit`.
-fn single(root: &Path, edit: impl FnOnce(&mut Value)) {
-    photographs(root, "images", 0..9, 1.0);
-    let mut listing = transforms(frames(9));
-    edit(&mut listing);
-    write_json(root.join("transforms.json"), &listing);
-}
 
 const POINTS: [[f32; 3]; 4] =
     [[0.5, 0.0, 0.25], [-0.5, 0.25, 0.0], [0.0, 0.5, -0.25], [0.125, 0.0, 0.5]];
@@ -54,21 +43,18 @@ fn points_of_a_ply_are_read_from_the_listed_or_usual_place() {
         ("points3d.ply", None),
         ("sparse_pc.ply", None),
     ] {
-        let folder = tempfile::tempdir().unwrap();
-        single(folder.path(), |listing| {
+        let folder = Folder::with_listing(9, |listing| {
             if let Some(key) = key {
                 listing["ply_file_path"] = json!(key);
             }
         });
-        write_points(&folder.path().join(place), &POINTS);
-        assert_eq!(positions(&load(folder.path())), expected(), "{place}");
+        write_points(&folder.join(place), &POINTS);
+        assert_eq!(positions(&load(&folder)), expected(), "{place}");
     }
-    let folder = tempfile::tempdir().unwrap();
-    photographs(folder.path(), "images", 0..9, 1.0);
-    model(9).write_text(&folder.path().join("sparse/0"));
-    fs::remove_file(folder.path().join("sparse/0/points3D.txt")).unwrap();
-    write_points(&folder.path().join("sparse/0/points3D.ply"), &POINTS);
-    assert_eq!(positions(&load(folder.path())), expected());
+    let folder = Folder::with_text_model(&model(9));
+    fs::remove_file(folder.join("sparse/0/points3D.txt")).unwrap();
+    write_points(&folder.join("sparse/0/points3D.ply"), &POINTS);
+    assert_eq!(positions(&load(&folder)), expected());
 }
 
 #[test]
@@ -76,24 +62,22 @@ fn the_applied_transform_of_a_listing_is_applied_to_points_that_lack_it() {
     let away = [[100.0, 0.0, 0.0], [101.0, 0.25, 0.0], [100.5, 0.5, 0.0], [100.0, 0.0, 0.5]];
     let applied = json!([[1.0, 0.0, 0.0, -100.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]);
     for (points, shift) in [(away, -100.0), (POINTS, 0.0)] {
-        let folder = tempfile::tempdir().unwrap();
-        single(folder.path(), |listing| {
+        let folder = Folder::with_listing(9, |listing| {
             listing["ply_file_path"] = json!("sparse_pc.ply");
             listing["applied_transform"] = applied.clone();
         });
-        write_points(&folder.path().join("sparse_pc.ply"), &points);
+        write_points(&folder.join("sparse_pc.ply"), &points);
         let expected = points.map(|[x, y, z]| DVec3::new(f64::from(x) + shift, y.into(), z.into()));
-        assert_eq!(positions(&load(folder.path())), expected);
+        assert_eq!(positions(&load(&folder)), expected);
     }
 }
 
 #[test]
 fn an_unsupported_file_of_points_is_named() {
-    let folder = tempfile::tempdir().unwrap();
-    single(folder.path(), |listing| listing["ply_file_path"] = json!("absent.ply"));
-    fs::write(folder.path().join("scan.las"), "LASF").unwrap();
-    fs::write(folder.path().join("points3d.ply"), "no ply").unwrap();
-    let lines = warnings(|| drop(load(folder.path())));
+    let folder = Folder::with_listing(9, |listing| listing["ply_file_path"] = json!("absent.ply"));
+    fs::write(folder.join("scan.las"), "LASF").unwrap();
+    fs::write(folder.join("points3d.ply"), "no ply").unwrap();
+    let lines = warnings(|| drop(load(&folder)));
     for part in [
         "absent.ply, its ply_file_path, is absent",
         "points3d.ply: is not a PLY file",
@@ -115,9 +99,7 @@ fn listed_masks_are_applied_and_dynamic_masks_inverted() {
     let hidden = |dataset: &Dataset, name: &str| {
         view(dataset, name).mask.as_ref().map(|mask| (mask.weights[0], mask.weights[39]))
     };
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
-    single(root, |listing| {
+    let root = &Folder::with_listing(9, |listing| {
         listing["frames"][1]["mask_path"] = json!("segmentation\\one.png");
         listing["frames"][2]["mask_path"] = json!("/home/user/scan/masks_2/two.png");
         listing["frames"][3]["mask_path"] = json!("absent.png");
@@ -144,14 +126,14 @@ fn listed_masks_are_applied_and_dynamic_masks_inverted() {
 #[test]
 fn listed_depth_maps_belong_to_their_views() {
     for key in ["depth_file_path", "depth_path"] {
-        let folder = tempfile::tempdir().unwrap();
-        single(folder.path(), |listing| listing["frames"][1][key] = json!("range/d1.png"));
-        let path = folder.path().join("range/d1.png");
+        let folder =
+            Folder::with_listing(9, |listing| listing["frames"][1][key] = json!("range/d1.png"));
+        let path = folder.join("range/d1.png");
         fs::create_dir_all(path.parent().unwrap()).unwrap();
         Image::from_fn(SIZE.0, SIZE.1, |x, _| [0.01 * x as f32; 3]).save_png8(path).unwrap();
         let depth = DepthOptions { load: true, ..DepthOptions::default() };
         let options = LoadOptions { depth, ..LoadOptions::default() };
-        let dataset = Dataset::load(folder.path(), &options).unwrap();
+        let dataset = Dataset::load(&folder, &options).unwrap();
         let depth = view(&dataset, "v01").depth.as_ref().unwrap();
         assert!(depth[0] < depth[39] && view(&dataset, "v02").depth.is_none());
     }
@@ -162,20 +144,18 @@ fn stated_splits_are_kept_and_bad_or_unlisted_frames_left_out() {
     let names_of = |views: std::ops::Range<usize>| -> Vec<String> {
         views.map(|index| format!("./images/{}.png", name(index))).collect()
     };
-    let folder = tempfile::tempdir().unwrap();
-    single(folder.path(), |listing| {
+    let folder = Folder::with_listing(9, |listing| {
         listing["train_filenames"] = json!(names_of(0..5));
         listing["val_filenames"] = json!(names_of(5..6));
         listing["test_filenames"] = json!(names_of(6..8));
     });
-    let dataset = load(folder.path());
+    let dataset = load(&folder);
     assert_eq!(names(&dataset, Split::Train), ["v00", "v01", "v02", "v03", "v04"]);
     assert_eq!(names(&dataset, Split::Test), ["v06", "v07"]);
-    let lines = warnings(|| drop(load(folder.path())));
+    let lines = warnings(|| drop(load(&folder)));
     assert!(lines.contains("2 frames are in none of its lists"), "{lines}");
 
-    let folder = tempfile::tempdir().unwrap();
-    single(folder.path(), |listing| {
+    let folder = Folder::with_listing(9, |listing| {
         let all = listing["frames"].as_array().unwrap().clone();
         listing["frames"] = json!(all[..6]);
         listing["test_frames"] = json!(all[6..]);
@@ -183,27 +163,25 @@ fn stated_splits_are_kept_and_bad_or_unlisted_frames_left_out() {
         listing["frames"][3]["is_bad"] = json!(false);
         listing["test_frames"][0]["is_bad"] = json!(1);
     });
-    let dataset = load(folder.path());
+    let dataset = load(&folder);
     assert_eq!(names(&dataset, Split::Train), ["v00", "v01", "v03", "v04", "v05"]);
     assert_eq!(names(&dataset, Split::Test), ["v07", "v08"]);
-    let lines = warnings(|| drop(load(folder.path())));
+    let lines = warnings(|| drop(load(&folder)));
     assert!(lines.contains("2 frames are marked bad"), "{lines}");
 
-    let folder = tempfile::tempdir().unwrap();
-    single(folder.path(), |listing| {
+    let folder = Folder::with_listing(9, |listing| {
         for (index, split) in ["train", "test", "val"].into_iter().enumerate() {
             listing["frames"][index]["split"] = json!(split);
         }
     });
-    let dataset = load(folder.path());
+    let dataset = load(&folder);
     assert!(names(&dataset, Split::Test).starts_with(&["v01", "v02"]));
     assert!(names(&dataset, Split::Train).contains(&"v00"));
 }
 
 #[test]
 fn keys_that_are_not_supported_are_named_in_one_line() {
-    let folder = tempfile::tempdir().unwrap();
-    single(folder.path(), |listing| {
+    let folder = Folder::with_listing(9, |listing| {
         listing["semantics_file"] = json!("classes.json");
         listing["k5"] = json!(0.0);
         listing["rolling_shutter"] = json!([0.0, 0.1]);
@@ -212,7 +190,7 @@ fn keys_that_are_not_supported_are_named_in_one_line() {
             listing["frames"][index]["colmap_im_id"] = json!(index);
         }
     });
-    let lines = warnings(|| drop(load(folder.path())));
+    let lines = warnings(|| drop(load(&folder)));
     assert_eq!(lines.lines().count(), 1, "{lines}");
     assert!(
         lines.contains(
@@ -224,54 +202,42 @@ fn keys_that_are_not_supported_are_named_in_one_line() {
 }
 
 /// Changes the matrix of every frame.
-fn with_matrices(root: &Path, change: impl Fn([[f64; 4]; 4]) -> [[f64; 4]; 4]) {
-    single(root, |listing| {
+fn with_matrices<T: Serialize>(change: impl Fn([[f64; 4]; 4]) -> T) -> Folder {
+    Folder::with_listing(9, |listing| {
         for frame in listing["frames"].as_array_mut().unwrap() {
             let matrix = serde_json::from_value(frame["transform_matrix"].clone()).unwrap();
             frame["transform_matrix"] = json!(change(matrix));
         }
-    });
+    })
 }
 
 #[test]
 fn scaled_rounded_and_transposed_matrices_are_read_with_a_remark() {
     // The values of a matrix may be a flat list.
-    let folder = tempfile::tempdir().unwrap();
-    single(folder.path(), |listing| {
-        for frame in listing["frames"].as_array_mut().unwrap() {
-            let rows: [[f64; 4]; 4] =
-                serde_json::from_value(frame["transform_matrix"].clone()).unwrap();
-            frame["transform_matrix"] = json!(rows.concat());
-        }
-    });
-    let dataset = load(folder.path());
+    let dataset = load(&with_matrices(|rows| rows.concat()));
     (0..9).for_each(|index| assert_camera_is_view(&dataset.views[index], index));
 
     type Change = fn([[f64; 4]; 4]) -> [[f64; 4]; 4];
     let cases: [(&str, Change); 2] = [
         ("hold a scale (9 of them, 0.2500 the last)", |mut matrix| {
-            matrix
-                .iter_mut()
-                .take(3)
-                .for_each(|row| row[..3].iter_mut().for_each(|entry| *entry *= 0.25));
+            let rotated = matrix[..3].iter_mut().flat_map(|row| &mut row[..3]);
+            rotated.for_each(|entry| *entry *= 0.25);
             matrix
         }),
         ("are transposed", |matrix| std::array::from_fn(|row| matrix.map(|other| other[row]))),
     ];
     for (expected, change) in cases {
-        let folder = tempfile::tempdir().unwrap();
-        with_matrices(folder.path(), change);
+        let folder = with_matrices(change);
         let lines = warnings(|| {
-            let dataset = load(folder.path());
+            let dataset = load(&folder);
             (0..9).for_each(|index| assert_camera_is_view(&dataset.views[index], index));
         });
         assert!(lines.contains(expected), "{lines}");
     }
-    let folder = tempfile::tempdir().unwrap();
-    with_matrices(folder.path(), |matrix| {
+    let folder = with_matrices(|matrix| {
         matrix.map(|row| row.map(|entry| (entry * 1000.0).round() / 1000.0))
     });
-    let dataset = load(folder.path());
+    let dataset = load(&folder);
     assert_eq!(dataset.views.len(), 9);
     for (index, view) in dataset.views.iter().enumerate() {
         let own = view.camera.view_from_world;
@@ -283,24 +249,21 @@ fn scaled_rounded_and_transposed_matrices_are_read_with_a_remark() {
 
 #[test]
 fn left_handed_matrices_are_refused_by_that_name() {
-    let folder = tempfile::tempdir().unwrap();
-    with_matrices(folder.path(), |mut matrix| {
+    let folder = with_matrices(|mut matrix| {
         matrix[0] = matrix[0].map(|entry| -entry);
         matrix
     });
-    let error = Dataset::load(folder.path(), &LoadOptions::default()).unwrap_err().to_string();
-    assert!(error.contains("v00.png: its transform_matrix is left-handed"), "{error}");
+    refuses(&folder, &["v00.png: its transform_matrix is left-handed"]);
 }
 
 #[test]
 fn a_frames_own_camera_model_overrides() {
-    let folder = tempfile::tempdir().unwrap();
-    single(folder.path(), |listing| {
+    let folder = Folder::with_listing(9, |listing| {
         listing["frames"][1]["camera_model"] = json!("OPENCV_FISHEYE");
         listing["frames"][1]["k1"] = json!(0.01);
         listing["frames"][2]["fl_x"] = json!(50.0);
     });
-    let dataset = load(folder.path());
+    let dataset = load(&folder);
     let model = |name: &str| view(&dataset, name).camera.model;
     assert!(model("v01") != model("v00") && model("v02") == model("v00"));
     assert_eq!(view(&dataset, "v02").camera.focal.x, 50.0);

@@ -5,16 +5,16 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use nightsplat::photographs::dataset::Split;
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic;
 use nightsplat::photographs::image::Image;
 
 use super::load;
 use super::synthetic::*;
-use crate::common::command::{command, refused, run, succeed};
+use crate::common::command::{refused, run, succeed};
+use crate::common::train::small_set;
 use crate::common::{not_run, shared};
 
 /// A program with the command line of COLMAP, and a few lines of shell for each of its commands.
-#[cfg(unix)]
 pub(super) fn stub(folder: &Path, cases: &str) -> PathBuf {
     let path = folder.join("colmap-stub");
     let lines = format!(
@@ -40,8 +40,23 @@ pub(super) fn stub(folder: &Path, cases: &str) -> PathBuf {
     path
 }
 
+/// The arguments of `nightsplat` for these photographs, the dataset to write and a program.
+pub(super) fn line(photos: &Path, out: &Path, colmap: &Path, more: &str) -> String {
+    let [photos, out, colmap] = [photos, out, colmap].map(Path::display);
+    format!("pose {photos} --out {out} --colmap {colmap} {more}")
+}
+
+/// The case of a stub that finds the models in `models`.
+pub(super) fn models(root: &Path) -> String {
+    format!("mapper) cp -r {}/models/* $output;;", root.display())
+}
+
+/// The case of a stub that keeps what it sees in `seen`, and finds nothing.
+fn seen(root: &Path) -> String {
+    format!("mapper) cp -r $images {}/seen; exit 1;;", root.display())
+}
+
 /// A shell script with these lines.
-#[cfg(unix)]
 fn script(path: &Path, lines: &str) {
     use std::os::unix::fs::PermissionsExt;
     fs::write(path, format!("#!/bin/sh\n{lines}\n")).unwrap();
@@ -75,11 +90,10 @@ fn nothing_is_left(out: &Path) {
     assert!(beside.is_empty(), "{beside:?}");
 }
 
-#[cfg(unix)]
 #[test]
 fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let folder = Folder::empty();
+    let root = &folder;
     let (photos, out) = (photographed(root), root.join("scene"));
     model(2).write_binary(&root.join("models/0"));
     model(8).write_binary(&root.join("models/1"));
@@ -87,8 +101,7 @@ fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
         root,
         &format!("mapper) cp -r {0}/models/* $output; cp -r $images {0}/seen;;", root.display()),
     );
-    let arguments =
-        format!("pose {} --out {} --colmap {}", photos.display(), out.display(), colmap.display());
+    let arguments = line(&photos, &out, &colmap, "");
     let (stdout, stderr) = run(&arguments, 0);
     assert!(
         stdout.contains("8 of 9 photographs") && stdout.contains("nightsplat train"),
@@ -122,38 +135,28 @@ fn the_dark_photographs_get_the_cameras_of_the_largest_model() {
 }
 
 /// One photograph in nine has no camera, so all are matched again.
-#[cfg(unix)]
 #[test]
 fn a_failed_second_matching_keeps_the_cameras_of_the_first() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let (photos, out) = (photographed(root), root.join("scene"));
     model(8).write_binary(&root.join("models/0"));
     let once = root.join("once");
     let first = format!("touch {0}; cp -r {1}/models/* $output", once.display(), root.display());
     let colmap = stub(root, &format!("mapper) [ -e {} ] && exit 9; {first};;", once.display()));
-    let arguments =
-        format!("pose {} --out {} --colmap {}", photos.display(), out.display(), colmap.display());
+    let arguments = line(&photos, &out, &colmap, "");
     let (stdout, stderr) = run(&arguments, 0);
     assert!(stdout.contains("8 of 9 photographs"), "{stdout}");
     assert!(stderr.contains("using the cameras of the first attempt"), "{stderr}");
 }
 
-#[cfg(unix)]
 #[test]
 fn cameras_are_registered_globally_by_colmap_or_else_by_glomap() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let photos = photographed(root);
     model(8).write_binary(&root.join("models/0"));
     let models = format!("cp -r {}/models/* $output", root.display());
     let pose = |out: &str, colmap: &Path, glomap: &str| {
-        let (photos, out) = (photos.display(), root.join(out));
-        format!(
-            "pose {photos} --out {} --colmap {} --mapper global --glomap {glomap}",
-            out.display(),
-            colmap.display()
-        )
+        line(&photos, &root.join(out), colmap, &format!("--mapper global --glomap {glomap}"))
     };
     // COLMAP has this command from 4.0 on.
     let new = stub(root, &format!("help) echo global_mapper;;\nglobal_mapper) {models};;"));
@@ -182,14 +185,12 @@ fn cameras_are_registered_globally_by_colmap_or_else_by_glomap() {
     assert!(stderr.contains("no cameras for these 9 photographs"), "{stderr}");
 }
 
-#[cfg(unix)]
 #[test]
 fn a_failure_of_colmap_is_reported_in_a_line_and_leaves_no_dataset() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let (photos, out) = (photographed(root), root.join("scene"));
     model(2).write_binary(&root.join("models/0"));
-    let two = format!("mapper) cp -r {}/models/* $output;;", root.display());
+    let two = models(root);
     for (cases, parts) in [
         (
             "feature_extractor) echo first; echo; echo no such camera >&2; exit 3;;",
@@ -206,26 +207,18 @@ fn a_failure_of_colmap_is_reported_in_a_line_and_leaves_no_dataset() {
         ),
         ("mapper) echo broken; exit 1;;", &["mapper ended with", "broken"]),
     ] {
-        let colmap = stub(root, cases);
-        let output = command(&format!("pose {} --out {}", photos.display(), out.display()))
-            .arg("--colmap")
-            .arg(&colmap)
-            .output()
-            .unwrap();
-        let stderr = String::from_utf8(output.stderr).unwrap();
+        let (_, stderr) = run(&line(&photos, &out, &stub(root, cases), ""), 3);
         let errors: Vec<&str> = stderr.lines().filter(|line| line.starts_with("error: ")).collect();
-        assert_eq!((output.status.code(), errors.len()), (Some(3), 1), "{stderr}");
+        assert_eq!(errors.len(), 1, "{stderr}");
         assert!(parts.iter().all(|part| errors[0].contains(part)), "{stderr}");
         assert!(root.join("scene.colmap.log").is_file());
         nothing_is_left(&out);
     }
 }
 
-#[cfg(unix)]
 #[test]
 fn colmap_gets_the_focal_length_of_the_exif() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let photos = root.join("photos");
     fs::create_dir_all(&photos).unwrap();
     // Orientation 6 and a focal length of 28 mm equivalent, big-endian as in some cameras.
@@ -238,9 +231,8 @@ fn colmap_gets_the_focal_length_of_the_exif() {
         let turned = [&jpeg[..2], &segment, &jpeg[2..]].concat();
         fs::write(photos.join(format!("{index}.JPG")), turned).unwrap();
     }
-    let colmap = stub(root, &format!("mapper) cp -r $images {}/seen; exit 1;;", root.display()));
-    let (photos, out) = (photos.display(), root.join("scene"));
-    run(&format!("pose {photos} --out {} --colmap {}", out.display(), colmap.display()), 3);
+    let colmap = stub(root, &seen(root));
+    run(&line(&photos, &root.join("scene"), &colmap, ""), 3);
     for index in 0..3 {
         let seen = fs::read(root.join(format!("seen/{index}.JPG"))).unwrap();
         let focal = b"\xa4\x05\0\x03\0\0\0\x01\0\x1c";
@@ -255,44 +247,33 @@ fn colmap_gets_the_focal_length_of_the_exif() {
 
 #[test]
 fn problems_before_the_start_are_reported_in_a_line() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let (photos, out) = (photographed(root), root.join("scene"));
-    let pose = |photos: &Path, more: &str| {
-        format!("pose {} --out {} {more}", photos.display(), out.display())
-    };
-    refused(
-        &pose(&photos, "--colmap /nowhere/colmap"),
-        2,
-        &[
-            "`/nowhere/colmap` is not found",
-            "apt install colmap",
-            "brew install",
-            "--colmap PATH",
-            "colmap mapper",
-        ],
-    );
     let train = format!("train {} --out {}", photos.display(), root.join("run").display());
     refused(&train, 3, &["9 photographs", "nightsplat pose", "--out DATASET"]);
-    refused(&pose(&root.join("absent"), "--colmap true"), 3, &["absent", "cannot be read"]);
     fs::create_dir(root.join("empty")).unwrap();
-    refused(&pose(&root.join("empty"), "--colmap true"), 3, &["contains 0 photographs"]);
-    refused(&pose(&photos, "--colmap true --fps 0"), 2, &["--fps"]);
     fs::write(root.join("clip.mp4"), "no clip").unwrap();
-    let clip = root.join("clip.mp4");
-    refused(
-        &pose(&clip, "--colmap true --ffmpeg /nowhere/ffmpeg"),
-        2,
-        &["`/nowhere/ffmpeg` is not found", "apt install ffmpeg", "--ffmpeg PATH"],
-    );
-    refused(&pose(&clip, "--colmap true --ffmpeg false"), 3, &["false", "ended with"]);
-    fs::copy(photos.join("v01.png"), photos.join("v00.webp")).unwrap();
-    refused(&pose(&photos, "--colmap true"), 3, &["v00.png and v00.webp have the same name"]);
-    fs::remove_file(photos.join("v00.webp")).unwrap();
-    for index in 0..9 {
-        photograph(&photos.join(name(index)).with_extension("png"), SIZE, 0.0);
+    fs::create_dir(root.join("twice")).unwrap();
+    for copy in ["twice/v00.png", "twice/v00.webp", "twice/v01.png"] {
+        fs::copy(photos.join("v01.png"), root.join(copy)).unwrap();
     }
-    refused(&pose(&photos, "--colmap true"), 3, &["photos", "black"]);
+    (0..9).for_each(|i| photograph(&root.join(format!("black/{}.png", name(i))), SIZE, 0.0));
+    let absent = "`/nowhere/colmap` is not found";
+    let remedies = [absent, "apt install colmap", "brew install", "--colmap PATH", "colmap mapper"];
+    refused(&line(&photos, &out, "/nowhere/colmap".as_ref(), ""), 2, &remedies);
+    let ffmpeg = "--ffmpeg /nowhere/ffmpeg";
+    let cases: [(&str, &str, i32, &[&str]); 7] = [
+        ("absent", "", 3, &["absent", "cannot be read"]),
+        ("empty", "", 3, &["contains 0 photographs"]),
+        ("photos", "--fps 0", 2, &["--fps"]),
+        ("clip.mp4", ffmpeg, 2, &["`/nowhere/ffmpeg` is", "apt install ffmpeg", "--ffmpeg PATH"]),
+        ("clip.mp4", "--ffmpeg false", 3, &["false", "ended with"]),
+        ("twice", "", 3, &["v00.png and v00.webp have the same name"]),
+        ("black", "", 3, &["/black", "black"]),
+    ];
+    for (photos, more, code, parts) in cases {
+        refused(&line(&root.join(photos), &out, "true".as_ref(), more), code, parts);
+    }
     nothing_is_left(&out);
 }
 
@@ -306,14 +287,12 @@ pub(super) fn is_installed(program: &str) -> bool {
     is_there
 }
 
-#[cfg(unix)]
 #[test]
 fn the_sharpest_frame_of_each_window_of_a_clip_is_used() {
     if !is_installed("ffmpeg") {
         return;
     }
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     fs::create_dir(root.join("frames")).unwrap();
     // Two seconds of eight frames; the third of every four is sharp.
     for index in 0..16 {
@@ -329,14 +308,9 @@ fn the_sharpest_frame_of_each_window_of_a_clip_is_used() {
         .output()
         .unwrap();
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-    let colmap = stub(root, &format!("mapper) cp -r $images {}/seen; exit 1;;", root.display()));
+    let colmap = stub(root, &seen(root));
     let (clip, out) = (root.join("clip.mkv"), root.join("scene"));
-    let arguments = format!(
-        "pose {} --out {} --colmap {} --fps 2",
-        clip.display(),
-        out.display(),
-        colmap.display()
-    );
+    let arguments = line(&clip, &out, &colmap, "--fps 2");
     let (_, stderr) = run(&arguments, 3);
     assert!(stderr.contains("4 photographs brightened"), "{stderr}");
     let mut seen: Vec<String> = fs::read_dir(root.join("seen"))
@@ -352,24 +326,13 @@ fn the_sharpest_frame_of_each_window_of_a_clip_is_used() {
 }
 
 /// A clip of one dark image, made by ffmpeg with these filters and options; `None` if this ffmpeg cannot.
-#[cfg(unix)]
 fn clip_of(root: &Path, name: &str, filters: &str, options: &[&str]) -> Option<PathBuf> {
     dark_picture(1).save_png8(root.join("source.png")).unwrap();
     let clip = root.join(name);
+    let still = "-v error -loop 1 -framerate 8 -i source.png -frames:v 4 -c:v ffv1";
     let made = Command::new("ffmpeg")
-        .args([
-            "-v",
-            "error",
-            "-loop",
-            "1",
-            "-framerate",
-            "8",
-            "-i",
-            "source.png",
-            "-frames:v",
-            "4",
-        ])
-        .args(["-vf", filters, "-c:v", "ffv1"])
+        .args(still.split(' '))
+        .args(["-vf", filters])
         .args(options)
         .arg(&clip)
         .current_dir(root)
@@ -379,23 +342,16 @@ fn clip_of(root: &Path, name: &str, filters: &str, options: &[&str]) -> Option<P
     made.status.success().then_some(clip)
 }
 
-#[cfg(unix)]
 #[test]
 fn hdr_and_wide_gamut_clips_give_the_frames_of_an_sdr_clip() {
     if !is_installed("ffmpeg") || !is_installed("ffprobe") {
         return;
     }
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
-    let colmap = stub(root, &format!("mapper) cp -r $images {}/seen; exit 1;;", root.display()));
+    let root = &Folder::empty();
+    let colmap = stub(root, &seen(root));
     let seen = |clip: &Path| {
         let out = root.join("scene");
-        let arguments = format!(
-            "pose {} --out {} --colmap {} --fps 2",
-            clip.display(),
-            out.display(),
-            colmap.display()
-        );
+        let arguments = line(&clip, &out, &colmap, "--fps 2");
         let (_, stderr) = run(&arguments, 3);
         let frame = fs::read_dir(root.join("seen")).unwrap().next().unwrap().unwrap().path();
         let frame = Image::load(frame);
@@ -428,23 +384,17 @@ fn hdr_and_wide_gamut_clips_give_the_frames_of_an_sdr_clip() {
     }
 }
 
-#[cfg(unix)]
 #[test]
 fn without_the_hdr_filters_of_ffmpeg_the_error_has_the_command() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     dark_picture(1).save_png8(root.join("source.png")).unwrap();
     let copy = format!("for last; do :; done; cp {}/source.png $(printf $last 1)", root.display());
     script(&root.join("ffmpeg"), &copy);
     script(&root.join("ffprobe"), "echo arib-std-b67");
     fs::write(root.join("clip.mov"), "a clip").unwrap();
     let [clip, out, ffmpeg] = ["clip.mov", "scene", "ffmpeg"].map(|name| root.join(name));
-    let arguments = format!(
-        "pose {} --out {} --colmap true --ffmpeg {}",
-        clip.display(),
-        out.display(),
-        ffmpeg.display()
-    );
+    let more = format!("--ffmpeg {}", ffmpeg.display());
+    let arguments = line(&clip, &out, "true".as_ref(), &more);
     let parts = ["clip.mov: is HDR (HLG)", "zscale=t=linear", "sdr.mp4"];
     refused(&arguments, 3, &parts);
     script(&root.join("ffprobe"), "exit 1");
@@ -457,15 +407,8 @@ fn colmap_finds_the_cameras_of_a_dark_set() {
     if !is_installed("colmap") {
         return;
     }
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
-    let options = SyntheticOptions {
-        views: 20,
-        width: 200,
-        height: 150,
-        seed: 3,
-        ..SyntheticOptions::default()
-    };
+    let root = &Folder::empty();
+    let options = small_set(20, [200, 150], 3);
     synthetic::write(root.join("set"), &options).unwrap();
     let photos = root.join("set/low");
     let out = root.join("scene");
@@ -494,9 +437,9 @@ fn real_dark_photographs_train_as_well_with_cameras_from_colmap_as_with_supplied
     if !is_installed("colmap") {
         return;
     }
-    let folder = tempfile::tempdir().unwrap();
+    let folder = Folder::empty();
     let [scene, found, given] =
-        ["scene", "found", "given"].map(|name| folder.path().join(name).display().to_string());
+        ["scene", "found", "given"].map(|name| folder.join(name).display().to_string());
     let chair = chair.display().to_string();
     succeed(&format!("pose {chair}/low --out {scene}"));
     assert_eq!(load(scene.as_ref()).views.len(), 48);

@@ -3,13 +3,14 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
+use nightsplat::photographs::dataset::synthetic;
 use nightsplat::photographs::image::Image;
 
 use super::load;
-use super::pose::{is_installed, photographed, stub};
+use super::pose::{is_installed, line, photographed, stub};
 use super::synthetic::*;
 use crate::common::command::{refused, run, succeed};
+use crate::common::train::small_set;
 
 /// Bright photographs `day/v00.png` to `day/v03.png`: names of dark photographs, too.
 fn bright(root: &Path) -> PathBuf {
@@ -33,11 +34,9 @@ fn mixed() -> Model {
     model
 }
 
-#[cfg(unix)]
 #[test]
 fn the_dark_and_the_bright_photographs_get_a_dataset_each_in_the_same_coordinates() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let (photos, day, out) = (photographed(root), bright(root), root.join("scene"));
     mixed().write_binary(&root.join("models/0"));
     // Of the models, the one with the most dark photographs counts.
@@ -47,14 +46,8 @@ fn the_dark_and_the_bright_photographs_get_a_dataset_each_in_the_same_coordinate
     let cases =
         format!("mapper) cp -r {0}/models/* $output; cp -r $images {0}/seen;;", root.display());
     let colmap = stub(root, &cases);
-    let arguments = format!(
-        "pose {} --with {} --out {} --colmap {}",
-        photos.display(),
-        day.display(),
-        out.display(),
-        colmap.display()
-    );
-    let (stdout, stderr) = run(&arguments, 0);
+    let with = format!("--with {}", day.display());
+    let (stdout, stderr) = run(&line(&photos, &out, &colmap, &with), 0);
     assert!(stdout.contains("5 of 9 photographs and 3 of 4 bright ones"), "{stdout}");
     assert!(stderr.contains("4 bright photographs beside them"), "{stderr}");
     let unplaced =
@@ -86,21 +79,14 @@ fn the_dark_and_the_bright_photographs_get_a_dataset_each_in_the_same_coordinate
     }
 }
 
-#[cfg(unix)]
 #[test]
 fn a_folder_that_cannot_pose_the_dark_photographs_is_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let folder = Folder::empty();
+    let root = &folder;
     let (photos, day, out) = (photographed(root), bright(root), root.join("scene"));
     let colmap = stub(root, "mapper) exit 0;;");
     let pose = |with: &Path, more: &str| {
-        format!(
-            "pose {} --with {} --out {} --colmap {} {more}",
-            photos.display(),
-            with.display(),
-            out.display(),
-            colmap.display()
-        )
+        line(&photos, &out, &colmap, &format!("--with {} {more}", with.display()))
     };
     refused(&pose(&photos, ""), 3, &["photos", "is the folder of the dark photographs itself"]);
     refused(&pose(&root.join("none"), ""), 3, &["none"]);
@@ -114,15 +100,8 @@ fn colmap_poses_dark_photographs_through_bright_ones_of_other_views() {
     if !is_installed("colmap") {
         return;
     }
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
-    let options = SyntheticOptions {
-        views: 24,
-        width: 200,
-        height: 150,
-        seed: 3,
-        ..SyntheticOptions::default()
-    };
+    let root = &Folder::empty();
+    let options = small_set(24, [200, 150], 3);
     synthetic::write(root.join("set"), &options).unwrap();
     // Every sixth view is dark.
     for index in 0..options.views {

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use super::load;
-use super::pose::{photographed, stub};
+use super::pose::{line, models, photographed, stub};
 use super::synthetic::*;
 use crate::common::command::{refused, run};
 
@@ -25,8 +25,7 @@ fn taken_at(path: &Path, focal: u8) {
 
 #[test]
 fn photographs_of_one_size_lens_and_focal_length_share_a_camera() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let photos = root.join("photos");
     fs::create_dir_all(&photos).unwrap();
     for index in 0..6 {
@@ -39,9 +38,7 @@ fn photographs_of_one_size_lens_and_focal_length_share_a_camera() {
     let cases =
         format!("feature_extractor) {{ tr '\\n' ' ' < $list; echo; }} >> {};;", lists.display());
     let colmap = stub(root, &cases);
-    let (photos, out) = (photos.display(), root.join("scene"));
-    let (_, stderr) =
-        run(&format!("pose {photos} --out {} --colmap {}", out.display(), colmap.display()), 3);
+    let (_, stderr) = run(&line(&photos, &root.join("scene"), &colmap, ""), 3);
     assert!(stderr.contains("3 groups of photographs by size, lens and focal length"), "{stderr}");
     let lists = fs::read_to_string(lists).unwrap();
     let lists: BTreeSet<&str> = lists.lines().map(str::trim).collect();
@@ -51,16 +48,14 @@ fn photographs_of_one_size_lens_and_focal_length_share_a_camera() {
 
 #[test]
 fn a_photograph_that_does_not_decode_is_left_out_and_hidden_files_are_ignored() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let (photos, out) = (photographed(root), root.join("scene"));
     fs::write(photos.join("broken.jpg"), "no photograph").unwrap();
     fs::write(photos.join("._v00.png"), "Mac OS X").unwrap();
     photograph(&photos.join("dynamic_mask_v01.png"), SIZE, 1.0);
     model(9).write_binary(&root.join("models/0"));
-    let colmap = stub(root, &format!("mapper) cp -r {}/models/* $output;;", root.display()));
-    let arguments =
-        format!("pose {} --out {} --colmap {}", photos.display(), out.display(), colmap.display());
+    let colmap = stub(root, &models(root));
+    let arguments = line(&photos, &out, &colmap, "");
     let (stdout, stderr) = run(&arguments, 0);
     assert!(stdout.contains("9 of 9 photographs with their cameras, one calibrated"), "{stdout}");
     assert!(stderr.contains("left out: ") && stderr.contains("broken.jpg"), "{stderr}");
@@ -73,20 +68,14 @@ fn a_photograph_that_does_not_decode_is_left_out_and_hidden_files_are_ignored() 
 
 #[test]
 fn an_implausible_calibration_is_reported() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let photos = photographed(root);
     for (out, fy, is_plausible) in [("good", 36.0, true), ("bad", 60.0, false)] {
         let cameras = vec![(3, "PINHOLE", 1, vec![35.0, fy, 20.0, 15.0])];
         Model { cameras, ..model(9) }.write_binary(&root.join("models/0"));
-        let colmap = stub(root, &format!("mapper) cp -r {}/models/* $output;;", root.display()));
+        let colmap = stub(root, &models(root));
         let out = root.join(out);
-        let arguments = format!(
-            "pose {} --out {} --colmap {}",
-            photos.display(),
-            out.display(),
-            colmap.display()
-        );
+        let arguments = line(&photos, &out, &colmap, "");
         let (stdout, stderr) = run(&arguments, 0);
         assert_eq!(
             stderr.contains("is implausible: its focal lengths are 71 % apart"),
@@ -99,19 +88,12 @@ fn an_implausible_calibration_is_reported() {
 
 #[test]
 fn few_photographs_start_from_a_closer_pair_and_options_go_to_their_command() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let (photos, out) = (photographed(root), root.join("scene"));
     model(9).write_binary(&root.join("models/0"));
     let copy = format!("cp -r {}/models/* $output", root.display());
     let pose = |cases: &str, more: &str| {
-        let colmap = stub(root, cases);
-        format!(
-            "pose {} --out {} --overwrite --colmap {} {more}",
-            photos.display(),
-            out.display(),
-            colmap.display()
-        )
+        line(&photos, &out, &stub(root, cases), &format!("--overwrite {more}"))
     };
     let relaxed = format!("mapper) [ \"$angle\" = 2 ] && {copy}; exit 0;;");
     let (stdout, stderr) = run(&pose(&relaxed, ""), 0);
@@ -141,15 +123,13 @@ fn few_photographs_start_from_a_closer_pair_and_options_go_to_their_command() {
 
 #[test]
 fn an_archive_of_photographs_is_read_in_place() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     let (photos, out) = (photographed(root), root.join("scene"));
     let zip = root.join("photos.zip");
     super::layouts::pack(&photos, &zip, "scan/");
     model(9).write_binary(&root.join("models/0"));
-    let colmap = stub(root, &format!("mapper) cp -r {}/models/* $output;;", root.display()));
-    let arguments =
-        format!("pose {} --out {} --colmap {}", zip.display(), out.display(), colmap.display());
+    let colmap = stub(root, &models(root));
+    let arguments = line(&zip, &out, &colmap, "");
     let (stdout, _) = run(&arguments, 0);
     assert!(stdout.contains("9 of 9 photographs"), "{stdout}");
     assert_eq!(load(&out).views.len(), 9);

@@ -100,8 +100,8 @@ fn dng(width: u16, height: u16, pixel: impl Fn(u16, u16) -> [u16; 3]) -> Vec<u8>
 
 #[test]
 fn a_linear_dng_is_linear_light_with_the_cameras_white() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("a.dng");
+    let folder = Folder::empty();
+    let path = folder.join("a.dng");
     // Grey of known light, 1/16 to 1/2, by a camera with weaker red and blue.
     let light = |x: u16| 1.0 / f32::from(16_u16 >> (x / 4));
     fs::write(&path, dng(16, 8, |x, _| counted([light(x); 3]))).unwrap();
@@ -115,7 +115,7 @@ fn a_linear_dng_is_linear_light_with_the_cameras_white() {
         }
     }
     // Linear light is processed as in EXR: the same photograph from either file.
-    let exr = folder.path().join("a.exr");
+    let exr = folder.join("a.exr");
     image.save_exr(&exr).unwrap();
     let other = Image::load(&exr).unwrap();
     let off = image.data.iter().zip(&other.data).map(|(a, b)| (a - b).abs());
@@ -124,8 +124,8 @@ fn a_linear_dng_is_linear_light_with_the_cameras_white() {
 
 #[test]
 fn a_damaged_raw_is_named() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("a.dng");
+    let folder = Folder::empty();
+    let path = folder.join("a.dng");
     let whole = dng(16, 8, |_, _| [1000; 3]);
     for bytes in [&b"no photograph"[..], &whole[..whole.len() / 2], &whole[..100]] {
         fs::write(&path, bytes).unwrap();
@@ -163,8 +163,8 @@ fn raw_set(set: &Path, options: &SyntheticOptions) -> usize {
 
 #[test]
 fn photographs_in_raw_train_as_the_same_light_in_another_format() {
-    let folder = tempfile::tempdir().unwrap();
-    let [encoded, raw] = ["encoded", "raw"].map(|name| folder.path().join(name));
+    let folder = Folder::empty();
+    let [encoded, raw] = ["encoded", "raw"].map(|name| folder.join(name));
     let options =
         SyntheticOptions { views: 9, width: 48, height: 36, ..SyntheticOptions::default() };
     synthetic::write(&encoded, &options).unwrap();
@@ -176,8 +176,8 @@ fn photographs_in_raw_train_as_the_same_light_in_another_format() {
 /// Sensor, target, inverse, EXR: what `render --as linear` writes of a model that fits its targets.
 #[test]
 fn light_on_the_sensor_comes_back_in_an_exr_through_target_and_inverse() {
-    let folder = tempfile::tempdir().unwrap();
-    let [raw, exr] = ["a.dng", "a.exr"].map(|name| folder.path().join(name));
+    let folder = Folder::empty();
+    let [raw, exr] = ["a.dng", "a.exr"].map(|name| folder.join(name));
     // Seven stops, in colours.
     let light = |x: u16, y: u16| {
         let own = 0.03 / f32::from(1_u16 << (x / 4));
@@ -217,8 +217,8 @@ fn light_on_the_sensor_comes_back_in_an_exr_through_target_and_inverse() {
 /// The light of a trained model in `render --as linear`, against that on the sensor, in bins of a stop.
 #[test]
 fn a_raw_set_stays_linear_to_the_exr_of_its_renders() {
-    let folder = tempfile::tempdir().unwrap();
-    let [set, run, out] = ["set", "run", "out"].map(|name| folder.path().join(name));
+    let folder = Folder::empty();
+    let [set, run, out] = ["set", "run", "out"].map(|name| folder.join(name));
     let options =
         SyntheticOptions { views: 12, width: 64, height: 48, ..SyntheticOptions::default() };
     let photographs = raw_set(&set, &options);
@@ -233,7 +233,7 @@ fn a_raw_set_stays_linear_to_the_exr_of_its_renders() {
     for entry in fs::read_dir(&out).unwrap() {
         let path = entry.unwrap().path();
         let name = path.file_stem().unwrap().to_string_lossy().into_owned();
-        let sensor = Image::load(folder.path().join(format!("set/low/{name}.dng"))).unwrap();
+        let sensor = Image::load(folder.join(format!("set/low/{name}.dng"))).unwrap();
         let render = Image::load(&path).unwrap();
         seen += 1;
         for (sensor, render) in sensor.data.iter().zip(&render.data) {

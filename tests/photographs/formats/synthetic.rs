@@ -1,6 +1,7 @@
 //! A small capture on a ring of cameras, written in every supported layout.
 
 use std::fs;
+use std::ops::Deref;
 use std::path::Path;
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
@@ -63,6 +64,11 @@ pub(crate) fn frame_of(pose: &DAffine3, file_path: &str) -> Value {
     json!({ "file_path": file_path, "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]] })
 }
 
+/// Frames of the photographs in `images/`.
+pub(crate) fn frames(count: usize) -> Vec<Value> {
+    (0..count).map(|index| frame(index, &format!("images/{}.png", name(index)))).collect()
+}
+
 pub(crate) fn transforms(frames: Vec<Value>) -> Value {
     json!({
         "w": f64::from(SIZE.0), "h": f64::from(SIZE.1), "fl_x": FOCAL.x, "fl_y": FOCAL.y,
@@ -70,8 +76,74 @@ pub(crate) fn transforms(frames: Vec<Value>) -> Value {
     })
 }
 
+/// Sets these keys of an object.
+pub(crate) fn extend(object: &mut Value, keys: &Value) {
+    object.as_object_mut().unwrap().extend(keys.as_object().unwrap().clone());
+}
+
 pub(crate) fn write_json(path: impl AsRef<Path>, value: &Value) {
     fs::write(path, serde_json::to_string_pretty(value).unwrap()).unwrap();
+}
+
+/// A folder for a dataset, removed when it is dropped.
+pub(crate) struct Folder(tempfile::TempDir);
+
+impl Deref for Folder {
+    type Target = Path;
+
+    fn deref(&self) -> &Path {
+        self.0.path()
+    }
+}
+
+impl AsRef<Path> for Folder {
+    fn as_ref(&self) -> &Path {
+        self
+    }
+}
+
+impl Folder {
+    pub(crate) fn empty() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+
+    /// A COLMAP model in `sparse/0`, and its photographs in `images`.
+    pub(crate) fn with_model(model: &Model) -> Self {
+        let folder = Self::empty();
+        photographs(&folder, "images", 0..model.images.len(), 1.0);
+        model.write_binary(&folder.join("sparse/0"));
+        folder
+    }
+
+    /// The same as text.
+    pub(crate) fn with_text_model(model: &Model) -> Self {
+        let folder = Self::empty();
+        photographs(&folder, "images", 0..model.images.len(), 1.0);
+        model.write_text(&folder.join("sparse/0"));
+        folder
+    }
+
+    /// The model in both encodings.
+    pub(crate) fn with_either_model(model: &Model) -> [Self; 2] {
+        [Self::with_model(model), Self::with_text_model(model)]
+    }
+
+    /// A listing, changed by `edit`, and its photographs in `images`.
+    pub(crate) fn with_listing(views: usize, edit: impl FnOnce(&mut Value)) -> Self {
+        let folder = Self::empty();
+        photographs(&folder, "images", 0..views, 1.0);
+        let mut listing = transforms(frames(views));
+        edit(&mut listing);
+        write_json(folder.join("transforms.json"), &listing);
+        folder
+    }
+
+    /// Ten views in the layout of LOM, two of them for tests.
+    pub(crate) fn lom() -> Self {
+        let folder = Self::empty();
+        lom(&folder, 10, &[2, 5]);
+        folder
+    }
 }
 
 /// `low/` for training and `high/` for scores, both for every view: the layout of LOM.

@@ -104,8 +104,8 @@ fn write(image: &Image, path: &Path) {
 
 /// The image as one of this orientation is shown.
 fn turned(image: Image, orientation: u8) -> Image {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("a.jpg");
+    let folder = Folder::empty();
+    let path = folder.join("a.jpg");
     write(&Image::filled(8, 8, [0.0; 3]), &path);
     orient(&path, orientation);
     image.turned(Orientation::of(&path))
@@ -134,8 +134,7 @@ fn points_that_photographs_share_tell_which_pixels_their_cameras_are_of() {
         [(WIDE, HALF_TURN), (WIDE, MIRRORED), (SQUARE, QUARTER_TURN), (SQUARE, MIRRORED)]
     {
         for of_exif in [false, true] {
-            let folder = tempfile::tempdir().unwrap();
-            let root = folder.path();
+            let root = &Folder::empty();
             capture(root, size, turn, of_exif, true);
             let (dataset, message) = loaded(root, PixelOrientation::Auto);
             assert!(are_right(&dataset, size), "{size:?} {turn:?} {of_exif}");
@@ -150,8 +149,7 @@ fn points_that_photographs_share_tell_which_pixels_their_cameras_are_of() {
 #[test]
 fn without_points_what_is_stored_is_taken_with_one_warning_and_the_option_says_otherwise() {
     for of_exif in [false, true] {
-        let folder = tempfile::tempdir().unwrap();
-        let root = folder.path();
+        let root = &Folder::empty();
         capture(root, WIDE, HALF_TURN, of_exif, false);
         let (dataset, message) = loaded(root, PixelOrientation::Auto);
         assert_eq!(are_right(&dataset, WIDE), !of_exif);
@@ -169,17 +167,16 @@ fn without_points_what_is_stored_is_taken_with_one_warning_and_the_option_says_o
 
 #[test]
 fn the_option_overrides_what_points_tell() {
-    let folder = tempfile::tempdir().unwrap();
-    capture(folder.path(), WIDE, HALF_TURN, false, true);
-    let (dataset, message) = loaded(folder.path(), PixelOrientation::Exif);
+    let folder = Folder::empty();
+    capture(&folder, WIDE, HALF_TURN, false, true);
+    let (dataset, message) = loaded(&folder, PixelOrientation::Exif);
     assert!(!are_right(&dataset, WIDE) && message.is_empty(), "{message}");
 }
 
 #[test]
 fn a_photograph_whose_size_tells_speaks_for_those_whose_size_does_not() {
     for of_exif in [false, true] {
-        let folder = tempfile::tempdir().unwrap();
-        let root = folder.path();
+        let root = &Folder::empty();
         capture(root, WIDE, HALF_TURN, of_exif, false);
         let path = root.join("images/v04.jpg");
         let lying = turned(taken(4, WIDE), 8);
@@ -190,11 +187,9 @@ fn a_photograph_whose_size_tells_speaks_for_those_whose_size_does_not() {
     }
 }
 
-#[cfg(feature = "cli")]
 #[test]
 fn the_configuration_keeps_the_option() {
-    let folder = tempfile::tempdir().unwrap();
-    let root = folder.path();
+    let root = &Folder::empty();
     capture(root, WIDE, HALF_TURN, true, false);
     let diagnose = format!("diagnose {}", root.display());
     assert!(run(&diagnose, 0).1.contains("--orientation exif"));

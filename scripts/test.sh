@@ -1,0 +1,37 @@
+#!/usr/bin/env bash
+# Runs `cargo test` with the given arguments, then prints the seconds of each test program and of the ten slowest tests.
+#
+# Not cargo-nextest, which prints the same: it starts a process for each test, which opens a Vulkan device and compiles
+# its kernels anew; the tests of a program share one.
+set -euo pipefail
+
+# As cargo's runner of the programs that it has built.
+if [ -n "${NIGHTSPLAT_TIMES:-}" ]; then
+    began=$EPOCHREALTIME
+    status=0
+    # The compiler's own times are not stable; this lets them be printed.
+    RUSTC_BOOTSTRAP=1 "$@" -Z unstable-options --report-time | tee -a "$NIGHTSPLAT_TIMES/tests" || status=$?
+    name=$(basename "$1")
+    awk -v name="${name%-*}" -v began="$began" -v ended="$EPOCHREALTIME" \
+        'BEGIN { printf "%8.1f s  %s\n", ended - began, name }' >> "$NIGHTSPLAT_TIMES/programs"
+    exit "$status"
+fi
+
+NIGHTSPLAT_TIMES=$(mktemp -d)
+export NIGHTSPLAT_TIMES
+trap 'rm -rf "$NIGHTSPLAT_TIMES"' EXIT
+touch "$NIGHTSPLAT_TIMES"/{tests,programs}
+status=0
+timed() { cargo test --config "target.'cfg(all())'.runner = ['$(realpath "$0")']" "$@"; }
+if [ $# -gt 0 ]; then
+    timed "$@" || status=$?
+else
+    # What cargo runs by default; examples of the documentation have no runner.
+    { timed --lib --bins --tests --examples && cargo test --doc; } || status=$?
+fi
+echo "test programs, slowest first:"
+sort -rn "$NIGHTSPLAT_TIMES/programs"
+echo "the slowest tests:"
+sed -n 's/^test \(.*\) \.\.\. .*<\([0-9.]*\)s>$/\2 \1/p' "$NIGHTSPLAT_TIMES/tests" | sort -rn | head |
+    awk '{ printf "%8.1f s  %s\n", $1, $2 }'
+exit "$status"
