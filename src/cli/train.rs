@@ -11,7 +11,7 @@ use anyhow::Result;
 pub(crate) use self::options::TrainOptions;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
-use super::{driver, finish, live, signals, view, word};
+use super::{driver, finish, live, phases, signals, view, word};
 use crate::base::output::{check_writable, printable};
 use crate::camera::frame;
 use crate::gpu::DeviceChoice;
@@ -156,6 +156,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
         Some(screen) => view::beside(screen, (&args.out, &dataset), &requests, train)?,
         None => train()?,
     };
+    phases::log();
     if !is_text {
         return Ok(());
     }
