@@ -91,7 +91,7 @@ type Measured = Result<(f64, u64)>;
 fn step(gpu: &Gpu, [width, height]: [u32; 2], gaussians: usize) -> Measured {
     gpu.reset_peak_memory();
     let scene = BenchScene::new(width, height, gaussians);
-    let mut trainer = scene::plain(gpu, &scene)?;
+    let mut trainer = scene::plain(gpu, &scene, &TrainConfig::bare().precision)?;
     Ok((least(|| trainer.profile_step())?, gpu.peak_memory()))
 }
 

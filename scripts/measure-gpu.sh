@@ -1,39 +1,45 @@
 #!/usr/bin/env bash
-# Measures a GPU on a machine that has its driver and nothing else: no compiler, no cargo, no network. Two halves:
+# Measures a GPU on a machine that has its driver and nothing else: no compiler, no cargo, no network.
 #
 #     scripts/measure-gpu.sh pack DIR SCENE    where nightsplat is built; SCENE is the folder of a LOM scene
-#     DIR/run.sh [--software] OUT              where the GPU is, after copying DIR there
+#     DIR/run.sh [--software] OUT [SECONDS]    where the GPU is, after copying DIR there; 570 seconds by default
+#     scripts/measure-gpu.sh rehearse          both at tiny sizes, on a software device, in three minutes
 #
-# The pack is below 64 MB: the program and the tests without symbols, the Vulkan loader and its validation layer, the
-# libraries that NVIDIA's driver links to, the sources that tests read, the scene. The run takes at most ten minutes, of
-# which each step has a share; a step that fails or runs out of time does not stop the others. It stops at once where
-# there is no GPU; --software rehearses it on a software device, with little of everything and ten times the time for
-# each step. OUT then contains, in order:
+# The pack is below 59 MB: the program and the tests without symbols, the Vulkan loader and its validation layer, the
+# libraries that NVIDIA's driver links to, the sources that tests read, the scene. The run decides by itself: what
+# counts most comes first, each experiment and each of its steps has a limit, and one that fails or runs out of time
+# does not stop the others. Each result is printed at once. It stops where there is no GPU; --software rehearses it on a
+# software device, with little of everything and ten times the time for each step. OUT then contains:
 #
-#     summary.txt       what ran, how it ended and how long it took; at the end, ten lines of results
+#     summary.txt       what was printed: each step, how it ended, how long it took and what it found
 #     log.txt           standard error of every step
-#     doctor.txt        the devices, their drivers, and the libraries of these
-#     clocks.csv        clocks, power, temperature and what limits the clocks, five times a second
-#     bench.json        kernels, stages, a step and the device's ceilings, unchecked
-#     pipelines.jsonl   registers, spills and shared memory of every kernel, by the driver
-#     many.json         a million Gaussians at 1080p
-#     tune.json         every tile at 500x375 and 1920x1080, with registers and spills
-#     tune-N.json       the same with subgroups of N lanes, where the device has a choice
-#     steady-*.json     512 steps as training submits them, at two sizes: wall, device, passes, processor
-#     checked.json      every pass against its reference: errors in units of their bounds
-#     hashes.txt        the models of equal runs, of one without push descriptors, and of one in other batches
-#     validation.txt    messages of the validation layer over two steps
-#     tests.txt         the result of every test binary, and the end of the output of those that failed
-#     gsplat.json       steps of gsplat on the same scene, if GSPLAT names a folder to import it from
-#     lom.txt           training by the paper's protocol, plain and with every part: scores, or the last steps
-#     growth.txt        how time and memory grow
+#     results.tar.gz    the rest, as it was after the last experiment:
+#         doctor.txt        the devices, their drivers, and the libraries of these
+#         clocks.csv        clocks, power, temperature and what limits the clocks, five times a second
+#         phases-*.txt      a training with its seconds by phase, with no and with a warm cache of pipelines
+#         bench-*.json      512 steps as training submits them, in 32 and 16 bits: small, many, 4 million, and a trained
+#                           model; that of many with the device's ceilings
+#         pipelines.jsonl   registers, spills and shared memory of every kernel, by the driver
+#         ab-*.json         steps with prototypes in place of kernels, and with none, in turn
+#         lita-*.jsonl      steps of LITA in single and half precision, with and without crops, and its pipelines
+#         tune*.json        every tile, of the trained model, the synthetic scene, and with subgroups of N lanes
+#         checked.json      every pass against its reference: errors in units of their bounds
+#         hashes.txt        the models of equal runs, of one without push descriptors, and of one in other batches
+#         validation.txt    messages of the validation layer over two steps
+#         tests.txt         the result of every test binary, and the end of the output of those that failed
+#         gsplat.json       steps of gsplat on the same scene, if GSPLAT names a folder to import it from
+#         lom.txt           training by the paper's protocol, plain and with every part: scores, or the last steps
+#         growth.txt        how time and memory grow
 #
-# Variables and their defaults. pack: PROFILE=release, TESTS (the test targets; all). run: TIME=570 (seconds; 5700), and
-# BENCH, TUNE, MANY, SMALL, CHECKED, LOM (arguments of the steps), STEPS=512 (of the steady ones), EQUAL=300 (of the
-# runs that must be equal).
+# Variables. pack: PROFILE=release, TESTS (the test targets; all), and NIGHTSPLAT_PROTOTYPES, a folder of kernels to
+# compare with those of the program: blend_forward.comp and blend_backward.comp, with the interfaces of those, subst.py,
+# which fits them to the modules of a run, and ../wrap.c, a driver around the real one that replaces modules by hash;
+# PROTOTYPE_FLAGS, for glslangValidator. run: ONLY, the experiments by the names of their functions (all); DRIVER, the
+# library of the real driver; GSPLAT.
 set -euo pipefail
 
-MAX_BYTES=64000000
+# A machine may take 64 MiB with the checkout.
+MAX_BYTES=59000000
 
 fail() {
     printf '%s\n' "$@" >&2
@@ -46,6 +52,19 @@ fail() {
 # The executables in cargo's messages, of the targets whose line matches the pattern.
 executables() {
     sed -n "/$1/"'s|.*"executable":"\([^"]*\)".*|\1|p'
+}
+
+# pack_prototypes FROM TO: compiles them; they are fitted to the device where that is.
+pack_prototypes() {
+    local from=$1 to=$2 include=(-Ishaders-glsl/include "-I$1")
+    mkdir -p "$to"
+    cc -O1 -shared -fPIC -o "$to/wrap.so" "$from/../wrap.c" -ldl -lpthread
+    # shellcheck disable=SC2086
+    kernel() { glslangValidator -V --target-env spirv1.5 "${include[@]}" ${PROTOTYPE_FLAGS:-} "$@" > /dev/null; }
+    kernel "$from/blend_forward.comp" -o "$to/forward.spv"
+    kernel "$from/blend_backward.comp" -o "$to/backward.spv"
+    kernel -DBUTTERFLY "$from/blend_backward.comp" -o "$to/butterfly.spv"
+    cp "$from/subst.py" "$(command -v spirv-opt)" "$to"
 }
 
 pack() {
@@ -83,10 +102,11 @@ pack() {
         if [ -e "$(dirname "$loader")/$library" ]; then cp -L "$(dirname "$loader")/$library" "$stage/x11/"; fi
     done
 
+    [ -z "${NIGHTSPLAT_PROTOTYPES:-}" ] || pack_prototypes "$NIGHTSPLAT_PROTOTYPES" "$stage/prototypes"
     git ls-files -z | tar --null -T - -c | tar -x -C "$stage/source"
     # The benchmark's preset recognises a scene by the name of its folder.
     cp -RL "$scene" "$stage/scene/"
-    local filters=(--lzma2=preset=6,dict=128MiB)
+    local filters=(--lzma2=preset="${PRESET:-6}",dict=128MiB)
     [ "$(uname -m)" != x86_64 ] || filters=(--x86 "${filters[@]}")
     tar -C "$stage" -c . | xz -T1 "${filters[@]}" > "$dir/pack.tar.xz"
     cp "$0" "$dir/run.sh"
@@ -103,25 +123,35 @@ pack() {
 # ---------------------------------------------------------------------------
 # Where the GPU is
 
-say() {
-    printf '%-10s %-14s %4d s\n' "$@" | tee -a "$out/summary.txt"
-}
+say() { printf '%-22s %-14s %4d s\n' "$@" | tee -a "$out/summary.txt"; }
+
+note() { echo "    $*" | tee -a "$out/summary.txt"; }
 
 # step NAME FILE LIMIT COMMAND..: appends the command's output to FILE; it has at most LIMIT of the remaining seconds.
 step() {
-    local name=$1 file=$2 limit=$(($3 * patience)) begin=$SECONDS code=0 left=$((end - SECONDS))
+    local name=$1 file=$2 limit=$(($3 * patience)) begin=$SECONDS code=0 left=$((until - SECONDS))
     shift 3
     if [ "$left" -lt 3 ]; then
         say "$name" 'no time left' 0
-        return
+        return 1
     fi
     printf '\n== %s: %s\n' "$name" "$*" >> "$out/log.txt"
-    timeout --kill-after=3 $((limit < left ? limit : left)) "$@" >> "$out/$file" 2>> "$out/log.txt" || code=$?
+    timeout --kill-after=3 $((limit < left ? limit : left)) "$@" >> "$found/$file" 2>> "$out/log.txt" || code=$?
     case $code in
         0) say "$name" ok $((SECONDS - begin)) ;;
         124 | 137) say "$name" 'out of time' $((SECONDS - begin)) ;;
-        *) say "$name" "failed ($code)" $((SECONDS - begin)) ;;
+        *) say "$name" "failed ($code)" $((SECONDS - begin)) && tail -n 3 "$out/log.txt" ;;
     esac
+    return "$code"
+}
+
+# experiment LIMIT FUNCTION: runs its steps within LIMIT seconds, and keeps what they found.
+experiment() {
+    [[ " ${ONLY:-$2} " == *" $2 "* ]] || return 0
+    until=$((SECONDS + $1 * patience))
+    until=$((until < end ? until : end))
+    "$2" || true
+    tar -czf "$out/.results" -C "$found" . && mv "$out/.results" "$out/results.tar.gz"
 }
 
 has_library() { PATH="$PATH:/usr/sbin:/sbin" ldconfig -p | grep -q "$1"; }
@@ -133,7 +163,8 @@ add_libraries() { export LD_LIBRARY_PATH="$1${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH
 find_vulkan() {
     has_library 'libvulkan\.so\.1' || add_libraries "$work/lib"
     has_library 'libXext\.so\.6' || add_libraries "$work/x11"
-    export VK_LAYER_PATH=$work/layers
+    # A program of the dev profile would validate what it times.
+    export VK_LAYER_PATH=/nonexistent
     [ -z "${VK_DRIVER_FILES:-${VK_ICD_FILENAMES:-}}" ] || return 0
     compgen -G '/etc/vulkan/icd.d/*.json' > /dev/null ||
         compgen -G '/usr/share/vulkan/icd.d/*.json' > /dev/null && return 0
@@ -177,12 +208,13 @@ place() {
 train() {
     local name=$1 limit=$2 run=$work/runs/$1
     shift 2
-    printf '\n== %s\n' "$*" >> "$out/lom.txt"
+    printf '\n== %s\n' "$*" >> "$found/lom.txt"
     step "$name" lom.txt "$limit" "$work/nightsplat" train "$work"/scene/* --out "$run" --preset lom "$@"
     if [ -e "$run/metrics.json" ]; then
-        cat "$run/metrics.json" >> "$out/lom.txt"
+        cat "$run/metrics.json" >> "$found/lom.txt"
+        note "$(sed -n '/^  "mean": {/,/^  }/s/^    \("[ps].*\),\{0,1\}$/\1/p' "$run/metrics.json" | tr -d '\n')"
     elif [ -e "$run/train.csv" ]; then
-        { head -n 1 "$run/train.csv" && tail -n 3 "$run/train.csv"; } >> "$out/lom.txt"
+        { head -n 1 "$run/train.csv" && tail -n 3 "$run/train.csv"; } >> "$found/lom.txt"
     fi
 }
 
@@ -193,35 +225,38 @@ equal() {
     step "$name" hashes.log 20 \
         "$work/nightsplat" train "$work"/scene/* --out "$run" --preset lom --curve ap3 --steps "$EQUAL" "$@"
     if [ -e "$run/model.ply" ]; then
-        echo "$(sha256sum < "$run/model.ply" | cut -c 1-16) $name" >> "$out/hashes.txt"
+        echo "$(sha256sum < "$run/model.ply" | cut -c 1-16) $name" >> "$found/hashes.txt"
     fi
 }
 
 run_tests() {
     local root program name code begin left result log=$work/test.log all=0 passed=0 most=$((90 * patience))
-    local tests_end=$((SECONDS + $1 * patience))
-    tests_end=$((tests_end < end ? tests_end : end))
     { read -r root && read -r program; } < "$work/paths"
     if ! place "$work/source" "$root" || ! place "$work/nightsplat" "$program" || ! cd "$root"; then
-        echo "tests were not run: they need $root and $program" | tee -a "$out/tests.txt" "$out/summary.txt"
+        echo "tests were not run: they need $root and $program" | tee -a "$found/tests.txt" "$out/summary.txt"
         return
     fi
     # What kernels, renders and training depend on comes first.
     for test in "$work"/tests/{splats,gpu,loss,train}-* "$work"/tests/*; do
         [ -x "$test" ] || continue
-        name=$(basename "$test") begin=$SECONDS left=$((tests_end - SECONDS)) code=0 all=$((all + 1))
+        name=$(basename "$test") begin=$SECONDS left=$((until - SECONDS)) code=0 all=$((all + 1))
         if [ "$left" -lt 3 ]; then
-            echo "$name: no time left" >> "$out/tests.txt"
+            echo "$name: no time left" >> "$found/tests.txt"
             rm "$test"
             continue
         fi
         timeout --kill-after=3 $((left < most ? left : most)) "$test" > "$log" 2>&1 || code=$?
         rm "$test"
         result=$(grep '^test result' "$log" || echo 'no result')
-        echo "$name: exit code $code, $((SECONDS - begin)) s; $result" >> "$out/tests.txt"
-        if [ "$code" = 0 ]; then passed=$((passed + 1)); else tail -n 60 "$log" >> "$out/tests.txt"; fi
+        echo "$name: exit code $code, $((SECONDS - begin)) s; $result" >> "$found/tests.txt"
+        if [ "$code" = 0 ]; then
+            passed=$((passed + 1))
+        else
+            note "$name: $result"
+            tail -n 60 "$log" >> "$found/tests.txt"
+        fi
     done
-    echo "$passed of $all test binaries pass" | tee -a "$out/tests.txt" "$out/summary.txt"
+    echo "$passed of $all test binaries pass" | tee -a "$found/tests.txt" "$out/summary.txt"
 }
 
 # value FILE NAME: the first number or text with this name.
@@ -232,109 +267,261 @@ members() {
     sed -n "/^  \"$2\": {/,/^  }/s/^    \"\(.*\)\": \([^,]*\),\{0,1\}$/\1 \2/p" "$out/$1" 2> /dev/null | sort -k 2 -gr
 }
 
-# Ten lines of results.
-results() {
-    local copy hashes small many name ms file
-    copy=$(members bench.json ceilings | sed -n 's/copy_gb_per_s //p')
-    small=$(members steady-small.json steady) many=$(members steady-many.json steady)
-    hashes=$(cut -d ' ' -f 1 "$out/hashes.txt" 2> /dev/null | sort -u | grep -c . || true)
-    for file in bench.json many.json checked.json; do [ -z "$(value "$file" device)" ] || break; done
-    echo "device: $(value "$file" device), $(value "$file" driver)"
-    echo "ceilings: $(members bench.json ceilings | tr '\n' ' ')"
-    echo "step, ms: 20 000 at 512x384: $(value bench.json step_ms)"
-    echo "step, ms: 50 000 at 500x375: $(tr '\n' ' ' <<< "$small")"
-    echo "step, ms: 1 000 000 at 1080p: $(tr '\n' ' ' <<< "$many")"
-    members many.json kernels | head -n 5 | while read -r name ms; do
-        members many.json gb_per_s_at_most | awk -v name="$name" -v ms="$ms" -v copy="${copy:-0}" \
-            '$1 == name { printf "%s %.3f ms, %.0f %% of the copy; ", name, ms, (copy > 0 ? 100 * $2 / copy : 0) }'
-    done
-    echo
-    echo "tiles: $(cat "$work/tiles.json" 2> /dev/null | tr -d ' \n' | sed 's/.*"tiles"://')"
-    echo "$(value checked.json passes); largest error / bound: $(members checked.json errors | head -n 1)"
-    echo "$(awk '/"disagreeing": \[/ { on = 1 } on { print } on && /\]/ { exit }' "$out/checked.json" 2> /dev/null |
-        tr -d ' \n')"
-    echo "models: $(grep -c . "$out/hashes.txt" 2> /dev/null || true) runs, $hashes distinct"
-    echo "validation: $(grep -c 'Validation Error\|SYNC-HAZARD' "$out/validation.txt" 2> /dev/null || true) messages;" \
-        "tests: $(tail -n 1 "$out/tests.txt" 2> /dev/null || true)"
+# value FILE NAME: the first number or text with this name.
+value() { sed -n "s/^ *\"$2\": \(.*[^,]\),\{0,1\}$/\1/p" "$found/$1" 2> /dev/null | head -n 1 | tr -d '"'; }
+
+# members FILE NAME: the names and values of an object, the largest first.
+members() {
+    sed -n "/^  \"$2\": {/,/^  }/s/^    \"\(.*\)\": \([^,]*\),\{0,1\}$/\1 \2/p" "$found/$1" 2> /dev/null | sort -k 2 -gr
 }
 
-run() {
-    local software=
-    patience=1
-    if [ "$1" = --software ]; then
-        software=yes patience=10
-        shift
-        local little='--gaussians 500 --width 128 --height 96 --repeats 1'
-        : "${BENCH:=$little}" "${SMALL:=$little}" "${CHECKED:=$little}" "${MANY:=$little}" "${TUNE:=$little}"
-        : "${STEPS:=4}" "${EQUAL:=10}" "${LOM:=--steps 10 --downscale 8}"
-    fi
-    local size many=${MANY:---gaussians 1000000 --width 1920 --height 1080}
-    local small=${SMALL:---gaussians 50000 --width 500 --height 375} warm=2
-    [ -z "$software" ] || warm=0
-    : "${TUNE:=--gaussians 100000}" "${STEPS:=512}" "${EQUAL:=300}"
-    end=$((SECONDS + ${TIME:-$((570 * patience))}))
-    mkdir -p "$1"
-    out=$(realpath "$1") work=$(mktemp -d) placed=() clocks=
-    trap '[ -z "$clocks" ] || kill "$clocks"; rm -rf "$work" ${placed[@]+"${placed[@]}"}' EXIT
-    tar -xJf "$(dirname "$0")/pack.tar.xz" -C "$work"
-    find_vulkan
-    export XDG_CACHE_HOME=$work/cache NIGHTSPLAT_TUNE=off
-    local nightsplat=$work/nightsplat
+# timed NAME LIMIT ARGUMENTS..: the steps of a bench, and its longest kernels.
+timed() {
+    local name=$1 limit=$2
+    shift 2
+    step "$name" "$name.json" "$limit" \
+        "$nightsplat" bench --unchecked --json --warm "$warm" --repeats "$REPEATS" --steady "$STEPS" "$@" || return
+    note "a step, ms: $(members "$name.json" steady | awk '/_ms/ { printf "%s %.3f, ", $1, $2 }')" \
+        "$(value "$name.json" gaussians) Gaussians, $(value "$name.json" intersections) intersections"
+    note "$(members "$name.json" kernels | head -n 8 | awk '{ printf "%s %.3f  ", $1, $2 }')"
+}
 
-    libraries > "$out/doctor.txt" 2>&1 || true
-    step doctor doctor.txt 30 "$nightsplat" doctor
-    if command -v nvidia-smi > /dev/null; then
-        step nvidia-smi doctor.txt 20 nvidia-smi
-        local queried=timestamp,clocks.sm,clocks.mem,power.draw,temperature.gpu,clocks_event_reasons.active
-        nvidia-smi -lms 200 --format=csv --query-gpu="$queried" \
-            > "$out/clocks.csv" 2>> "$out/log.txt" &
-        clocks=$!
-    fi
-    case $(kind) in
-        discrete | integrated | virtual) ;;
-        software) [ -n "$software" ] || fail "there is no GPU: see $out/doctor.txt; or rehearse with --software" ;;
-        *) fail "no device is found: see $out/doctor.txt" ;;
-    esac
-
-    # What counts most comes first.
-    NIGHTSPLAT_STATISTICS=$out/pipelines.jsonl step pipelines pipelines.log 30 \
-        "$nightsplat" bench --unchecked --json ${BENCH:-}
-    step bench bench.json 30 "$nightsplat" bench --unchecked --json --ceilings --warm $warm ${BENCH:-}
-    step many many.json 30 "$nightsplat" bench --unchecked --json --warm $warm $many
-    NIGHTSPLAT_TUNE=$work/tiles.json step tune tune.json 100 "$nightsplat" bench --tune --json $TUNE
-    for size in $(sed -n 's/.*NIGHTSPLAT_SUBGROUP: or \([0-9, ]*\)).*/\1/p' "$out/doctor.txt" | head -n 1 | tr -d ,); do
-        NIGHTSPLAT_SUBGROUP=$size NIGHTSPLAT_TUNE=$work/tiles-$size.json \
-            step "tune-$size" "tune-$size.json" 60 "$nightsplat" bench --tune --json $TUNE
+# Wall time of a training by phase: the second time, its pipelines are known.
+phases() {
+    local name
+    for name in cold warm; do
+        step "phases-$name" "phases-$name.txt" 25 "$nightsplat" train "$work"/scene/* --out "$work/runs/trained" \
+            --overwrite --progress plain -v ${PHASES:-} || return
+        note "$(grep -o 'seconds: .*' "$out/log.txt" | tail -n 1)"
     done
-    # From here on with the fastest tiles.
-    export NIGHTSPLAT_TUNE=$work/tiles.json
-    step steady-small steady-small.json 15 \
-        "$nightsplat" bench --unchecked --json --warm $warm --steady "$STEPS" $small
-    step steady-many steady-many.json 30 \
-        "$nightsplat" bench --unchecked --json --warm $warm --steady "$STEPS" --ply "$work/bench.ply" $many
-    step checked checked.json 60 "$nightsplat" bench --json ${CHECKED:-}
+}
 
+# The step of the published figures and that of a training by default, which stores 16 bits.
+baseline() {
+    local bits
+    for bits in 32 16; do
+        timed "bench-many-$bits" 25 $MANY --precision $bits $CEILINGS
+        timed "bench-small-$bits" 15 $SMALL --precision $bits
+        timed "bench-trained-$bits" 15 "$work/runs/trained" --precision $bits
+    done
+    note "ceilings: $(members bench-many-32.json ceilings | tr '\n' ' ')"
+    NIGHTSPLAT_STATISTICS=$found/pipelines.jsonl step pipelines pipelines.txt 30 "$nightsplat" bench --unchecked $MANY
+}
+
+# The library of the driver in use.
+driver() {
+    local manifest path
+    for manifest in $(tr : ' ' <<< "${VK_DRIVER_FILES:-${VK_ICD_FILENAMES:-}}") \
+        {/etc,/usr/share}/vulkan/icd.d/*"${software:+lvp}"*.json; do
+        [ -e "$manifest" ] || continue
+        path=$(sed -n 's/.*"library_path": *"\([^"]*\)".*/\1/p' "$manifest")
+        [[ $path != */* || $path == /* ]] || path=$(dirname "$manifest")/$path
+        echo "$path"
+        return
+    done
+}
+
+# Kernels of others in place of those of the program, which is not changed: sets in turn, with none in between. A tile
+# that four subgroups share, in small views, keeps its backward kernel.
+prototypes() {
+    local own=$work/prototypes sets=$work/sets set size round name seen
+    if [ ! -e "$own/wrap.so" ]; then
+        say prototypes 'none packed' 0
+        return
+    elif ! command -v python3 > /dev/null; then
+        say prototypes 'no python3' 0
+        return
+    fi
+    printf '{"file_format_version": "1.0.0", "ICD": {"library_path": "%s", "api_version": "1.3.0"}}\n' "$own/wrap.so" \
+        > "$own/wrap.json"
+    local -x WRAP_REAL=1 WRAP_ICD=${DRIVER:-$(driver)} VK_DRIVER_FILES=$own/wrap.json VK_ICD_FILENAMES=$own/wrap.json
+    local -A sizes=([many]=$MANY [small]=$SMALL)
+    mkdir -p "$sets"/{modules,none,both}
+    for size in many small; do
+        WRAP_OUT=$sets/modules step "modules-$size" prototypes.txt 20 \
+            "$nightsplat" bench --unchecked --repeats 1 ${sizes[$size]} || return
+    done
+    for set in forward backward butterfly; do
+        ONE_SUBGROUP=$([ $set = forward ] || echo 1) PATH=$PATH:$own step "fit-$set" prototypes.txt 10 \
+            python3 "$own/subst.py" "$sets/modules" "$sets/$set" "$own/$set.spv" || return
+    done
+    cp "$sets"/{forward,backward}/*.spv "$sets/both"
+    for ((round = 1; round <= ROUNDS; round++)); do
+        for size in many small; do
+            for set in none forward backward both butterfly; do
+                name=ab-$size-$set-$round seen=$(wc -l < "$out/log.txt")
+                WRAP_SUBST=$sets/$set step "$name" "$name.json" 15 "$nightsplat" bench --unchecked --json \
+                    --warm "$warm" --repeats "$REPEATS" --steady $((STEPS / 2)) ${sizes[$size]} || continue
+                note "$(tail -n "+$seen" "$out/log.txt" | grep -c replaced || true) replaced; step, ms:" \
+                    "$(members "$name.json" steady | sed -n 's/device_ms//p');" \
+                    "$(members "$name.json" kernels | grep ^blend_ | tr '\n' ' ')"
+            done
+        done
+    done
+    # What they compute.
+    for set in both butterfly; do
+        WRAP_SUBST=$sets/$set step "checked-$set" "ab-checked-$set.json" 30 \
+            "$nightsplat" bench --json --repeats 1 $LARGE
+        note "error / bound: $(members "ab-checked-$set.json" errors | grep ^blend_ | tr '\n' ' ')"
+    done
+}
+
+four_million() { timed bench-4-million 45 $MOST; }
+
+# The tiles of a trained model, which has twice the pixels a splat; then its step with the fastest.
+trained_tiles() {
+    NIGHTSPLAT_TUNE=$work/trained.json tune tune-trained 60 "$work/runs/trained"
+    NIGHTSPLAT_TUNE=$work/trained.json timed bench-trained-tuned 15 "$work/runs/trained"
+}
+
+# The networks in half precision, on crops, and both. Kernels that do not fit the registers have scratch memory.
+lita() {
+    local name options half='--denoiser-precision half' crop='--denoiser-crop 128'
+    for options in '' "$half" "$crop" "$half $crop"; do
+        name=lita$(tr -d ' ' <<< "${options//--denoiser/}")
+        NIGHTSPLAT_STATISTICS=$found/$name-pipelines.jsonl step "$name" "$name.jsonl" 40 \
+            "$nightsplat" train "$work"/scene/* --out "$work/runs/$name" --preset lom --curve ap3 --model lita \
+            --progress json $LITA $options || continue
+        note "a step, ms: $(sed -n 's/.*"ms_per_step":\([0-9.]*\).*/\1/p' "$found/$name.jsonl" | tail -n 1);" \
+            "with scratch memory: $(grep -v '"scratch":0\.0' "$found/$name-pipelines.jsonl" | grep '"scratch"' |
+                sed 's/.*"kernel":"\([^"]*\)".*"scratch":\([0-9.]*\).*/\1 \2/' | sort -u | tr '\n' ' ')"
+    done
+}
+
+# tune NAME LIMIT ARGUMENTS..
+tune() {
+    local name=$1 limit=$2
+    shift 2
+    step "$name" "$name.json" "$limit" "$nightsplat" bench --tune --json --repeats "$REPEATS" "$@" || return
+    note "$(sed -n '/^  "tiles": \[/,/^  \]/p' "$found/$name.json" | tr -d ' \n')"
+}
+
+tiles() {
+    local lanes
+    NIGHTSPLAT_TUNE=$work/tiles.json tune tune 100 $TUNE
+    for lanes in $(sed -n 's/.*NIGHTSPLAT_SUBGROUP: or \([0-9, ]*\)).*/\1/p' "$found/doctor.txt" | tr -d ,); do
+        NIGHTSPLAT_SUBGROUP=$lanes NIGHTSPLAT_TUNE=$work/tiles-$lanes.json tune "tune-$lanes" 60 $TUNE
+    done
+}
+
+checks() {
+    if step checked checked.json 60 "$nightsplat" bench --json --repeats 1 ${CHECKED:-}; then
+        note "$(value checked.json passes); largest error / bound: $(members checked.json errors | head -n 1)"
+    else
+        note "$(sed -n '/"disagreeing": \[/,/\]/p' "$found/checked.json" | tr -d ' \n')"
+    fi
     equal first
     equal second
     NIGHTSPLAT_PUSH_DESCRIPTORS=off equal sets
     equal batches --hash-every 7
-    VK_INSTANCE_LAYERS=VK_LAYER_KHRONOS_validation \
+    note "models: $(grep -c . "$found/hashes.txt" || true) runs," \
+        "$(cut -d ' ' -f 1 "$found/hashes.txt" 2> /dev/null | sort -u | grep -c . || true) distinct"
+    VK_LAYER_PATH=$work/layers VK_INSTANCE_LAYERS=VK_LAYER_KHRONOS_validation \
         VK_LAYER_ENABLES=VK_VALIDATION_FEATURE_ENABLE_SYNCHRONIZATION_VALIDATION_EXT \
         step validation validation.txt 20 "$nightsplat" train "$work"/scene/* --out "$work/runs/validated" \
         --preset lom --curve ap3 --steps 2
-    NIGHTSPLAT_TUNE=off run_tests 120
-    [ -z "${GSPLAT:-}" ] || PYTHONPATH=$GSPLAT step gsplat gsplat.json 50 \
+    note "$(grep -c 'Validation Error\|SYNC-HAZARD' "$found/validation.txt" || true) messages"
+}
+
+compared() {
+    [ -n "${GSPLAT:-}" ] || return 0
+    "$nightsplat" bench --unchecked --repeats 1 $MANY --ply "$work/bench.ply" > /dev/null
+    PYTHONPATH=$GSPLAT step gsplat gsplat.json 50 \
         python3 "$work/source/scripts/gsplat-rasteriser.py" --ply "$work/bench.ply"
-    train plain 40 --curve ap3 ${LOM:-}
-    # The rest of the time is for the networks and for growth.
-    train lita $(((end - SECONDS) / 2 / patience)) --curve ap3 --model lita ${LOM:-}
+}
+
+# The rest of the time is for training, for the networks, and for growth.
+training() {
+    train lom-plain 40 --curve ap3 ${LOM:-}
+    train lom-lita $(((end - SECONDS) / 2 / patience)) --curve ap3 --model lita ${LOM:-}
     step growth growth.txt 60 "$work/growth" ${software:+64 48 100}
-    results | tee -a "$out/summary.txt"
+}
+
+run() {
+    local software=
+    patience=1 warm=2
+    if [ "$1" = --software ]; then
+        software=yes patience=10 warm=0
+        shift
+        local little='--gaussians 300 --width 64 --height 48'
+        MANY=$little SMALL=$little LARGE=$little MOST=$little TUNE=$little CHECKED=$little STEPS=2 EQUAL=5 ROUNDS=1 CEILINGS= REPEATS=1
+        PHASES='--downscale 8 --steps 10' LITA='--downscale 8 --steps 3' LOM='--steps 5 --downscale 8'
+    fi
+    : "${MANY=--gaussians 1000000 --width 1920 --height 1080}" "${SMALL=--gaussians 50000 --width 500 --height 375}"
+    : "${LARGE=--gaussians 20000 --width 1280 --height 1024}" "${MOST=--gaussians 4000000 --width 1920 --height 1080}"
+    : "${TUNE=--gaussians 100000}" "${STEPS=512}" "${EQUAL=300}" "${ROUNDS=3}" "${LITA=--steps 60}"
+    : "${CEILINGS=--ceilings}" "${REPEATS=9}"
+    end=$((SECONDS + ${2:-570} * patience)) until=$((SECONDS + 60 * patience))
+    mkdir -p "$1"
+    out=$(realpath "$1") work=$(mktemp -d) placed=() clocks=
+    trap '[ -z "$clocks" ] || kill "$clocks"; rm -rf "$work" ${placed[@]+"${placed[@]}"}' EXIT
+    tar -xJf "$(dirname "$0")/pack.tar.xz" -C "$work"
+    found=$work/found nightsplat=$work/nightsplat
+    mkdir "$found"
+    find_vulkan
+    export XDG_CACHE_HOME=$work/cache NIGHTSPLAT_TUNE=off
+
+    libraries > "$found/doctor.txt" 2>&1 || true
+    step doctor doctor.txt 30 "$nightsplat" doctor || true
+    if command -v nvidia-smi > /dev/null; then
+        step nvidia-smi doctor.txt 20 nvidia-smi || true
+        local queried=timestamp,clocks.sm,clocks.mem,power.draw,temperature.gpu,clocks_event_reasons.active
+        nvidia-smi -lms 200 --format=csv --query-gpu="$queried" \
+            > "$found/clocks.csv" 2>> "$out/log.txt" &
+        clocks=$!
+    fi
+    case $(kind) in
+        discrete | integrated | virtual) ;;
+        software) [ -n "$software" ] || fail "there is no GPU: see $out/log.txt; or rehearse with --software" ;;
+        *) cat "$found/doctor.txt" && fail "no device is found" ;;
+    esac
+
+    # What counts most comes first: times, without checks. Not here, for want of kernels or of their settings: the tile
+    # sort, Adam in 16 bits over whole Gaussians, the lengths of segments.
+    experiment 60 phases
+    experiment 120 baseline
+    experiment 150 prototypes
+    experiment 50 four_million
+    experiment 80 trained_tiles
+    experiment 120 lita
+    experiment 160 tiles
+    # From here on with the fastest tiles.
+    export NIGHTSPLAT_TUNE=$work/tiles.json
+    experiment 120 checks
+    VK_LAYER_PATH=$work/layers NIGHTSPLAT_TUNE=off experiment 120 run_tests
+    experiment 60 compared
+    experiment "$((end - SECONDS))" training
+}
+
+# The program and one test binary of the dev profile, a synthetic scene, and a run of all experiments.
+rehearse() {
+    local dir status=0
+    dir=$(mktemp -d)
+    # shellcheck disable=SC2064
+    trap "rm -rf '$dir'" EXIT
+    if [ -n "${NIGHTSPLAT_PROTOTYPES:-}" ]; then
+        # What lavapipe of Mesa 22.3 takes.
+        cp -r "$NIGHTSPLAT_PROTOTYPES" "$dir/prototypes"
+        cp "$NIGHTSPLAT_PROTOTYPES/../wrap.c" "$dir"
+        chmod -R u+w "$dir"
+        sed 's/local_size_x_id = 100, local_size_y_id = 9/local_size_x = 8/' shaders-glsl/include/tile.glsl \
+            > "$dir/prototypes/tile.glsl"
+        sed -i 's/ \[\[subgroup_uniform_control_flow\]\]//; /GL_EXT_subgroup_uniform/d' "$dir"/prototypes/*.comp
+        export NIGHTSPLAT_PROTOTYPES=$dir/prototypes PROTOTYPE_FLAGS=-DOLD_LAVAPIPE
+    fi
+    cargo build --bin nightsplat
+    "${CARGO_TARGET_DIR:-target}/debug/nightsplat" synth "$dir/chair" --views 9 --width 256 --height 192 > /dev/null
+    PRESET=0 PROFILE=dev TESTS=house "$0" pack "$dir/pack" "$dir/chair"
+    "$dir/pack/run.sh" --software "$dir/out"
+    ! grep -E 'failed|out of time|no time left' "$dir/out/summary.txt" || status=1
+    tar -tzf "$dir/out/results.tar.gz" | sort
+    exit "$status"
 }
 
 case ${1:-} in
     pack) [ $# -eq 3 ] || fail "usage: $0 pack DIR SCENE" && pack "$2" "$3" ;;
+    rehearse) rehearse ;;
     --software | [!-]*) [ -e "$(dirname "$0")/pack.tar.xz" ] ||
         fail "$0: there is no pack next to it; usage: $0 pack DIR SCENE" && run "$@" ;;
-    *) fail "usage: $0 pack DIR SCENE, then DIR/run.sh [--software] OUT" ;;
+    *) fail "usage: $0 pack DIR SCENE, then DIR/run.sh [--software] OUT [SECONDS]; or $0 rehearse" ;;
 esac

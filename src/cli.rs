@@ -30,6 +30,7 @@ mod help;
 mod hints;
 pub mod live;
 pub mod man;
+mod phases;
 pub mod pose;
 pub mod progress;
 pub mod render;
@@ -45,6 +46,7 @@ pub mod view;
 mod words;
 
 pub use hints::hint;
+pub use phases::Phases;
 
 /// 3D Gaussian Splatting from dark photographs, on any Vulkan device.
 #[derive(Debug, Parser)]
@@ -52,7 +54,7 @@ pub use hints::hint;
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
-    /// Log more to stderr; -vv for debugging
+    /// Log more to stderr, of a training also the seconds of its phases; -vv for debugging
     #[arg(short, long, global = true, action = clap::ArgAction::Count, display_order = 998)]
     verbose: u8,
 }

@@ -4,8 +4,9 @@ use std::io::{IsTerminal, Write};
 use std::process::ExitCode;
 
 use nightsplat::Error;
-use nightsplat::cli::{Cli, hint, in_one_line, message};
-use tracing_subscriber::filter::LevelFilter;
+use nightsplat::cli::{Cli, Phases, hint, in_one_line, message};
+use tracing_subscriber::filter::{LevelFilter, filter_fn};
+use tracing_subscriber::prelude::*;
 
 fn main() -> ExitCode {
     let cli = match Cli::read(std::env::args_os().collect()) {
@@ -17,12 +18,16 @@ fn main() -> ExitCode {
         1 => LevelFilter::INFO,
         _ => LevelFilter::DEBUG,
     };
-    tracing_subscriber::fmt()
+    let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
-        .with_max_level(level)
         .with_target(false)
-        .without_time()
+        .without_time();
+    let is_line = filter_fn(move |own| own.is_event() && *own.level() <= level);
+    let phases = (cli.verbosity() > 0).then(|| Phases::begin().with_filter(Phases::filter()));
+    tracing_subscriber::registry()
+        .with(lines.with_filter(is_line.with_max_level_hint(level)))
+        .with(phases)
         .init();
     let Err(error) = cli.run() else { return ExitCode::SUCCESS };
     if is_broken_pipe(&error) {

@@ -267,6 +267,7 @@ impl Trainer {
     /// process, [`Error::Disagrees`] if a checked step differs from its references and [`TrainConfig::check`] says to
     /// stop, or the device is out of memory or lost.
     pub fn advance(&mut self, until: u64) -> Result<Vec<StepReport>> {
+        let _phase = tracing::info_span!("steps").entered();
         if until > self.step && self.step < self.config.steps && self.has_ended() {
             return Err(Error::Usage(format!(
                 "the run has ended at step {}, before step {until}: the held-out views have converged \

@@ -20,18 +20,23 @@ use crate::Error;
 use crate::ceilings::Ceiling;
 use crate::gpu::{CheckReport, DeviceChoice, Gpu, PassTime};
 use crate::kernels;
+use crate::splats::scene::Features;
+use crate::train::{PrecisionConfig, TrainConfig};
 use ceilings::Ceilings;
-use scene::BenchScene;
+use scene::{BenchScene, Source};
 use stages::KernelTime;
 use steady::Steady;
 
 /// Check a training step against the CPU references, then time its kernels and stages.
 ///
-/// The scene is synthetic and always the same. A disagreement is an error once everything is printed. With --tune,
-/// times the rasteriser with every tile size that the device supports, and stores the fastest in the user's cache
-/// folder, where training finds it unless `NIGHTSPLAT_TUNE=off`.
+/// Without a model, the scene is synthetic and always the same. A disagreement is an error once everything is printed.
+/// With --tune, times the rasteriser with every tile size that the device supports, and stores the fastest in the
+/// user's cache folder, where training finds it unless `NIGHTSPLAT_TUNE=off`.
 #[derive(Clone, Debug, clap::Args)]
 pub struct BenchArgs {
+    /// Trained model to time instead: a run, seen by its first training camera, or PLY, SPZ or SOG, seen along z
+    #[arg(conflicts_with = "gaussians")]
+    pub model: Option<PathBuf>,
     /// Print JSON instead of tables
     #[arg(long)]
     pub json: bool,
@@ -41,15 +46,18 @@ pub struct BenchArgs {
     /// Vulkan device: its index, part of its name, uuid:..., pci:... or cpu [default: the best]
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<DeviceChoice>,
-    /// Width of the view, pixels [default: 512; with --tune, 500 and 1920]
+    /// Width of the view, pixels [default: the camera's, else 512; with --tune, 500 and 1920]
     #[arg(long)]
     pub width: Option<u32>,
-    /// Height of the view, pixels [default: 384; with --tune, 375 and 1080]
+    /// Height of the view, pixels [default: the camera's, else 384; with --tune, 375 and 1080]
     #[arg(long)]
     pub height: Option<u32>,
     /// Number of Gaussians
     #[arg(long, default_value_t = GAUSSIANS)]
     pub gaussians: usize,
+    /// Bits of the SH coefficients above degree 0 and of Adam's moments: 32, or 16 as `train` stores them by default
+    #[arg(long, value_name = "BITS", default_value = "32")]
+    pub precision: String,
     /// Skip the check, which takes minutes for a million Gaussians
     #[arg(long)]
     pub unchecked: bool,
@@ -77,9 +85,11 @@ const GAUSSIANS: usize = 20_000;
 /// A stage and its milliseconds.
 type Timing = (&'static str, f64);
 
-/// Device and repetitions.
+/// What is measured, and how.
 struct Bench {
     gpu: Gpu,
+    source: Source,
+    precision: PrecisionConfig,
     repeats: usize,
 }
 
@@ -94,32 +104,40 @@ struct Findings {
 
 /// Checks, times and prints.
 pub fn run(args: &BenchArgs) -> Result<()> {
-    let [width, height] = [args.width.unwrap_or(SIZE[0]), args.height.unwrap_or(SIZE[1])];
-    let sizes_hold = (16..=8192).contains(&width)
-        && (16..=8192).contains(&height)
+    let side_holds = |side: Option<u32>| side.is_none_or(|side| (16..=8192).contains(&side));
+    let numbers_hold = side_holds(args.width)
+        && side_holds(args.height)
         && (1..=10_000_000).contains(&args.gaussians)
         && args.repeats > 0
         && (0.0..=60.0).contains(&args.warm);
-    if !sizes_hold {
+    if !numbers_hold {
         let rule = "--width and --height take 16 to 8192, --gaussians 1 to 10000000, --repeats 1 or more, \
                     --warm at most 60";
         return Err(Error::Usage(rule.to_owned()).into());
     }
+    let precision = ["rest", "moments"].map(|key| format!("precision.{key}={}", args.precision));
+    let precision = TrainConfig::bare().with(&precision)?.precision;
+    let source = match &args.model {
+        Some(path) => Source::open(path, SIZE)?,
+        None => Source::Synthetic(args.gaussians),
+    };
+    let size = source.size().unwrap_or(SIZE);
+    let size = [args.width.unwrap_or(size[0]), args.height.unwrap_or(size[1])];
     let gpu = driver::open(&args.device.clone().unwrap_or_default())?;
-    let bench = Bench { gpu, repeats: args.repeats };
+    let bench = Bench { gpu, source, precision, repeats: args.repeats };
     if args.tune {
         let is_sized = args.width.is_some() || args.height.is_some();
-        let sizes = if is_sized { &[[width, height]][..] } else { &TUNED_SIZES };
-        return tune::run(&bench, sizes, args.gaussians, args.json);
+        let sizes = if is_sized { &[size][..] } else { &TUNED_SIZES };
+        return tune::run(&bench, sizes, args.json);
     }
-    let scene = BenchScene::new(width, height, args.gaussians);
+    let scene = bench.source.scene(size, Features::NONE);
     if let Some(path) = &args.ply {
         scene.gaussians.save(path)?;
     }
     let findings = Findings::gather(&bench, &scene, args)?;
     let mut out = std::io::stdout().lock();
     if args.json {
-        writeln!(out, "{:#}", findings.as_json(&bench))?;
+        writeln!(out, "{:#}", findings.as_json(&bench, &scene))?;
     } else {
         write!(out, "{}", findings.as_text(&bench, &scene))?;
         finish("", "nightsplat bench --tune")?;
@@ -129,7 +147,7 @@ pub fn run(args: &BenchArgs) -> Result<()> {
 
 impl Findings {
     fn gather(bench: &Bench, scene: &BenchScene, args: &BenchArgs) -> crate::Result<Self> {
-        let mut trainers = scene::trainers(&bench.gpu, scene)?;
+        let mut trainers = scene::trainers(&bench.gpu, scene, &bench.precision)?;
         let checked = match args.unchecked {
             true => CheckReport::default(),
             false => stages::check(bench, &mut trainers)?,
@@ -167,7 +185,7 @@ impl Findings {
         kernels::NAMES.iter().copied().filter(|name| !is_covered(name)).collect()
     }
 
-    fn as_json(&self, bench: &Bench) -> Value {
+    fn as_json(&self, bench: &Bench, scene: &BenchScene) -> Value {
         let entry = |(name, milliseconds): &Timing| ((*name).to_owned(), json!(milliseconds));
         let properties = bench.gpu.properties();
         let Self { stages, .. } = self;
@@ -179,6 +197,11 @@ impl Findings {
         json!({
             "device": properties.name,
             "driver": properties.driver,
+            "scene": bench.source.name(),
+            "precision": bench.precision,
+            "width": scene.camera.width,
+            "height": scene.camera.height,
+            "gaussians": scene.gaussians.count,
             "intersections": stages.intersections,
             "errors": errors.into_iter().map(|(name, _, error)| (name.to_owned(), json!(error))).collect::<Map<_, _>>(),
             "disagreeing": self.disagreeing(),
@@ -196,9 +219,10 @@ impl Findings {
     fn as_text(&self, bench: &Bench, scene: &BenchScene) -> String {
         let (properties, stages) = (bench.gpu.properties(), &self.stages);
         let head = format!(
-            "{}, {}\n{}x{} pixels, {} Gaussians, {} intersections; medians of {} runs",
+            "{}, {}\n{}: {}x{} pixels, {} Gaussians, {} intersections; medians of {} runs",
             properties.name,
             properties.driver,
+            bench.source.name(),
             scene.camera.width,
             scene.camera.height,
             scene.gaussians.count,

@@ -16,6 +16,7 @@ const COMPILES: &str = "compiles";
 
 /// [`Gpu::new`], after a driver that is new on this machine was seen to compile every kernel.
 pub(super) fn open(choice: &DeviceChoice) -> Result<Gpu> {
+    let _phase = tracing::info_span!("device").entered();
     check_new(choice)?;
     Gpu::new(choice)
 }

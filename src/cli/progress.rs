@@ -4,8 +4,9 @@ use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
+use super::phases;
 use crate::results::eval::{After, Evaluation, Metric, ReferenceKind};
 use crate::results::run::Event;
 use crate::train::{MemoryEstimate, StepReport};
@@ -178,13 +179,23 @@ impl Reporter {
             Event::Evaluated { step, evaluation } => {
                 json!({ "event": "evaluated", "step": step, "mean": means(evaluation) })
             }
-            Event::Finished(trained) => json!({
-                "event": "finished",
-                "step": trained.trainer.steps_done(),
-                "gaussians": trained.trainer.gaussian_count(),
-                "seconds": trained.spent.seconds,
-                "mean": means(&trained.evaluation),
-            }),
+            Event::Finished(trained) => {
+                let mut finished = json!({
+                    "event": "finished",
+                    "step": trained.trainer.steps_done(),
+                    "gaussians": trained.trainer.gaussian_count(),
+                    "seconds": trained.spent.seconds,
+                    "mean": means(&trained.evaluation),
+                });
+                let phases: Map<String, Value> = phases::seconds()
+                    .into_iter()
+                    .map(|(name, seconds)| (name.to_owned(), seconds.into()))
+                    .collect();
+                if !phases.is_empty() {
+                    finished["phases"] = phases.into();
+                }
+                finished
+            }
             _ => return,
         };
         // A closed pipe does not stop the run.

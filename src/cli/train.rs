@@ -11,7 +11,7 @@ use anyhow::Result;
 pub(crate) use self::options::TrainOptions;
 use super::diagnose;
 use super::progress::{ProgressForm, Reporter, summary};
-use super::{driver, finish, live, signals, view, word};
+use super::{driver, finish, live, phases, signals, view, word};
 use crate::base::output::{check_writable, printable};
 use crate::camera::frame;
 use crate::gpu::DeviceChoice;
@@ -141,6 +141,7 @@ pub fn run(args: &TrainArgs) -> Result<()> {
     };
     let done = run::train_in(&gpu, &config, &dataset, &args.out, &session, observe)?;
     let RunSummary { trainer, ended, evaluation, spent, .. } = done;
+    phases::log();
     if !is_text {
         return Ok(());
     }

@@ -57,6 +57,7 @@ impl Gpu {
         interface: &'static Interface,
         constants: Vec<(u32, u32)>,
     ) -> Result<Objects> {
+        let _phase = tracing::info_span!("pipelines").entered();
         let shared = &self.shared;
         let fail = |call| move |result| shared.error(call, result);
         let name = described(interface, &constants);

@@ -144,6 +144,7 @@ impl Dataset {
         options: &LoadOptions,
         look: Option<Look<'_>>,
     ) -> Result<Self> {
+        let _phase = tracing::info_span!("decoding").entered();
         options.check()?;
         let files = Files::default();
         let layout = Layout::of(root)?;

@@ -152,6 +152,7 @@ impl Trainer {
 
     /// Scores the held-out views, keeps the model if it is the best so far, and decides whether the run has converged.
     pub(super) fn score_held_out(&mut self) -> Result<()> {
+        let _phase = tracing::info_span!("scoring").entered();
         let Some(psnr) = self.held_out_psnr()? else { return Ok(()) };
         let [_, whole] = self.config.schedule.resolution_steps;
         let score = Score { step: self.step, score: (1e3 * psnr).round() as i64 };

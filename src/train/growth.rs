@@ -42,6 +42,7 @@ impl Trainer {
 
     /// Density control after the last step, whose view had this many intersections.
     pub(super) fn control_density(&mut self, intersections: u32) -> Result<()> {
+        let _phase = tracing::info_span!("density control").entered();
         let rounds_left = match self.config.density.control {
             DensityControl::Conserving => {
                 self.config.schedule.rounds_left(self.step, self.cooldown_begin())

@@ -90,6 +90,7 @@ impl RequestedSettings {
 
     /// Loads the dataset and plans what is not requested.
     pub fn planned(&self, planning: PlanSource<'_>, gpu: &Gpu) -> Result<PlannedRun> {
+        let _phase = tracing::info_span!("plan").entered();
         let config = self.settings(None)?.config()?;
         config.check()?;
         let options = match planning {

@@ -101,6 +101,7 @@ impl Trainer {
         dataset: &Dataset,
         initial: &Initial,
     ) -> Result<Self> {
+        let _phase = tracing::info_span!("upload").entered();
         config.check()?;
         config.disable_missing_parts(dataset);
         config.frame.get_or_insert_with(|| dataset.frame());
@@ -167,8 +168,9 @@ impl Trainer {
             sizes.iter().try_for_each(|&size| exposures.reserve(size))?;
         }
         dataset.views.iter().filter_map(|view| view.original.as_ref()).for_each(Original::release);
+        let waits = tracing::info_span!("pipelines");
         let (Kernels { mut renderer, mut losses, adam, finite, floor, densifier }, fingerprint) =
-            beside.join().unwrap_or_else(|panic| resume_unwind(panic))?;
+            waits.in_scope(|| beside.join().unwrap_or_else(|panic| resume_unwind(panic)))?;
         if lamp.is_some() {
             renderer.set_lamp(lamp)?;
         }

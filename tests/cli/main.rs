@@ -335,6 +335,30 @@ fn bench_checks_and_times_every_kernel_of_a_step_and_lists_the_others() {
 }
 
 #[test]
+fn bench_times_a_trained_model_in_the_storage_of_training() {
+    let fixture = fixture();
+    let run = fixture.run();
+    let bench = |arguments: &str| -> Value {
+        let options = "--json --unchecked --repeats 1 --steady 2";
+        serde_json::from_str(&succeed(&format!("bench {options} {arguments}"))).unwrap()
+    };
+    let of_run = bench(&format!("{run} --precision 16"));
+    let kernels = keys(&of_run["kernels"]);
+    assert!(kernels.contains(&"adam_rest") && !kernels.contains(&"adam_gaussian"), "{kernels:?}");
+    assert_eq!(
+        (&of_run["scene"], &of_run["precision"]["rest"]),
+        (&run.as_str().into(), &"16".into())
+    );
+    let of_file = bench(&format!("{run}/model.ply --width 32 --height 40"));
+    assert_eq!((&of_file["width"], &of_file["height"]), (&32.into(), &40.into()));
+    let counts = [&of_run["gaussians"], &of_file["gaussians"]].map(|count| count.as_u64().unwrap());
+    assert!(counts[0] > 0 && counts[0] == counts[1], "{counts:?}");
+    for seen in [&of_run, &of_file] {
+        assert!(seen["intersections"].as_u64().unwrap() > counts[0] / 2, "{seen}");
+    }
+}
+
+#[test]
 fn demo_changes_no_foreign_folder() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("thesis.tex"), "mine").unwrap();

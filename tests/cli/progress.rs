@@ -49,6 +49,30 @@ fn json_is_a_line_for_each_event_and_nothing_else() {
 }
 
 #[test]
+fn more_logging_names_the_seconds_of_each_phase_once() {
+    let (stdout, stderr) = trained("--progress json -v");
+    let told: Vec<&str> =
+        stderr.lines().filter_map(|line| line.split_once("seconds: ")).map(|told| told.1).collect();
+    let [told] = told[..] else { panic!("{stderr}") };
+    let finished: Value = serde_json::from_str(stdout.lines().next_back().unwrap()).unwrap();
+    let phases = finished["phases"].as_object().unwrap();
+    for name in ["device", "decoding", "plan", "upload", "pipelines", "steps", "scoring", "files"] {
+        assert!(
+            phases[name].as_f64().unwrap() > 0.0 && told.contains(&format!("{name} ")),
+            "{name}: {told}"
+        );
+    }
+    let seconds = |name: &str| phases[name].as_f64().unwrap();
+    let sum: f64 = phases.keys().filter(|name| *name != "all").map(|name| seconds(name)).sum();
+    assert!(
+        (sum - seconds("all")).abs() < 1e-6 && seconds("other") < 0.5 * seconds("all"),
+        "{told}"
+    );
+    let (stdout, stderr) = trained("--progress json");
+    assert!(!stdout.contains("phases") && !stderr.contains("seconds: "), "{stdout}{stderr}");
+}
+
+#[test]
 fn an_unknown_form_is_refused_with_the_list_of_forms() {
     refused("train photos --out run --progress loud", 2, &["bar", "plain", "json", "none"]);
 }

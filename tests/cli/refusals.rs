@@ -148,6 +148,9 @@ fn misuse_is_one_line_with_exit_code_2() {
     refused("evaluate x", 2, &["evaluate"]);
     refused("render x --split none --out y", 2, &["none", "train, test, all"]);
     refused("bench --repeats 0", 2, &["--repeats"]);
+    refused("bench --precision 8", 2, &["precision.rest", "32 or 16"]);
+    refused("bench model.ply --gaussians 7", 2, &["--gaussians"]);
+    refused("bench no.ply", 3, &["no.ply"]);
     refused("train photos --out run --steps -3", 2, &["--steps", "-3"]);
 }
 

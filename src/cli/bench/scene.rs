@@ -1,8 +1,8 @@
-//! The synthetic scene of the bench, with the statistics of a trained one.
+//! The scene of the bench: a synthetic one with the statistics of a trained one, or a trained model.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use glam::{DAffine3, DVec2, Vec3};
+use glam::{DAffine3, DVec2, DVec3, Vec3};
 
 use crate::Result;
 use crate::base::random::Stream;
@@ -11,19 +11,83 @@ use crate::gpu::{CheckReport, Gpu};
 use crate::photographs::dataset::{Dataset, Point, Split, View};
 use crate::photographs::image::Image;
 use crate::photographs::tone::{ToneCurve, ToneSettings};
+use crate::results::{models, run};
+use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer, Status};
-use crate::splats::scene::{Gaussians, SH_C0, Shape};
-use crate::train::{Part, TrainConfig, Trainer};
+use crate::splats::scene::{Features, Gaussians, MAX_SH_DEGREE, SH_C0, Shape};
+use crate::train::{Part, PrecisionConfig, TrainConfig, Trainer};
 
-/// Gaussians before a camera that looks along z from the origin.
+/// Where the Gaussians come from.
+#[derive(Debug)]
+pub(super) enum Source {
+    /// This number is made.
+    Synthetic(usize),
+    /// A trained model, seen by a camera.
+    Model { path: PathBuf, model: Box<Model>, camera: Camera },
+}
+
+impl Source {
+    /// Reads a model. A run is seen by its first training camera; a file has no cameras, and is seen along z from where
+    /// most of it is in view.
+    pub(super) fn open(path: &Path, size: [u32; 2]) -> Result<Self> {
+        let (gaussians, facts) = models::read(path)?;
+        let mut model = Model::of_shown(gaussians, &facts);
+        let own = match path.is_dir() {
+            true => {
+                let config = run::load_config(path)?;
+                let dataset = Dataset::load(&config.dataset, &config.load_options())?;
+                dataset.train_views().next().map(|view| view.camera)
+            }
+            false => None,
+        };
+        let camera = own.unwrap_or_else(|| facing(&model.gaussians, size));
+        let origin = std::mem::take(&mut model.gaussians.origin);
+        let view_from_world = camera.view_from_world * DAffine3::from_translation(origin);
+        let camera = Camera { view_from_world, ..camera };
+        Ok(Self::Model { path: path.to_owned(), model: Box::new(model), camera })
+    }
+
+    /// The width and height of the camera; the synthetic scene fits any.
+    pub(super) fn size(&self) -> Option<[u32; 2]> {
+        match self {
+            Self::Synthetic(_) => None,
+            Self::Model { camera, .. } => Some([camera.width, camera.height]),
+        }
+    }
+
+    /// The scene in a view of this size.
+    pub(super) fn scene(&self, [width, height]: [u32; 2], features: Features) -> BenchScene {
+        match self {
+            Self::Synthetic(count) => {
+                let camera = camera(width, height);
+                let shape = Shape { sh_degree: MAX_SH_DEGREE, features };
+                BenchScene { gaussians: gaussians(&camera, *count, shape), camera, near: None }
+            }
+            Self::Model { model, camera, .. } => BenchScene {
+                camera: camera.framed([width, height]),
+                gaussians: model.gaussians.with_sh_degree(MAX_SH_DEGREE).with_features(features),
+                near: Some(model.near),
+            },
+        }
+    }
+
+    pub(super) fn name(&self) -> String {
+        match self {
+            Self::Synthetic(_) => "synthetic".to_owned(),
+            Self::Model { path, .. } => path.display().to_string(),
+        }
+    }
+}
+
+/// Gaussians before a camera.
 #[derive(Clone, Debug)]
 pub struct BenchScene {
-    /// At the origin.
+    /// That of the synthetic scene is at the origin and looks along z.
     pub camera: Camera,
-    /// In the camera's view.
+    /// Of the highest SH degree.
     pub gaussians: Gaussians,
-    /// A dark photograph of the camera's size.
-    pub low: Image,
+    /// The near plane of a trained model, in its units.
+    pub near: Option<f32>,
 }
 
 /// Mean and deviation of the natural logarithm of a Gaussian's standard deviation in pixels. 20 000 Gaussians then have
@@ -36,15 +100,20 @@ const DRAWS: u64 = 32;
 impl BenchScene {
     /// `count` Gaussians in a view of `width` x `height` pixels.
     pub fn new(width: u32, height: u32, count: usize) -> Self {
-        let camera = camera(width, height);
-        Self { low: dark(width, height), gaussians: gaussians(&camera, count, 3), camera }
+        Source::Synthetic(count).scene([width, height], Features::NONE)
+    }
+
+    /// The settings of a renderer of the scene.
+    pub(super) fn render_settings(&self) -> RenderSettings {
+        let defaults = RenderSettings { shape: self.gaussians.shape, ..RenderSettings::default() };
+        RenderSettings { near: self.near.unwrap_or(defaults.near), ..defaults }
     }
 
     /// One view with a depth map; the points are the means of the Gaussians.
     fn dataset(&self) -> Dataset {
         let Camera { width, height, .. } = self.camera;
         let depth = (0..width * height).map(|i| (i / width) as f32 / height as f32);
-        let view = View::new("view", Split::Train, self.camera, Some(self.low.clone()));
+        let view = View::new("view", Split::Train, self.camera, Some(dark(width, height)));
         let view = View { depth: Some(depth.collect()), ..view };
         let point = |mean: &Vec3| Point { position: mean.as_dvec3(), views: vec![0] };
         let points = self.gaussians.means().iter().map(point).collect();
@@ -64,15 +133,20 @@ pub(super) struct Trainers {
     pub(super) intersections: u32,
 }
 
-pub(super) fn trainers(gpu: &Gpu, scene: &BenchScene) -> Result<Trainers> {
-    let plain = plain(gpu, scene)?;
-    let (lita, lita_begins) = gpu.checked(|| lita(gpu));
+pub(super) fn trainers(
+    gpu: &Gpu,
+    scene: &BenchScene,
+    precision: &PrecisionConfig,
+) -> Result<Trainers> {
+    let plain = plain(gpu, scene, precision)?;
+    let (lita, lita_begins) = gpu.checked(|| lita(gpu, precision));
     Ok(Trainers { plain, lita: lita?, lita_begins, intersections: intersections(gpu, scene)? })
 }
 
 /// A configuration whose steps all do the same work once all SH degrees are in use.
-fn config() -> TrainConfig {
-    let mut config = TrainConfig { tone: ToneSettings::new(ToneCurve::Ap3), ..TrainConfig::bare() };
+fn config(precision: &PrecisionConfig) -> TrainConfig {
+    let tone = ToneSettings::new(ToneCurve::Ap3);
+    let mut config = TrainConfig { tone, precision: precision.clone(), ..TrainConfig::bare() };
     config.schedule.sh_degree_interval = 1;
     config.schedule.initial_rate_factor = 1.0;
     config.schedule.densify_after = i64::MAX as u64;
@@ -81,9 +155,14 @@ fn config() -> TrainConfig {
 }
 
 /// The plain model after the steps that enable all SH degrees.
-pub fn plain(gpu: &Gpu, scene: &BenchScene) -> Result<Trainer> {
+pub fn plain(gpu: &Gpu, scene: &BenchScene, precision: &PrecisionConfig) -> Result<Trainer> {
     let dataset = scene.dataset();
-    let mut config = config();
+    let mut config = config(precision);
+    if let Some(near) = scene.near {
+        config.near = (f64::from(near) / dataset.extent()).clamp(1e-6, 1.0);
+        // A model stays what it is.
+        config.schedule.initial_rates = config.schedule.initial_rates.scaled(1e-6);
+    }
     let Camera { width, height, .. } = scene.camera;
     config.tile = Some(config.render_settings().tile_for(gpu, std::iter::once([width, height]))?);
     let mut trainer = Trainer::from_gaussians(gpu, config, &dataset, &scene.gaussians)?;
@@ -94,8 +173,8 @@ pub fn plain(gpu: &Gpu, scene: &BenchScene) -> Result<Trainer> {
 }
 
 /// All parts on a small scene, with densification in every step.
-fn lita(gpu: &Gpu) -> Result<Trainer> {
-    let mut config = config();
+fn lita(gpu: &Gpu, precision: &PrecisionConfig) -> Result<Trainer> {
+    let mut config = config(precision);
     config.model.follow_paper();
     config.model.set_parts(&Part::LITA);
     config.ssim_weight = 0.0;
@@ -108,8 +187,9 @@ fn lita(gpu: &Gpu) -> Result<Trainer> {
 }
 
 /// The number of splat-tile intersections.
-fn intersections(gpu: &Gpu, BenchScene { camera, gaussians, .. }: &BenchScene) -> Result<u32> {
-    let mut renderer = Renderer::new(gpu, RenderSettings::default())?;
+fn intersections(gpu: &Gpu, scene: &BenchScene) -> Result<u32> {
+    let BenchScene { camera, gaussians, .. } = scene;
+    let mut renderer = Renderer::new(gpu, scene.render_settings())?;
     renderer.reserve(gaussians.count, [camera])?;
     let parameters = gaussians.upload(gpu)?;
     let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
@@ -127,6 +207,23 @@ pub fn camera(width: u32, height: u32) -> Camera {
         model: CameraModel::Pinhole,
         view_from_world: DAffine3::IDENTITY,
     }
+}
+
+/// Looking along z at the middle of the Gaussians, from where nine tenths of them are in view.
+fn facing(gaussians: &Gaussians, [width, height]: [u32; 2]) -> Camera {
+    let share = |mut values: Vec<f64>, share: f64| {
+        let nth = (share * values.len() as f64) as usize;
+        values.sort_by(f64::total_cmp);
+        values.get(nth).copied().unwrap_or_default()
+    };
+    let means: Vec<DVec3> = gaussians.means().iter().map(Vec3::as_dvec3).collect();
+    let middle = |axis: usize| share(means.iter().map(|mean| mean[axis]).collect(), 0.5);
+    let middle = DVec3::from_array([0, 1, 2].map(middle));
+    let radius = share(means.iter().map(|mean| mean.distance(middle)).collect(), 0.9);
+    let camera = camera(width, height);
+    let distance = radius * camera.focal.x / (0.5 * f64::from(width.min(height)));
+    let to_view = DVec3::Z * distance - middle;
+    Camera { view_from_world: DAffine3::from_translation(to_view), ..camera }
 }
 
 /// Gaussians spread over the camera's view, with sizes in pixels that do not depend on the resolution.

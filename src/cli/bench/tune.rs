@@ -4,13 +4,14 @@ use std::io::Write;
 
 use anyhow::Result;
 use rayon::prelude::*;
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 
-use super::{Bench, finish, median, scene, stages, table, total};
+use super::scene::BenchScene;
+use super::{Bench, finish, median, stages, table, total};
 use crate::camera::Camera;
-use crate::gpu::{Buffer, Resources, Statistic, TUNE_VARIABLE, Tile, TunedTile};
+use crate::gpu::{Buffer, Resources, TUNE_VARIABLE, Tile, TunedTile};
 use crate::splats::render::{Damping, Gradients, RenderOptions, RenderSettings, Renderer, Status};
-use crate::splats::scene::{DeviceGaussians, Features, Layout, MAX_SH_DEGREE, Shape};
+use crate::splats::scene::{DeviceGaussians, Features, Layout, MAX_SH_DEGREE};
 
 /// From a few pixels for narrow subgroups to 512 for wide ones.
 const SIZES: [[u32; 2]; 7] = [[8, 4], [8, 8], [16, 4], [16, 8], [16, 16], [32, 8], [32, 16]];
@@ -31,6 +32,7 @@ const MEAN_DIFFERENCE: f64 = 1e-5;
 struct Case {
     channels: usize,
     size: [u32; 2],
+    gaussians: usize,
     tiles: Vec<TileTiming>,
 }
 
@@ -41,24 +43,17 @@ struct TileTiming {
     /// Largest and mean difference from the render of the first tile.
     differences: (f32, f64),
     /// Milliseconds of forward and backward blending, and of the whole rasteriser.
-    forward: f64,
-    backward: f64,
-    rasteriser: f64,
-    /// Statistics of the blend kernels, forward and backward.
-    statistics: Option<[Vec<Statistic>; 2]>,
+    times: [f64; 3],
+    /// Of the blend kernels, forward and backward, as far as the driver reports.
+    resources: Option<[Resources; 2]>,
 }
 
 /// Measures every case, stores the fastest tiles and prints.
-pub(super) fn run(
-    bench: &Bench,
-    sizes: &[[u32; 2]],
-    gaussians: usize,
-    as_json: bool,
-) -> Result<()> {
+pub(super) fn run(bench: &Bench, sizes: &[[u32; 2]], as_json: bool) -> Result<()> {
     let mut cases = vec![];
     for features in FEATURES {
         for &size in sizes {
-            cases.push(Case::measure(bench, features, size, gaussians)?);
+            cases.push(Case::measure(bench, &bench.source.scene(size, features))?);
         }
     }
     let chosen: Vec<_> = FEATURES.iter().filter_map(|f| fastest(&cases, f.channels())).collect();
@@ -70,7 +65,7 @@ pub(super) fn run(
             "device": properties.name,
             "driver": properties.driver,
             "subgroup_size": properties.subgroup_size,
-            "gaussians": gaussians,
+            "scene": bench.source.name(),
             "repeats": bench.repeats,
             "cases": cases.iter().map(Case::as_json).collect::<Vec<_>>(),
             "tiles": chosen,
@@ -80,7 +75,7 @@ pub(super) fn run(
         return Ok(());
     }
     for case in &cases {
-        writeln!(out, "{}", case.as_text(gaussians))?;
+        writeln!(out, "{}", case.as_text())?;
     }
     if !bench.gpu.properties().has_pipeline_statistics {
         writeln!(out, "registers and spills: not reported by the driver")?;
@@ -102,7 +97,7 @@ fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
     let cost = |tile: Tile| {
         let relative = |case: &Case| {
             let own = case.candidates().find(|measured| measured.tile == tile);
-            own.map_or(f64::INFINITY, |own| own.rasteriser / case.least())
+            own.map_or(f64::INFINITY, |own| own.rasteriser() / case.least())
         };
         cases().map(relative).sum::<f64>()
     };
@@ -111,25 +106,11 @@ fn fastest(cases: &[Case], channels: usize) -> Option<TunedTile> {
     Some(TunedTile { channels, tile })
 }
 
-/// A renderer for one tile with its measurements so far.
-struct Candidate {
-    renderer: Renderer,
-    measured: TileTiming,
-    times: Vec<[f64; 3]>,
-}
-
 impl Case {
-    fn measure(
-        bench: &Bench,
-        features: Features,
-        [width, height]: [u32; 2],
-        gaussians: usize,
-    ) -> crate::Result<Self> {
+    fn measure(bench: &Bench, scene: &BenchScene) -> crate::Result<Self> {
+        let BenchScene { camera, gaussians, .. } = scene;
         let gpu = &bench.gpu;
-        let shape = Shape { sh_degree: MAX_SH_DEGREE, features };
-        let camera = scene::camera(width, height);
-        let scene = scene::gaussians(&camera, gaussians, shape);
-        let on_device = scene.upload(gpu)?;
+        let on_device = gaussians.upload(gpu)?;
         let subgroups = if gpu.properties().is_cpu { &SUBGROUPS[..1] } else { &SUBGROUPS };
         let sharing = |size| subgroups.iter().map(move |&subgroups| Tile { size, subgroups });
         let is_tried = |tile: &Tile| {
@@ -140,39 +121,44 @@ impl Case {
         let tiles: Vec<_> = SIZES.into_iter().flat_map(sharing).filter(is_tried).collect();
         // Compiling takes longer than everything else.
         let compiled = tiles.into_par_iter().map(|tile| {
-            let settings = RenderSettings { shape, tile: Some(tile), ..RenderSettings::default() };
+            let settings = RenderSettings { tile: Some(tile), ..scene.render_settings() };
             let renderer = Renderer::new(gpu, settings)?;
-            let statistics = renderer.blend_statistics()?;
-            Ok((tile, renderer, statistics))
+            let resources = renderer.blend_statistics()?;
+            let resources = resources.map(|all| all.each_ref().map(|own| Resources::of(own)));
+            Ok((tile, renderer, resources))
         });
         let compiled = compiled.collect::<crate::Result<Vec<_>>>()?;
         let (mut candidates, mut first) = (vec![], None);
-        for (tile, mut renderer, statistics) in compiled {
-            renderer.reserve(gaussians, [&camera])?;
-            let render = renderer.render_channels(&on_device, &camera, &OPTIONS)?;
+        for (tile, mut renderer, resources) in compiled {
+            renderer.reserve(gaussians.count, [camera])?;
+            let render = renderer.render_channels(&on_device, camera, &OPTIONS)?;
             let first = first.get_or_insert_with(|| render.clone());
+            let status = Status::from_words(&gpu.read(renderer.status())?);
             let measured = TileTiming {
                 tile,
-                intersections: 0,
+                intersections: status.intersections,
                 differences: differences(&render, first),
-                forward: 0.0,
-                backward: 0.0,
-                rasteriser: 0.0,
-                statistics,
+                times: [0.0; 3],
+                resources,
             };
-            candidates.push(Candidate { renderer, measured, times: vec![] });
+            candidates.push((renderer, measured, vec![]));
         }
-        let mut pass = Pass::new(bench, camera, on_device)?;
+        let mut pass = Pass::new(bench, *camera, on_device)?;
         // Interleaved, so that other load affects all tiles alike; the first round is a warm-up.
         for round in 0..=bench.repeats {
-            for candidate in &mut candidates {
-                let times = pass.profile(bench, &mut candidate.renderer)?;
-                candidate.times.extend((round > 0).then_some(times));
+            for (renderer, _, rounds) in &mut candidates {
+                let times = pass.profile(bench, renderer)?;
+                rounds.extend((round > 0).then_some(times));
             }
         }
-        let tiles = candidates.into_iter().map(|candidate| candidate.finish(bench));
-        let tiles = tiles.collect::<crate::Result<_>>()?;
-        Ok(Self { channels: features.channels(), size: [width, height], tiles })
+        let tiles = candidates.into_iter().map(|(_, measured, rounds)| {
+            let median = |part: usize| median(rounds.iter().map(|times| times[part]).collect());
+            TileTiming { times: [0, 1, 2].map(median), ..measured }
+        });
+        let tiles = tiles.collect();
+        let channels = gaussians.shape.features.channels();
+        let (size, gaussians) = ([camera.width, camera.height], gaussians.count);
+        Ok(Self { channels, size, gaussians, tiles })
     }
 
     /// The tiles to choose from: those that render what the others do, without the ones that spill unless all do.
@@ -184,7 +170,7 @@ impl Case {
 
     /// The time of the fastest tile.
     fn least(&self) -> f64 {
-        self.candidates().map(|measured| measured.rasteriser).fold(f64::INFINITY, f64::min)
+        self.candidates().map(TileTiming::rasteriser).fold(f64::INFINITY, f64::min)
     }
 
     fn as_json(&self) -> Value {
@@ -192,23 +178,23 @@ impl Case {
             "channels": self.channels,
             "width": self.size[0],
             "height": self.size[1],
+            "gaussians": self.gaussians,
             "tiles": self.tiles.iter().map(TileTiming::as_json).collect::<Vec<_>>(),
         })
     }
 
-    fn as_text(&self, gaussians: usize) -> String {
-        let (channels, [width, height]) = (self.channels, self.size);
+    fn as_text(&self) -> String {
+        let Self { channels, size: [width, height], gaussians, .. } = self;
         let head = ["tile", "blend forward", "backward", "rasteriser, ms", "intersections", ""];
         let mut rows = vec![head.map(str::to_owned).to_vec()];
         rows.extend(self.tiles.iter().map(|measured| {
-            let TileTiming { tile, intersections, .. } = measured;
+            let TileTiming { tile, intersections, times, .. } = measured;
             let note = match measured.agrees() {
                 false => "renders differently",
-                true if measured.rasteriser == self.least() => "fastest",
+                true if measured.rasteriser() == self.least() => "fastest",
                 true if measured.spills() => "spills registers",
                 true => "",
             };
-            let times = [measured.forward, measured.backward, measured.rasteriser];
             let mut row = vec![tile.to_string()];
             row.extend(times.map(|milliseconds| format!("{milliseconds:.3}")));
             row.extend([intersections.to_string(), note.to_owned()]);
@@ -271,17 +257,11 @@ impl Pass {
     }
 }
 
-impl Candidate {
-    fn finish(self, bench: &Bench) -> crate::Result<TileTiming> {
-        let status = Status::from_words(&bench.gpu.read(self.renderer.status())?);
-        let [forward, backward, rasteriser] =
-            [0, 1, 2].map(|part| median(self.times.iter().map(|times| times[part]).collect()));
-        let intersections = status.intersections;
-        Ok(TileTiming { intersections, forward, backward, rasteriser, ..self.measured })
-    }
-}
-
 impl TileTiming {
+    fn rasteriser(&self) -> f64 {
+        self.times[2]
+    }
+
     /// Whether the render matches that of the first tile; phrased so that NaN does not.
     fn agrees(&self) -> bool {
         self.differences.0 <= LARGEST_DIFFERENCE && self.differences.1 <= MEAN_DIFFERENCE
@@ -289,42 +269,36 @@ impl TileTiming {
 
     /// Whether registers do not suffice a blend kernel, as far as the driver reports.
     fn spills(&self) -> bool {
-        let spill = |statistics: &Vec<Statistic>| Resources::of(statistics).spill();
-        self.statistics.as_ref().is_some_and(|kernels| kernels.iter().any(spill))
+        self.resources.is_some_and(|kernels| kernels.into_iter().any(Resources::spill))
     }
 
     fn as_json(&self) -> Value {
-        let of_kernel = |statistics: &Vec<Statistic>| {
-            let entry = |told: &Statistic| (told.name.clone(), json!(told.value));
-            statistics.iter().map(entry).collect::<Map<_, _>>()
-        };
-        let statistics = self.statistics.as_ref().map(|[forward, backward]| {
-            json!({ "blend_forward": of_kernel(forward), "blend_backward": of_kernel(backward) })
-        });
+        let [forward, backward, rasteriser] = self.times;
+        let resources = self.resources.map(
+            |[forward, backward]| json!({ "blend_forward": forward, "blend_backward": backward }),
+        );
         json!({
             "tile": self.tile,
             "intersections": self.intersections,
             "agrees": self.agrees(),
             "spills": self.spills(),
             "largest_difference": self.differences.0,
-            "blend_forward_ms": self.forward,
-            "blend_backward_ms": self.backward,
-            "rasteriser_ms": self.rasteriser,
-            "statistics": statistics,
+            "blend_forward_ms": forward,
+            "blend_backward_ms": backward,
+            "rasteriser_ms": rasteriser,
+            "resources": resources,
         })
     }
 
     /// A line with the registers and spills that the driver reports.
     fn registers(&self) -> Option<String> {
-        let counts = |statistics: &Vec<Statistic>| {
-            let is_meant = |told: &&Statistic| {
-                let name = told.name.to_lowercase();
-                ["regist", "gpr", "spill", "local mem"].iter().any(|part| name.contains(part))
-            };
-            let count = |told: &Statistic| format!("{} {}", told.name, told.value);
-            statistics.iter().filter(is_meant).map(count).collect::<Vec<_>>().join(", ")
+        let counts = |Resources { registers, spills, scratch, .. }: Resources| {
+            let of = |name, count: Option<f64>| count.map(|count| format!("{count} {name}"));
+            let all =
+                [of("registers", registers), of("spills", spills), of("bytes of scratch", scratch)];
+            all.into_iter().flatten().collect::<Vec<_>>().join(", ")
         };
-        let [forward, backward] = self.statistics.as_ref()?.each_ref().map(counts);
+        let [forward, backward] = self.resources?.map(counts);
         Some(format!("{}: forward {forward}; backward {backward}\n", self.tile))
     }
 }
@@ -347,12 +321,10 @@ mod tests {
             tile: size.into(),
             intersections: 0,
             differences: (difference, 0.0),
-            forward: 0.0,
-            backward: 0.0,
-            rasteriser,
-            statistics: None,
+            times: [0.0, 0.0, rasteriser],
+            resources: None,
         };
-        Case { channels, size: [4, 4], tiles: times.iter().map(measured).collect() }
+        Case { channels, size: [4, 4], gaussians: 1, tiles: times.iter().map(measured).collect() }
     }
 
     #[test]
@@ -373,10 +345,10 @@ mod tests {
         let chosen = |spills: [f64; 2]| {
             let mut own = case(3, &[(small, 2.0, 0.0), (large, 1.0, 0.0)]);
             for (measured, value) in own.tiles.iter_mut().zip(spills) {
-                let told = |value| vec![Statistic { name: "Spilled VGPRs".to_owned(), value }];
-                measured.statistics = Some([told(0.0), told(value)]);
+                let spills = |count| Resources { spills: Some(count), ..Resources::default() };
+                measured.resources = Some([spills(0.0), spills(value)]);
             }
-            let text = own.as_text(1);
+            let text = own.as_text();
             (fastest(&[own], 3).unwrap().tile, text)
         };
         assert_eq!(chosen([0.0, 0.0]).0, large.into());

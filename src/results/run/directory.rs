@@ -223,6 +223,7 @@ impl RunDirectory {
     /// Flushes the log, then writes a checkpoint and the model. The previous checkpoint is kept, the only one until
     /// this is complete.
     pub fn save_checkpoint(&mut self, trainer: &mut Trainer) -> Result<()> {
+        let _phase = tracing::info_span!("files").entered();
         self.log.flush().map_err(|error| unwritable(&self.path, &error))?;
         let newest = generations::rotate(&self.path)?;
         trainer.save_checkpoint(&newest)?;
@@ -231,6 +232,7 @@ impl RunDirectory {
 
     /// Writes the current model with its networks, lamp and exposures.
     pub(super) fn save_trained(&mut self, trainer: &mut Trainer) -> Result<()> {
+        let _phase = tracing::info_span!("files").entered();
         self.save_model(trainer)?;
         if let Some(networks) = trainer.networks() {
             self.save_networks(networks)?;

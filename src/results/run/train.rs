@@ -362,6 +362,7 @@ impl<'a> TrainLoop<'a> {
         directory: &mut RunDirectory,
         observe: &mut impl FnMut(Event<'_>),
     ) -> Result<(Ended, Evaluation, ResourceUsage)> {
+        let _phase = tracing::info_span!("scoring").entered();
         let ended = trainer.end()?;
         if let Some(events) = &mut self.events {
             events.text(ended.step, "run/ended", &ended.to_string())?;
@@ -405,6 +406,7 @@ impl<'a> TrainLoop<'a> {
         directory: &RunDirectory,
         observe: &mut impl FnMut(Event<'_>),
     ) -> Result<Evaluation> {
+        let _phase = tracing::info_span!("scoring").entered();
         let mut score_reference = match self.score_reference.take() {
             Some(known) => known,
             None => ScoreReference::in_scene(
