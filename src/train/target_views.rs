@@ -5,7 +5,7 @@ use glam::{DVec2, UVec2};
 use super::Trainer;
 use super::measuring::{TargetExposure, scene_of, tone_map_source, tone_mapping_of};
 use super::terms::NetworkTerms;
-use super::views::ImageKind;
+use super::views::{ImageKind, TrainingPhotograph};
 use crate::Result;
 use crate::camera::{Camera, TrainingFrame};
 use crate::gpu::Gpu;
@@ -29,7 +29,7 @@ struct TargetView {
     target: Image,
     mask: Option<Mask>,
     /// The training photograph whose learned exposure the target has; `None` for the neutral exposure.
-    place: Option<usize>,
+    photograph: Option<TrainingPhotograph>,
 }
 
 impl TargetViews {
@@ -54,7 +54,7 @@ impl TargetViews {
             }
             let target = target_of(pseudo_gt, view, &photograph, scene)?;
             let (camera, mask) = (frame.camera(&view.camera), view.mask.clone());
-            shown.push(TargetView { camera, target, mask, place: None });
+            shown.push(TargetView { camera, target, mask, photograph: None });
         }
         Ok(Self(shown))
     }
@@ -72,13 +72,11 @@ impl TargetViews {
             dataset.train_views().filter(|view| view.has_photograph()).collect();
         let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
         let mut probes = vec![];
-        for place in Camera::covering(&cameras, count) {
-            let Self(of_view) = Self::new(pseudo_gt, [views[place]], frame, scene)?;
-            probes.extend(
-                of_view
-                    .into_iter()
-                    .map(|view| TargetView { place: Some(place), ..view.shrunk(pixels) }),
-            );
+        for at in Camera::covering(&cameras, count) {
+            let Self(of_view) = Self::new(pseudo_gt, [views[at]], frame, scene)?;
+            let photograph = Some(TrainingPhotograph(at));
+            let shrunk = |view: TargetView| TargetView { photograph, ..view.shrunk(pixels) };
+            probes.extend(of_view.into_iter().map(shrunk));
         }
         Ok(Self(probes))
     }
@@ -92,13 +90,13 @@ impl TargetViews {
         mut render: impl FnMut(&Camera) -> Result<Rendered>,
     ) -> Result<Option<[f64; 2]>> {
         let mut sums = [0.0; 2];
-        for TargetView { camera, target, mask, place } in &self.0 {
-            let exposure = place.and_then(|place| affines.get(place));
+        for TargetView { camera, target, mask, photograph } in &self.0 {
+            let exposure = photograph.and_then(|own| affines.get(own.0));
             let neutral = exposure.map(|own| own.inverse().applied(target));
             let target = neutral.as_ref().unwrap_or(target);
             let rendered = render(camera)?;
             for (sum, image) in sums.iter_mut().zip([&rendered.colors, rendered.output()]) {
-                let is_aligned = place.is_none() && !affines.is_empty();
+                let is_aligned = photograph.is_none() && !affines.is_empty();
                 let aligned =
                     is_aligned.then(|| Affine::least_squares(image, target)).transpose()?;
                 let aligned = aligned.map(|own| own.applied(image));
@@ -252,8 +250,8 @@ impl Trainer {
             )?;
             let UVec2 { x: width, y: height } = view.size();
             let target = Image { width, height, data: target.concat() };
-            let (camera, place) = (view.patch.own_camera(), Some(view.place));
-            Ok(TargetView { camera, target, mask: None, place })
+            let (camera, photograph) = (view.patch.own_camera(), Some(view.photograph));
+            Ok(TargetView { camera, target, mask: None, photograph })
         });
         Ok(TargetViews(some.collect::<Result<_>>()?))
     }
