@@ -12,12 +12,13 @@ use crate::gpu::DeviceChoice;
 use crate::networks::lpips::{Lpips, Range};
 use crate::photographs::dataset::{DOWNSCALE, View};
 use crate::photographs::metrics::psnr_of_counted;
+use crate::photographs::targets::SceneTone;
 use crate::results::eval::{self, ScoreReference, ScoredImages};
 use crate::results::evaluation::{EvalPage, score_table};
 use crate::results::finished_run::{FinishedRun, is_model};
 use crate::results::linear_light::{photograph_of, slope_at, stops_between};
 use crate::results::run;
-use crate::train::{OnOff, SceneLight, known_stops};
+use crate::train::{OnOff, known_stops};
 
 /// Score a run on the test views of its dataset.
 ///
@@ -48,7 +49,7 @@ pub struct EvalArgs {
     #[arg(long)]
     pub align: bool,
     /// Add the scores of the renders as dark photographs, against the photographs of the test views: PSNR, by how many
-    /// stops the render is brighter, and by how much the tone law, which multiplies differences, raises that PSNR
+    /// stops the render is brighter, and by how much the tone curve, which multiplies differences, raises that PSNR
     #[arg(long)]
     pub photographs: bool,
     /// Add LPIPS, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)
@@ -88,13 +89,13 @@ impl From<LpipsRange> for Range {
 }
 
 /// PSNR of a render as a photograph against the photograph of its view, the stops by which it is brighter, and the
-/// slope of the tone law; `None` if the view has no photograph.
+/// slope of the tone curve; `None` if the view has no photograph.
 fn as_photograph(
-    light: &SceneLight,
+    scene: &SceneTone,
     compared: &ScoredImages<'_>,
 ) -> crate::Result<Option<[f64; 3]>> {
     let Some(photograph) = compared.view.loaded()? else { return Ok(None) };
-    let inverse = light.of_view(compared.view)?;
+    let inverse = scene.inverse(compared.view)?;
     let (own, _) = photograph_of(&compared.render, &inverse);
     let mask = compared.view.mask.as_ref();
     let psnr = psnr_of_counted(&own, &photograph, mask)?;
@@ -123,7 +124,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
     let load = |weights| Lpips::load(&gpu, weights, args.lpips_range.into());
     let lpips = args.lpips.as_ref().map(load).transpose()?;
     let measure = lpips.as_ref().map(Lpips::measure);
-    let light = args.photographs.then(|| SceneLight::of(&config.tone, &dataset)).transpose()?;
+    let scene = args.photographs.then(|| SceneTone::measure(&config.tone, &dataset)).transpose()?;
     let stops = known_stops(&dataset, &config)?;
     let mut score_reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;
     let images = match is_model(&args.run) {
@@ -146,8 +147,8 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         if let Some(stops) = stops.get(&score.name) {
             score.exposed = Some(compared.exposed(*stops)?);
         }
-        if let Some(light) = &light {
-            score.photograph = as_photograph(light, compared)?;
+        if let Some(scene) = &scene {
+            score.photograph = as_photograph(scene, compared)?;
         }
         if args.save_images {
             compared.save(&images, score.against)?;
@@ -222,7 +223,7 @@ pub fn run(args: &EvalArgs) -> Result<()> {
         if let Some([.., slope]) = eval::mean_photograph(&scored) {
             writeln!(
                 out,
-                "the tone law multiplies differences of the photographs by {slope:.2}: {:.2} dB of PSNR, dark",
+                "the tone curve multiplies differences of the photographs by {slope:.2}: {:.2} dB of PSNR, dark",
                 20.0 * slope.log10()
             )?;
         }

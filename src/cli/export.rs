@@ -15,6 +15,7 @@ use crate::camera::frame::relative_to;
 use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
+use crate::photographs::targets::{SceneTone, Targets};
 use crate::photographs::tone::ToneCurve;
 use crate::results::edit::fingerprint;
 use crate::results::export::page::{Bookmark, Page, Picture, moved};
@@ -27,7 +28,7 @@ use crate::splats::joined::Manifest;
 use crate::splats::levels;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE};
-use crate::train::{SceneLight, TestTargets, TrainConfig};
+use crate::train::TrainConfig;
 use crate::{Error, results::run};
 
 pub use up::Up;
@@ -271,7 +272,7 @@ fn linear(
     gaussians: Gaussians,
     facts: Facts,
 ) -> crate::Result<(Gaussians, Facts)> {
-    let inverse = scene_light(args, config)?.of_scene()?;
+    let inverse = scene_tone(args, config)?.inverse_of_scene()?;
     let stops = inverse.stops_to_target();
     let (linear, clipped) = linear_gaussians(&gaussians, &inverse, stops);
     if clipped > 0 {
@@ -284,14 +285,14 @@ fn linear(
     Ok((linear, Facts { linear: Some(stops as f32), law: None, ..facts }))
 }
 
-/// The light of the photographs of a run.
-fn scene_light(args: &ExportArgs, config: &TrainConfig) -> crate::Result<SceneLight> {
+/// The curves of the photographs of a run.
+fn scene_tone(args: &ExportArgs, config: &TrainConfig) -> crate::Result<SceneTone> {
     let mut config = config.clone();
     if let Some(dataset) = &args.dataset {
         config.move_dataset(dataset);
     }
     let dataset = Dataset::load(&config.dataset, &config.load_options())?;
-    SceneLight::of(&config.tone, &dataset)
+    SceneTone::measure(&config.tone, &dataset)
 }
 
 /// The model as stored, what is stated of it, and its settings.
@@ -401,13 +402,13 @@ fn targets(
     config: &TrainConfig,
     dataset: &Dataset,
     gpu: impl FnOnce() -> crate::Result<Gpu>,
-) -> crate::Result<Option<TestTargets>> {
+) -> crate::Result<Option<Targets>> {
     let lacks = |view: &View| view.has_photograph() && !view.has_reference();
     if config.tone.curve == ToneCurve::None || !dataset.views.iter().any(lacks) {
         return Ok(None);
     }
     match gpu() {
-        Ok(gpu) => TestTargets::new(&gpu, &config.tone, dataset).map(Some),
+        Ok(gpu) => Targets::new(&gpu, &config.tone, dataset).map(Some),
         Err(error) => {
             tracing::warn!("the page has no targets to compare with: {error}");
             Ok(None)
@@ -419,7 +420,7 @@ fn bookmarks(
     args: &ExportArgs,
     origin: DVec3,
     dataset: &Dataset,
-    mut targets: Option<TestTargets>,
+    targets: Option<Targets>,
     mut rendered: impl FnMut(&View) -> crate::Result<Option<(String, Image)>>,
 ) -> crate::Result<Vec<Bookmark>> {
     let mut views: Vec<&View> = dataset.test_views().collect();
@@ -429,9 +430,11 @@ fn bookmarks(
     let (all, count) = (views.len(), args.views.clamp(1, views.len().max(1)));
     let bookmark = |place: usize| {
         let view = views[place * all / count];
-        let lit = match (view.loaded_reference()?, &mut targets) {
+        let lit = match (view.loaded_reference()?, &targets) {
             (Some(image), _) => Some(("reference".to_owned(), image.into_owned())),
-            (None, Some(targets)) => targets.of(view)?.map(|image| ("target".to_owned(), image)),
+            (None, Some(targets)) => {
+                targets.target(view)?.map(|image| ("target".to_owned(), image))
+            }
             (None, None) => None,
         };
         let photograph = view.loaded()?.map(|own| ("photograph".to_owned(), own.into_owned()));

@@ -13,12 +13,13 @@ use crate::networks::lpips::{Lpips, Measure};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use crate::photographs::metrics::{self, Scores};
-use crate::photographs::tone::{SceneTone, ToneCurve, ToneSettings};
+use crate::photographs::targets::{SceneTone, Targets};
+use crate::photographs::tone::{ToneCurve, ToneSettings};
 use crate::splats::lamp::Lamp;
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::{DeviceGaussians, Shape};
-use crate::train::{Networks, Rendered, TestTargets, TrainConfig};
+use crate::train::{Networks, Rendered, TrainConfig};
 use crate::{Error, Result};
 
 mod layers;
@@ -76,7 +77,7 @@ pub struct ScoreReference {
     /// Their kind.
     pub against: ReferenceKind,
     /// Makes the targets, unless there are reference images.
-    targets: Option<TestTargets>,
+    targets: Option<Targets>,
     /// Targets made so far, by view, if photographs are cached as well.
     made: BTreeMap<String, Image>,
 }
@@ -85,23 +86,18 @@ impl ScoreReference {
     /// The reference images of the test views that have one; without any, the targets that `tone apply` gives the test
     /// views, with the statistics of the training photographs.
     pub fn of(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
-        Self::made_by(tone, dataset, || TestTargets::new(gpu, tone, dataset))
+        Self::made_by(tone, dataset, || Targets::new(gpu, tone, dataset))
     }
 
     /// [`ScoreReference::of`] with given statistics of the training photographs.
-    pub fn in_scene(
-        gpu: &Gpu,
-        tone: &ToneSettings,
-        dataset: &Dataset,
-        scene: &SceneTone,
-    ) -> Result<Self> {
-        Self::made_by(tone, dataset, || TestTargets::in_scene(gpu, tone, scene))
+    pub fn in_scene(gpu: &Gpu, dataset: &Dataset, scene: &SceneTone) -> Result<Self> {
+        Self::made_by(scene.settings(), dataset, || Targets::in_scene(gpu, scene.clone()))
     }
 
     fn made_by(
         tone: &ToneSettings,
         dataset: &Dataset,
-        targets: impl FnOnce() -> Result<TestTargets>,
+        targets: impl FnOnce() -> Result<Targets>,
     ) -> Result<Self> {
         let against = Self::kind(tone, dataset);
         let targets = (against != ReferenceKind::References).then(targets).transpose()?;
@@ -112,10 +108,12 @@ impl ScoreReference {
     pub fn kind(tone: &ToneSettings, dataset: &Dataset) -> ReferenceKind {
         let has_references = dataset.test_views().any(View::has_reference);
         let has_photographs = dataset.test_views().any(View::has_photograph);
-        match tone.curve {
-            _ if has_references || !has_photographs => ReferenceKind::References,
-            ToneCurve::None => ReferenceKind::Photographs,
-            _ => ReferenceKind::PseudoGt,
+        if has_references || !has_photographs {
+            ReferenceKind::References
+        } else if tone.curve == ToneCurve::None {
+            ReferenceKind::Photographs
+        } else {
+            ReferenceKind::PseudoGt
         }
     }
 
@@ -142,7 +140,7 @@ impl ScoreReference {
         if let Some(made) = self.made.get(&view.name) {
             return Ok(Some(made.clone()));
         }
-        let target = targets.of(view)?.map(|target| quantized(&target));
+        let target = targets.target(view)?.map(|target| quantized(&target));
         let kept = target.as_ref().filter(|_| view.image.is_some());
         self.made.extend(kept.map(|target| (view.name.clone(), target.clone())));
         Ok(target)

@@ -110,11 +110,10 @@ impl Trainer {
         for view in views {
             let camera = coarse(&view.patch.camera, pixels);
             let depths = self.depths(&mut renderer, gaussians, &camera)?;
-            let target = self.supervision.views.picture(
-                &self.gpu,
-                &self.supervision.pseudo_gt,
-                view.photograph,
-            )?;
+            let target = self
+                .supervision
+                .views
+                .picture(&self.supervision.targets.pseudo_gt, view.photograph)?;
             let exposure =
                 exposures.as_ref().and_then(|exposures| exposures.get(view.photograph.0));
             let neutral = exposure.map(Affine::inverse).map(|inverse| inverse.applied(&target));

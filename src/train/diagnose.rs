@@ -26,7 +26,8 @@ use serde::Serialize;
 use crate::camera::Camera;
 use crate::photographs::dataset::{self, Borders, Dataset, LoadOptions, View};
 use crate::photographs::image::{ColourCounts, Image, MIDDLE_GREY, Mask, PictureFile, files};
-use crate::photographs::tone::{Exposure, LuminanceHistogram, is_black};
+use crate::photographs::targets::SceneTone;
+use crate::photographs::tone::{Exposure, MeasuredPhotograph, ToneSettings, is_black};
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 use geometry::Shared;
@@ -197,14 +198,16 @@ impl Diagnosis {
         known.extend(read(&dataset.root, &files, unknown.collect(), options)?);
         let photographs = views.iter().filter_map(|(_, view)| known.remove(&view.name));
         let photographs: Vec<Photograph> = photographs.collect();
-        let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);
-        let Some(exposure) = exposure else {
+        let measured = photographs.iter().zip(&views);
+        let measured: Vec<MeasuredPhotograph> = measured
+            .map(|(one, (_, view))| one.measured.encoded.clone().seen_by(&view.camera))
+            .collect();
+        let scene = SceneTone::from_photographs(&ToneSettings::default(), &measured);
+        let Some(exposure) = scene.and_then(|scene| scene.exposure) else {
             let problem = "every training photograph is almost black (99 % of its pixels are below 2 of 255); \
                            expose longer";
             return Err(Error::input(&dataset.root, problem));
         };
-        let cameras = views.iter().map(|(_, view)| view.camera);
-        let exposure = exposure.seen_by(photographs.iter().map(|one| &one.histogram).zip(cameras));
         let of_view = |(place, photograph): (usize, &Photograph)| {
             photograph.diagnosis(&views[place].1.name, &shared, place)
         };
@@ -275,7 +278,6 @@ fn read(
 struct Photograph {
     size: [u32; 2],
     measured: PhotographStatistics,
-    histogram: LuminanceHistogram,
     noise_in_target: Option<TargetNoise>,
 }
 
@@ -299,27 +301,29 @@ impl Photograph {
     fn of(image: &Image, mask: Option<&Mask>) -> Self {
         let counted = mask.map(|mask| mask.counted(image));
         let counted = counted.as_deref().unwrap_or(&image.data);
-        let histogram = LuminanceHistogram::of(counted);
-        let exposure = Exposure::of([&histogram], None);
+        let measured = PhotographStatistics::of(image, counted);
+        let alone = std::slice::from_ref(&measured.encoded);
+        let scene = SceneTone::from_photographs(&ToneSettings::default(), alone);
+        let curve = scene.and_then(|scene| scene.inverse_of_scene().ok());
         Self {
             size: [image.width, image.height],
-            measured: PhotographStatistics::of(image, counted),
-            noise_in_target: exposure.and_then(|own| target_noise::target_noise(image, &own)),
-            histogram,
+            noise_in_target: curve.and_then(|own| target_noise::target_noise(image, &own)),
+            measured,
         }
     }
 
     fn diagnosis(&self, name: &str, shared: &Shared, place: usize) -> ViewDiagnosis {
-        let Self { size, measured, histogram, noise_in_target } = self;
-        let [p10, p90] = measured.statistics.percentiles();
+        let Self { size, measured, noise_in_target } = self;
+        let MeasuredPhotograph { statistics, luminance, .. } = &measured.encoded;
+        let [p10, p90] = statistics.percentiles();
         ViewDiagnosis {
             name: name.to_owned(),
             size: *size,
             p10,
             p90,
-            r: measured.statistics.printed_ratio(),
-            mean_luminance: measured.statistics.mean_luminance.into(),
-            cubic_mean: histogram.cubic_mean(),
+            r: statistics.printed_ratio(),
+            mean_luminance: statistics.mean_luminance.into(),
+            cubic_mean: luminance.cubic_mean(),
             light: measured.light,
             darkening: darkening(measured.light),
             exposure: shared.exposures[place],
@@ -332,7 +336,7 @@ impl Photograph {
             unevenness: measured.unevenness,
             points: shared.points[place],
             overlap: shared.overlaps[place],
-            is_black: is_black(histogram),
+            is_black: is_black(luminance),
         }
     }
 }
@@ -488,23 +492,23 @@ mod tests {
     use crate::gpu::testing::gpu;
     use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
     use crate::photographs::image::openings;
-    use crate::photographs::tone::{ToneCurve, ToneSettings};
+    use crate::photographs::tone::{Tone, ToneCurve};
     use crate::train::{CacheSize, TrainConfig, Trainer};
 
     #[test]
     fn a_photograph_is_opened_once_before_the_first_step() {
         let set = SyntheticOptions { views: 9, width: 64, height: 48, ..Default::default() };
         for (downscale, curve) in [
-            (1.0, ToneCurve::Auto),
-            (2.0, ToneCurve::Auto),
-            (1.0, ToneCurve::Ase),
-            (2.0, ToneCurve::Ase),
+            (1.0, Tone::Auto),
+            (2.0, Tone::Auto),
+            (1.0, ToneCurve::Ase.into()),
+            (2.0, ToneCurve::Ase.into()),
         ] {
             let folder = tempfile::tempdir().unwrap();
             synthetic::write(folder.path(), &set).unwrap();
             let config = TrainConfig {
                 dataset: folder.path().to_owned(),
-                tone: ToneSettings::new(curve),
+                tone: ToneSettings::new(curve.clone()),
                 cache: Some(CacheSize(1 << 28)),
                 downscale,
                 ..TrainConfig::default()

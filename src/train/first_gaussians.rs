@@ -49,7 +49,6 @@ impl Views {
     /// in the targets of the training views, without the light of the lamp, in world units.
     pub(super) fn initial_gaussians(
         &self,
-        gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         dataset: &Dataset,
         config: &TrainConfig,
@@ -58,11 +57,11 @@ impl Views {
     ) -> Result<Gaussians> {
         let frame = config.frame.unwrap_or_default();
         let points = self.points(dataset, config, &frame);
-        let kept = &sampled(points, config, gpu);
+        let kept = &sampled(points, config, pseudo_gt.gpu());
         // The training photograph of each view of the dataset.
         let mut photographs = vec![None; dataset.views.len()];
         self.photographs().for_each(|view| photographs[view.in_dataset.0] = Some(view.photograph));
-        let mut targets = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Targets);
+        let mut targets = ImageBatches::new(self, pseudo_gt, ImageKind::Targets);
         let factor = |view: &View, point: &Point| {
             let in_view = view.camera.view_from_world.transform_point3(point.position);
             lamp.map_or(1.0, |lamp| lamp.factor(in_view) as f32)
@@ -90,7 +89,7 @@ impl Views {
             Gaussians::from_points(&positions, &colors, shape, &config.start, seed)?;
         if config.model.network.variant == NetworkVariant::Identity {
             let low = if shape.features.illumination {
-                let mut dark = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Photographs);
+                let mut dark = ImageBatches::new(self, pseudo_gt, ImageKind::Photographs);
                 init::colors_from_views(
                     kept,
                     &dataset.views,
@@ -146,22 +145,21 @@ impl Views {
 /// Targets of the photographs in order, made in batches.
 struct ImageBatches<'a> {
     views: &'a Views,
-    gpu: &'a Gpu,
     pseudo_gt: &'a PseudoGt,
     kind: ImageKind,
     made: BTreeMap<TrainingPhotograph, Image>,
 }
 
 impl<'a> ImageBatches<'a> {
-    fn new(views: &'a Views, gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, kind: ImageKind) -> Self {
-        Self { views, gpu, pseudo_gt, kind, made: BTreeMap::new() }
+    fn new(views: &'a Views, pseudo_gt: &'a PseudoGt, kind: ImageKind) -> Self {
+        Self { views, pseudo_gt, kind, made: BTreeMap::new() }
     }
 
     /// The target of a photograph; earlier ones are dropped.
     fn next(&mut self, photograph: TrainingPhotograph) -> Result<Image> {
         /// The pixels of a batch.
         const MAX_PIXELS: usize = 1 << 20;
-        let Self { views, gpu, pseudo_gt, kind, ref mut made } = *self;
+        let Self { views, pseudo_gt, kind, ref mut made } = *self;
         if !made.contains_key(&photograph) {
             let mut pixels = 0;
             let whole = views.whole();
@@ -173,7 +171,7 @@ impl<'a> ImageBatches<'a> {
                 is_first || pixels <= MAX_PIXELS
             });
             let last = now.last().map_or(photograph, |view| view.photograph);
-            let images = views.pictures(gpu, pseudo_gt, photograph..=last, kind)?;
+            let images = views.pictures(pseudo_gt, photograph..=last, kind)?;
             *made = (photograph.0..).map(TrainingPhotograph).zip(images).collect();
         }
         let gone = || Error::Usage(format!("there is no training photograph {}", photograph.0));

@@ -78,12 +78,10 @@ impl Views {
     /// The target of a photograph, at its full size.
     pub(super) fn picture(
         &self,
-        gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         photograph: TrainingPhotograph,
     ) -> Result<Image> {
-        let pictures =
-            self.pictures(gpu, pseudo_gt, photograph..=photograph, ImageKind::Targets)?;
+        let pictures = self.pictures(pseudo_gt, photograph..=photograph, ImageKind::Targets)?;
         let gone = || Error::Usage(format!("there is no training photograph {}", photograph.0));
         pictures.into_iter().next().ok_or_else(gone)
     }
@@ -91,13 +89,12 @@ impl Views {
     /// Images of photographs at full size, assembled from their patches.
     pub(super) fn pictures(
         &self,
-        gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         photographs: RangeInclusive<TrainingPhotograph>,
         shown: ImageKind,
     ) -> Result<Vec<Image>> {
         let views = self.of_photographs(photographs);
-        Ok(put_together(views, self.read(gpu, pseudo_gt, views, shown)?))
+        Ok(put_together(views, self.read(pseudo_gt, views, shown)?))
     }
 
     /// The full-size patches of some photographs.

@@ -1,6 +1,6 @@
 //! The training views on the device: photographs, their curves, and the order of steps.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
 
@@ -9,17 +9,16 @@ use glam::UVec2;
 use super::TrainConfig;
 use super::cache::{Cache, CacheSize, Slot};
 use super::epochs::Epochs;
-use super::measuring::{TargetExposure, photographs};
 use super::precision::Encoder;
-use super::scene_light::SceneLight;
 use crate::Result;
 use crate::camera::Patch;
-use crate::gpu::{Buffer, Download, Gpu, Recorder};
+use crate::gpu::{Buffer, Download, Recorder};
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
 use crate::photographs::dataset::Dataset;
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::targets::{Targets, photographs};
 use crate::splats::render::{Viewpoint, Viewpoints};
 use crate::splats::scene::COLOR_CHANNELS;
 
@@ -78,13 +77,12 @@ impl Views {
     /// Uploads every training photograph or its target for every level, and the photograph if a network uses it. Only
     /// one photograph at a time is in memory at its own size.
     pub(super) fn upload(
-        gpu: &Gpu,
-        pseudo_gt: &PseudoGt,
-        light: &SceneLight,
+        targets: &Targets,
         dataset: &Dataset,
         config: &TrainConfig,
-    ) -> Result<(Self, Option<TargetExposure>)> {
-        let settings = pseudo_gt.settings().clone();
+    ) -> Result<Self> {
+        let Targets { scene, pseudo_gt } = targets;
+        let gpu = pseudo_gt.gpu();
         let keeps_photographs = config.model.denoiser || config.model.tonemapper;
         let frame = config.frame.unwrap_or_default();
         let mut encoder = Encoder::new(gpu, config.precision.photographs);
@@ -92,18 +90,16 @@ impl Views {
         let mut cache = Cache::new(gpu, budget, config.spool.clone());
         let mut levels = vec![];
         levels.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
-        let (mut gains, mut curves) = (BTreeMap::new(), vec![]);
-        for (place, ((index, view), tone_mapping)) in
-            photographs(dataset).zip(light.tone_mappings(dataset)?).enumerate()
-        {
-            gains.extend(tone_mapping.gain.map(|gain| (view.name.clone(), gain)));
+        let mut curves = vec![];
+        for (at, (index, view)) in photographs(dataset).enumerate() {
+            let Some(tone_mapping) = scene.tone_mapping(view)? else { continue };
             curves.push(tone_mapping.parameters);
             let Some(image) = view.loaded()? else { continue };
             let own = UVec2::new(image.width, image.height);
             let sizes = (0..levels.len()).map(|level| shrunk(own, level as u32));
             let sizes: Vec<UVec2> = sizes.collect();
             // At its own size, the curve is applied in every step.
-            let own = view.own_size().filter(|_| settings.full_resolution);
+            let own = view.own_size().filter(|_| scene.settings().full_resolution);
             let is_larger = own.filter(|own| sizes.iter().any(|size| size != own));
             let whole = if is_larger.is_some() { view.photograph()? } else { None };
             let whole =
@@ -117,7 +113,7 @@ impl Views {
                 let depth = view.depth.as_ref().filter(|_| !is_as_loaded);
                 let print = LevelImage {
                     name: &view.name,
-                    photograph: TrainingPhotograph(place),
+                    photograph: TrainingPhotograph(at),
                     in_dataset: DatasetView(index),
                     keeps_dark: keeps_photographs,
                     dark: resized(&image),
@@ -133,7 +129,7 @@ impl Views {
         let ranges = (0..levels.len()).map(|level| end_of(level)..end_of(level + 1)).collect();
         let mut all: Vec<TrainView> = levels.into_iter().flatten().collect();
         all.iter_mut().enumerate().for_each(|(at, view)| view.id = TrainingView(at));
-        let views = Self {
+        Ok(Self {
             viewpoints: Viewpoints::new(gpu, all.iter().map(|view| view.patch).collect())?,
             all,
             levels: ranges,
@@ -141,12 +137,7 @@ impl Views {
             cache,
             epochs: Epochs::default(),
             curves: gpu.buffer("curves", &curves)?,
-        };
-        // A profile determines the brightness of its targets.
-        let scene = light.scene();
-        let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
-        let exposure = exposure.map(|own| TargetExposure::new(own, gains, scene.recorded_gain()));
-        Ok((views, exposure))
+        })
     }
 
     /// Makes the images of the next steps resident, for as many steps as fit but at least one; returns the last of
@@ -183,14 +174,13 @@ impl Views {
     /// The images that loss terms compare views with.
     pub(super) fn sources<'a>(
         &'a self,
-        gpu: &'a Gpu,
         pseudo_gt: &'a PseudoGt,
         dataset: &'a Dataset,
     ) -> Vec<ViewSource<'a>> {
         let source = |view: &'a TrainView| ViewSource {
             size: view.size(),
             depth: view.depth.as_deref().or(dataset.views[view.in_dataset.0].depth.as_deref()),
-            target: Box::new(|| self.target(gpu, pseudo_gt, view)),
+            target: Box::new(|| self.target(pseudo_gt, view)),
         };
         self.all.iter().map(source).collect()
     }
@@ -226,11 +216,11 @@ impl Views {
     /// Reads back targets or dark photographs of views, (3, H, W), in one submission.
     pub(super) fn read(
         &self,
-        gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         views: &[TrainView],
         kind: ImageKind,
     ) -> Result<Vec<Vec<f32>>> {
+        let gpu = pseudo_gt.gpu();
         let (mut stored, mut scratch) = (vec![], vec![]);
         for view in views {
             let slot = view.dark.filter(|_| kind == ImageKind::Photographs);
@@ -251,12 +241,8 @@ impl Views {
     }
 
     /// The target of a view, (3, H, W), in a new buffer or in the stored one.
-    fn target(
-        &self,
-        gpu: &Gpu,
-        pseudo_gt: &PseudoGt,
-        view: &TrainView,
-    ) -> Result<Arc<Buffer<f32>>> {
+    fn target(&self, pseudo_gt: &PseudoGt, view: &TrainView) -> Result<Arc<Buffer<f32>>> {
+        let gpu = pseudo_gt.gpu();
         let stored = self.cache.load(view.stored)?;
         let curve = self.curve(view);
         if stored.code_bits == 32 && curve.is_none() {
@@ -270,9 +256,10 @@ impl Views {
     }
 
     /// The target of white of each photograph.
-    pub(super) fn whites(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Vec<[f32; 3]>> {
+    pub(super) fn whites(&self, pseudo_gt: &PseudoGt) -> Result<Vec<[f32; 3]>> {
         /// Photographs of one submission.
         const AT_ONCE: usize = 256;
+        let gpu = pseudo_gt.gpu();
         let white = gpu.buffer("white", &[1.0; COLOR_CHANNELS])?;
         let places: Vec<usize> = (0..self.curves.len()).collect();
         let mut whites = vec![];

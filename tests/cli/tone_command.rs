@@ -9,7 +9,7 @@ use nightsplat::cli::ImageFormat;
 use nightsplat::cli::tone::apply::{ApplyArgs, ToneReport, apply};
 use nightsplat::photographs::image::{Image, srgb_from_linear};
 use nightsplat::photographs::metrics::psnr;
-use nightsplat::photographs::tone::{GainChoice, Statistics, ToneCurve, ToneSettings};
+use nightsplat::photographs::tone::{GainChoice, Statistics, Tone, ToneCurve, ToneSettings};
 
 fn args(input: &Path, out: PathBuf) -> ApplyArgs {
     ApplyArgs {
@@ -364,7 +364,7 @@ fn an_unknown_curve_is_misuse_and_lists_the_curves() {
 
 /// The output of the automatic curve for a folder.
 fn automatic(input: &Path) -> ApplyArgs {
-    ApplyArgs { curve: ToneCurve::Auto.into(), out: None, ..args(input, PathBuf::new()) }
+    ApplyArgs { curve: Tone::Auto.into(), out: None, ..args(input, PathBuf::new()) }
 }
 
 #[test]
@@ -458,10 +458,10 @@ fn a_well_lit_folder_is_unchanged_and_a_black_one_refused() {
     };
     let auto = Some(GainChoice::Auto);
     let of = |curve: ToneCurve| ApplyArgs { curve: curve.into(), ..automatic(&folder) };
-    refused(ApplyArgs { gain: Some(GainChoice::C(2.0)), ..of(ToneCurve::Auto) }, "tone.brightness");
+    refused(ApplyArgs { gain: Some(GainChoice::C(2.0)), ..automatic(&folder) }, "tone.brightness");
     refused(ApplyArgs { brightness: Some(0.5), ..of(ToneCurve::Ap3) }, "tone.brightness");
-    refused(ApplyArgs { brightness: Some(2.0), ..of(ToneCurve::Auto) }, "tone.brightness");
-    refused(ApplyArgs { colour: Some(-0.5), ..of(ToneCurve::Auto) }, "tone.colour");
+    refused(ApplyArgs { brightness: Some(2.0), ..automatic(&folder) }, "tone.brightness");
+    refused(ApplyArgs { colour: Some(-0.5), ..automatic(&folder) }, "tone.colour");
     refused(ApplyArgs { gain: auto, ..of(ToneCurve::LumPreserve) }, "no automatic gain");
 }
 

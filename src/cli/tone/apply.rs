@@ -17,10 +17,10 @@ use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
 use crate::photographs::image::{ColourCounts, Image, Mask, Orientation};
 use crate::photographs::metrics::Scores;
-use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::targets::{SceneTone, Targets};
 use crate::photographs::tone::{
-    CurveChoice, Exposure, GainChoice, MeasuredPhotograph, Profile, SceneTone, Statistics,
-    ToneCurve, ToneSettings, all_black,
+    CurveChoice, Exposure, GainChoice, MeasuredPhotograph, Profile, Statistics, Tone, ToneCurve,
+    ToneSettings, all_black,
 };
 use crate::photographs::white_balance::WhiteBalance;
 use crate::results::eval;
@@ -233,7 +233,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     let settings = match &args.profile {
         Some(file) => ToneSettings {
             scene_statistics: args.scene_statistics,
-            ..ToneSettings::of_profile(Profile::load(file)?)
+            ..ToneSettings::new(Tone::Profile(Profile::load(file)?))
         },
         None => settings(args, &args.curve)?,
     };
@@ -271,7 +271,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     }
     progress.finish_and_clear();
     set.colours.say();
-    let exposure = set.scene.exposure;
+    let exposure = set.targets.scene.exposure;
     let Some(mut scene) = scene(&views) else {
         let nothing = || Error::input(&args.input, "contains no photograph");
         return Err(unusable.unwrap_or_else(nothing));
@@ -289,7 +289,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
 /// The settings of a curve with the options of the command line.
 fn settings(args: &ApplyArgs, curve: &CurveChoice) -> Result<ToneSettings> {
     let mut settings = curve.settings()?;
-    if *curve == ToneCurve::Auto.into() && !Dataset::is_at(&args.input) {
+    if *curve == Tone::Auto.into() && !Dataset::is_at(&args.input) {
         // References of single photographs are less saturated than those of scenes.
         settings.colour = 0.0;
     }
@@ -306,8 +306,7 @@ fn settings(args: &ApplyArgs, curve: &CurveChoice) -> Result<ToneSettings> {
 
 /// A curve with its statistics of the whole dataset, if it has any.
 struct CurveOnSet {
-    pseudo_gt: PseudoGt,
-    scene: SceneTone,
+    targets: Targets,
     /// Masks hide white.
     inverted: bool,
     /// Counts of converted and unsupported colours.
@@ -322,7 +321,6 @@ impl CurveOnSet {
         photographs: &[Listed],
         (input, inverted): (&Path, bool),
     ) -> Result<Self> {
-        let pseudo_gt = PseudoGt::new(gpu, &settings)?;
         let mut measured = vec![];
         if settings.scene_statistics || settings.takes_exposure() {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
@@ -337,12 +335,16 @@ impl CurveOnSet {
                 return Err(Error::Usage(problem.to_owned()));
             }
         }
-        let scene = match settings.scene(&measured) {
+        let scene = match SceneTone::from_photographs(&settings, &measured) {
             Some(scene) => scene,
-            None if measured.is_empty() => SceneTone::default(),
+            None if measured.is_empty() => SceneTone::new(&settings),
             None => return Err(all_black(input)),
         };
-        Ok(Self { pseudo_gt, scene, inverted, colours: ColourCounts::default() })
+        Ok(Self {
+            targets: Targets::in_scene(gpu, scene)?,
+            inverted,
+            colours: ColourCounts::default(),
+        })
     }
 
     /// Statistics of a photograph, its mapped image and the gain.
@@ -352,12 +354,8 @@ impl CurveOnSet {
         gaps: &[usize],
     ) -> Result<(Statistics, Image, Option<f64>)> {
         let measured = MeasuredPhotograph::of(&without(photograph, gaps));
-        let tone_mapping = self.pseudo_gt.settings().tone_mapping(&self.scene, &measured);
-        Ok((
-            measured.statistics,
-            self.pseudo_gt.tone_mapped(photograph, &tone_mapping)?,
-            tone_mapping.gain,
-        ))
+        let image = self.targets.tone_mapped(photograph, &measured)?;
+        Ok((measured.statistics, image, self.targets.scene.mapping_of(&measured).gain))
     }
 }
 

@@ -10,7 +10,8 @@ use toml::{Table, Value};
 use crate::base::settings::{Rule, Setting};
 use crate::cli::words::{self, Words};
 use crate::photographs::dataset::exclude;
-use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneLaw, ToneSettings};
+use crate::photographs::targets::SceneTone;
+use crate::photographs::tone::{CurveChoice, GainChoice, Profile, Tone, ToneSettings};
 use crate::train::diagnose::Plan;
 use crate::train::settings::SETTINGS;
 use crate::train::{
@@ -259,7 +260,8 @@ impl TrainOptions {
     fn push_law(&self, options: &mut SettingsLayer) -> Result<()> {
         let law = self.single.0.iter().find(|(row, _)| row.key == "tone.law");
         let Some((_, path)) = law else { return Ok(()) };
-        push_curve(options, ToneLaw::load(Path::new(path))?.tone, "--law")
+        let scene = SceneTone::load(Path::new(path))?;
+        push_curve(options, scene.settings().clone(), "--law")
     }
 }
 
@@ -302,7 +304,9 @@ impl SeveralSettings {
 
     fn push_tone(&self, options: &mut SettingsLayer) -> Result<()> {
         let from_file = match (&self.curve, &self.profile) {
-            (_, Some(file)) => Some((ToneSettings::of_profile(Profile::load(file)?), "--profile")),
+            (_, Some(file)) => {
+                Some((ToneSettings::new(Tone::Profile(Profile::load(file)?)), "--profile"))
+            }
             (Some(CurveChoice::Named(curve)), _) => {
                 options.push("tone.curve", curve.name().into(), Origin::Option("--curve"))?;
                 None

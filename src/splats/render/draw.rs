@@ -157,7 +157,7 @@ impl Renderer {
         if let Some(own) = &mut self.host_targets {
             own.reserve(&self.gpu, pixels, target)?;
             if let (Some(law), None) = (law, &own.photograph) {
-                let tone_curve = law.curve.constant();
+                let tone_curve = law.curve;
                 own.photograph =
                     Some(self.gpu.pipeline(&photograph_light::Constants { tone_curve })?);
             }

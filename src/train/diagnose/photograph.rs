@@ -3,7 +3,7 @@
 use super::noise::{self, Noise, Patch};
 use super::sharpness;
 use crate::photographs::image::{Image, linear_from_srgb};
-use crate::photographs::tone::{Statistics, luminance, measurable};
+use crate::photographs::tone::{MeasuredPhotograph, luminance, measurable};
 
 /// Blur is measured in the middle of the photograph, in at most this many pixels each way.
 const BLUR_SIDE: u32 = 640;
@@ -13,7 +13,7 @@ const REGIONS: [usize; 2] = [8, 6];
 /// Measurements of one photograph; fractions are over the values of all channels.
 #[derive(Clone, Debug)]
 pub(super) struct PhotographStatistics {
-    pub(super) statistics: Statistics,
+    pub(super) encoded: MeasuredPhotograph,
     /// The mean luminance in linear light.
     pub(super) light: f64,
     pub(super) clipped_fraction: f64,
@@ -43,7 +43,7 @@ impl PhotographStatistics {
         }
         let luminance = luminances(&linear.planes);
         Self {
-            statistics: Statistics::of(counted),
+            encoded: MeasuredPhotograph::of(counted),
             light: mean(&luminance),
             // Written so that a NaN is neither.
             clipped_fraction: fraction(|value| value >= 1.0),
