@@ -216,7 +216,7 @@ pub use {
     photographs::dataset::{Dataset, DepthOptions, LoadOptions, Original, Point, Split, View},
     photographs::image::{Mask, Orientation},
     photographs::metrics::Scores,
-    photographs::tone::{Profile, Table, ToneCurve, ToneSettings},
+    photographs::tone::{Profile, Table, Tone, ToneCurve, ToneSettings},
     photographs::white_balance::WhiteBalance,
     results::export::{Format, spz::Version as SpzVersion},
     splats::scene::init::Initialization,
@@ -231,7 +231,7 @@ pub mod config {
     pub use crate::loss::{ParameterWeights, Weights};
     pub use crate::networks::{DenoiserSettings, NetworkVariant, Precision};
     pub use crate::photographs::dataset::{MeasuredSize, PixelOrientation};
-    pub use crate::photographs::tone::{GainChoice, TableInput, White};
+    pub use crate::photographs::tone::{GainChoice, White};
     pub use crate::splats::densify::DensityControl;
     pub use crate::splats::optimizer::{LearningRates, Schedule};
     pub use crate::train::{

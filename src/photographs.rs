@@ -8,8 +8,9 @@
 //! - [`tone`]: curves that brighten a photograph
 //! - [`fit`]: the constants of a curve from pairs of photographs
 //! - [`dataset`]: photographs with their cameras and points, from disk
-//! - `pose`: camera poses of dark photographs, by COLMAP (feature `cli`)
 //! - [`pseudo_gt`]: dark photograph and curve to target, on the device
+//! - [`targets`]: the curve of every view of a scene, and its target
+//! - `pose`: camera poses of dark photographs, by COLMAP (feature `cli`)
 //! - [`structure`]: the edges of a pseudo-GT that do not depend on its illumination
 
 #[cfg(feature = "io")]
@@ -25,6 +26,8 @@ pub mod pose;
 pub mod pseudo_gt;
 #[cfg(feature = "io")]
 pub mod structure;
+#[cfg(feature = "io")]
+pub mod targets;
 pub mod tone;
 #[cfg(feature = "io")]
 pub mod white_balance;

@@ -10,6 +10,7 @@ mod depth_seeding;
 pub mod diagnose;
 mod difference;
 mod early_stopping;
+mod encoding;
 mod epochs;
 mod exposures;
 mod first_gaussians;
@@ -17,7 +18,6 @@ mod growth;
 mod lamp;
 mod layers;
 mod masks;
-mod measuring;
 mod memory;
 mod model;
 mod networks;
@@ -31,7 +31,6 @@ mod preset;
 #[cfg(feature = "testing")]
 mod reference;
 mod rendered;
-mod scene_light;
 pub mod settings;
 mod start;
 mod submission;
@@ -66,8 +65,6 @@ pub(crate) use exposures::known_stops;
 use growth::Growth;
 use lamp::LampLearning;
 pub use layers::{Origin, Settings, SettingsLayer, values};
-pub use measuring::TargetExposure;
-pub(crate) use measuring::law_of;
 pub use memory::MemoryEstimate;
 use model::Model;
 pub use networks::Networks;
@@ -79,10 +76,8 @@ pub use preset::Preset;
 #[cfg(feature = "testing")]
 pub use reference::reference;
 pub use rendered::Rendered;
-pub use scene_light::SceneLight;
 use submission::Submissions;
 use supervision::Supervision;
-pub use target_views::TestTargets;
 
 /// The streams of random numbers that training draws from, one per purpose.
 mod streams {

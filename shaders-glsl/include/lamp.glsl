@@ -7,7 +7,7 @@
 //
 // The light on the axis at the reference distance is 1, whatever the learned numbers: brightness cannot move between
 // the lamp and the colours, which are those in a light of 1. Ambient light and that of the lamp add in linear light, so
-// the sum is taken there. Colours are encoded by the tone law, which saturates: black + tone(x), with x in proportion
+// the sum is taken there. Colours are encoded by the tone curve, which saturates: black + tone(x), with x in proportion
 // to linear light to the power of slope, and
 //
 //   tone(x) = reach (1 - exp(-x / reach)), a line below 0 and beyond LAMP_KNEE reach; x for a reach of 0.
@@ -20,7 +20,7 @@ const uint LAMP_WIDTH = 9;
 const uint LAMP_AMBIENT = 5;
 const uint LAMP_EXPONENT = 6;
 const uint LAMP_FALLOFFS = 7;
-// Then those of the set: the reference distance in world units, and the tone law.
+// Then those of the set: the reference distance in world units, and the tone curve.
 const uint LAMP_REFERENCE_DISTANCE = 9;
 const uint LAMP_SLOPE = 10;
 const uint LAMP_BLACK = 11;
@@ -35,6 +35,6 @@ const float LAMP_NEAREST = 0.0625;
 const float LAMP_FARTHEST = 65536.0;
 const float LAMP_LEAST_AMBIENT = 1e-4;
 const float LAMP_LARGEST_EXPONENT = 4.0;
-// Where the tone law becomes a line, and the share of its reach that is left there: exp(-LAMP_KNEE).
+// Where the tone curve becomes a line, and the share of its reach that is left there: exp(-LAMP_KNEE).
 const float LAMP_KNEE = 2.7725887;
 const float LAMP_LEFT = 0.0625;

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::base::input;
 use crate::photographs::dataset::Dataset;
 use crate::photographs::dataset::block::Block;
-use crate::photographs::tone::ToneLaw;
+use crate::photographs::targets::SceneTone;
 use crate::train::TrainConfig;
 use crate::{Error, Result};
 
@@ -102,7 +102,7 @@ pub(crate) struct BlockPlan {
     pub(crate) shared: f64,
     /// The settings that the tasks share.
     pub(super) config: TrainConfig,
-    pub(super) law: ToneLaw,
+    pub(super) law: SceneTone,
     /// That of the coarse model, and those of the rows.
     pub(super) blocks: Vec<Block>,
 }

@@ -9,7 +9,8 @@ use super::plan::{BlockPlan, LAW, PlanFile, Request, VERSION};
 use super::visibility::Visibility;
 use crate::base::hash::{self, Hasher};
 use crate::photographs::dataset::Dataset;
-use crate::train::{PlannedRun, StopConfig, TrainConfig, law_of};
+use crate::photographs::targets::SceneTone;
+use crate::train::{PlannedRun, StopConfig, TrainConfig};
 use crate::{Error, Result};
 
 /// Blocks whose mean share of the views is larger do not pay.
@@ -33,7 +34,7 @@ pub(crate) fn plan(planned: &PlannedRun, request: &Request) -> Result<BlockPlan>
     let serving = visibility.serving(&parts);
     let shared = mean_share(&serving, visibility.training.len());
     check_views(root, &serving, shared)?;
-    let law = law_of(&config.tone, dataset)?;
+    let law = SceneTone::measure_all(&config.tone, dataset)?;
     settle(&mut config, dataset);
     let stamp = Dataset::stamp(root, &config.load_options())?;
     let thinned = visibility.thinned();

@@ -44,7 +44,7 @@ pub struct EvalArgs {
     #[arg(long)]
     pub align: bool,
     /// Add the scores of the renders as dark photographs, against the photographs of the test views: PSNR, by how many
-    /// stops the render is brighter, and by how much the tone law, which multiplies differences, raises that PSNR
+    /// stops the render is brighter, and by how much the tone curve, which multiplies differences, raises that PSNR
     #[arg(long)]
     pub photographs: bool,
     /// Add LPIPS, with AlexNet or VGG-16 weights as safetensors (scripts/lpips-weights.py writes them)

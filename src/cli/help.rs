@@ -4,6 +4,7 @@ use clap::{Arg, ArgAction, Command, CommandFactory};
 use toml::Value;
 
 use super::Cli;
+use crate::photographs::tone::Tone;
 use crate::train::{TrainConfig, values};
 
 /// The options of a command that `-h` shows; of a command that is not listed it shows all.
@@ -107,7 +108,7 @@ fn filled(help: &str) -> String {
 fn default_of(setting: &str) -> String {
     let (key, curve) = setting.split_once(" of ").unwrap_or((setting, ""));
     let mut config = TrainConfig::default();
-    if let Ok(curve) = curve.parse() {
+    if let Ok(curve) = curve.parse::<Tone>() {
         config.tone = config.tone.with_curve(curve);
     }
     match values(&config).unwrap_or_default().get(key) {

@@ -16,13 +16,13 @@ use crate::camera::Easing;
 use crate::gpu::DeviceChoice;
 use crate::photographs::dataset::{Dataset, Split, View};
 use crate::photographs::image::Image;
+use crate::photographs::targets::SceneTone;
 use crate::results::colour_map;
 use crate::results::eval::RenderLayer;
 use crate::results::finished_run::FinishedRun;
 use crate::results::linear_light::{Clipped, STOPS, photograph_of};
 use crate::results::video;
 use crate::results::view_exposures::ViewExposures;
-use crate::train::SceneLight;
 
 /// Render a run from the cameras of its dataset, or along a path through them.
 ///
@@ -287,9 +287,9 @@ pub fn run(args: &RenderArgs) -> Result<()> {
     }
     let exposures = if *view_exposure { Some(ViewExposures::of(run)?) } else { None };
     let (shots, fps) = shots(args, &config, &dataset)?;
-    let light = match args.light {
+    let scene = match args.light {
         Light::Target => None,
-        _ => Some(SceneLight::of(&config.tone, &dataset)?),
+        _ => Some(SceneTone::measure(&config.tone, &dataset)?),
     };
     let mut clipped = Clipped::default();
     model_renderer.set_background(args.background.0);
@@ -304,11 +304,11 @@ pub fn run(args: &RenderArgs) -> Result<()> {
                 Some(exposures) => exposures.applied(name, image),
                 None => image,
             };
-            let Some(light) = &light else { return format.save(&image, &path) };
+            let Some(scene) = &scene else { return format.save(&image, &path) };
             let view = dataset.views.iter().find(|view| view.name == *name);
             let inverse = match view.filter(|_| args.light == Light::Photograph) {
-                Some(view) => light.of_view(view)?,
-                None => light.at(camera)?,
+                Some(view) => scene.inverse(view)?,
+                None => scene.inverse_at(camera)?,
             };
             let photograph = clipped.add(photograph_of(&image, &inverse));
             match format {

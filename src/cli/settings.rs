@@ -10,7 +10,7 @@ use toml::{Table, Value};
 
 use super::words::{self, Words};
 use crate::base::settings::{Rule, Setting};
-use crate::photographs::tone::{CurveChoice, GainChoice, Profile, ToneSettings};
+use crate::photographs::tone::{CurveChoice, GainChoice, Profile, Tone, ToneSettings};
 use crate::train::settings::SETTINGS;
 use crate::train::{Origin, SettingsLayer};
 use crate::{Error, Result};
@@ -163,7 +163,9 @@ impl CurveOptions {
     /// Adds what the command line gives.
     pub(super) fn push(&self, layer: &mut SettingsLayer) -> Result<()> {
         let from_file = match (&self.curve, &self.profile) {
-            (_, Some(file)) => Some((ToneSettings::of_profile(Profile::load(file)?), "--profile")),
+            (_, Some(file)) => {
+                Some((ToneSettings::new(Tone::Profile(Profile::load(file)?)), "--profile"))
+            }
             (Some(CurveChoice::Named(curve)), _) => {
                 layer.push("tone.curve", curve.name().into(), Origin::Option("--curve"))?;
                 None

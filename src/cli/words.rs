@@ -8,7 +8,7 @@ use std::str::FromStr;
 use clap::builder::{PossibleValue, StringValueParser, TypedValueParser};
 use clap::{Arg, Command, Error};
 
-use crate::photographs::tone::ToneCurve;
+use crate::photographs::tone::{Tone, ToneCurve};
 use crate::results::export::Format;
 use crate::train::{Part, Preset};
 
@@ -24,7 +24,7 @@ impl<T> Words<T> {
 
 /// The names of all curves.
 pub(super) fn curves<T>() -> Words<T> {
-    Words::new(std::iter::once(ToneCurve::Auto).chain(ToneCurve::ALL).map(ToneCurve::name))
+    Words::new(std::iter::once(Tone::Auto.name()).chain(ToneCurve::ALL.map(ToneCurve::name)))
 }
 
 /// The names of all presets.

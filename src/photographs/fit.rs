@@ -178,7 +178,7 @@ impl Scores {
     fn of(settings: &ToneSettings, score: impl Fn(&ToneSettings) -> f64) -> Self {
         Self {
             fitted: score(settings),
-            frozen: score(&ToneSettings::new(settings.curve)),
+            frozen: score(&ToneSettings::new(settings.curve.clone())),
             ap3: score(&ToneSettings::new(ToneCurve::Ap3)),
         }
     }

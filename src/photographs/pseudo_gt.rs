@@ -4,7 +4,7 @@
 //! stored photograph, parameters -> pseudo_gt -> target
 //! ```
 //!
-//! The host derives the parameters from the statistics of the photograph ([`ToneSettings::tone_mapping`]). A photograph
+//! The host derives the parameters from the statistics of the photograph ([`super::targets::SceneTone`]). A photograph
 //! beyond the device's limits is processed in tiles.
 
 mod encoded;
@@ -16,7 +16,7 @@ use std::sync::OnceLock;
 
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
 use crate::kernels::{self, ToneParameters};
-use crate::photographs::tone::ToneSettings;
+use crate::photographs::tone::{Tone, ToneSettings};
 use crate::{Error, Result};
 
 /// The supported numbers of bits per stored value.
@@ -26,7 +26,8 @@ const CODE_BITS: [u32; 3] = [8, 16, 32];
 #[derive(Debug)]
 pub struct PseudoGt {
     gpu: Gpu,
-    settings: ToneSettings,
+    /// A `CURVE_*` number.
+    tone_curve: u32,
     /// For values stored in 8, 16 and 32 bits, created when needed: with a curve, and for decoding alone.
     with_curve: [OnceLock<Pipeline<kernels::pseudo_gt::Kernel>>; 3],
     decoders: [OnceLock<Pipeline<kernels::pseudo_gt::Kernel>>; 3],
@@ -41,10 +42,10 @@ impl PseudoGt {
     /// Builds the kernels for one curve.
     pub fn new(gpu: &Gpu, settings: &ToneSettings) -> Result<Self> {
         settings.check()?;
-        let numbers = match (&settings.table, &settings.profile) {
-            (_, Some(profile)) => profile.rows(),
-            (Some(table), None) => table.knots().iter().flat_map(|knot| knot.to_array()).collect(),
-            (None, None) => vec![],
+        let numbers = match &settings.curve {
+            Tone::Profile(profile) => profile.rows(),
+            Tone::Table(table) => table.knots().iter().flat_map(|knot| knot.to_array()).collect(),
+            Tone::Formula(_) | Tone::Auto => vec![],
         };
         Ok(Self {
             gpu: gpu.clone(),
@@ -54,13 +55,12 @@ impl PseudoGt {
             numbers: gpu.buffer("curve numbers", &numbers)?,
             no_parameters: gpu.uninit("no parameters", 0)?,
             no_codes: gpu.uninit("no codes", 0)?,
-            settings: settings.clone(),
+            tone_curve: settings.curve.constant(),
         })
     }
 
-    /// The curve and its constants.
-    pub fn settings(&self) -> &ToneSettings {
-        &self.settings
+    pub(crate) fn gpu(&self) -> &Gpu {
+        &self.gpu
     }
 
     /// Records `target = curve(image)` with `parameters[view]`; both planar `(3, pixels)`.
@@ -149,7 +149,7 @@ impl PseudoGt {
         if let Some(pipeline) = pipelines[place].get() {
             return Ok(pipeline);
         }
-        let tone_curve = self.settings.curve.constant();
+        let tone_curve = self.tone_curve;
         let constants = kernels::pseudo_gt::Constants { code_bits, with_curve, tone_curve };
         let pipeline = self.gpu.pipeline(&constants)?;
         Ok(pipelines[place].get_or_init(|| pipeline))

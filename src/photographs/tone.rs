@@ -18,6 +18,8 @@
 //! [`Table`] of values from a file and a camera [`Profile`] are curves, too.
 
 #[cfg(feature = "io")]
+mod curve;
+#[cfg(feature = "io")]
 mod exposure;
 mod families;
 #[cfg(feature = "io")]
@@ -27,14 +29,10 @@ mod histogram;
 #[cfg(feature = "io")]
 mod inverse;
 #[cfg(feature = "io")]
-mod law;
-#[cfg(feature = "io")]
 mod mapping;
 #[cfg(feature = "io")]
 mod profile;
 mod real;
-#[cfg(feature = "io")]
-mod recorded;
 mod scene_law;
 #[cfg(feature = "io")]
 mod settings;
@@ -43,23 +41,23 @@ mod statistics;
 #[cfg(feature = "io")]
 mod table;
 
+#[cfg(feature = "cli")]
+pub(crate) use self::curve::{Curve, Variable};
+#[cfg(feature = "io")]
+pub(crate) use self::curve::{clamped, curve_at, tone_curve};
 #[cfg(feature = "io")]
 pub(crate) use self::exposure::all_black;
 #[cfg(feature = "io")]
 pub use self::exposure::{Exposure, exposed_anew, is_black, soft};
-pub use self::families::{Constant, FAMILIES, Family, OffsetMode, ToneCurve, White};
+pub use self::families::{Constant, FAMILIES, Family, ToneCurve, White};
 #[cfg(feature = "io")]
 pub use self::file::CurveChoice;
 #[cfg(feature = "io")]
 pub use self::histogram::LuminanceHistogram;
 #[cfg(feature = "io")]
 pub use self::inverse::{InverseTone, Inverted};
-#[cfg(feature = "cli")]
-pub(crate) use self::law::{CurveInputs, PhotographCurve, law};
 #[cfg(feature = "io")]
-pub(crate) use self::law::{clamped, curve_at, tone_curve};
-#[cfg(feature = "io")]
-pub use self::mapping::{MeasuredPhotograph, SceneTone};
+pub use self::mapping::{MeasuredPhotograph, ToneMapping};
 #[cfg(feature = "io")]
 pub use self::profile::Profile;
 #[cfg(feature = "check")]
@@ -67,10 +65,6 @@ pub(crate) use self::profile::profiled;
 #[cfg(feature = "cli")]
 pub(crate) use self::real::Dual;
 pub use self::real::Real;
-#[cfg(feature = "io")]
-pub(crate) use self::recorded::ToneLaw;
-#[cfg(feature = "io")]
-pub use self::recorded::ToneMapping;
 pub use self::scene_law::SceneLaw;
 #[cfg(feature = "io")]
 pub(crate) use self::settings::OF_CURVE;
@@ -80,88 +74,63 @@ pub use self::settings::{GainChoice, ToneSettings};
 pub use self::statistics::{Statistics, percentile};
 #[cfg(feature = "io")]
 pub(crate) use self::statistics::{luminance, measurable};
+#[cfg(feature = "io")]
+pub use self::table::Table;
 #[cfg(feature = "check")]
 pub(crate) use self::table::interpolate;
-#[cfg(feature = "io")]
-pub use self::table::{Table, TableInput};
 pub use crate::kernels::ToneParameters;
+use crate::kernels::curves::{CURVE_AUTO, CURVE_PROFILE, CURVE_TABLE};
 use crate::{Error, Result};
 use std::fmt;
 use std::str::FromStr;
 
-/// The name of the curve given by a table of values.
-const TABLE_NAME: &str = "table";
-
-/// The name of the curve with automatic gain.
-const AUTO_NAME: &str = "auto";
-
-/// The name of the curve given by a camera profile.
-const PROFILE_NAME: &str = "profile";
+/// The name of the curve of this number in `include/curves.glsl`.
+fn name_of(number: u32) -> &'static str {
+    match number {
+        CURVE_TABLE => "table",
+        CURVE_AUTO => "auto",
+        CURVE_PROFILE => "profile",
+        family => FAMILIES[family as usize].name,
+    }
+}
 
 impl ToneCurve {
-    /// The curve's row in the table. A [`Table`] or a [`Profile`] has no formula, and the row of `none`; the automatic
-    /// curve has the row of `ase`, its formula for grey.
+    /// The formula's row in the table.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn family(self) -> &'static Family {
-        &FAMILIES[match self {
-            Self::Table | Self::Profile => Self::None,
-            Self::Auto => Self::Ase,
-            family => family,
-        } as usize]
+        &FAMILIES[self as usize]
     }
 
     /// The name on the command line.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Table => TABLE_NAME,
-            Self::Auto => AUTO_NAME,
-            Self::Profile => PROFILE_NAME,
-            family => family.family().name,
-        }
+        self.family().name
     }
 
-    /// The curve's number in `include/curves.glsl`: the specialization constant `TONE_CURVE`.
+    /// The number in `include/curves.glsl`: the specialization constant `TONE_CURVE`.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn constant(self) -> u32 {
         self as u32
     }
 
-    /// The curve of that number.
-    #[cfg(feature = "check")]
-    pub(crate) fn of_constant(constant: u32) -> Option<Self> {
-        let others = [Self::Table, Self::Auto, Self::Profile];
-        Self::ALL.into_iter().chain(others).find(|curve| curve.constant() == constant)
-    }
-
     /// The curve at t = x / white, in [0, 1], in f64.
     ///
     /// `lum_preserve` and `per_channel` are straight lines here: they depend on more than one value.
-    #[cfg(feature = "io")]
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn value(self, t: f64, offset: f64, gain: f64, constants: &[f64]) -> f64 {
+    #[cfg(any(test, feature = "testing"))]
+    pub fn value(self, t: f64, offset: f64, gain: f64, constants: &[f64]) -> f64 {
         let constants = families::padded(constants);
         clamped(curve_at(self.constant(), t, [offset, gain], &constants))
     }
 
     /// The curve at the sRGB-encoded value `x`, in the arithmetic of the kernels.
-    #[cfg(feature = "io")]
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn apply(self, x: f32, parameters: &ToneParameters) -> f32 {
+    #[cfg(any(test, feature = "testing"))]
+    pub fn apply(self, x: f32, parameters: &ToneParameters) -> f32 {
         tone_curve(self.constant(), x, parameters)
-    }
-
-    /// Whether each value of the target is a formula of one value of the photograph.
-    pub(crate) fn is_formula(self) -> bool {
-        !matches!(
-            self,
-            Self::Table | Self::LumPreserve | Self::PerChannel | Self::Auto | Self::Profile
-        )
     }
 
     /// All names, for help texts and errors.
     pub(crate) fn names() -> String {
         let families = Self::ALL.map(Self::name).join(", ");
-        format!("{AUTO_NAME}, {families}")
+        format!("{}, {families}", name_of(CURVE_AUTO))
     }
 }
 
@@ -175,30 +144,111 @@ impl FromStr for ToneCurve {
     type Err = Error;
 
     fn from_str(name: &str) -> Result<Self> {
-        // Names are in lower case; papers write AP3.
-        let small = name.to_ascii_lowercase();
-        match small.as_str() {
-            TABLE_NAME => return Ok(Self::Table),
-            AUTO_NAME => return Ok(Self::Auto),
-            PROFILE_NAME => return Ok(Self::Profile),
-            _ => {}
-        }
-        Family::find(&small).map(|family| family.curve).ok_or_else(|| {
+        Family::find(name).map(|family| family.curve).ok_or_else(|| {
             Error::Usage(format!("unknown curve `{name}`; the curves are {}", Self::names()))
         })
     }
 }
 
-impl TryFrom<String> for ToneCurve {
-    type Error = Error;
+/// What a tone curve is.
+///
+/// ```
+/// use nightsplat::{Tone, ToneSettings, TrainConfig};
+///
+/// let curve: Tone = "ase".parse()?;
+/// let config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::default() };
+/// config.check()?;
+/// # Ok::<(), nightsplat::Error>(())
+/// ```
+#[cfg(feature = "io")]
+#[derive(Clone, Debug, PartialEq)]
+pub enum Tone {
+    /// A formula with constants.
+    Formula(ToneCurve),
+    /// The curve whose gain follows from all photographs: (1 - lambda) soft(x) + lambda x soft(Y) / Y.
+    Auto,
+    /// Values from a file.
+    Table(Table),
+    /// The colours of a camera.
+    Profile(Profile),
+}
 
-    fn try_from(name: String) -> Result<Self> {
-        name.parse()
+#[cfg(feature = "io")]
+impl Tone {
+    /// The names of curves that need a file.
+    const OF_FILES: [&str; 2] = ["table", "profile"];
+
+    /// The formula's row in the table.
+    pub(crate) fn family(&self) -> Option<&'static Family> {
+        match self {
+            Self::Formula(curve) => Some(curve.family()),
+            _ => None,
+        }
+    }
+
+    /// The name on the command line.
+    pub fn name(&self) -> &'static str {
+        name_of(self.constant())
+    }
+
+    /// The number in `include/curves.glsl`: the specialization constant `TONE_CURVE`.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn constant(&self) -> u32 {
+        match self {
+            Self::Formula(curve) => curve.constant(),
+            Self::Auto => CURVE_AUTO,
+            Self::Table(_) => CURVE_TABLE,
+            Self::Profile(_) => CURVE_PROFILE,
+        }
+    }
+
+    /// The curve at the sRGB-encoded value `x`, in the arithmetic of the kernels.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn apply(&self, x: f32, parameters: &ToneParameters) -> f32 {
+        tone_curve(self.constant(), x, parameters)
+    }
+
+    /// Whether the gain of the curve always follows from the photographs.
+    pub(crate) fn is_exposed(&self) -> bool {
+        matches!(self, Self::Auto | Self::Profile(_))
     }
 }
 
-impl From<ToneCurve> for String {
+#[cfg(feature = "io")]
+impl From<ToneCurve> for Tone {
     fn from(curve: ToneCurve) -> Self {
-        curve.name().to_owned()
+        Self::Formula(curve)
+    }
+}
+
+#[cfg(feature = "io")]
+impl PartialEq<ToneCurve> for Tone {
+    fn eq(&self, curve: &ToneCurve) -> bool {
+        matches!(self, Self::Formula(own) if own == curve)
+    }
+}
+
+#[cfg(feature = "io")]
+impl fmt::Display for Tone {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+#[cfg(feature = "io")]
+impl FromStr for Tone {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        match name.to_ascii_lowercase().as_str() {
+            "auto" => Ok(Self::Auto),
+            "table" => Err(Error::Usage(
+                "a table of values is named by its file: FILE.csv or FILE.cube".to_owned(),
+            )),
+            "profile" => Err(Error::Usage(
+                "a camera profile is named by its file: --profile FILE".to_owned(),
+            )),
+            _ => name.parse().map(Self::Formula),
+        }
     }
 }

@@ -1,4 +1,4 @@
-//! The lamp of `include/lamp_law.glsl`, in f64, from the numbers of the device.
+//! The lamp of `include/lamp_falloff.glsl`, in f64, from the numbers of the device.
 
 use glam::DVec3;
 

@@ -4,14 +4,13 @@ use super::rounding::{Rounded, UNIT, rounded_tone_curve};
 use crate::gpu::{Reference, Tolerance};
 use crate::kernels::curves::{CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL};
 use crate::kernels::photograph_light::{Constants, Kernel, PRECISION, Params, Slices, Tolerances};
-use crate::photographs::tone::{InverseTone, ToneCurve};
+use crate::photographs::tone::InverseTone;
 
 /// Roundings of the curve and of the quotient by alpha, in values of at most 1.
 const ROUNDINGS: f64 = 32.0;
 
 fn inverse(params: &Params, constants: &Constants) -> InverseTone {
-    let curve = ToneCurve::of_constant(constants.tone_curve).unwrap_or(ToneCurve::None);
-    InverseTone::of_curve(curve, None, &params.tone)
+    InverseTone::of_curve(constants.tone_curve, None, &params.tone)
 }
 
 /// The colour of a pixel before its coverage, and alpha; `None` where nothing is seen.

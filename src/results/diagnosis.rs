@@ -2,7 +2,9 @@
 
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
-use crate::photographs::tone::{Exposure, LuminanceHistogram, luminance, soft};
+use crate::photographs::targets::SceneTone;
+use crate::photographs::tone::{ToneSettings, luminance};
+use crate::results::linear_light::target_of;
 use crate::results::report::{
     Best, Column, Comparison, Distribution, Facts, Picture, Report, Table, distributions,
 };
@@ -191,7 +193,8 @@ fn lamp(scene: &SceneDiagnosis) -> String {
 /// The page: the plan first, then measurements and photographs.
 pub(crate) fn page(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> String {
     let views: Vec<&View> = dataset.train_views().filter(|view| view.has_photograph()).collect();
-    let exposure = exposure(&views);
+    let tone = ToneSettings { full_resolution: false, ..ToneSettings::default() };
+    let scene = SceneTone::measure(&tone, dataset).ok();
     let (mut dark, mut bright) = (Distribution::new("photographs"), Distribution::new("targets"));
     let stride = views.len().div_ceil(SHOWN).max(1);
     let mut comparisons = vec![];
@@ -199,8 +202,8 @@ pub(crate) fn page(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
         // A photograph that can no longer be read is skipped.
         let Ok(Some(image)) = view.loaded() else { continue };
         let image = image.as_ref();
-        let target =
-            exposure.as_ref().map_or_else(|| image.clone(), |found| tone_mapped(image, found));
+        let curve = scene.as_ref().and_then(|scene| scene.inverse(view).ok());
+        let target = curve.map_or_else(|| image.clone(), |curve| target_of(image, &curve));
         dark.add(&image.data);
         bright.add(&target.data);
         let [shown, target] = [image.clone(), target].map(|image| view.upright(image));
@@ -233,25 +236,6 @@ pub(crate) fn page(dataset: &Dataset, diagnosis: &Diagnosis, plan: &Plan) -> Str
         ..Report::default()
     }
     .html()
-}
-
-fn exposure(views: &[&View]) -> Option<Exposure> {
-    let histograms: Vec<LuminanceHistogram> = views
-        .iter()
-        .filter_map(|view| Some(LuminanceHistogram::of(&view.loaded().ok()??.data)))
-        .collect();
-    Exposure::of(&histograms, None)
-}
-
-/// Approximately the target of `--curve auto`.
-fn tone_mapped(image: &Image, exposure: &Exposure) -> Image {
-    let gain = exposure.gain_of(&LuminanceHistogram::of(&image.data), None);
-    let weight = exposure.weight();
-    let value = |&x: &f32| {
-        let x = f64::from(x);
-        (weight * soft(x, gain) + (1.0 - weight) * x) as f32
-    };
-    Image { data: image.data.iter().map(value).collect(), ..*image }
 }
 
 fn comparison(name: &str, image: &Image, target: &Image) -> Comparison {

@@ -11,13 +11,14 @@ use crate::networks::lpips::Lpips;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use crate::photographs::metrics::{self, Scores, psnr_of_counted};
-use crate::photographs::tone::{SceneTone, ToneCurve, ToneSettings};
+use crate::photographs::targets::{SceneTone, Targets};
+use crate::photographs::tone::{ToneCurve, ToneSettings};
 use crate::results::linear_light::{photograph_of, slope_at, stops_between};
 use crate::splats::lamp::Lamp;
 use crate::splats::model::Model;
 use crate::splats::render::{RenderOptions, RenderSettings, Renderer};
 use crate::splats::scene::{DeviceGaussians, Shape};
-use crate::train::{Networks, Rendered, SceneLight, TestTargets, TrainConfig};
+use crate::train::{Networks, Rendered, TrainConfig};
 use crate::{Error, Result};
 
 mod layers;
@@ -80,7 +81,7 @@ pub struct ScoreReference {
     /// Their kind.
     pub against: ReferenceKind,
     /// Makes the targets, unless there are reference images.
-    targets: Option<TestTargets>,
+    targets: Option<Targets>,
     /// Targets made so far, by view, if photographs are cached as well.
     made: BTreeMap<String, Image>,
 }
@@ -89,23 +90,18 @@ impl ScoreReference {
     /// The reference images of the test views that have one; without any, the targets that `tone apply` gives the test
     /// views, with the statistics of the training photographs.
     pub fn of(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
-        Self::made_by(tone, dataset, || TestTargets::new(gpu, tone, dataset))
+        Self::made_by(tone, dataset, || Targets::new(gpu, tone, dataset))
     }
 
     /// [`ScoreReference::of`] with given statistics of the training photographs.
-    pub fn in_scene(
-        gpu: &Gpu,
-        tone: &ToneSettings,
-        dataset: &Dataset,
-        scene: &SceneTone,
-    ) -> Result<Self> {
-        Self::made_by(tone, dataset, || TestTargets::in_scene(gpu, tone, scene))
+    pub fn in_scene(gpu: &Gpu, dataset: &Dataset, scene: &SceneTone) -> Result<Self> {
+        Self::made_by(scene.settings(), dataset, || Targets::in_scene(gpu, scene.clone()))
     }
 
     fn made_by(
         tone: &ToneSettings,
         dataset: &Dataset,
-        targets: impl FnOnce() -> Result<TestTargets>,
+        targets: impl FnOnce() -> Result<Targets>,
     ) -> Result<Self> {
         let against = Self::kind(tone, dataset);
         let targets = (against != ReferenceKind::References).then(targets).transpose()?;
@@ -116,10 +112,12 @@ impl ScoreReference {
     pub fn kind(tone: &ToneSettings, dataset: &Dataset) -> ReferenceKind {
         let has_references = dataset.test_views().any(View::has_reference);
         let has_photographs = dataset.test_views().any(View::has_photograph);
-        match tone.curve {
-            _ if has_references || !has_photographs => ReferenceKind::References,
-            ToneCurve::None => ReferenceKind::Photographs,
-            _ => ReferenceKind::PseudoGt,
+        if has_references || !has_photographs {
+            ReferenceKind::References
+        } else if tone.curve == ToneCurve::None {
+            ReferenceKind::Photographs
+        } else {
+            ReferenceKind::PseudoGt
         }
     }
 
@@ -146,7 +144,7 @@ impl ScoreReference {
         if let Some(made) = self.made.get(&view.name) {
             return Ok(Some(made.clone()));
         }
-        let target = targets.of(view)?.map(|target| quantized(&target));
+        let target = targets.target(view)?.map(|target| quantized(&target));
         let kept = target.as_ref().filter(|_| view.image.is_some());
         self.made.extend(kept.map(|target| (view.name.clone(), target.clone())));
         Ok(target)
@@ -186,10 +184,10 @@ impl ScoredImages<'_> {
     }
 
     /// The scores of the render as a photograph, against the photograph of the view; none if it has no photograph.
-    fn as_photograph(&self, light: &SceneLight) -> Result<Vec<(Metric, f64)>> {
+    fn as_photograph(&self, scene: &SceneTone) -> Result<Vec<(Metric, f64)>> {
         let Self { view, render, .. } = self;
         let Some(photograph) = view.loaded()? else { return Ok(vec![]) };
-        let inverse = light.of_view(view)?;
+        let inverse = scene.inverse(view)?;
         let (dark, _) = photograph_of(render, &inverse);
         Ok(vec![
             (Metric::Psnr, psnr_of_counted(&dark, &photograph, view.mask.as_ref())?),
@@ -314,8 +312,8 @@ pub(crate) struct Extras<'a> {
     pub(crate) with_gain_and_bias: bool,
     /// The exposures of views by name: stops relative to the mean of the training views.
     pub(crate) stops: BTreeMap<String, f64>,
-    /// The renders as photographs in this light, against the photographs.
-    pub(crate) light: Option<SceneLight>,
+    /// The curves whose inverses make photographs of renders, to score against the photographs.
+    pub(crate) scene: Option<SceneTone>,
 }
 
 impl Evaluation {
@@ -330,7 +328,7 @@ impl Evaluation {
     ) -> Result<Self> {
         let requested = [
             extras.with_gain_and_bias.then_some(After::GainAndBias),
-            extras.light.as_ref().map(|_| After::InverseCurve),
+            extras.scene.as_ref().map(|_| After::InverseCurve),
         ];
         let mut evaluation = Self {
             scores: vec![],
@@ -388,8 +386,8 @@ impl Evaluation {
             value,
         };
         self.scores.extend(values.into_iter().map(|value| row(against, After::Model, value)));
-        if let Some(light) = &extras.light {
-            let values = images.as_photograph(light)?;
+        if let Some(scene) = &extras.scene {
+            let values = images.as_photograph(scene)?;
             let row = |value| row(ReferenceKind::Photographs, After::InverseCurve, value);
             self.scores.extend(values.into_iter().map(row));
         }

@@ -15,7 +15,8 @@ use crate::networks::lpips::{Lpips, Range};
 use crate::photographs::dataset::View;
 use crate::photographs::image::Image;
 use crate::photographs::metrics::Scores;
-use crate::train::{SceneLight, TrainConfig, known_stops};
+use crate::photographs::targets::SceneTone;
+use crate::train::{TrainConfig, known_stops};
 
 /// Maximum width of an image, pixels.
 const PICTURE_WIDTH: u32 = 480;
@@ -73,11 +74,11 @@ impl RunEvaluation {
         model_renderer.set_lamp(lamp)?;
         let lpips = options.lpips.map(|(weights, range)| Lpips::load(&gpu, weights, range));
         let lpips = lpips.transpose()?;
-        let light = options.photographs.then(|| SceneLight::of(&config.tone, &dataset));
+        let scene = options.photographs.then(|| SceneTone::measure(&config.tone, &dataset));
         let extras = Extras {
             lpips: lpips.as_ref().map(|lpips| (lpips, &gpu)),
             with_gain_and_bias: options.align || config.exposure.learn,
-            light: light.transpose()?,
+            scene: scene.transpose()?,
             stops: known_stops(&dataset, &config)?,
         };
         let mut reference = ScoreReference::of(&gpu, &config.tone, &dataset)?;

@@ -23,6 +23,13 @@ pub(crate) fn photograph_of(target: &Image, inverse: &InverseTone) -> (Image, us
     (Image { data, ..*target }, inverted.iter().filter(|pixel| pixel.is_clipped).count())
 }
 
+/// The target of a photograph under this curve.
+pub(crate) fn target_of(photograph: &Image, curve: &InverseTone) -> Image {
+    let Image { width, height, .. } = *photograph;
+    let target = |x, y| curve.target(photograph.pixel(x, y).map(f64::from));
+    Image::from_fn(width, height, |x, y| target(x, y).map(|value| value.min(1.0) as f32))
+}
+
 /// The slope of the tone curve at the values of a target: the inverse of the root mean square slope of the inverse
 /// curve, over the values that the curve determines. The PSNR of photographs is higher than that of their targets by
 /// 20 log10 of it.
@@ -122,15 +129,15 @@ mod tests {
     use super::*;
     use crate::photographs::image::srgb_from_linear;
     use crate::photographs::metrics::psnr_of_counted;
-    use crate::photographs::tone::{MeasuredPhotograph, ToneCurve, ToneSettings};
+    use crate::photographs::targets::SceneTone;
+    use crate::photographs::tone::{MeasuredPhotograph, Tone, ToneSettings};
 
     #[test]
     fn the_colours_of_gaussians_become_their_light_in_every_direction() {
-        let settings = ToneSettings::new(ToneCurve::Auto);
+        let settings = ToneSettings::new(Tone::Auto);
         let dark = MeasuredPhotograph::of(&[0.05; 300]);
-        let scene = settings.scene(std::slice::from_ref(&dark)).unwrap();
-        let mapping = settings.tone_mapping(&scene, &dark);
-        let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
+        let scene = SceneTone::from_photographs(&settings, &[dark]).unwrap();
+        let inverse = scene.inverse_of_scene().unwrap();
         for degree in [0, 3] {
             let mut gaussians = Gaussians::zeros(2, degree);
             gaussians.dc_mut()[0] = glam::Vec3::new(0.2, -0.3, 0.0);
@@ -156,22 +163,19 @@ mod tests {
     }
 
     /// The automatic curve's target of a dark photograph, and the inverse.
-    fn target_of(dark: &Image) -> (InverseTone, Image) {
-        let settings = ToneSettings::new(ToneCurve::Auto);
+    fn brightened(dark: &Image) -> (InverseTone, Image) {
+        let settings = ToneSettings::new(Tone::Auto);
         let photograph = MeasuredPhotograph::of(&dark.data);
-        let scene = settings.scene(std::slice::from_ref(&photograph)).unwrap();
-        let mapping = settings.tone_mapping(&scene, &photograph);
-        let inverse = InverseTone::new(&settings, &mapping.parameters).unwrap();
-        let target = Image::from_fn(dark.width, dark.height, |x, y| {
-            inverse.target(dark.pixel(x, y).map(f64::from)).map(|value| value as f32)
-        });
+        let scene = SceneTone::from_photographs(&settings, &[photograph]).unwrap();
+        let inverse = scene.inverse_of_scene().unwrap();
+        let target = target_of(dark, &inverse);
         (inverse, target)
     }
 
     #[test]
     fn the_psnr_of_photographs_is_that_of_their_targets_divided_by_the_slope() {
         let dark = Image::from_fn(40, 30, |x, y| [0.01 + 0.004 * x as f32, 0.006 * y as f32, 0.05]);
-        let (inverse, target) = target_of(&dark);
+        let (inverse, target) = brightened(&dark);
         // A difference of one sign in all channels of a pixel, and of the other in its neighbours.
         let off = Image::from_fn(40, 30, |x, y| {
             let sign = if (x + y).is_multiple_of(2) { 1.0 } else { -1.0 };
@@ -188,7 +192,7 @@ mod tests {
     #[test]
     fn a_target_becomes_its_photograph_and_clipped_pixels_are_counted() {
         let dark = Image::from_fn(16, 9, |x, y| [0.01 + 0.01 * x as f32, 0.02 * y as f32, 0.05]);
-        let (inverse, mut target) = target_of(&dark);
+        let (inverse, mut target) = brightened(&dark);
         let mut clipped = Clipped::default();
         let back = clipped.add(photograph_of(&target, &inverse));
         assert_eq!(clipped.clipped, 0);

@@ -11,6 +11,7 @@ use glam::{DQuat, DVec3};
 use self::up::{Turn, Up};
 use crate::base::output::{is_same_file, write_whole};
 use crate::photographs::dataset::Dataset;
+use crate::photographs::targets::SceneTone;
 use crate::results::export::streamed::{self, Division, Tile, Written};
 use crate::results::export::{Format, Provenance};
 use crate::results::finished_run::{Opener, config_of_file, is_model, needs_photographs};
@@ -19,7 +20,7 @@ use crate::results::{models, run};
 use crate::splats::joined::Manifest;
 use crate::splats::levels;
 use crate::splats::scene::{Facts, Gaussians, MAX_SH_DEGREE};
-use crate::train::{SceneLight, TrainConfig};
+use crate::train::TrainConfig;
 use crate::{Error, Result};
 
 /// What is exported, and how.
@@ -162,7 +163,7 @@ impl ExportOptions<'_> {
     ) -> Result<(Gaussians, Facts)> {
         let config = self.with_dataset(config);
         let dataset = Dataset::load(&config.dataset, &config.load_options())?;
-        let inverse = SceneLight::of(&config.tone, &dataset)?.of_scene()?;
+        let inverse = SceneTone::measure(&config.tone, &dataset)?.inverse_of_scene()?;
         let stops = inverse.stops_to_target();
         let (linear, clipped) = linear_gaussians(gaussians, &inverse, stops);
         if clipped > 0 {

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::eval::ScoreReference;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, Split};
-use crate::photographs::tone::ToneCurve;
+use crate::photographs::tone::{Tone, ToneCurve};
 use crate::train::TrainConfig;
 use crate::train::diagnose::Plan;
 
@@ -46,10 +46,12 @@ impl RunFacts {
         let of = |split| dataset.views.iter().filter(|view| view.split == split).count();
         let first = dataset.train_views().next();
         let planned = plan.map(|plan| plan.curve.why.clone());
-        let why = match config.tone.curve {
-            ToneCurve::None if planned.is_none() => "as requested: the photographs are the targets",
-            ToneCurve::Auto => "brightness chosen from the photographs",
-            ToneCurve::None => "",
+        let why = match &config.tone.curve {
+            Tone::Formula(ToneCurve::None) if planned.is_none() => {
+                "as requested: the photographs are the targets"
+            }
+            Tone::Auto => "brightness chosen from the photographs",
+            Tone::Formula(ToneCurve::None) => "",
             _ => "as requested",
         };
         Self {

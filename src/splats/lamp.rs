@@ -1,4 +1,4 @@
-//! A lamp that moves with the camera, on the host; `include/lamp.glsl` has its law.
+//! A lamp that moves with the camera, on the host; `include/lamp.glsl` has its formula.
 
 use glam::DVec3;
 #[cfg(feature = "io")]
@@ -25,7 +25,7 @@ const FARTHEST_NUMBER: f64 = 12.0;
 /// ambient + (1 - ambient) (reference_distance / d)^exponent exp(-falloffs[0] u - falloffs[1] u^2)
 /// ```
 ///
-/// and the colour of a Gaussian is black + tone(light^slope tone^-1(colour - black)), with the saturating tone law
+/// and the colour of a Gaussian is black + tone(light^slope tone^-1(colour - black)), with the saturating tone curve
 /// tone(x) = reach (1 - exp(-x / reach)), a line below 0 and near its reach; x for a reach of 0.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -42,12 +42,12 @@ pub struct Lamp {
     pub falloffs: [f64; 2],
     /// The distance at which the light on the axis is 1, that of evenly lit colours; world units.
     pub reference_distance: f64,
-    /// The slope of the tone law near black: d ln(target - black) / d ln linear light.
+    /// The slope of the tone curve near black: d ln(target - black) / d ln linear light.
     pub slope: f64,
     /// The target of no light.
     #[serde(default)]
     pub black: f64,
-    /// The target above black to which the tone law saturates; 0: it does not.
+    /// The target above black to which the tone curve saturates; 0: it does not.
     #[serde(default)]
     pub reach: f64,
 }
@@ -88,7 +88,7 @@ impl Lamp {
         self.ambient + (1.0 - self.ambient) * beam
     }
 
-    /// light^slope at a point in view space: the factor on the argument of the tone law.
+    /// light^slope at a point in view space: the factor on the argument of the tone curve.
     pub fn factor(&self, point: DVec3) -> f64 {
         self.light(point).powf(self.slope)
     }
@@ -102,7 +102,7 @@ impl Lamp {
         Vec3::from_array(unlit.map(|value| value as f32))
     }
 
-    /// The colour of the tone law's argument `x`, which is in proportion to light^slope.
+    /// The colour of the tone curve's argument `x`, which is in proportion to light^slope.
     #[cfg(feature = "io")]
     pub(crate) fn tone(&self, x: f64) -> f64 {
         let bent = x / self.reach;
@@ -113,7 +113,7 @@ impl Lamp {
         self.black + self.reach * if bent < LAMP_KNEE { -(-bent).exp_m1() } else { line }
     }
 
-    /// The argument of the tone law for a colour: the inverse of [`Lamp::tone`].
+    /// The argument of the tone curve for a colour: the inverse of [`Lamp::tone`].
     #[cfg(feature = "io")]
     pub(crate) fn tone_inverse(&self, value: f64) -> f64 {
         let above = value - self.black;
@@ -295,7 +295,7 @@ mod tests {
 
     #[test]
     #[cfg(feature = "io")]
-    fn the_tone_law_has_an_inverse_on_both_sides_of_black_and_of_its_knee() {
+    fn the_tone_curve_has_an_inverse_on_both_sides_of_black_and_of_its_knee() {
         for reach in [0.0, 0.5, 0.9] {
             let lamp = Lamp { black: 0.07, reach, ..lamp() };
             for value in [-0.3, 0.07, 0.08, 0.4, 0.53, 0.95, 1.5] {

@@ -110,12 +110,12 @@ impl Trainer {
         for view in views {
             let camera = coarse(&view.patch.camera, pixels);
             let depths = self.depths(&mut renderer, gaussians, &camera)?;
-            let target = self.supervision.views.picture(
-                &self.gpu,
-                &self.supervision.pseudo_gt,
-                view.place,
-            )?;
-            let exposure = exposures.as_ref().and_then(|exposures| exposures.get(view.place));
+            let target = self
+                .supervision
+                .views
+                .picture(&self.supervision.targets.pseudo_gt, view.photograph)?;
+            let exposure =
+                exposures.as_ref().and_then(|exposures| exposures.get(view.photograph.0));
             let neutral = exposure.map(Affine::inverse).map(|inverse| inverse.applied(&target));
             let target = neutral.unwrap_or(target).resized(camera.width, camera.height);
             let mask = self.mask_of(view)?.map(|mask| mask.resized(camera.width, camera.height));
@@ -154,13 +154,13 @@ impl Trainer {
 
     /// The mask of a view, as an image of three equal channels.
     fn mask_of(&self, view: &TrainView) -> Result<Option<Image>> {
-        if self.supervision.masks.of_view(view.number).is_none() {
+        if self.supervision.masks.of_view(view.id).is_none() {
             return Ok(None);
         }
-        let views = self.supervision.views.of_places(view.place..view.place + 1);
+        let views = self.supervision.views.of_photographs(view.photograph..=view.photograph);
         let weights = |view: &TrainView| {
             let weights =
-                self.supervision.masks.of_view(view.number).map(|weights| self.gpu.read(weights));
+                self.supervision.masks.of_view(view.id).map(|weights| self.gpu.read(weights));
             Ok(weights.transpose()?.unwrap_or_default().repeat(3))
         };
         let parts = views.iter().map(weights).collect::<Result<_>>()?;

@@ -26,7 +26,8 @@ use serde::Serialize;
 use crate::camera::Camera;
 use crate::photographs::dataset::{self, Borders, Dataset, LoadOptions, View};
 use crate::photographs::image::{ColourCounts, Image, MIDDLE_GREY, Mask, PictureFile, files};
-use crate::photographs::tone::{Exposure, is_black};
+use crate::photographs::targets::SceneTone;
+use crate::photographs::tone::{Exposure, MeasuredPhotograph, ToneSettings, is_black};
 use crate::photographs::white_balance::WhiteBalanceGains;
 use crate::{Error, Result};
 use geometry::Shared;
@@ -197,14 +198,15 @@ impl Diagnosis {
         known.extend(read(&dataset.root, &files, unknown.collect(), options)?);
         let photographs = views.iter().filter_map(|(_, view)| known.remove(&view.name));
         let photographs: Vec<PhotographStatistics> = photographs.collect();
-        let exposure = Exposure::of(photographs.iter().map(|one| &one.histogram), None);
-        let Some(exposure) = exposure else {
+        let measured = photographs.iter().zip(&views);
+        let measured: Vec<MeasuredPhotograph> =
+            measured.map(|(one, (_, view))| one.encoded.clone().seen_by(&view.camera)).collect();
+        let scene = SceneTone::from_photographs(&ToneSettings::default(), &measured);
+        let Some(exposure) = scene.and_then(|scene| scene.exposure) else {
             let problem = "every training photograph is almost black (99 % of its pixels are below 2 of 255); \
                            expose longer";
             return Err(Error::input(&dataset.root, problem));
         };
-        let cameras = views.iter().map(|(_, view)| view.camera);
-        let exposure = exposure.seen_by(photographs.iter().map(|one| &one.histogram).zip(cameras));
         let of_view = |(index, photograph): (usize, &PhotographStatistics)| {
             photograph.diagnosis(&views[index].1.name, &shared, index)
         };
@@ -289,15 +291,16 @@ impl PhotographStatistics {
     }
 
     fn diagnosis(&self, name: &str, shared: &Shared, index: usize) -> ViewDiagnosis {
-        let [p10, p90] = self.statistics.percentiles();
+        let MeasuredPhotograph { statistics, luminance, .. } = &self.encoded;
+        let [p10, p90] = statistics.percentiles();
         ViewDiagnosis {
             name: name.to_owned(),
             size: self.size,
             p10,
             p90,
-            r: self.statistics.printed_ratio(),
-            mean_luminance: self.statistics.mean_luminance.into(),
-            cubic_mean: self.histogram.cubic_mean(),
+            r: statistics.printed_ratio(),
+            mean_luminance: statistics.mean_luminance.into(),
+            cubic_mean: luminance.cubic_mean(),
             light: self.light,
             darkening: darkening(self.light),
             exposure: shared.exposures[index],
@@ -310,7 +313,7 @@ impl PhotographStatistics {
             unevenness: self.unevenness,
             points: shared.points[index],
             overlap: shared.overlaps[index],
-            is_black: is_black(&self.histogram),
+            is_black: is_black(luminance),
         }
     }
 }
@@ -458,23 +461,23 @@ mod tests {
     use crate::gpu::testing::gpu;
     use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
     use crate::photographs::image::openings;
-    use crate::photographs::tone::{ToneCurve, ToneSettings};
+    use crate::photographs::tone::{Tone, ToneCurve};
     use crate::train::{CacheSize, TrainConfig, Trainer};
 
     #[test]
     fn a_photograph_is_opened_once_before_the_first_step() {
         let set = SyntheticOptions { views: 9, width: 64, height: 48, ..Default::default() };
         for (downscale, curve) in [
-            (1.0, ToneCurve::Auto),
-            (2.0, ToneCurve::Auto),
-            (1.0, ToneCurve::Ase),
-            (2.0, ToneCurve::Ase),
+            (1.0, Tone::Auto),
+            (2.0, Tone::Auto),
+            (1.0, ToneCurve::Ase.into()),
+            (2.0, ToneCurve::Ase.into()),
         ] {
             let folder = tempfile::tempdir().unwrap();
             synthetic::write(folder.path(), &set).unwrap();
             let config = TrainConfig {
                 dataset: folder.path().to_owned(),
-                tone: ToneSettings::new(curve),
+                tone: ToneSettings::new(curve.clone()),
                 cache: Some(CacheSize(1 << 28)),
                 downscale,
                 ..TrainConfig::default()

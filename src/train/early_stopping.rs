@@ -14,8 +14,7 @@ use super::target_views::TargetViews;
 use super::{TrainConfig, Trainer};
 use crate::Result;
 use crate::photographs::dataset::{Dataset, Split};
-use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::SceneTone;
+use crate::photographs::targets::Targets;
 
 /// Steps after a round of density control in which the held-out views are not scored.
 const SETTLING_DISTANCE: u64 = 50;
@@ -68,15 +67,10 @@ pub(super) struct Convergence {
 
 impl Convergence {
     /// The state before the first step, with the targets of the held-out views.
-    pub(super) fn new(
-        pseudo_gt: &PseudoGt,
-        dataset: &Dataset,
-        config: &TrainConfig,
-        scene: &SceneTone,
-    ) -> Result<Self> {
+    pub(super) fn new(targets: &Targets, dataset: &Dataset, config: &TrainConfig) -> Result<Self> {
         let frame = config.frame.unwrap_or_default();
         let held_out = dataset.views.iter().filter(|view| view.split == Split::HeldOut);
-        let held_out = TargetViews::new(pseudo_gt, held_out, &frame, scene)?;
+        let held_out = TargetViews::new(targets, held_out, &frame)?;
         if config.stop.views > 0 && held_out.is_empty() {
             tracing::info!("every held-out view is black or masked: the run takes all its steps");
         }

@@ -9,8 +9,7 @@ use super::{TrainConfig, Trainer};
 use crate::loss::exposure::{Affine, table};
 use crate::photographs::dataset::{Dataset, LoadOptions, Photograph, View};
 use crate::photographs::image::{Image, exposure_value, linear_from_srgb, srgb_from_linear};
-use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{MeasuredPhotograph, SceneTone};
+use crate::photographs::targets::Targets;
 use crate::{Error, Result};
 
 impl Trainer {
@@ -73,9 +72,8 @@ impl Views {
     /// view without one starts at the identity.
     pub(super) fn exposures(
         &self,
-        pseudo_gt: &PseudoGt,
+        targets: &Targets,
         dataset: &Dataset,
-        scene: &SceneTone,
         config: &TrainConfig,
     ) -> Result<Option<Vec<Affine>>> {
         if !config.exposure.learn {
@@ -94,10 +92,11 @@ impl Views {
         });
         let stops: Vec<f64> = stops.collect();
         let mean = stops.iter().sum::<f64>() / stops.len().max(1) as f64;
-        let mut targets = Targets { pseudo_gt, dataset, scene };
         let affine = |name: &str| match starts.get(name) {
             Some(InitialExposures::Affine(affine)) => Ok(*affine),
-            Some(InitialExposures::Stops(stops)) => targets.affine_of_stops(name, stops - mean),
+            Some(InitialExposures::Stops(stops)) => {
+                affine_of_stops(targets, dataset, name, stops - mean)
+            }
             None => Ok(Affine::IDENTITY),
         };
         self.names().map(affine).collect::<Result<Vec<_>>>().map(Some)
@@ -176,40 +175,22 @@ impl Views {
     }
 }
 
-/// Makes targets from photographs outside the dataset, as for those inside.
-struct Targets<'a> {
-    pseudo_gt: &'a PseudoGt,
-    dataset: &'a Dataset,
-    scene: &'a SceneTone,
-}
-
-impl Targets<'_> {
-    fn target(&mut self, photograph: &Image, view: &View) -> Result<Image> {
-        let tone_mapping = self.scene.recorded_mapping(&view.name)?.unwrap_or_else(|| {
-            let measured = MeasuredPhotograph::of(&photograph.data).seen_by(&view.camera);
-            self.pseudo_gt.settings().tone_mapping(self.scene, &measured)
-        });
-        self.pseudo_gt.tone_mapped(photograph, &tone_mapping)
-    }
-
-    /// The affine of the target for `stops` of the photograph in linear light: it maps the target of the photograph
-    /// without these stops to the target of the photograph as it is, by least squares. A curve that follows each
-    /// photograph compensates much of the difference.
-    fn affine_of_stops(&mut self, name: &str, stops: f64) -> Result<Affine> {
-        let views = &self.dataset.views;
-        let place = views.binary_search_by(|view| view.name.as_str().cmp(name));
-        let view = place.ok().map(|place| &views[place]);
-        let photograph = view.map(View::loaded).transpose()?.flatten();
-        let Some((view, photograph)) = view.zip(photograph) else { return Ok(Affine::IDENTITY) };
-        let scale = (-stops).exp2() as f32;
-        let without = |&x: &f32| srgb_from_linear(scale * linear_from_srgb(x));
-        let neutral =
-            Image { data: photograph.data.iter().map(without).collect(), ..*photograph.as_ref() };
-        let [neutral, own] =
-            [&neutral, &*photograph].map(|photograph| self.target(photograph, view));
-        let affine = Affine::least_squares(&neutral?, &own?)?;
-        // A photograph of one colour determines no affine.
-        let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);
-        Ok(if is_exposure { affine } else { Affine::IDENTITY })
-    }
+/// The affine of the target for `stops` of the photograph in linear light: it maps the target of the photograph without
+/// these stops to the target of the photograph as it is, by least squares. A curve that follows each photograph
+/// compensates much of the difference.
+fn affine_of_stops(targets: &Targets, dataset: &Dataset, name: &str, stops: f64) -> Result<Affine> {
+    let views = &dataset.views;
+    let found = views.binary_search_by(|view| view.name.as_str().cmp(name));
+    let view = found.ok().map(|index| &views[index]);
+    let photograph = view.map(View::loaded).transpose()?.flatten();
+    let Some((view, photograph)) = view.zip(photograph) else { return Ok(Affine::IDENTITY) };
+    let scale = (-stops).exp2() as f32;
+    let without = |&x: &f32| srgb_from_linear(scale * linear_from_srgb(x));
+    let neutral =
+        Image { data: photograph.data.iter().map(without).collect(), ..*photograph.as_ref() };
+    let neutral = targets.target_of(view, &neutral)?;
+    let affine = Affine::least_squares(&neutral, &targets.target_of(view, &photograph)?)?;
+    // A photograph of one colour determines no affine.
+    let is_exposure = affine.gain.iter().all(|&gain| gain > 0.0);
+    Ok(if is_exposure { affine } else { Affine::IDENTITY })
 }

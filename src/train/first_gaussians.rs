@@ -6,7 +6,7 @@ use std::path::Path;
 
 use glam::{DVec3, Vec3};
 
-use super::views::{ImageKind, TrainView, Views};
+use super::views::{ImageKind, TrainView, TrainingPhotograph, Views};
 use super::{TrainConfig, streams};
 use crate::base::random::Stream;
 use crate::camera::{Camera, Patch, TrainingFrame};
@@ -35,7 +35,7 @@ impl Views {
         if count == 0 {
             return own.into();
         }
-        let firsts = self.all().filter(|view| view.patch.is_first());
+        let firsts = self.all().iter().filter(|view| view.patch.is_first());
         let cameras: Vec<Camera> = firsts.map(|view| view.patch.camera).collect();
         let seed = Stream::new(config.seed, streams::POINTS).bits(0);
         let found = if own.is_empty() { "no".to_owned() } else { own.len().to_string() };
@@ -49,7 +49,6 @@ impl Views {
     /// in the targets of the training views, without the light of the lamp, in world units.
     pub(super) fn initial_gaussians(
         &self,
-        gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         dataset: &Dataset,
         config: &TrainConfig,
@@ -58,19 +57,19 @@ impl Views {
     ) -> Result<Gaussians> {
         let frame = config.frame.unwrap_or_default();
         let points = self.points(dataset, config, &frame);
-        let kept = &sampled(points, config, gpu);
-        // The position of each view of the dataset among the training views.
-        let mut places = vec![None; dataset.views.len()];
-        self.photographs().for_each(|view| places[view.index] = Some(view.place));
-        let mut targets = ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Targets);
+        let kept = &sampled(points, config, pseudo_gt.gpu());
+        // The training photograph of each view of the dataset.
+        let mut photographs = vec![None; dataset.views.len()];
+        self.photographs().for_each(|view| photographs[view.in_dataset.0] = Some(view.photograph));
+        let mut targets = ImageBatches::new(self, pseudo_gt, ImageKind::Targets);
         let factor = |view: &View, point: &Point| {
             let in_view = view.camera.view_from_world.transform_point3(point.position);
             lamp.map_or(1.0, |lamp| lamp.factor(in_view) as f32)
         };
         let mut colors = init::colors_from_views(kept, &dataset.views, factor, |index| {
-            let Some(place) = places[index] else { return Ok(None) };
-            let target = targets.next(place)?;
-            let exposure = exposures.and_then(|exposures| exposures.get(place));
+            let Some(photograph) = photographs[index] else { return Ok(None) };
+            let target = targets.next(photograph)?;
+            let exposure = exposures.and_then(|exposures| exposures.get(photograph.0));
             let mut target =
                 exposure.map_or_else(|| target.clone(), |own| own.inverse().applied(&target));
             if let Some(lamp) = lamp {
@@ -90,13 +89,12 @@ impl Views {
             Gaussians::from_points(&positions, &colors, shape, &config.start, seed)?;
         if config.model.network.variant == NetworkVariant::Identity {
             let low = if shape.features.illumination {
-                let mut photographs =
-                    ImageBatches::new(self, gpu, pseudo_gt, ImageKind::Photographs);
+                let mut dark = ImageBatches::new(self, pseudo_gt, ImageKind::Photographs);
                 init::colors_from_views(
                     kept,
                     &dataset.views,
                     |_, _| 1.0,
-                    |index| places[index].map(|place| photographs.next(place)).transpose(),
+                    |index| photographs[index].map(|own| dark.next(own)).transpose(),
                 )?
             } else {
                 vec![]
@@ -147,39 +145,37 @@ impl Views {
 /// Targets of the photographs in order, made in batches.
 struct ImageBatches<'a> {
     views: &'a Views,
-    gpu: &'a Gpu,
     pseudo_gt: &'a PseudoGt,
     kind: ImageKind,
-    /// By position.
-    made: BTreeMap<usize, Image>,
+    made: BTreeMap<TrainingPhotograph, Image>,
 }
 
 impl<'a> ImageBatches<'a> {
-    fn new(views: &'a Views, gpu: &'a Gpu, pseudo_gt: &'a PseudoGt, kind: ImageKind) -> Self {
-        Self { views, gpu, pseudo_gt, kind, made: BTreeMap::new() }
+    fn new(views: &'a Views, pseudo_gt: &'a PseudoGt, kind: ImageKind) -> Self {
+        Self { views, pseudo_gt, kind, made: BTreeMap::new() }
     }
 
-    /// The target at a position; earlier ones are dropped.
-    fn next(&mut self, place: usize) -> Result<Image> {
+    /// The target of a photograph; earlier ones are dropped.
+    fn next(&mut self, photograph: TrainingPhotograph) -> Result<Image> {
         /// The pixels of a batch.
         const MAX_PIXELS: usize = 1 << 20;
-        let Self { views, gpu, pseudo_gt, kind, ref mut made } = *self;
-        if !made.contains_key(&place) {
+        let Self { views, pseudo_gt, kind, ref mut made } = *self;
+        if !made.contains_key(&photograph) {
             let mut pixels = 0;
             let whole = views.whole();
-            let after = &whole[whole.partition_point(|view| view.place < place)..];
+            let after = &whole[whole.partition_point(|view| view.photograph < photograph)..];
             let after = after.iter().filter(|view| view.patch.is_first());
             let now = after.take_while(|view| {
                 let is_first = pixels == 0;
                 pixels += Patch::from(&view.patch.camera).pixel_count();
                 is_first || pixels <= MAX_PIXELS
             });
-            let last = now.last().map_or(place, |view| view.place);
-            let images = views.pictures(gpu, pseudo_gt, place..last + 1, kind)?;
-            *made = (place..).zip(images).collect();
+            let last = now.last().map_or(photograph, |view| view.photograph);
+            let images = views.pictures(pseudo_gt, photograph..=last, kind)?;
+            *made = (photograph.0..).map(TrainingPhotograph).zip(images).collect();
         }
-        let gone = || Error::Usage(format!("there is no training photograph {place}"));
-        made.remove(&place).ok_or_else(gone)
+        let gone = || Error::Usage(format!("there is no training photograph {}", photograph.0));
+        made.remove(&photograph).ok_or_else(gone)
     }
 }
 

@@ -146,9 +146,8 @@ mod tests {
     use super::*;
     use crate::gpu::testing::gpu;
     use crate::photographs::dataset::synthetic::{self, SyntheticOptions};
-    use crate::photographs::pseudo_gt::PseudoGt;
+    use crate::photographs::targets::Targets;
     use crate::train::Preset;
-    use crate::train::measuring::scene_of;
     use crate::train::target_views::TargetViews;
 
     /// The most dB that a round may cost the training views.
@@ -159,10 +158,9 @@ mod tests {
         let gpu = gpu();
         let dataset = Dataset::load(&config.dataset, &config.load_options()).unwrap();
         let frame = dataset.frame();
-        let pseudo_gt = PseudoGt::new(&gpu, &config.tone).unwrap();
-        let scene = scene_of(pseudo_gt.settings(), &dataset).unwrap();
+        let targets = Targets::new(&gpu, &config.tone, &dataset).unwrap();
         let all = [usize::MAX; 2];
-        let views = TargetViews::probes(&pseudo_gt, &dataset, &frame, &scene, all).unwrap();
+        let views = TargetViews::probes(&targets, &dataset, &frame, all).unwrap();
         let mut trainer = Trainer::new(&gpu, config.clone(), &dataset).unwrap();
         let psnr = |trainer: &mut Trainer| {
             let (degree, affines) = (trainer.sh_degree_in_use(), trainer.affines().unwrap());

@@ -5,13 +5,13 @@ use std::collections::BTreeMap;
 use glam::DVec3;
 
 use super::LampRates;
-use super::scene_light::{Encoding, SceneLight};
+use super::encoding::Encoding;
 use super::{Optimizer, TrainConfig, Trainer};
 use crate::Result;
 use crate::gpu::{Gpu, Recorder, Slice, SliceMut};
 use crate::kernels::lamp::LAMP_WIDTH;
 use crate::photographs::dataset::{Dataset, Point, View};
-use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::targets::Targets;
 use crate::splats::lamp::Lamp;
 use crate::splats::optimizer::{AdamBuffers, Learnable, Moments};
 use crate::splats::render::{DeviceLamp, Renderer};
@@ -102,13 +102,8 @@ impl Trainer {
 }
 
 /// The lamp of the first step, in the training frame: that of the configuration at the median distance of what the
-/// views show, with the tone law of the photographs. The unit of light is that on the median of the points.
-pub(super) fn start(
-    pseudo_gt: &PseudoGt,
-    light: &SceneLight,
-    dataset: &Dataset,
-    config: &TrainConfig,
-) -> Result<Lamp> {
+/// views show, with the tone curve of the photographs. The unit of light is that on the median of the points.
+pub(super) fn start(targets: &Targets, dataset: &Dataset, config: &TrainConfig) -> Result<Lamp> {
     let views = dataset.train_views().count();
     if views < FEWEST_VIEWS {
         tracing::warn!(
@@ -133,7 +128,7 @@ pub(super) fn start(
     }
     let all = distances.into_iter().flatten().collect();
     let reference_distance = median(all).unwrap_or_else(|| config.extent_of(dataset));
-    let Encoding { black, slope, reach } = light.encoding(pseudo_gt)?;
+    let Encoding { black, slope, reach } = Encoding::measured(targets)?;
     let lamp = Lamp {
         ambient: config.lamp.ambient,
         exponent: config.lamp.exponent,
@@ -148,7 +143,7 @@ pub(super) fn start(
     let lamp = median(lights).map_or(lamp, |light| lamp.in_units_of(light));
     let reference_distance = lamp.reference_distance;
     tracing::info!(
-        "a lamp at the camera: reference distance {reference_distance:.3}, slope of the tone law {slope:.3}, which \
+        "a lamp at the camera: reference distance {reference_distance:.3}, slope of the tone curve {slope:.3}, which \
          saturates at {reach:.3}"
     );
     Ok(lamp.scaled(scale))

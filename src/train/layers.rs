@@ -188,8 +188,11 @@ impl Settings {
     /// The curve's own constants.
     fn constants(&self) -> Table {
         let curve = self.0.get("tone.curve").and_then(|(value, _)| value.as_str()?.parse().ok());
-        let constants = curve.unwrap_or(ToneCurve::Auto).family().constants.iter();
-        constants.map(|constant| (constant.name.to_owned(), constant.default.into())).collect()
+        let constants = curve.map_or(&[][..], |curve: ToneCurve| curve.family().constants);
+        constants
+            .iter()
+            .map(|constant| (constant.name.to_owned(), constant.default.into()))
+            .collect()
     }
 
     /// The configuration.

@@ -3,7 +3,7 @@
 
 use glam::UVec2;
 
-use super::views::Views;
+use super::views::{TrainingView, Views};
 use crate::Result;
 use crate::camera::Camera;
 use crate::gpu::{Buffer, Gpu, Pipeline, Recorder, Threads};
@@ -14,7 +14,7 @@ use crate::splats::scene::COLOR_CHANNELS;
 /// The masks of the views and the kernels that apply them; a view without a mask costs nothing.
 #[derive(Debug)]
 pub(super) struct Masks {
-    /// By the number of the view; (H, W).
+    /// By the training view; (H, W).
     weights: Vec<Option<Buffer<f32>>>,
     /// `None` if no view has a mask.
     masking: Option<Masking>,
@@ -26,7 +26,7 @@ impl Masks {
         let (mut weights, mut largest) = (vec![], 0);
         for view in views.all() {
             let (size, Camera { width, height, .. }) = (view.size(), view.patch.camera);
-            let mask = dataset.views[view.index].mask.as_ref();
+            let mask = dataset.views[view.in_dataset.0].mask.as_ref();
             let mask = mask.map(|mask| mask.resized(width, height));
             let mask = mask.map(|mask| gpu.buffer("mask", &view.patch.cut(&mask.weights)));
             largest = largest.max(if mask.is_some() { value_count(size) } else { 0 });
@@ -42,20 +42,20 @@ impl Masks {
     }
 
     /// The mask of a view, (H, W).
-    pub(super) fn of_view(&self, view: usize) -> Option<&Buffer<f32>> {
-        self.weights.get(view)?.as_ref()
+    pub(super) fn of_view(&self, view: TrainingView) -> Option<&Buffer<f32>> {
+        self.weights.get(view.0)?.as_ref()
     }
 
     /// The image for the loss, (3, H, W): `render`, with the target at masked pixels.
     pub(super) fn shown<'a>(
         &'a mut self,
         pass: &mut Recorder<'_>,
-        view: usize,
+        view: TrainingView,
         size: UVec2,
         render: &'a Buffer<f32>,
         target: &Buffer<f32>,
     ) -> Result<&'a Buffer<f32>> {
-        let weights = self.weights.get(view).and_then(Option::as_ref);
+        let weights = self.weights.get(view.0).and_then(Option::as_ref);
         match weights.zip(self.masking.as_mut()) {
             Some((weights, masking)) => masking.shown(pass, weights, size, render, target),
             None => Ok(render),
@@ -66,7 +66,7 @@ impl Masks {
     pub(super) fn hide(
         &self,
         pass: &mut Recorder<'_>,
-        view: usize,
+        view: TrainingView,
         size: UVec2,
         channels: usize,
         d_render: &mut Buffer<f32>,

@@ -47,7 +47,7 @@ impl Trainer {
     /// Reserves the renderer's memory for every view.
     pub(super) fn reserve(&mut self) -> Result<()> {
         let Self { model, supervision, renderer, .. } = self;
-        let sizes = supervision.views.all().map(TrainView::size);
+        let sizes = supervision.views.all().iter().map(TrainView::size);
         renderer.reserve_sizes(model.count(), model.capacity(), sizes)
     }
 
@@ -87,8 +87,13 @@ impl Trainer {
 
     /// The intersections of the first Gaussians in the largest view, for which memory is then reserved.
     fn intersections_of_largest_view(&mut self) -> Result<u32> {
-        let largest =
-            self.supervision.views.all().map(|view| view.patch).max_by_key(Patch::pixel_count);
+        let largest = self
+            .supervision
+            .views
+            .all()
+            .iter()
+            .map(|view| view.patch)
+            .max_by_key(Patch::pixel_count);
         let Some(patch) = largest else { return Ok(0) };
         let options = RenderOptions { sh_degree: 0, background: [0.0; 3] };
         self.renderer.render_patch(&self.model.gaussians, &patch, &options)?;

@@ -3,13 +3,13 @@
 //! A step trains on one patch as if it were a view. Measurements, target and exposure are those of the whole
 //! photograph.
 
-use std::ops::Range;
+use std::ops::RangeInclusive;
 
 use glam::UVec2;
 
 use super::config::MIN_PATCH;
 use super::memory::MARGIN;
-use super::views::{ImageKind, TrainView, Views};
+use super::views::{ImageKind, TrainView, TrainingPhotograph, Views};
 use super::{TrainConfig, Trainer};
 use crate::camera::{Camera, Patch};
 use crate::gpu::Gpu;
@@ -39,11 +39,14 @@ impl Trainer {
     /// or if smaller patches do not help.
     pub(super) fn fewer_patch_pixels(&mut self) -> Result<Option<u64>> {
         let of_photograph = |patch: &Patch| Patch::from(&patch.camera).pixel_count();
-        let patches = || self.supervision.views.whole().iter().map(|view| (view.place, view.patch));
+        let patches =
+            || self.supervision.views.whole().iter().map(|view| (view.photograph, view.patch));
         let largest = patches().max_by_key(|(_, patch)| of_photograph(patch));
         let Some((largest, _)) = largest else { return Ok(None) };
-        let patches: Vec<Patch> =
-            patches().filter(|&(place, _)| place == largest).map(|(_, patch)| patch).collect();
+        let patches: Vec<Patch> = patches()
+            .filter(|&(photograph, _)| photograph == largest)
+            .map(|(_, patch)| patch)
+            .collect();
         let gaussians = self.model.gaussians.slice();
         let mut met = 0;
         for patch in &patches {
@@ -60,8 +63,8 @@ impl Views {
     /// Logs the photographs that are trained in patches.
     pub(super) fn log_patches(&self, gpu: &Gpu) {
         let mut cut = self.photographs().filter(|view| !view.patch.is_whole());
-        let Some(TrainView { name, place, patch, .. }) = cut.next() else { return };
-        let own = self.whole().iter().filter(|view| view.place == *place).count();
+        let Some(TrainView { name, photograph, patch, .. }) = cut.next() else { return };
+        let own = self.whole().iter().filter(|view| view.photograph == *photograph).count();
         let (Camera { width, height, .. }, UVec2 { x, y }) = (patch.camera, patch.size);
         tracing::warn!(
             "{} of {} photographs are trained in patches, due to {} or patch_pixels: {name}, \
@@ -73,29 +76,36 @@ impl Views {
     }
 
     /// The target of a photograph, at its full size.
-    pub(super) fn picture(&self, gpu: &Gpu, pseudo_gt: &PseudoGt, place: usize) -> Result<Image> {
-        let pictures = self.pictures(gpu, pseudo_gt, place..place + 1, ImageKind::Targets)?;
-        let gone = || Error::Usage(format!("there is no training photograph {place}"));
+    pub(super) fn picture(
+        &self,
+        pseudo_gt: &PseudoGt,
+        photograph: TrainingPhotograph,
+    ) -> Result<Image> {
+        let pictures = self.pictures(pseudo_gt, photograph..=photograph, ImageKind::Targets)?;
+        let gone = || Error::Usage(format!("there is no training photograph {}", photograph.0));
         pictures.into_iter().next().ok_or_else(gone)
     }
 
     /// Images of photographs at full size, assembled from their patches.
     pub(super) fn pictures(
         &self,
-        gpu: &Gpu,
         pseudo_gt: &PseudoGt,
-        places: Range<usize>,
+        photographs: RangeInclusive<TrainingPhotograph>,
         shown: ImageKind,
     ) -> Result<Vec<Image>> {
-        let views = self.of_places(places);
-        Ok(put_together(views, self.read(gpu, pseudo_gt, views, shown)?))
+        let views = self.of_photographs(photographs);
+        Ok(put_together(views, self.read(pseudo_gt, views, shown)?))
     }
 
     /// The full-size patches of some photographs.
-    pub(super) fn of_places(&self, places: Range<usize>) -> &[TrainView] {
+    pub(super) fn of_photographs(
+        &self,
+        photographs: RangeInclusive<TrainingPhotograph>,
+    ) -> &[TrainView] {
         let views = self.whole();
-        let first = |place: usize| views.partition_point(|view| view.place < place);
-        &views[first(places.start)..first(places.end)]
+        let begin = views.partition_point(|view| view.photograph < *photographs.start());
+        let end = views.partition_point(|view| view.photograph <= *photographs.end());
+        &views[begin..end]
     }
 }
 

@@ -55,7 +55,7 @@ impl RequestedSettings {
         let get = |key: &str| requested.iter().rev().find_map(|layer| layer.get(key));
         let mut settings = Settings::default();
         if let Some(preset) = self.preset {
-            let curve = get("tone.curve").and_then(|name| name.as_str()?.parse().ok());
+            let curve = get("tone.curve").and_then(Value::as_str);
             let dataset = get("dataset").and_then(Value::as_str).unwrap_or_default();
             settings.merge(&preset.layer(curve, Path::new(dataset))?);
         }

@@ -9,7 +9,7 @@ use toml::Value;
 
 use super::TrainConfig;
 use super::layers::{Origin, SettingsLayer};
-use crate::photographs::tone::ToneCurve;
+use crate::photographs::tone::{Tone, ToneCurve};
 use crate::{Error, Result};
 
 /// A trade-off of time and quality, or a benchmark of the paper.
@@ -89,36 +89,36 @@ impl Preset {
     /// # Errors
     /// Never.
     pub fn apply(self, config: &mut TrainConfig) -> Result<()> {
-        let curve = Some(config.tone.curve).filter(|&curve| curve != ToneCurve::Auto);
+        let curve = Some(&config.tone.curve).filter(|&curve| *curve != Tone::Auto).map(Tone::name);
         *config = config.overlaid(&self.layer(curve, &config.dataset)?)?;
         Ok(())
     }
 
-    /// The preset's settings for a named `curve`. A benchmark has the paper's constants and, if its code has a file for
-    /// the scene that the dataset's folder is named after, that file's.
-    pub(super) fn layer(self, curve: Option<ToneCurve>, dataset: &Path) -> Result<SettingsLayer> {
+    /// The preset's settings for the curve of this name. A benchmark has the paper's constants and, if its code has a
+    /// file for the scene that the dataset's folder is named after, that file's.
+    pub(super) fn layer(self, curve: Option<&str>, dataset: &Path) -> Result<SettingsLayer> {
         let origin = Origin::Preset(self.name());
         let mut layer = SettingsLayer::of_toml(self.toml(), &origin)?;
         let mut say = |key: &str, value: Value| layer.push(key, value, origin.clone());
         if let (false, Some(curve)) = (self.is_planned(), curve) {
-            say("tone.curve", curve.name().into())?;
+            say("tone.curve", curve.into())?;
         }
         if !self.is_benchmark() {
             return Ok(layer);
         }
         let is_realx3d = self == Self::RealX3d;
-        let curve = curve.unwrap_or(ToneCurve::Ap3);
+        let curve = curve.unwrap_or(ToneCurve::Ap3.name());
         let [of_ase, of_ap3] = match self {
             Self::Lom => [3.0, 1.0],
             Self::RealX3d => [4.0, 2.0],
             _ => [0.0, 0.0],
         };
-        match curve {
-            ToneCurve::Ase => say("tone.gain_c", of_ase.into())?,
-            ToneCurve::Ap3 => say("tone.gain_c", of_ap3.into())?,
+        match curve.parse() {
+            Ok(ToneCurve::Ase) => say("tone.gain_c", of_ase.into())?,
+            Ok(ToneCurve::Ap3) => say("tone.gain_c", of_ap3.into())?,
             _ => {}
         }
-        if curve != ToneCurve::Auto {
+        if curve != Tone::Auto.name() {
             say("tone.alpha", 0.12.into())?;
         }
         say("tone.theta", if is_realx3d { 0.37 } else { 0.49 }.into())?;
@@ -180,7 +180,7 @@ mod tests {
     use crate::splats::scene::init::Initialization;
     use crate::train::{DensityConfig, ModelConfig};
 
-    fn applied(preset: Preset, scene: &str, curve: ToneCurve) -> TrainConfig {
+    fn applied(preset: Preset, scene: &str, curve: impl Into<Tone>) -> TrainConfig {
         let tone = ToneSettings::new(curve);
         let mut config =
             TrainConfig { dataset: Path::new("data").join(scene), tone, ..Default::default() };
@@ -213,7 +213,7 @@ mod tests {
     #[test]
     fn balanced_is_the_default_and_paper_is_the_paper_added_to_the_bare_method() {
         assert_eq!(
-            applied(Preset::Balanced, "x", ToneCurve::Auto),
+            applied(Preset::Balanced, "x", Tone::Auto),
             TrainConfig { dataset: "data/x".into(), ..TrainConfig::default() }
         );
         let mut model = ModelConfig::default();
@@ -227,7 +227,7 @@ mod tests {
             model,
             ..TrainConfig::bare()
         };
-        assert_eq!(applied(Preset::Paper, "x", ToneCurve::Auto), expected);
+        assert_eq!(applied(Preset::Paper, "x", Tone::Auto), expected);
         assert!(!Preset::Paper.is_planned() && Preset::Balanced.is_planned());
     }
 

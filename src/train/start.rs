@@ -12,10 +12,8 @@ use super::early_stopping::Convergence;
 use super::growth::Growth;
 use super::lamp::{self, LampLearning};
 use super::masks::Masks;
-use super::measuring::TargetExposure;
 use super::model::Model;
 use super::passes::{Kernels, first_sh_degree};
-use super::scene_light::SceneLight;
 use super::submission::{MAX_STEPS, Submissions};
 use super::supervision::Supervision;
 use super::target_views::TargetViews;
@@ -26,8 +24,7 @@ use crate::gpu::Gpu;
 use crate::loss::exposure::Exposures;
 use crate::loss::{LossLog, ParameterTerms};
 use crate::photographs::dataset::{Dataset, Fingerprint, Original};
-use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::SceneTone;
+use crate::photographs::targets::{SceneTone, Targets};
 use crate::splats::densify::DensityControl;
 use crate::splats::scene::{FEATURES, Gaussians, Shape, ply};
 use crate::{Error, Result};
@@ -125,28 +122,25 @@ impl Trainer {
             gpu.limit_memory(bytes);
         }
         let frame = config.frame.unwrap_or_default();
-        let pseudo_gt = PseudoGt::new(gpu, &config.tone)?;
-        let light = SceneLight::of(&config.tone, dataset)?;
-        let (views, target_exposure) = Views::upload(gpu, &pseudo_gt, &light, dataset, &config)?;
-        let scene = light.scene().clone();
+        let targets = Targets::in_scene(gpu, SceneTone::measure(&config.tone, dataset)?)?;
+        let views = Views::upload(&targets, dataset, &config)?;
         let sizes = views.sizes();
-        let probes = probes(&pseudo_gt, dataset, &config, &scene, &sizes)?;
-        let convergence = Convergence::new(&pseudo_gt, dataset, &config, &scene)?;
-        if let Some(TargetExposure { scene, .. }) = &target_exposure {
-            tracing::info!("{}", scene.reason());
+        let probes = probes(&targets, dataset, &config, &sizes)?;
+        let convergence = Convergence::new(&targets, dataset, &config)?;
+        if let Some(exposure) = targets.scene.model_exposure() {
+            tracing::info!("{}", exposure.reason());
         }
         config.model.log_parts(&sizes);
-        let lamp = config.model.lamp.then(|| lamp::start(&pseudo_gt, &light, dataset, &config));
+        let lamp = config.model.lamp.then(|| lamp::start(&targets, dataset, &config));
         let lamp = lamp.transpose()?;
-        let starts = views.exposures(&pseudo_gt, dataset, &scene, &config)?;
+        let starts = views.exposures(&targets, dataset, &config)?;
         let gaussians = match &initial.gaussians {
             Some(gaussians) => given(gaussians, &config)?,
             None => {
                 let lamp = lamp.map(|lamp| lamp.scaled(1.0 / frame.scale));
                 let exposures = starts.as_deref();
                 views.initial_gaussians(
-                    gpu,
-                    &pseudo_gt,
+                    &targets.pseudo_gt,
                     dataset,
                     &config,
                     exposures,
@@ -160,7 +154,7 @@ impl Trainer {
         }
         let masks = Masks::new(gpu, dataset, &views)?;
         let exposures = starts.map(|starts| {
-            let whites = views.whites(gpu, &pseudo_gt)?;
+            let whites = views.whites(&targets.pseudo_gt)?;
             Exposures::new(gpu, config.exposure.rates, &starts, &whites)
         });
         let mut exposures = exposures.transpose()?;
@@ -174,18 +168,18 @@ impl Trainer {
         if lamp.is_some() {
             renderer.set_lamp(lamp)?;
         }
-        losses.prepare(&views.sources(gpu, &pseudo_gt, dataset))?;
+        losses.prepare(&views.sources(&targets.pseudo_gt, dataset))?;
         let networks = NetworkTerms::new(gpu, &config, &sizes, !masks.is_empty())?;
         let pixels = sizes.iter().map(|size| size.x as usize * size.y as usize).max();
         let values = config.render_settings().channels() * pixels.unwrap_or_default();
         let pictures = views.largest_view_values();
         // Only networks use the photograph in addition to the target.
         let photographs = if networks.is_some() { pictures } else { 0 };
+        // A curve without an inverse has no law.
+        let law = targets.scene.law().ok();
         let supervision = Supervision {
             views,
-            scene,
-            target_exposure,
-            pseudo_gt,
+            targets,
             target: gpu.uninit("target", pictures)?,
             photograph: gpu.uninit("low", photographs)?,
             masks,
@@ -205,8 +199,7 @@ impl Trainer {
             fingerprint,
             frame,
             extent: config.extent_of(dataset) * frame.scale,
-            // A curve without an inverse has no law.
-            law: light.law().ok(),
+            law,
             step: 0,
             supervision,
             model: Model::upload(gpu, &gaussians, degree, precision, frozen_columns)?,
@@ -248,10 +241,9 @@ const PROBES: usize = 8;
 const MAX_PROBE_PIXELS: usize = 1 << 20;
 
 fn probes(
-    pseudo_gt: &PseudoGt,
+    targets: &Targets,
     dataset: &Dataset,
     config: &TrainConfig,
-    scene: &SceneTone,
     sizes: &[UVec2],
 ) -> Result<TargetViews> {
     if config.density.control == DensityControl::Paper {
@@ -261,5 +253,5 @@ fn probes(
     let largest = sizes.iter().map(|size| size.element_product() as usize).max();
     let pixels = largest.unwrap_or_default().min(MAX_PROBE_PIXELS);
     let frame = config.frame.unwrap_or_default();
-    TargetViews::probes(pseudo_gt, dataset, &frame, scene, [PROBES, pixels])
+    TargetViews::probes(targets, dataset, &frame, [PROBES, pixels])
 }

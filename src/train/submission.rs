@@ -8,7 +8,7 @@ use std::collections::VecDeque;
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
-use super::views::{TrainView, ViewId};
+use super::views::{TrainView, TrainingView};
 use super::{NotFinite, StepReport, Trainer};
 use crate::gpu::Download;
 use crate::loss::{LossLogDownload, StepLosses};
@@ -290,8 +290,8 @@ impl Trainer {
 
     /// Leaves out the view of an undone step; false if it is the last view.
     fn leave_out_view_of(&mut self, step: u64) -> Result<bool> {
-        let place = self.view_of(step).place;
-        if !self.supervision.views.leave_out(place) {
+        let photograph = self.view_of(step).photograph;
+        if !self.supervision.views.leave_out(photograph) {
             return Ok(false);
         }
         let Self { model, renderer, .. } = self;
@@ -306,7 +306,7 @@ impl Trainer {
     }
 
     /// The view of a step.
-    pub(super) fn view_id(&self, step: u64) -> ViewId {
+    pub(super) fn view_id(&self, step: u64) -> TrainingView {
         let level = self.config.schedule.resolution_level(step);
         self.supervision.views.of_step(self.config.seed, step, level)
     }

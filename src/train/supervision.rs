@@ -7,17 +7,15 @@
 //! ```
 
 use super::masks::Masks;
-use super::measuring::TargetExposure;
 use super::model::Model;
 use super::networks::Networks;
 use super::terms::{NetworkTerms, Photographs};
-use super::views::{ViewId, Views};
+use super::views::{TrainingView, Views};
 use crate::Result;
 use crate::gpu::{Buffer, Recorder};
 use crate::loss::exposure::Exposures;
 use crate::loss::{LogSlot, LossLog, Losses, ParameterTerms, TermInputs};
-use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::SceneTone;
+use crate::photographs::targets::Targets;
 use crate::splats::optimizer::{Adam, Learnable};
 use crate::splats::render::Renderer;
 use crate::splats::scene::{COLOR_CHANNELS, Features};
@@ -26,10 +24,7 @@ use crate::splats::scene::{COLOR_CHANNELS, Features};
 #[derive(Debug)]
 pub(super) struct Supervision {
     pub(super) views: Views,
-    /// The shared part of the photographs' tone curves.
-    pub(super) scene: SceneTone,
-    pub(super) target_exposure: Option<TargetExposure>,
-    pub(super) pseudo_gt: PseudoGt,
+    pub(super) targets: Targets,
     /// The target of a step's view, (3, H, W).
     pub(super) target: Buffer<f32>,
     /// Its dark photograph, if a network uses it.
@@ -55,46 +50,46 @@ impl Supervision {
         &mut self,
         pass: &mut Recorder<'_>,
         step: u64,
-        view: ViewId,
+        id: TrainingView,
         features: Features,
         renderer: &mut Renderer,
         slot: u32,
     ) -> Result<()> {
-        let Self { views, pseudo_gt, masks, d_render, losses, .. } = self;
-        let view = views.get(view);
+        let Self { views, targets, masks, d_render, losses, .. } = self;
+        let view = views.get(id);
         let (render, status) = renderer.render_and_status();
-        let (size, number) = (view.size(), view.number);
+        let (size, photograph) = (view.size(), view.photograph.0);
         let channels = COLOR_CHANNELS + features.width();
-        let target = views.record_target(pass, pseudo_gt, view, &mut self.target)?;
+        let target = views.record_target(pass, &targets.pseudo_gt, view, &mut self.target)?;
         let log = &mut LogSlot { log: &mut self.log, slot, status };
         let inputs =
-            &TermInputs { step, view: number, size, features, render, colors: render, target };
+            &TermInputs { step, view: id.0, size, features, render, colors: render, target };
         let exposed = match &mut self.exposures {
             Some(exposures) => {
-                exposures.expose(pass, view.place, size, [render, target])?;
+                exposures.expose(pass, photograph, size, [render, target])?;
                 exposures.exposed()
             }
             None => render,
         };
-        let colors = masks.shown(pass, number, size, exposed, target)?;
+        let colors = masks.shown(pass, id, size, exposed, target)?;
         losses.record(pass, &TermInputs { colors, ..*inputs }, d_render, log)?;
-        masks.hide(pass, number, size, channels, d_render)?;
+        masks.hide(pass, id, size, channels, d_render)?;
         if let Some(exposures) = &mut self.exposures {
-            exposures.backward(pass, view.place, size, [render, target], d_render)?;
+            exposures.backward(pass, photograph, size, [render, target], d_render)?;
         }
         let Some(networks) = &mut self.networks else { return Ok(()) };
-        let low = views.record_photograph(pass, pseudo_gt, view, &mut self.photograph)?;
+        let low = views.record_photograph(pass, &targets.pseudo_gt, view, &mut self.photograph)?;
         // Networks see the model at the neutral exposure.
         let target = match &mut self.exposures {
             Some(exposures) if networks.follow_target() => {
-                exposures.neutralize(pass, view.place, size, target)?;
+                exposures.neutralize(pass, photograph, size, target)?;
                 exposures.exposed()
             }
             _ => target,
         };
-        let photographs = Photographs { mask: masks.of_view(number), low, target };
+        let photographs = Photographs { mask: masks.of_view(id), low, target };
         networks.record(pass, inputs, photographs, d_render, log)?;
-        masks.hide(pass, number, size, channels, d_render)
+        masks.hide(pass, id, size, channels, d_render)
     }
 
     /// Records the terms on parameters, which add to the gradients of the model.

@@ -3,18 +3,16 @@
 use glam::{DVec2, UVec2};
 
 use super::Trainer;
-use super::measuring::{TargetExposure, scene_of, tone_map_source, tone_mapping_of};
 use super::terms::NetworkTerms;
-use super::views::ImageKind;
+use super::views::{ImageKind, TrainingPhotograph};
 use crate::Result;
 use crate::camera::{Camera, TrainingFrame};
-use crate::gpu::Gpu;
 use crate::loss::exposure::{Affine, Exposures};
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::{Image, Mask};
 use crate::photographs::metrics::psnr_of_counted;
-use crate::photographs::pseudo_gt::PseudoGt;
-use crate::photographs::tone::{LuminanceHistogram, SceneTone, ToneSettings, is_black};
+use crate::photographs::targets::{SceneTone, Targets};
+use crate::photographs::tone::{LuminanceHistogram, is_black};
 
 use super::rendered::Rendered;
 
@@ -29,21 +27,20 @@ struct TargetView {
     target: Image,
     mask: Option<Mask>,
     /// The training photograph whose learned exposure the target has; `None` for the neutral exposure.
-    place: Option<usize>,
+    photograph: Option<TrainingPhotograph>,
 }
 
 impl TargetViews {
     /// The views with their targets, made as for training views. Views that are entirely black or masked are left out,
     /// with a warning.
     pub(super) fn new<'a>(
-        pseudo_gt: &PseudoGt,
+        targets: &Targets,
         views: impl IntoIterator<Item = &'a View>,
         frame: &TrainingFrame,
-        scene: &SceneTone,
     ) -> Result<Self> {
-        let (mut shown, full_resolution) = (vec![], pseudo_gt.settings().full_resolution);
+        let mut shown = vec![];
         for view in views {
-            let Some(photograph) = tone_map_source(view, full_resolution)? else { continue };
+            let Some(photograph) = targets.scene.source(view)? else { continue };
             let counted = view.counted(&photograph);
             if counted.is_empty() || is_black(&LuminanceHistogram::of(&counted)) {
                 let name = &view.name;
@@ -52,9 +49,9 @@ impl TargetViews {
                 );
                 continue;
             }
-            let target = target_of(pseudo_gt, view, &photograph, scene)?;
+            let target = targets.target_of(view, &photograph)?;
             let (camera, mask) = (frame.camera(&view.camera), view.mask.clone());
-            shown.push(TargetView { camera, target, mask, place: None });
+            shown.push(TargetView { camera, target, mask, photograph: None });
         }
         Ok(Self(shown))
     }
@@ -62,23 +59,20 @@ impl TargetViews {
     /// `count` training views that cover the cameras, to measure the cost of a change. Views with more than `pixels`
     /// are resized to about that.
     pub(super) fn probes(
-        pseudo_gt: &PseudoGt,
+        targets: &Targets,
         dataset: &Dataset,
         frame: &TrainingFrame,
-        scene: &SceneTone,
         [count, pixels]: [usize; 2],
     ) -> Result<Self> {
         let views: Vec<&View> =
             dataset.train_views().filter(|view| view.has_photograph()).collect();
         let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
         let mut probes = vec![];
-        for place in Camera::covering(&cameras, count) {
-            let Self(of_view) = Self::new(pseudo_gt, [views[place]], frame, scene)?;
-            probes.extend(
-                of_view
-                    .into_iter()
-                    .map(|view| TargetView { place: Some(place), ..view.shrunk(pixels) }),
-            );
+        for at in Camera::covering(&cameras, count) {
+            let Self(of_view) = Self::new(targets, [views[at]], frame)?;
+            let photograph = Some(TrainingPhotograph(at));
+            let shrunk = |view: TargetView| TargetView { photograph, ..view.shrunk(pixels) };
+            probes.extend(of_view.into_iter().map(shrunk));
         }
         Ok(Self(probes))
     }
@@ -92,13 +86,13 @@ impl TargetViews {
         mut render: impl FnMut(&Camera) -> Result<Rendered>,
     ) -> Result<Option<[f64; 2]>> {
         let mut sums = [0.0; 2];
-        for TargetView { camera, target, mask, place } in &self.0 {
-            let exposure = place.and_then(|place| affines.get(place));
+        for TargetView { camera, target, mask, photograph } in &self.0 {
+            let exposure = photograph.and_then(|own| affines.get(own.0));
             let neutral = exposure.map(|own| own.inverse().applied(target));
             let target = neutral.as_ref().unwrap_or(target);
             let rendered = render(camera)?;
             for (sum, image) in sums.iter_mut().zip([&rendered.colors, rendered.output()]) {
-                let is_aligned = place.is_none() && !affines.is_empty();
+                let is_aligned = photograph.is_none() && !affines.is_empty();
                 let aligned =
                     is_aligned.then(|| Affine::least_squares(image, target)).transpose()?;
                 let aligned = aligned.map(|own| own.applied(image));
@@ -132,55 +126,11 @@ fn clamped(image: &Image) -> Image {
     Image { data, ..*image }
 }
 
-/// The target of a view, made as for training views.
-fn target_of(
-    pseudo_gt: &PseudoGt,
-    view: &View,
-    photograph: &Image,
-    scene: &SceneTone,
-) -> Result<Image> {
-    let tone_mapping = tone_mapping_of(pseudo_gt.settings(), scene, view, photograph)?;
-    let target = pseudo_gt.tone_mapped(photograph, &tone_mapping)?;
-    Ok(target.resized(view.camera.width, view.camera.height))
-}
-
-/// The targets of test views: their photographs through the tone curve of the training photographs, as by `tone apply`.
-#[derive(Debug)]
-pub struct TestTargets {
-    pseudo_gt: PseudoGt,
-    scene: SceneTone,
-}
-
-impl TestTargets {
-    /// Measures the training photographs.
-    pub fn new(gpu: &Gpu, tone: &ToneSettings, dataset: &Dataset) -> Result<Self> {
-        let scene = scene_of(tone, dataset)?;
-        Self::in_scene(gpu, tone, &scene)
-    }
-
-    /// [`TestTargets::new`] for training photographs that are already measured.
-    pub fn in_scene(gpu: &Gpu, tone: &ToneSettings, scene: &SceneTone) -> Result<Self> {
-        Ok(Self { pseudo_gt: PseudoGt::new(gpu, tone)?, scene: scene.clone() })
-    }
-
-    /// The target of a view, of its camera's size; `None` without a photograph.
-    pub fn of(&mut self, view: &View) -> Result<Option<Image>> {
-        let photograph = tone_map_source(view, self.pseudo_gt.settings().full_resolution)?;
-        let target = |photograph| target_of(&self.pseudo_gt, view, photograph, &self.scene);
-        photograph.as_deref().map(target).transpose()
-    }
-}
-
 impl Trainer {
-    /// The shared part of the tone curves, for [`TestTargets::in_scene`].
-    pub(crate) fn scene(&self) -> &SceneTone {
-        &self.supervision.scene
-    }
-
-    /// The exposure of the targets; `None` if the curve's constants determine it.
+    /// The curves of the photographs.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn target_exposure(&self) -> Option<&TargetExposure> {
-        self.supervision.target_exposure.as_ref()
+    pub(crate) fn scene(&self) -> &SceneTone {
+        &self.supervision.targets.scene
     }
 
     /// The mean PSNR, dB, of the Gaussians' colours on the held-out views against their targets; `None` without
@@ -245,15 +195,14 @@ impl Trainer {
         let some = views.iter().step_by(views.len().div_ceil(MOST).max(1)).map(|view| {
             let views = std::slice::from_ref(view);
             let target = self.supervision.views.read(
-                &self.gpu,
-                &self.supervision.pseudo_gt,
+                &self.supervision.targets.pseudo_gt,
                 views,
                 ImageKind::Targets,
             )?;
             let UVec2 { x: width, y: height } = view.size();
             let target = Image { width, height, data: target.concat() };
-            let (camera, place) = (view.patch.own_camera(), Some(view.place));
-            Ok(TargetView { camera, target, mask: None, place })
+            let (camera, photograph) = (view.patch.own_camera(), Some(view.photograph));
+            Ok(TargetView { camera, target, mask: None, photograph })
         });
         Ok(TargetViews(some.collect::<Result<_>>()?))
     }

@@ -1,7 +1,7 @@
 //! The training views on the device: photographs, their curves, and the order of steps.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::ops::RangeInclusive;
+use std::collections::BTreeSet;
+use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
 
 use glam::UVec2;
@@ -9,17 +9,16 @@ use glam::UVec2;
 use super::TrainConfig;
 use super::cache::{Cache, CacheSize, Slot};
 use super::epochs::Epochs;
-use super::measuring::{TargetExposure, photographs};
 use super::precision::Encoder;
-use super::scene_light::SceneLight;
 use crate::Result;
 use crate::camera::Patch;
-use crate::gpu::{Buffer, Download, Gpu, Recorder};
+use crate::gpu::{Buffer, Download, Recorder};
 use crate::kernels::ToneParameters;
 use crate::loss::ViewSource;
 use crate::photographs::dataset::Dataset;
 use crate::photographs::image::Image;
 use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::targets::{Targets, photographs};
 use crate::splats::render::{Viewpoint, Viewpoints};
 use crate::splats::scene::COLOR_CHANNELS;
 
@@ -27,12 +26,9 @@ use crate::splats::scene::COLOR_CHANNELS;
 #[derive(Debug)]
 pub(super) struct TrainView {
     pub(super) name: String,
-    /// Its number among the training views of all levels.
-    pub(super) number: usize,
-    /// The position of its photograph among those trained on.
-    pub(super) place: usize,
-    /// Index into the dataset's views.
-    pub(super) index: usize,
+    pub(super) id: TrainingView,
+    pub(super) photograph: TrainingPhotograph,
+    pub(super) in_dataset: DatasetView,
     /// Its part of the photograph, in the frame.
     pub(super) patch: Patch,
     /// The given depth, (H, W), if the dataset's map has another size.
@@ -43,27 +39,31 @@ pub(super) struct TrainView {
     /// photograph's own size.
     gets_curve: bool,
     /// The dark photograph, if it is not the stored image and a network uses it.
-    photograph: Option<Slot>,
+    dark: Option<Slot>,
 }
 
-/// A training view.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct ViewId {
-    /// The level of the resolution schedule.
-    level: usize,
-    /// The index among the views of the level.
-    index: usize,
-}
+/// An index into the dataset's views.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct DatasetView(pub(super) usize);
+
+/// The position of a photograph among those trained on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct TrainingPhotograph(pub(super) usize);
+
+/// The position of a view among the training views of all levels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct TrainingView(pub(super) usize);
 
 /// All training views in the dataset's order, at full size and then for each level of the resolution schedule at half
 /// the size of the one before.
 #[derive(Debug)]
 pub(super) struct Views {
-    levels: Vec<Vec<TrainView>>,
-    /// By number.
+    all: Vec<TrainView>,
+    /// The views of each level.
+    levels: Vec<Range<usize>>,
     viewpoints: Viewpoints,
-    /// The positions of photographs left out of training.
-    left_out: BTreeSet<usize>,
+    /// The photographs left out of training.
+    left_out: BTreeSet<TrainingPhotograph>,
     cache: Cache,
     epochs: Epochs,
     /// The curve of every photograph, by position.
@@ -77,37 +77,34 @@ impl Views {
     /// Uploads every training photograph or its target for every level, and the photograph if a network uses it. Only
     /// one photograph at a time is in memory at its own size.
     pub(super) fn upload(
-        gpu: &Gpu,
-        pseudo_gt: &PseudoGt,
-        light: &SceneLight,
+        targets: &Targets,
         dataset: &Dataset,
         config: &TrainConfig,
-    ) -> Result<(Self, Option<TargetExposure>)> {
-        let settings = pseudo_gt.settings().clone();
+    ) -> Result<Self> {
+        let Targets { scene, pseudo_gt } = targets;
+        let gpu = pseudo_gt.gpu();
         let keeps_photographs = config.model.denoiser || config.model.tonemapper;
         let frame = config.frame.unwrap_or_default();
         let mut encoder = Encoder::new(gpu, config.precision.photographs);
         let budget = CacheSize::on_device(config.cache, config.max_vram, gpu);
         let mut cache = Cache::new(gpu, budget, config.spool.clone());
-        let mut views = vec![];
-        views.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
-        let (mut gains, mut curves) = (BTreeMap::new(), vec![]);
-        for (place, ((index, view), tone_mapping)) in
-            photographs(dataset).zip(light.tone_mappings(dataset)?).enumerate()
-        {
-            gains.extend(tone_mapping.gain.map(|gain| (view.name.clone(), gain)));
+        let mut levels = vec![];
+        levels.resize_with(config.schedule.resolution_levels(), Vec::<TrainView>::new);
+        let mut curves = vec![];
+        for (at, (index, view)) in photographs(dataset).enumerate() {
+            let Some(tone_mapping) = scene.tone_mapping(view)? else { continue };
             curves.push(tone_mapping.parameters);
             let Some(image) = view.loaded()? else { continue };
             let own = UVec2::new(image.width, image.height);
-            let sizes = (0..views.len()).map(|level| shrunk(own, level as u32));
+            let sizes = (0..levels.len()).map(|level| shrunk(own, level as u32));
             let sizes: Vec<UVec2> = sizes.collect();
             // At its own size, the curve is applied in every step.
-            let own = view.own_size().filter(|_| settings.full_resolution);
+            let own = view.own_size().filter(|_| scene.settings().full_resolution);
             let is_larger = own.filter(|own| sizes.iter().any(|size| size != own));
             let whole = if is_larger.is_some() { view.photograph()? } else { None };
             let whole =
                 whole.map(|whole| pseudo_gt.tone_mapped(&whole, &tone_mapping)).transpose()?;
-            for (views, size) in views.iter_mut().zip(sizes) {
+            for (views, size) in levels.iter_mut().zip(sizes) {
                 let resized = |whole: &Image| view.blacked_out(whole.resized(size.x, size.y));
                 let camera = frame.camera(&view.camera).resized(size.x, size.y);
                 let patches = config.patches(gpu, &camera);
@@ -116,10 +113,10 @@ impl Views {
                 let depth = view.depth.as_ref().filter(|_| !is_as_loaded);
                 let print = LevelImage {
                     name: &view.name,
-                    place,
-                    index,
-                    keeps_photograph: keeps_photographs,
-                    photograph: resized(&image),
+                    photograph: TrainingPhotograph(at),
+                    in_dataset: DatasetView(index),
+                    keeps_dark: keeps_photographs,
+                    dark: resized(&image),
                     target: whole.as_ref().filter(|_| own != Some(size)).map(resized),
                     depth: depth.map(|depth| resized_plane(depth, &image, size)),
                 };
@@ -128,22 +125,19 @@ impl Views {
                 }
             }
         }
-        views.iter_mut().flatten().enumerate().for_each(|(number, view)| view.number = number);
-        let patches = views.iter().flatten().map(|view| view.patch).collect();
-        let viewpoints = Viewpoints::new(gpu, patches)?;
-        let views = Self {
-            levels: views,
-            viewpoints,
+        let end_of = |level: usize| levels[..level].iter().map(Vec::len).sum();
+        let ranges = (0..levels.len()).map(|level| end_of(level)..end_of(level + 1)).collect();
+        let mut all: Vec<TrainView> = levels.into_iter().flatten().collect();
+        all.iter_mut().enumerate().for_each(|(at, view)| view.id = TrainingView(at));
+        Ok(Self {
+            viewpoints: Viewpoints::new(gpu, all.iter().map(|view| view.patch).collect())?,
+            all,
+            levels: ranges,
             left_out: BTreeSet::new(),
             cache,
             epochs: Epochs::default(),
             curves: gpu.buffer("curves", &curves)?,
-        };
-        // A profile determines the brightness of its targets.
-        let scene = light.scene();
-        let exposure = scene.exposure.clone().filter(|_| settings.profile.is_none());
-        let exposure = exposure.map(|own| TargetExposure::new(own, gains, scene.recorded_gain()));
-        Ok((views, exposure))
+        })
     }
 
     /// Makes the images of the next steps resident, for as many steps as fit but at least one; returns the last of
@@ -156,18 +150,18 @@ impl Views {
         if self.cache.holds_all() {
             return Ok(*steps.end());
         }
-        let (mut numbers, mut wanted) = (BTreeSet::new(), vec![]);
+        let (mut taken, mut wanted) = (BTreeSet::new(), vec![]);
         let (mut bytes, mut last) = (0, *steps.start());
         for step in steps {
             let level = config.schedule.resolution_level(step);
             let view = self.get(self.of_step(config.seed, step, level));
-            let slots = [Some(view.stored), view.photograph].into_iter().flatten();
+            let slots = [Some(view.stored), view.dark].into_iter().flatten();
             let own: u64 = slots.clone().map(|slot| self.cache.bytes(slot)).sum();
-            let is_new = !numbers.contains(&view.number);
-            if !numbers.is_empty() && is_new && bytes + own > self.cache.budget() {
+            let is_new = !taken.contains(&view.id);
+            if !taken.is_empty() && is_new && bytes + own > self.cache.budget() {
                 break;
             }
-            if numbers.insert(view.number) {
+            if taken.insert(view.id) {
                 bytes += own;
                 wanted.extend(slots);
             }
@@ -180,16 +174,15 @@ impl Views {
     /// The images that loss terms compare views with.
     pub(super) fn sources<'a>(
         &'a self,
-        gpu: &'a Gpu,
         pseudo_gt: &'a PseudoGt,
         dataset: &'a Dataset,
     ) -> Vec<ViewSource<'a>> {
         let source = |view: &'a TrainView| ViewSource {
             size: view.size(),
-            depth: view.depth.as_deref().or(dataset.views[view.index].depth.as_deref()),
-            target: Box::new(|| self.target(gpu, pseudo_gt, view)),
+            depth: view.depth.as_deref().or(dataset.views[view.in_dataset.0].depth.as_deref()),
+            target: Box::new(|| self.target(pseudo_gt, view)),
         };
-        self.levels.iter().flatten().map(source).collect()
+        self.all.iter().map(source).collect()
     }
 
     /// Records the target of a resident view, (3, H, W), which is either `scratch` or the stored image.
@@ -211,26 +204,26 @@ impl Views {
         view: &TrainView,
         scratch: &'a mut Buffer<f32>,
     ) -> Result<&'a Buffer<f32>> {
-        let photograph = self.cache.on_device(view.photograph.unwrap_or(view.stored))?;
+        let photograph = self.cache.on_device(view.dark.unwrap_or(view.stored))?;
         pseudo_gt.record(pass, photograph, None, scratch)
     }
 
     /// The curve from the stored image of a view to its target.
     fn curve(&self, view: &TrainView) -> Option<(&Buffer<ToneParameters>, u32)> {
-        view.gets_curve.then_some((&self.curves, view.place as u32))
+        view.gets_curve.then_some((&self.curves, view.photograph.0 as u32))
     }
 
     /// Reads back targets or dark photographs of views, (3, H, W), in one submission.
     pub(super) fn read(
         &self,
-        gpu: &Gpu,
         pseudo_gt: &PseudoGt,
         views: &[TrainView],
         kind: ImageKind,
     ) -> Result<Vec<Vec<f32>>> {
+        let gpu = pseudo_gt.gpu();
         let (mut stored, mut scratch) = (vec![], vec![]);
         for view in views {
-            let slot = view.photograph.filter(|_| kind == ImageKind::Photographs);
+            let slot = view.dark.filter(|_| kind == ImageKind::Photographs);
             let photograph = self.cache.load(slot.unwrap_or(view.stored))?;
             let curve = self.curve(view).filter(|_| kind == ImageKind::Targets);
             scratch.push(gpu.uninit("target", photograph.value_count)?);
@@ -248,12 +241,8 @@ impl Views {
     }
 
     /// The target of a view, (3, H, W), in a new buffer or in the stored one.
-    fn target(
-        &self,
-        gpu: &Gpu,
-        pseudo_gt: &PseudoGt,
-        view: &TrainView,
-    ) -> Result<Arc<Buffer<f32>>> {
+    fn target(&self, pseudo_gt: &PseudoGt, view: &TrainView) -> Result<Arc<Buffer<f32>>> {
+        let gpu = pseudo_gt.gpu();
         let stored = self.cache.load(view.stored)?;
         let curve = self.curve(view);
         if stored.code_bits == 32 && curve.is_none() {
@@ -267,9 +256,10 @@ impl Views {
     }
 
     /// The target of white of each photograph.
-    pub(super) fn whites(&self, gpu: &Gpu, pseudo_gt: &PseudoGt) -> Result<Vec<[f32; 3]>> {
+    pub(super) fn whites(&self, pseudo_gt: &PseudoGt) -> Result<Vec<[f32; 3]>> {
         /// Photographs of one submission.
         const AT_ONCE: usize = 256;
+        let gpu = pseudo_gt.gpu();
         let white = gpu.buffer("white", &[1.0; COLOR_CHANNELS])?;
         let places: Vec<usize> = (0..self.curves.len()).collect();
         let mut whites = vec![];
@@ -294,55 +284,56 @@ impl Views {
 
     /// The view of a step at a level: every epoch takes each view once, in its own order; the view after one that is
     /// left out is taken twice.
-    pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> ViewId {
-        let views = &self.levels[level];
-        let (order, place) = self.epochs.of_step(seed, step, views.len());
-        let from_place = order[place..].iter().chain(&order[..place]);
-        let own = from_place.copied().find(|at| !self.left_out.contains(&views[*at].place));
-        ViewId { level, index: own.unwrap_or(order[place]) }
+    pub(super) fn of_step(&self, seed: u64, step: u64, level: usize) -> TrainingView {
+        let range = self.levels[level].clone();
+        let (order, first) = self.epochs.of_step(seed, step, range.len());
+        let views = &self.all[range];
+        let in_turn = order[first..].iter().chain(&order[..first]);
+        let mut kept = in_turn.filter(|at| !self.left_out.contains(&views[**at].photograph));
+        views[*kept.next().unwrap_or(&order[first])].id
     }
 
-    pub(super) fn get(&self, ViewId { level, index }: ViewId) -> &TrainView {
-        &self.levels[level][index]
+    pub(super) fn get(&self, TrainingView(at): TrainingView) -> &TrainView {
+        &self.all[at]
     }
 
     /// The camera of a view, on the device.
-    pub(super) fn viewpoint(&self, view: ViewId) -> Viewpoint<'_> {
-        self.viewpoints.get(self.get(view).number)
+    pub(super) fn viewpoint(&self, TrainingView(at): TrainingView) -> Viewpoint<'_> {
+        self.viewpoints.get(at)
     }
 
     /// Leaves a photograph out of training; false if it is the last.
-    pub(super) fn leave_out(&mut self, place: usize) -> bool {
+    pub(super) fn leave_out(&mut self, photograph: TrainingPhotograph) -> bool {
         let has_others = self.left_out.len() + 1 < self.photographs().count();
-        has_others && self.left_out.insert(place)
+        has_others && self.left_out.insert(photograph)
     }
 
     /// The names of the views left out.
     pub(super) fn left_out(&self) -> Vec<String> {
-        let views = self.photographs().filter(|view| self.left_out.contains(&view.place));
+        let views = self.photographs().filter(|view| self.left_out.contains(&view.photograph));
         views.map(|view| view.name.clone()).collect()
     }
 
     /// Leaves out exactly these views.
     pub(super) fn set_left_out(&mut self, names: &[String]) {
         let views = self.photographs().filter(|view| names.contains(&view.name));
-        self.left_out = views.map(|view| view.place).collect();
+        self.left_out = views.map(|view| view.photograph).collect();
     }
 
-    /// The views of all levels, by number.
-    pub(super) fn all(&self) -> impl Iterator<Item = &TrainView> {
-        self.levels.iter().flatten()
+    /// The views of all levels.
+    pub(super) fn all(&self) -> &[TrainView] {
+        &self.all
     }
 
     /// The full-size views, grouped by photograph.
     pub(super) fn whole(&self) -> &[TrainView] {
-        self.levels.first().map_or(&[], Vec::as_slice)
+        self.levels.first().map_or(&[], |range| &self.all[range.clone()])
     }
 
     /// The number of values of the largest view.
     pub(super) fn largest_view_values(&self) -> usize {
         let values = |view: &TrainView| COLOR_CHANNELS * view.size().element_product() as usize;
-        self.all().map(values).max().unwrap_or_default()
+        self.all.iter().map(values).max().unwrap_or_default()
     }
 
     /// One full-size view of every photograph.
@@ -373,13 +364,13 @@ pub(super) enum ImageKind {
 /// A photograph at the size of a level.
 struct LevelImage<'a> {
     name: &'a str,
-    place: usize,
-    index: usize,
-    photograph: Image,
+    photograph: TrainingPhotograph,
+    in_dataset: DatasetView,
+    dark: Image,
     /// Its target, if the curve was applied at another size.
     target: Option<Image>,
     /// Whether the photograph is kept in addition to the target.
-    keeps_photograph: bool,
+    keeps_dark: bool,
     /// The depth, if it differs from the dataset's map.
     depth: Option<Vec<f32>>,
 }
@@ -388,24 +379,23 @@ impl LevelImage<'_> {
     fn view(&self, patch: Patch, encoder: &mut Encoder, cache: &mut Cache) -> Result<TrainView> {
         let mut upload =
             |name, image: &Image| cache.keep(encoder.upload(name, &patch.cut(&image.data))?);
-        let (stored, photograph) = match &self.target {
+        let (stored, dark) = match &self.target {
             Some(target) => {
-                let photograph = self.keeps_photograph.then(|| upload("low", &self.photograph));
-                let photograph = photograph.transpose()?;
-                (upload("target", target)?, photograph)
+                let dark = self.keeps_dark.then(|| upload("low", &self.dark)).transpose()?;
+                (upload("target", target)?, dark)
             }
-            None => (upload("low", &self.photograph)?, None),
+            None => (upload("low", &self.dark)?, None),
         };
         Ok(TrainView {
             name: self.name.to_owned(),
-            number: 0,
-            place: self.place,
-            index: self.index,
+            id: TrainingView(0),
+            photograph: self.photograph,
+            in_dataset: self.in_dataset,
             patch,
             depth: self.depth.as_ref().map(|depth| patch.cut(depth).into_owned()),
             stored,
             gets_curve: self.target.is_none(),
-            photograph,
+            dark,
         })
     }
 }

@@ -360,7 +360,7 @@ fn a_law_is_read_in_place_of_measuring_and_one_of_another_set_is_refused() {
     let short = city.path("short.toml");
     fs::write(
         &short,
-        text.lines().filter(|line| !line.starts_with("\"005\"")).collect::<Vec<_>>().join("\n"),
+        text.lines().filter(|line| !line.starts_with("005 ")).collect::<Vec<_>>().join("\n"),
     )
     .unwrap();
     let train = format!("train {street} --out {run}2 --steps 1 --plan none");

@@ -30,9 +30,10 @@ fn reference(settings: &ToneSettings, dark: &Image, noise: f64, seed: u64) -> Im
     let parameters = settings.parameters(&Statistics::of(&dark.data));
     let plane = dark.pixel_count();
     let data = dark.data.iter().enumerate().map(|(index, &x)| {
-        let y = match settings.curve {
-            ToneCurve::PerChannel => (x / parameters.constants[index / plane]).min(1.0),
-            curve => curve.apply(x, &parameters),
+        let y = if settings.curve == ToneCurve::PerChannel {
+            (x / parameters.constants[index / plane]).min(1.0)
+        } else {
+            settings.curve.apply(x, &parameters)
         };
         (f64::from(y) + noise * stream.normal(index as u64)) as f32
     });
@@ -127,7 +128,7 @@ fn black_level_gain_and_target_mean_are_recovered_for_adaptive_curves() {
         let mut truth = ToneSettings { theta: 0.42, ..ToneSettings::new(family.curve) };
         if family.white == White::P90 {
             (truth.alpha, truth.gain_c) = (0.1, 1.7);
-            if family.law == nightsplat::photographs::tone::OffsetMode::Rescaled {
+            if family.is_rescaled {
                 truth.base_gain = 0.9;
             }
         }

@@ -6,9 +6,8 @@ use nightsplat::gpu::testing::{gpu, gpu_that_binds};
 use nightsplat::kernels::ToneParameters;
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::tone::{
-    MeasuredPhotograph, SceneTone, ToneCurve, ToneMapping, ToneSettings,
-};
+use nightsplat::photographs::targets::SceneTone;
+use nightsplat::photographs::tone::{MeasuredPhotograph, ToneCurve, ToneMapping, ToneSettings};
 
 use crate::common::{assert_close, fixture, shared};
 
@@ -45,7 +44,7 @@ fn a_curve_agrees_with_the_host_from_tiny_to_huge_values() {
 /// The tone mapping of a single photograph, and its target on the device.
 fn tone_mapped(gpu: &Gpu, settings: &ToneSettings, photograph: &Image) -> (ToneMapping, Image) {
     let tone_mapping =
-        settings.tone_mapping(&SceneTone::default(), &MeasuredPhotograph::of(&photograph.data));
+        SceneTone::new(settings).mapping_of(&MeasuredPhotograph::of(&photograph.data));
     let pseudo_gt = PseudoGt::new(gpu, settings).unwrap();
     (tone_mapping, pseudo_gt.tone_mapped(photograph, &tone_mapping).unwrap())
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use nightsplat::Error;
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::tone::{
-    GainChoice, Statistics, ToneCurve, ToneParameters, ToneSettings, percentile,
+    GainChoice, Statistics, Tone, ToneCurve, ToneParameters, ToneSettings, percentile,
 };
 
 use crate::common::{fixture, shared};
@@ -134,11 +134,10 @@ fn nan_and_negative_values_map_into_the_range() {
 
 #[test]
 fn curves_are_found_by_name_and_an_unknown_name_lists_them() {
-    let of_files_and_photographs = [ToneCurve::Table, ToneCurve::Profile, ToneCurve::Auto];
-    for curve in ToneCurve::ALL.into_iter().chain(of_files_and_photographs) {
-        assert_eq!(curve.to_string().parse::<ToneCurve>().unwrap(), curve);
+    for curve in ToneCurve::ALL.map(Tone::Formula).into_iter().chain([Tone::Auto]) {
+        assert_eq!(curve.to_string().parse::<Tone>().unwrap(), curve);
     }
-    let error = "gama".parse::<ToneCurve>().unwrap_err();
+    let error = "gama".parse::<Tone>().unwrap_err();
     assert!(matches!(error, Error::Usage(_)));
     let message = error.to_string();
     for part in ["gama", "linear", "ase", "ap3", "none"] {

@@ -14,7 +14,7 @@ use nightsplat::photographs::dataset::Dataset;
 use nightsplat::photographs::dataset::synthetic;
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
-use nightsplat::photographs::tone::{Statistics, ToneCurve, ToneSettings};
+use nightsplat::photographs::tone::{Statistics, Tone, ToneCurve, ToneSettings};
 use nightsplat::reference::gaussian::Gaussian;
 use nightsplat::splats::packed_sh::StorageFormat;
 use nightsplat::splats::scene::{Features, Shape};
@@ -196,10 +196,10 @@ fn dark(pixels: u64) -> Vec<f32> {
 #[test]
 fn every_pass_of_the_pseudo_gt_agrees_with_its_reference_for_every_curve() {
     let gpu = gpu();
-    let profile = ToneSettings::of_profile(crate::common::setup::profile());
-    let named = ToneCurve::ALL.into_iter().chain([ToneCurve::Auto]).map(ToneSettings::new);
-    for settings in named.chain([profile]) {
-        let curve = settings.curve;
+    let profile = ToneSettings::new(Tone::Profile(crate::common::setup::profile()));
+    let named = ToneCurve::ALL.map(ToneSettings::new).into_iter();
+    for settings in named.chain([ToneSettings::default(), profile]) {
+        let curve = &settings.curve;
         if settings.check().is_err() {
             continue;
         }

@@ -6,10 +6,11 @@ use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::dataset::{Dataset, LoadOptions};
 use nightsplat::photographs::image::Image;
 use nightsplat::photographs::pseudo_gt::PseudoGt;
+use nightsplat::photographs::targets::{SceneTone, TargetExposure};
 use nightsplat::photographs::tone::{
-    GainChoice, MeasuredPhotograph, Table, ToneCurve, ToneSettings,
+    GainChoice, MeasuredPhotograph, Table, Tone, ToneCurve, ToneSettings,
 };
-use nightsplat::train::{TargetExposure, TrainConfig, Trainer};
+use nightsplat::train::{TrainConfig, Trainer};
 
 use crate::common::train::small_set;
 
@@ -45,8 +46,8 @@ fn every_kind_of_curve_trains_and_a_recorded_configuration_repeats_it() {
         ToneSettings { colour: 0.0, brightness: Some(0.4), ..ToneSettings::default() },
         ToneSettings::new(ToneCurve::Ap3).with_gain(GainChoice::Auto),
         ToneSettings { full_resolution: true, ..ToneSettings::new(ToneCurve::Ap3) },
-        ToneSettings::of_table(dense_table(ToneCurve::Rational)),
-        ToneSettings::of_profile(crate::common::setup::profile()),
+        ToneSettings::new(Tone::Table(dense_table(ToneCurve::Rational))),
+        ToneSettings::new(Tone::Profile(crate::common::setup::profile())),
     ];
     for tone in kinds {
         let config = config(tone);
@@ -61,7 +62,7 @@ fn every_kind_of_curve_trains_and_a_recorded_configuration_repeats_it() {
 fn a_baked_target_trains_as_the_curve_in_the_loss() {
     let dataset = crate::common::train::dataset(5, [32, 24]);
     let in_loss = train(&config(ToneSettings::new(ToneCurve::PowerSoftexp)), &dataset).0;
-    let table = ToneSettings::of_table(dense_table(ToneCurve::PowerSoftexp));
+    let table = ToneSettings::new(Tone::Table(dense_table(ToneCurve::PowerSoftexp)));
     let baked = train(&config(table), &dataset).0;
     for (a, b) in in_loss.iter().zip(&baked) {
         assert!((a - b).abs() < 2e-3, "{in_loss:?} and {baked:?}");
@@ -87,7 +88,7 @@ fn exposure(
         image.data.iter_mut().for_each(|x| *x = (*x * factors(place)).min(1.0));
     }
     let trainer = Trainer::new(&gpu(), config(ToneSettings::default()), &dataset)?;
-    Ok(trainer.target_exposure().unwrap().clone())
+    Ok(trainer.scene().target_exposure(&dataset).unwrap())
 }
 
 #[test]
@@ -105,7 +106,8 @@ fn darker_views_get_more_gain_and_the_model_the_mean_of_them() {
     assert!((varied.model_gain / product.powf(0.2) - 1.0).abs() < 1e-9);
     let shared = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
     let trainer = Trainer::new(&gpu(), config(shared), &dataset).unwrap();
-    let TargetExposure { scene, gains, .. } = trainer.target_exposure().unwrap();
+    let exposure = trainer.scene().target_exposure(&dataset);
+    let TargetExposure { scene, gains, .. } = exposure.unwrap();
     assert!(gains.values().all(|&gain| gain == scene.gain));
 }
 
@@ -160,10 +162,9 @@ fn photographs_are_tone_mapped_before_they_are_downscaled() {
     let measured: Vec<_> = seen
         .map(|((_, image), view)| MeasuredPhotograph::of(&image.data).seen_by(&view.camera))
         .collect();
-    let scene = settings.scene(&measured).unwrap();
+    let scene = SceneTone::from_photographs(&settings, &measured).unwrap();
     for ((name, photograph), measured) in photographs.iter().zip(&measured) {
-        let tone_mapped =
-            pseudo_gt.tone_mapped(photograph, &settings.tone_mapping(&scene, measured)).unwrap();
+        let tone_mapped = pseudo_gt.tone_mapped(photograph, &scene.mapping_of(measured)).unwrap();
         tone_mapped.save_png16(folder.path().join("low").join(format!("{name}.png"))).unwrap();
     }
     let elsewhere = train(&config(ToneSettings::new(ToneCurve::None)), &load()).0;

@@ -169,7 +169,7 @@ fn a_lamp_is_told_from_the_surfaces_that_it_lights() {
     assert!(lit > 24.0 && evenly > 20.0, "lit {lit:.2} dB, evenly lit {evenly:.2} dB");
     assert!(lit > plain[0] + 2.0, "without a lamp {:.2} dB", plain[0]);
     assert_eq!(without.lamp().unwrap(), None);
-    // The law along the axis and across it, up to the reference distances of both and the slope of the tone law.
+    // The light along the axis and across it, up to the reference distances of both and the slope of the tone curve.
     let own = with.lamp().unwrap().unwrap();
     let ratio = |lamp: &Lamp, point: DVec3| lamp.factor(point) / lamp.factor(1.5 * DVec3::Z);
     for point in [DVec3::Z, 3.0 * DVec3::Z, DVec3::new(0.7, 0.0, 1.2)] {

@@ -32,7 +32,7 @@ layout(binding = 3) readonly  buffer Colors { vec4 colors[]; };  // (gaussian_co
 layout(binding = 4) readonly  buffer Gradients { float gradients[]; };  // trained planes
 layout(binding = 5) writeonly buffer Partials { float partials[]; };  // (chunks, LAMP_WIDTH)
 
-#include "lamp_law.glsl"
+#include "lamp_falloff.glsl"
 #include "trained.glsl"
 
 void main() {

@@ -50,7 +50,7 @@ layout(constant_id = 11) const uint VIEW_DEPTHS = 0;  // 1: the last channel is 
 const uint FEATURE_COUNT = CHANNELS - 3 - VIEW_DEPTHS;
 
 #include "rest.glsl"
-#include "lamp_law.glsl"
+#include "lamp_falloff.glsl"
 
 // Depth is positive, so its bits sort like its value.
 uint depth_key(float depth) {

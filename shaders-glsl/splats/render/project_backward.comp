@@ -59,7 +59,7 @@ const uint FEATURE_COUNT = CHANNELS - 3;
 #include "rest.glsl"
 #include "gradient_records.glsl"
 #include "conic.glsl"
-#include "lamp_law.glsl"
+#include "lamp_falloff.glsl"
 
 #define STORE_VEC3(column, i, v) { \
     uint at = trained_place((column) * gaussian_count + 3 * (i)); \

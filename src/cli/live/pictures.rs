@@ -13,9 +13,10 @@ use crate::cli::driver;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, LoadOptions, MeasuredSize, View};
 use crate::photographs::image::Image;
+use crate::photographs::targets::Targets;
 use crate::photographs::tone::ToneCurve;
 use crate::results::export::page::{Bookmark, Picture, moved};
-use crate::train::{TestTargets, TrainConfig};
+use crate::train::TrainConfig;
 
 /// What an image shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,7 +46,7 @@ pub(in crate::cli) struct Pictures {
     /// Opened for the first target.
     gpu: Option<Gpu>,
     /// The training photographs are measured for the first target.
-    targets: Option<TestTargets>,
+    targets: Option<Targets>,
     /// The last are kept.
     finished: VecDeque<((usize, Kind), Bytes)>,
 }
@@ -158,10 +159,10 @@ impl Pictures {
                         Some(own) => own,
                         None => driver::open(&config.device.parse()?)?,
                     };
-                    *targets = Some(TestTargets::new(&opened, &config.tone, dataset)?);
+                    *targets = Some(Targets::new(&opened, &config.tone, dataset)?);
                     *gpu = Some(opened);
                 }
-                targets.as_mut().map_or(Ok(None), |targets| targets.of(view))?
+                targets.as_ref().map_or(Ok(None), |targets| targets.target(view))?
             }
         };
         Ok(image.map(|image| view.upright(image)))

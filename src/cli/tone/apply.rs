@@ -18,10 +18,9 @@ use crate::gpu::{DeviceChoice, Gpu};
 use crate::photographs::dataset::{Dataset, Split};
 use crate::photographs::image::{ColourCounts, Image, Mask, Orientation};
 use crate::photographs::metrics::Scores;
-use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::targets::{SceneTone, Targets};
 use crate::photographs::tone::{
-    CurveChoice, Exposure, MeasuredPhotograph, SceneTone, Statistics, ToneCurve, ToneSettings,
-    all_black,
+    CurveChoice, Exposure, MeasuredPhotograph, Statistics, Tone, ToneCurve, ToneSettings, all_black,
 };
 use crate::results::eval;
 use crate::results::report::Distribution;
@@ -84,7 +83,7 @@ impl ApplyArgs {
             (tone.curve, tone.profile) = (Some(curve.clone()), None);
         }
         let is_auto = tone.profile.is_none()
-            && tone.curve.as_ref().is_none_or(|curve| *curve == ToneCurve::Auto.into());
+            && tone.curve.as_ref().is_none_or(|curve| *curve == Tone::Auto.into());
         let mut requested = RequestedSettings::default();
         tone.push(&mut requested.options)?;
         self.settings.push(&mut requested.options)?;
@@ -276,7 +275,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
     }
     progress.finish_and_clear();
     set.colours.say();
-    let exposure = set.scene.exposure;
+    let exposure = set.targets.scene.exposure;
     let Some(mut scene) = scene(&views) else {
         let nothing = || Error::input(&args.input, "contains no photograph");
         return Err(unusable.unwrap_or_else(nothing));
@@ -293,8 +292,7 @@ pub fn apply(args: &ApplyArgs) -> Result<ToneOutput> {
 
 /// A curve with its statistics of the whole dataset, if it has any.
 struct CurveOnSet {
-    pseudo_gt: PseudoGt,
-    scene: SceneTone,
+    targets: Targets,
     /// Masks hide white.
     inverted: bool,
     /// Counts of converted and unsupported colours.
@@ -309,7 +307,6 @@ impl CurveOnSet {
         photographs: &[Listed],
         (input, inverted): (&Path, bool),
     ) -> Result<Self> {
-        let pseudo_gt = PseudoGt::new(gpu, &settings)?;
         let mut measured = vec![];
         if settings.scene_statistics || settings.takes_exposure() {
             for listed in photographs.iter().filter(|listed| listed.split != Some(Split::Test)) {
@@ -324,12 +321,16 @@ impl CurveOnSet {
                 return Err(Error::Usage(problem.to_owned()));
             }
         }
-        let scene = match settings.scene(&measured) {
+        let scene = match SceneTone::from_photographs(&settings, &measured) {
             Some(scene) => scene,
-            None if measured.is_empty() => SceneTone::default(),
+            None if measured.is_empty() => SceneTone::new(&settings),
             None => return Err(all_black(input)),
         };
-        Ok(Self { pseudo_gt, scene, inverted, colours: ColourCounts::default() })
+        Ok(Self {
+            targets: Targets::in_scene(gpu, scene)?,
+            inverted,
+            colours: ColourCounts::default(),
+        })
     }
 
     /// Statistics of a photograph, its mapped image and the gain.
@@ -339,12 +340,8 @@ impl CurveOnSet {
         gaps: &[usize],
     ) -> Result<(Statistics, Image, Option<f64>)> {
         let measured = MeasuredPhotograph::of(&without(photograph, gaps));
-        let tone_mapping = self.pseudo_gt.settings().tone_mapping(&self.scene, &measured);
-        Ok((
-            measured.statistics,
-            self.pseudo_gt.tone_mapped(photograph, &tone_mapping)?,
-            tone_mapping.gain,
-        ))
+        let image = self.targets.tone_mapped(photograph, &measured)?;
+        Ok((measured.statistics, image, self.targets.scene.mapping_of(&measured).gain))
     }
 }
 

@@ -88,14 +88,10 @@ impl std::str::FromStr for FamilyChoice {
         if name == "all" {
             return Ok(Self::All);
         }
-        match name.parse()? {
-            ToneCurve::Table => {
-                Err(Error::Usage("a table of values has no constants to fit".to_owned()))
-            }
-            ToneCurve::Profile => {
-                Err(Error::Usage("a camera profile is fitted with --profile".to_owned()))
-            }
-            curve => Ok(Self::One(curve)),
+        match name {
+            "table" => Err(Error::Usage("a table of values has no constants to fit".to_owned())),
+            "profile" => Err(Error::Usage("a camera profile is fitted with --profile".to_owned())),
+            name => name.parse().map(Self::One),
         }
     }
 }

@@ -8,7 +8,7 @@ use crate::cli::{finish, table, words};
 use crate::photographs::dataset::{Dataset, LoadOptions, Split};
 use crate::photographs::image::{ColourCounts, Image};
 use crate::photographs::tone::{
-    CurveChoice, FAMILIES, Family, Statistics, ToneCurve, ToneSettings,
+    CurveChoice, FAMILIES, Family, Statistics, Tone, ToneCurve, ToneSettings,
 };
 use crate::results::report::{Chart, Series, VerticalLine};
 use crate::{Error, Result};
@@ -42,15 +42,9 @@ pub struct ListArgs {
 const AUTO: &str = "0.075 + 0.925 ((1 - lambda) s(x) + lambda x s(Y) / Y), s(x) = 1 - exp(-k x)
     monotone, bounded; k from the luminance of all photographs, see the guide; drawn over t = k x";
 
-/// The curves of a plot without names.
-const PLOTTED: [ToneCurve; 6] = [
-    ToneCurve::Auto,
-    ToneCurve::Linear,
-    ToneCurve::Ase,
-    ToneCurve::Ap3,
-    ToneCurve::Gamma,
-    ToneCurve::Reinhard,
-];
+/// The curves of a plot without names, after the automatic curve.
+const PLOTTED: [ToneCurve; 5] =
+    [ToneCurve::Linear, ToneCurve::Ase, ToneCurve::Ap3, ToneCurve::Gamma, ToneCurve::Reinhard];
 
 /// A curve with its name.
 struct Curve {
@@ -69,7 +63,7 @@ pub fn text(args: &ListArgs) -> Result<String> {
     if let Some(t) = args.at.iter().find(|&&t| t.is_nan() || t < 0.0) {
         return Err(Error::Usage(format!("--at {t}: t must be 0 or more")));
     }
-    let plotted: Vec<CurveChoice> = PLOTTED.into_iter().map(CurveChoice::Named).collect();
+    let plotted = auto_and(PLOTTED);
     let is_plain_plot = args.plot.is_some() && !args.table && args.curves.is_empty();
     let curves = chosen(if is_plain_plot { &plotted } else { &args.curves })?;
     let scene = args.dataset.as_deref().map(scene_statistics).transpose()?;
@@ -89,13 +83,13 @@ pub fn text(args: &ListArgs) -> Result<String> {
     Ok(text)
 }
 
-/// The automatic curve, then those of the table.
-fn every_curve() -> impl Iterator<Item = ToneCurve> {
-    std::iter::once(ToneCurve::Auto).chain(ToneCurve::ALL)
+/// The automatic curve, then these.
+fn auto_and(formulas: impl IntoIterator<Item = ToneCurve>) -> Vec<CurveChoice> {
+    std::iter::once(Tone::Auto.into()).chain(formulas.into_iter().map(CurveChoice::from)).collect()
 }
 
 fn chosen(choices: &[CurveChoice]) -> Result<Vec<Curve>> {
-    let all: Vec<CurveChoice> = every_curve().map(CurveChoice::Named).collect();
+    let all = auto_and(ToneCurve::ALL);
     let choices = if choices.is_empty() { &all } else { choices };
     let curve =
         |choice: &CurveChoice| Ok(Curve { name: choice.to_string(), settings: choice.settings()? });
@@ -118,16 +112,17 @@ fn scene_statistics(root: &std::path::Path) -> Result<Statistics> {
 fn listing(curves: &[Curve]) -> String {
     let mut text = String::new();
     for Curve { name, settings } in curves {
-        let Family { formula, source, monotone, bounded, constants, aliases, .. } =
-            settings.curve.family();
-        if settings.table.is_some() {
-            text += &format!("{name}\n    a table of values, monotone cubics between them\n");
+        let what = match &settings.curve {
+            Tone::Formula(_) => "",
+            Tone::Auto => AUTO,
+            Tone::Table(_) => "a table of values, monotone cubics between them",
+            Tone::Profile(_) => "a camera profile: matrix, gain, bias and segments of each channel",
+        };
+        let Some(family) = settings.curve.family() else {
+            text += &format!("{name}\n    {what}\n");
             continue;
-        }
-        if settings.curve == ToneCurve::Auto {
-            text += &format!("{name}\n    {AUTO}\n");
-            continue;
-        }
+        };
+        let Family { formula, source, monotone, bounded, constants, aliases, .. } = family;
         let also =
             if aliases.is_empty() { String::new() } else { format!(" ({})", aliases.join(", ")) };
         let rises = if *monotone { "monotone" } else { "not monotone" };

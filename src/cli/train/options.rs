@@ -8,7 +8,7 @@ use toml::Value;
 use crate::cli::settings::{CurveOptions, Selection, SettingOptions, push_curve, push_dataset};
 use crate::cli::words::{self, Words};
 use crate::photographs::dataset::exclude;
-use crate::photographs::tone::ToneLaw;
+use crate::photographs::targets::SceneTone;
 use crate::train::diagnose::Plan;
 use crate::train::{
     ModelName, Origin, Part, Preset, RequestedSettings, SettingsLayer, TrainConfig,
@@ -170,7 +170,7 @@ impl TrainOptions {
     /// The curve of the tone law, which its photographs were measured for.
     fn push_law(&self, options: &mut SettingsLayer) -> Result<()> {
         let Some(path) = self.single.get("tone.law") else { return Ok(()) };
-        push_curve(options, ToneLaw::load(Path::new(path))?.tone, "--law")
+        push_curve(options, SceneTone::load(Path::new(path))?.settings().clone(), "--law")
     }
 }
 

@@ -2,20 +2,9 @@
 
 use super::{FitOptions, Pair};
 use crate::photographs::tone::{
-    Constant, CurveInputs, Dual, Family, OffsetMode, PhotographCurve, Real, Statistics,
-    ToneSettings, White, clamped, curve_at, law,
+    Constant, Curve, Dual, Family, Real, Statistics, ToneSettings, Variable, White, clamped,
 };
 use crate::{Error, Result};
-
-/// The place of a fitted value in [`ToneSettings`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum SettingSlot {
-    Shape(usize),
-    Theta,
-    Alpha,
-    GainC,
-    BaseGain,
-}
 
 /// A setting that is not among a family's constants; it starts at the family's value.
 const fn setting(name: &'static str, low: f64, high: f64) -> Constant {
@@ -30,7 +19,7 @@ const BASE_GAIN: Constant = setting("base_gain", 0.1, 10.0);
 #[derive(Clone, Debug)]
 pub(super) struct Model {
     pub(super) family: &'static Family,
-    slots: Vec<SettingSlot>,
+    slots: Vec<Variable>,
     /// In the order of every vector of values.
     pub(super) free: Vec<Constant>,
 }
@@ -67,19 +56,19 @@ impl Exposure {
 
 impl Model {
     pub(super) fn new(family: &'static Family, options: &FitOptions) -> Result<Self> {
-        let mut slots: Vec<SettingSlot> =
-            (0..family.constants.len()).map(SettingSlot::Shape).collect();
+        let mut slots: Vec<Variable> =
+            (0..family.constants.len()).map(Variable::Constant).collect();
         match family.white {
             White::One => {}
             White::P90 if options.adapt || family.alpha > 0.0 || family.gain_c > 0.0 => {
-                slots.extend([SettingSlot::Alpha, SettingSlot::GainC]);
-                if family.law == OffsetMode::Rescaled {
-                    slots.push(SettingSlot::BaseGain);
+                slots.extend([Variable::Alpha, Variable::GainC]);
+                if family.is_rescaled {
+                    slots.push(Variable::BaseGain);
                 }
             }
             White::P90 => {}
             White::Mean | White::P80 | White::MeanLuminance | White::ChannelMeans => {
-                slots.push(SettingSlot::Theta);
+                slots.push(Variable::Theta);
             }
         }
         if slots.is_empty() {
@@ -92,18 +81,18 @@ impl Model {
         let starting_at =
             |constant: Constant, value: f64| Constant { default: value, start: value, ..constant };
         let free = slots.iter().map(|&slot| match slot {
-            SettingSlot::Shape(index) => family.constants[index],
-            SettingSlot::Theta => starting_at(THETA, settings.theta),
-            SettingSlot::Alpha => starting_at(ALPHA, settings.alpha),
-            SettingSlot::GainC => starting_at(GAIN_C, settings.gain_c),
-            SettingSlot::BaseGain => starting_at(BASE_GAIN, settings.base_gain),
+            Variable::Constant(index) => family.constants[index],
+            Variable::Theta => starting_at(THETA, settings.theta),
+            Variable::Alpha => starting_at(ALPHA, settings.alpha),
+            Variable::GainC => starting_at(GAIN_C, settings.gain_c),
+            Variable::BaseGain => starting_at(BASE_GAIN, settings.base_gain),
         });
         Ok(Self { free: free.collect(), family, slots })
     }
 
     /// Whether photographs with different statistics have different curves of t.
     pub(super) fn differs_by_photograph(&self) -> bool {
-        self.slots.iter().any(|slot| !matches!(slot, SettingSlot::Shape(_)))
+        self.slots.iter().any(|slot| !matches!(slot, Variable::Constant(_)))
     }
 
     /// Whether the channels of a photograph have different curves.
@@ -121,61 +110,55 @@ impl Model {
         let mut settings = ToneSettings::new(self.family.curve);
         for (&slot, &value) in self.slots.iter().zip(values) {
             match slot {
-                SettingSlot::Shape(index) => settings.constants[index] = value,
-                SettingSlot::Theta => settings.theta = value,
-                SettingSlot::Alpha => settings.alpha = value,
-                SettingSlot::GainC => settings.gain_c = value,
-                SettingSlot::BaseGain => settings.base_gain = value,
+                Variable::Constant(index) => settings.constants[index] = value,
+                Variable::Theta => settings.theta = value,
+                Variable::Alpha => settings.alpha = value,
+                Variable::GainC => settings.gain_c = value,
+                Variable::BaseGain => settings.base_gain = value,
             }
         }
         settings
     }
 
     /// The curve of a photograph of this exposure with these values.
-    pub(super) fn curve(&self, values: &[f64], exposure: &Exposure) -> Curve<f64> {
-        self.curve_of(&CurveInputs::from(&self.settings(values)), exposure)
+    pub(super) fn curve(&self, values: &[f64], exposure: &Exposure) -> CurveOfT<f64> {
+        curve_of(&self.settings(values), exposure, |_, value| value)
     }
 
     /// [`Self::curve`] with its derivatives with respect to every value.
     pub(super) fn slopes(&self, values: &[f64], exposure: &Exposure) -> Slopes {
-        let numbers = CurveInputs::<Dual>::from(&self.settings(values));
-        let by = |&slot: &SettingSlot| {
-            let mut numbers = numbers;
-            let variable = match slot {
-                SettingSlot::Shape(index) => &mut numbers.constants[index],
-                SettingSlot::Theta => &mut numbers.theta,
-                SettingSlot::Alpha => &mut numbers.alpha,
-                SettingSlot::GainC => &mut numbers.gain_c,
-                SettingSlot::BaseGain => &mut numbers.base_gain,
-            };
-            variable.derivative = 1.0;
-            self.curve_of(&numbers, exposure)
+        let settings = self.settings(values);
+        let by = |&variable: &Variable| {
+            curve_of(&settings, exposure, |of, value| {
+                let derivative = f64::from(u8::from(of == variable));
+                Dual { value, derivative }
+            })
         };
         Slopes(self.slots.iter().map(by).collect())
     }
+}
 
-    fn curve_of<T: Real>(&self, numbers: &CurveInputs<T>, exposure: &Exposure) -> Curve<T> {
-        let family = self.family;
-        let curve = law(family, family.white, numbers, &exposure.statistics);
-        let white = match family.white {
-            White::ChannelMeans => curve.constants[exposure.channel],
-            _ => curve.white,
-        };
-        let number = family.curve.constant();
-        Curve { number, p90: exposure.p90(), curve: PhotographCurve { white, ..curve } }
+/// The curve of a photograph of this exposure, or of one of its channels.
+fn curve_of<T: Real>(
+    settings: &ToneSettings,
+    exposure: &Exposure,
+    number: impl Fn(Variable, f64) -> T,
+) -> CurveOfT<T> {
+    let mut curve = settings.curve_of(&exposure.statistics, number);
+    if settings.white() == White::ChannelMeans {
+        curve.white = curve.constants[exposure.channel];
     }
+    CurveOfT { p90: exposure.p90(), curve }
 }
 
 /// The curve of a photograph, or of one of its channels, as a function of t = x / p90.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Curve<T> {
-    /// A `CURVE_*` number.
-    number: u32,
+pub(super) struct CurveOfT<T> {
     p90: f64,
-    curve: PhotographCurve<T>,
+    curve: Curve<T>,
 }
 
-impl<T: Real> Curve<T> {
+impl<T: Real> CurveOfT<T> {
     /// At t, clamped.
     pub(super) fn at(&self, t: f64) -> T {
         clamped(self.raw_at(t))
@@ -183,14 +166,13 @@ impl<T: Real> Curve<T> {
 
     /// At t, unclamped.
     pub(super) fn raw_at(&self, t: f64) -> T {
-        let PhotographCurve { white, offset, gain, constants } = &self.curve;
-        curve_at(self.number, T::of(t * self.p90) / *white, [*offset, *gain], constants)
+        self.curve.at(T::of(t * self.p90))
     }
 }
 
 /// The derivatives of a curve with respect to every value of its model; those that are not finite count as 0.
 #[derive(Clone, Debug)]
-pub(super) struct Slopes(Vec<Curve<Dual>>);
+pub(super) struct Slopes(Vec<CurveOfT<Dual>>);
 
 impl Slopes {
     /// Of the clamped curve at t.
@@ -210,12 +192,10 @@ fn counted(number: Dual) -> f64 {
 
 /// The PSNR over all pixels and channels of the dark photograph tone-mapped with `settings`, dB.
 pub fn psnr(settings: &ToneSettings, pair: &Pair) -> f64 {
-    let model = Model { family: settings.curve.family(), slots: vec![], free: vec![] };
-    let numbers = CurveInputs::<f64>::from(settings);
     let [mut count, mut squares] = [0.0; 2];
     for (channel, histogram) in pair.channels.iter().enumerate() {
         let exposure = Exposure::of(pair.statistics, channel);
-        let curve = model.curve_of(&numbers, &exposure);
+        let curve = curve_of(settings, &exposure, |_, value| value);
         squares += histogram.residuals(|x| curve.at(x / exposure.p90()))[1];
         count += histogram.count();
     }
@@ -240,12 +220,11 @@ mod tests {
         for family in &FAMILIES {
             let settings = ToneSettings::new(family.curve);
             let parameters = settings.parameters(&statistics);
-            let model = Model { family, slots: vec![], free: vec![] };
-            let numbers = CurveInputs::<f64>::from(&settings);
             for x in [0.0, 0.004, 0.03, 0.13, 0.3, 0.9] {
                 for channel in 0..3 {
                     let exposure = Exposure::of(statistics, channel);
-                    let found = model.curve_of(&numbers, &exposure).at(x / exposure.p90());
+                    let curve = curve_of(&settings, &exposure, |_, value| value);
+                    let found = curve.at(x / exposure.p90());
                     let expected = if family.curve == ToneCurve::PerChannel {
                         clamped(x as f32 / parameters.constants[channel])
                     } else {

@@ -3,7 +3,7 @@
 use levenberg_marquardt::{LeastSquaresProblem, LevenbergMarquardt};
 use nalgebra::{DMatrix, DVector, Dyn, Owned};
 
-use super::model::{Curve, Exposure, Model, Slopes};
+use super::model::{CurveOfT, Exposure, Model, Slopes};
 use super::{Channels, FitOptions, Histogram, Pair, Weighting};
 use crate::base::random::Stream;
 use crate::photographs::tone::{Constant, Statistics};
@@ -207,7 +207,7 @@ impl<'a> Solver<'a> {
     }
 
     /// The curve of every group.
-    fn curves(&self, values: &[f64]) -> Vec<Curve<f64>> {
+    fn curves(&self, values: &[f64]) -> Vec<CurveOfT<f64>> {
         self.groups.iter().map(|group| self.model.curve(values, &group.exposure)).collect()
     }
 

@@ -9,7 +9,7 @@ use crate::base::output::create_folder;
 use crate::gpu::Gpu;
 use crate::photographs::image::files::stem;
 use crate::photographs::image::{ColourCounts, Image, PictureFile, exif_segment};
-use crate::photographs::pseudo_gt::PseudoGt;
+use crate::photographs::targets::{SceneTone, Targets};
 use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, all_black};
 
 /// Tone-maps the photographs into `folder`, in their stored orientation, and returns the gain of the scene. A JPEG
@@ -27,7 +27,6 @@ pub(super) fn write(
     create_folder(folder)?;
     // The same curve for all, so that features keep matching.
     let settings = ToneSettings { scene_statistics: true, ..ToneSettings::default() };
-    let pseudo_gt = PseudoGt::new(gpu, &settings)?;
     let (mut done, all) = (0, photographs.len());
     let root = photographs.first().and_then(|path| path.parent()).unwrap_or(folder).to_owned();
     let colours = ColourCounts::default();
@@ -49,10 +48,11 @@ pub(super) fn write(
         return Err(error);
     }
     colours.say();
-    let scene = settings.scene(&measured).ok_or_else(|| all_black(&root))?;
+    let scene = SceneTone::from_photographs(&settings, &measured);
+    let targets = Targets::in_scene(gpu, scene.ok_or_else(|| all_black(&root))?)?;
     for (at, (path, measured)) in photographs.iter().zip(&measured).enumerate() {
         let (photograph, _) = PictureFile::open(path)?.decode()?;
-        let image = pseudo_gt.tone_mapped(&photograph, &settings.tone_mapping(&scene, measured))?;
+        let image = targets.tone_mapped(&photograph, measured)?;
         let file = folder.join(name(path));
         if is_jpeg(path) {
             image.save_jpeg(file, exif_of(path)?.as_deref())?;
@@ -61,7 +61,7 @@ pub(super) fn write(
         }
         report(Progress::Photographs { done: at + 1, all: photographs.len() });
     }
-    Ok(scene.exposure.map_or(1.0, |exposure| exposure.gain))
+    Ok(targets.scene.exposure.map_or(1.0, |exposure| exposure.gain))
 }
 
 /// The name that a tone-mapped photograph is saved under.

@@ -62,8 +62,8 @@ pub fn soft(x: f64, gain: f64) -> f64 {
 }
 
 /// The exposure of a set of photographs.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[serde(into = "SerializedExposure")]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(into = "SerializedExposure", from = "SerializedExposure")]
 pub struct Exposure {
     /// The gain of all training photographs together, except black ones.
     pub gain: f64,
@@ -79,7 +79,7 @@ pub struct Exposure {
     /// The number of almost black photographs.
     pub black: usize,
     /// The requested mean luminance, in place of the rule's.
-    brightness: Option<f64>,
+    pub(crate) brightness: Option<f64>,
     /// The gains of views by their cameras, if known.
     around: Option<NeighbourGains>,
 }
@@ -174,12 +174,6 @@ impl Exposure {
         Self { share: share.clamp(0.0, 1.0), around: Some(around), ..self }
     }
 
-    /// Its numbers for a file.
-    pub(super) fn recorded(&self) -> RecordedExposure {
-        let Self { gain, target, mean, spread, share, black, brightness, .. } = *self;
-        RecordedExposure { gain, target, mean, spread, share, black, brightness }
-    }
-
     /// The exposure with one gain for every photograph.
     #[must_use]
     pub fn shared(self) -> Self {
@@ -255,8 +249,8 @@ pub fn exposed_anew([from, to]: [f64; 2], weight: f64) -> Vec<[f32; 2]> {
     (0..=KNOTS).map(knot).collect()
 }
 
-/// The exposure in JSON.
-#[derive(Serialize)]
+/// The exposure in files: neither the requested brightness, which is a setting, nor the gains by camera.
+#[derive(Serialize, Deserialize)]
 struct SerializedExposure {
     gain: f64,
     target: f64,
@@ -269,24 +263,10 @@ struct SerializedExposure {
     reason: String,
 }
 
-/// The numbers of an [`Exposure`].
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct RecordedExposure {
-    pub(super) gain: f64,
-    pub(super) target: f64,
-    pub(super) mean: f64,
-    pub(super) spread: f64,
-    pub(super) share: f64,
-    pub(super) black: usize,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(super) brightness: Option<f64>,
-}
-
-impl From<RecordedExposure> for Exposure {
-    fn from(recorded: RecordedExposure) -> Self {
-        let RecordedExposure { gain, target, mean, spread, share, black, brightness } = recorded;
-        Self { gain, target, mean, spread, share, black, brightness, around: None }
+impl From<SerializedExposure> for Exposure {
+    fn from(written: SerializedExposure) -> Self {
+        let SerializedExposure { gain, target, mean, spread, share, black, .. } = written;
+        Self { gain, target, mean, spread, share, black, brightness: None, around: None }
     }
 }
 

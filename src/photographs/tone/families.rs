@@ -7,15 +7,6 @@ use super::real::{Dual, Real, within};
 pub(crate) use catalogue::{Constants, curve_shape};
 pub use catalogue::{FAMILIES, ToneCurve};
 
-/// How black level and gain are applied to a curve's shape f.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum OffsetMode {
-    /// delta0 + b f(t), b = 1 + c Y, as AP3.
-    Added,
-    /// delta0 + (1 - delta0) f(g t), g = g0 + c Y, as ASE.
-    Rescaled,
-}
-
 /// The value that t = 1 corresponds to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum White {
@@ -71,8 +62,9 @@ pub struct Family {
     /// Whether data determine each constant; otherwise a fit finds one of many equivalent solutions.
     #[cfg_attr(not(feature = "testing"), expect(dead_code, reason = "what tests hold a curve to"))]
     pub identifiable: bool,
-    /// How black level and gain are applied to the shape.
-    pub law: OffsetMode,
+    /// Whether black level and gain rescale the shape, delta0 + (1 - delta0) f(g t) with g = g0 + c Y as ASE; else it
+    /// is delta0 + b f(t) with b = 1 + c Y, as AP3.
+    pub is_rescaled: bool,
     /// The value that t = 1 corresponds to.
     pub white: White,
     /// alpha, the highest black level, by default.

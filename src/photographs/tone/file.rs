@@ -4,7 +4,7 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use super::{Profile, Table, ToneCurve, ToneSettings};
+use super::{Profile, Table, Tone, ToneCurve, ToneSettings};
 use crate::base::input;
 use crate::{Error, Result};
 
@@ -12,7 +12,7 @@ use crate::{Error, Result};
 #[derive(Clone, Debug, PartialEq)]
 pub enum CurveChoice {
     /// A curve of the table.
-    Named(ToneCurve),
+    Named(Tone),
     /// A TOML file with settings (also a run's config.toml), or a CSV or .cube file with values.
     File(PathBuf),
 }
@@ -28,13 +28,8 @@ impl FromStr for CurveChoice {
             return Ok(Self::File(text.into()));
         }
         match text.parse() {
-            Ok(ToneCurve::Table) => Err(Error::Usage(
-                "a table of values is named by its file: FILE.csv or FILE.cube".to_owned(),
-            )),
-            Ok(ToneCurve::Profile) => Err(Error::Usage(
-                "a camera profile is named by its file: --profile FILE".to_owned(),
-            )),
             Ok(curve) => Ok(Self::Named(curve)),
+            Err(error) if Tone::OF_FILES.contains(&text) => Err(error),
             Err(error) => Err(Error::Usage(format!("{error}, or a .toml, .csv or .cube file"))),
         }
     }
@@ -49,9 +44,15 @@ impl fmt::Display for CurveChoice {
     }
 }
 
+impl From<Tone> for CurveChoice {
+    fn from(curve: Tone) -> Self {
+        Self::Named(curve)
+    }
+}
+
 impl From<ToneCurve> for CurveChoice {
     fn from(curve: ToneCurve) -> Self {
-        Self::Named(curve)
+        Self::Named(curve.into())
     }
 }
 
@@ -59,7 +60,7 @@ impl CurveChoice {
     /// The curve with the constants of its row or file.
     pub fn settings(&self) -> Result<ToneSettings> {
         match self {
-            Self::Named(curve) => Ok(ToneSettings::new(*curve)),
+            Self::Named(curve) => Ok(ToneSettings::new(curve.clone())),
             Self::File(path) => ToneSettings::load(path),
         }
     }
@@ -75,8 +76,8 @@ impl ToneSettings {
         let text = input::text(path)?;
         let wrong = |problem: String| Error::input(path, format!("is not a tone curve: {problem}"));
         let settings = match extension(path).as_str() {
-            "csv" => Self::of_table(Table::from_csv(&text).map_err(wrong)?),
-            "cube" => Self::of_table(Table::from_cube(&text).map_err(wrong)?),
+            "csv" => Self::new(Tone::Table(Table::from_csv(&text).map_err(wrong)?)),
+            "cube" => Self::new(Tone::Table(Table::from_cube(&text).map_err(wrong)?)),
             _ => from_toml(&text).map_err(wrong)?,
         };
         settings.check().map_err(|error| wrong(error.to_string()))?;

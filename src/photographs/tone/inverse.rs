@@ -6,9 +6,10 @@
 //! Where a curve is flat, no inverse is accurate: values within half a code of 8 bits of its maximum become those of
 //! that limit, and are counted.
 
-use super::law::{clamped, curve_at};
+use super::curve::{Curve, clamped};
 use super::real::Real;
-use super::{SceneLaw, Table, ToneCurve, ToneParameters, ToneSettings};
+use super::{SceneLaw, Table, Tone, ToneParameters, ToneSettings};
+use crate::kernels::curves::{CURVE_AUTO, CURVE_LUM_PRESERVE, CURVE_PER_CHANNEL, CURVE_TABLE};
 use crate::photographs::image::{linear_from_srgb, srgb_from_linear};
 use crate::{Error, Result};
 
@@ -23,13 +24,9 @@ const TRIALS: usize = 60;
 /// The inverse of the curve of a photograph.
 #[derive(Clone, Debug)]
 pub struct InverseTone {
-    curve: ToneCurve,
+    curve: Curve<f64>,
     table: Option<Table>,
-    white: f64,
-    offset: f64,
-    gain: f64,
     weight: f64,
-    constants: [f64; crate::kernels::curves::MAX_CONSTANTS as usize],
     /// The largest value of a target of each channel that is inverted.
     largest: [f64; 3],
 }
@@ -46,12 +43,16 @@ pub struct Inverted {
 impl InverseTone {
     /// The inverse of this curve with the parameters of a photograph.
     pub fn new(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {
-        if settings.curve == ToneCurve::Profile {
-            let problem = "a camera profile mixes and bends channels, and has no inverse; train with a curve for \
+        let table = match &settings.curve {
+            Tone::Table(table) => Some(table.clone()),
+            Tone::Formula(_) | Tone::Auto => None,
+            Tone::Profile(_) => {
+                let problem = "a camera profile mixes and bends channels, and has no inverse; train with a curve for \
                            linear light";
-            return Err(Error::Usage(problem.to_owned()));
-        }
-        Ok(Self::of_curve(settings.curve, settings.table.clone(), parameters))
+                return Err(Error::Usage(problem.to_owned()));
+            }
+        };
+        Ok(Self::of_curve(settings.curve.constant(), table, parameters))
     }
 
     /// The inverse of the law of a scene.
@@ -60,27 +61,15 @@ impl InverseTone {
         Self::of_curve(law.curve, None, &law.parameters)
     }
 
-    /// The inverse of any curve but a camera profile.
-    pub(crate) fn of_curve(
-        curve: ToneCurve,
-        table: Option<Table>,
-        parameters: &ToneParameters,
-    ) -> Self {
+    /// The inverse of any curve but a camera profile, by its `CURVE_*` number.
+    pub(crate) fn of_curve(number: u32, table: Option<Table>, parameters: &ToneParameters) -> Self {
         let ToneParameters { white, offset, gain, weight, constants } = *parameters;
         let [white, offset, gain, weight] = [white, offset, gain, weight].map(f64::from);
-        let mut inverse = Self {
-            curve,
-            table,
-            white,
-            offset,
-            gain,
-            weight,
-            constants: constants.map(f64::from),
-            largest: [1.0; 3],
-        };
+        let curve = Curve { number, white, offset, gain, constants: constants.map(f64::from) };
+        let mut inverse = Self { curve, table, weight, largest: [1.0; 3] };
         // The automatic curve reaches white in every channel, through its own curve or that of the luminance.
-        let highest = |channel| match curve {
-            ToneCurve::Auto => 1.0,
+        let highest = |channel| match number {
+            CURVE_AUTO => 1.0,
             _ => inverse.channel(LARGEST, channel, 0.0).min(1.0),
         };
         inverse.largest = [0, 1, 2].map(|channel| highest(channel) - FLAT);
@@ -89,28 +78,26 @@ impl InverseTone {
 
     /// The target of one channel. `factor`: s(Y) / Y of the pixel's luminance, if the curve uses it.
     fn channel(&self, x: f64, channel: usize, factor: f64) -> f64 {
-        let t = x / self.white;
-        let curved = match self.curve {
-            ToneCurve::Auto => {
-                let share = self.constants[0];
+        let Curve { number, white, offset, gain, constants } = &self.curve;
+        let t = x / white;
+        let curved = match *number {
+            CURVE_AUTO => {
+                let share = constants[0];
                 let own = (1.0 - share) * t.one_minus_exp() + share * t * factor;
-                self.offset + (1.0 - self.offset) * own
+                offset + (1.0 - offset) * own
             }
-            ToneCurve::Table => self.table.as_ref().map_or(t, |table| table.value(t, channel)),
+            CURVE_TABLE => self.table.as_ref().map_or(t, |table| table.value(t, channel)),
             // A pixel's gain is that of its luminance, up to 1e-6 of it.
-            ToneCurve::LumPreserve => self.gain * x,
-            ToneCurve::PerChannel => x / self.constants[channel],
-            curve => {
-                let law = [self.offset, self.gain];
-                clamped(curve_at(curve.constant(), t, law, &self.constants))
-            }
+            CURVE_LUM_PRESERVE => gain * x,
+            CURVE_PER_CHANNEL => x / constants[channel],
+            _ => clamped(self.curve.at(x)),
         };
         if self.weight < 1.0 { x.min(1.0) + self.weight * (curved - x.min(1.0)) } else { curved }
     }
 
     /// The factor s(Y) / Y of the automatic curve.
     fn factor(&self, rgb: [f64; 3]) -> f64 {
-        let y = (luminance(rgb) / self.white).max(1e-20);
+        let y = (luminance(rgb) / self.curve.white).max(1e-20);
         y.one_minus_exp() / y
     }
 
@@ -121,7 +108,7 @@ impl InverseTone {
         if !is_lit {
             return 0.0;
         }
-        let (mut low, mut high) = (0.0, self.white.min(1.0));
+        let (mut low, mut high) = (0.0, self.curve.white.min(1.0));
         while high < LARGEST && self.channel(high, channel, factor) < value {
             (low, high) = (high, 2.0 * high);
         }
@@ -155,7 +142,7 @@ impl InverseTone {
             |factor: f64| [0, 1, 2].map(|channel| self.solved(bounded[channel], channel, factor));
         // The factor is 1 for black, where the result is the darkest.
         let mut rgb = solved(1.0);
-        if self.curve != ToneCurve::Auto || self.constants[0] == 0.0 {
+        if self.curve.number != CURVE_AUTO || self.curve.constants[0] == 0.0 {
             return Inverted { rgb, is_clipped };
         }
         // Secants of Y - luminance(rgb(Y)), which is negative below the solution.
@@ -188,7 +175,6 @@ impl InverseTone {
     }
 
     /// The target of a colour of a photograph, unclamped above.
-    #[cfg(any(test, feature = "testing"))]
     pub fn target(&self, rgb: [f64; 3]) -> [f64; 3] {
         let factor = self.factor(rgb);
         [0, 1, 2].map(|channel| self.channel(rgb[channel], channel, factor))
@@ -203,7 +189,8 @@ fn luminance([r, g, b]: [f64; 3]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::photographs::tone::{MeasuredPhotograph, Profile};
+    use crate::photographs::targets::SceneTone;
+    use crate::photographs::tone::{MeasuredPhotograph, Profile, ToneCurve};
 
     /// Dark colours, and some near and above white.
     fn colours() -> Vec<[f64; 3]> {
@@ -214,17 +201,16 @@ mod tests {
     fn inverse(settings: &ToneSettings) -> InverseTone {
         let dark: Vec<f32> = (0..3000).map(|i| 0.2 * (i as f32 / 3000.0).powi(2)).collect();
         let photograph = MeasuredPhotograph::of(&dark);
-        let scene = settings.scene(std::slice::from_ref(&photograph)).unwrap();
-        let mapping = settings.tone_mapping(&scene, &photograph);
-        InverseTone::new(settings, &mapping.parameters).unwrap()
+        SceneTone::from_photographs(settings, &[photograph]).unwrap().inverse_of_scene().unwrap()
     }
 
     /// In stops of linear light: an eighth of a code value of the target, and what a flat curve makes of it.
     #[test]
     fn the_round_trip_through_a_curve_restores_linear_light_to_a_thousandth_of_a_stop() {
         let linear = |x: f64| f64::from(linear_from_srgb(x as f32));
-        for curve in [ToneCurve::Auto, ToneCurve::Ase, ToneCurve::Linear, ToneCurve::None] {
-            let inverse = inverse(&ToneSettings::new(curve));
+        let formulas = [ToneCurve::Ase, ToneCurve::Linear, ToneCurve::None].map(Tone::Formula);
+        for curve in formulas.into_iter().chain([Tone::Auto]) {
+            let inverse = inverse(&ToneSettings::new(curve.clone()));
             let mut restored = 0;
             for rgb in colours() {
                 let target = inverse.target(rgb);
@@ -244,7 +230,7 @@ mod tests {
 
     #[test]
     fn values_in_the_flat_part_are_counted_and_stay_finite() {
-        let inverse = inverse(&ToneSettings::new(ToneCurve::Auto));
+        let inverse = inverse(&ToneSettings::new(Tone::Auto));
         for flat in [[1.0; 3], [2.0, 0.3, 0.3], [0.9999, 0.1, 0.1]] {
             let Inverted { rgb, is_clipped } = inverse.of(flat);
             assert!(is_clipped && rgb.iter().all(|x| x.is_finite()), "{rgb:?}");
@@ -264,7 +250,7 @@ mod tests {
             bias: [0.0; 3],
             segments: [bent.clone(), bent.clone(), bent],
         };
-        let settings = ToneSettings::of_profile(profile);
+        let settings = ToneSettings::new(Tone::Profile(profile));
         let parameters = ToneParameters::default();
         let refused = InverseTone::new(&settings, &parameters).unwrap_err().to_string();
         assert!(refused.contains("has no inverse"), "{refused}");

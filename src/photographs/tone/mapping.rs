@@ -1,20 +1,36 @@
-//! From the measurements of a scene's photographs to the curve of each.
+//! From the measurements of a photograph to its curve, at a gain that follows from the exposure if it is automatic.
 
-use std::sync::Arc;
-
+use super::curve::{Curve, Variable, clamped, curve_at};
 use super::exposure::{Exposure, solved};
+use super::families::{Constants, White, padded};
 use super::histogram::LuminanceHistogram;
-use super::law::{clamped, curve_at};
-use super::recorded::{ToneLaw, ToneMapping};
-use super::{Statistics, ToneCurve, ToneParameters, ToneSettings};
+use super::real::Real;
+use super::{Statistics, Tone, ToneParameters, ToneSettings};
 use crate::camera::Camera;
-use crate::{Error, Result};
+
+/// The smallest white of linear scaling: it keeps a black photograph black.
+const MIN_WHITE: f64 = 1e-12;
+
+/// Added to a mean that is a divisor.
+const EPSILON: f64 = 1e-6;
+
+/// Minimum and maximum gain of `p80` and `lum_preserve`.
+const GAINS: [f64; 2] = [1.0, 6.0];
 
 /// Minimum and maximum of a solved gain.
 const STRENGTHS: [f64; 2] = [1e-3, 1e4];
 
+/// How a photograph is tone-mapped to its target.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ToneMapping {
+    /// The curve.
+    pub parameters: ToneParameters,
+    /// k of soft(x; k), whose mean luminance the target has, if it follows from the exposure.
+    pub gain: Option<f64>,
+}
+
 /// Measurements of a photograph.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct MeasuredPhotograph {
     /// Percentiles and means.
     pub statistics: Statistics,
@@ -31,6 +47,15 @@ impl MeasuredPhotograph {
         Self { statistics, luminance, camera: None }
     }
 
+    /// All of them as one: the means of the statistics, and the luminance of every pixel.
+    pub(crate) fn together(photographs: &[Self]) -> Self {
+        let statistics: Vec<Statistics> = photographs.iter().map(|one| one.statistics).collect();
+        let statistics = Statistics::mean_of(&statistics).unwrap_or_default();
+        let mut luminance = LuminanceHistogram::default();
+        photographs.iter().for_each(|one| luminance.add(&one.luminance));
+        Self { statistics, luminance, camera: None }
+    }
+
     /// Adds the camera.
     #[must_use]
     pub fn seen_by(self, camera: &Camera) -> Self {
@@ -38,94 +63,117 @@ impl MeasuredPhotograph {
     }
 }
 
-/// The shared part of the curves of a scene's photographs.
-#[derive(Clone, Debug, Default)]
-pub struct SceneTone {
-    /// The means over the training photographs, if one curve is used for all.
-    statistics: Option<Statistics>,
-    /// The exposure of the targets, if it is automatic.
-    pub exposure: Option<Exposure>,
-    /// The recorded mappings, if the photographs are not measured.
-    law: Option<Arc<ToneLaw>>,
-}
-
-impl SceneTone {
-    /// The scene whose photographs are mapped as recorded.
-    pub(crate) fn recorded(law: ToneLaw) -> Self {
-        Self { statistics: None, exposure: law.exposure.clone(), law: Some(Arc::new(law)) }
-    }
-
-    /// The recorded mapping of a view's photograph; `None` if photographs are measured.
-    pub(crate) fn recorded_mapping(&self, view: &str) -> Result<Option<ToneMapping>> {
-        let Some(law) = &self.law else { return Ok(None) };
-        let missing =
-            || Error::Usage(format!("the tone law lacks the view {view}; it is another dataset's"));
-        law.mappings.get(view).copied().map(Some).ok_or_else(missing)
-    }
-
-    /// The recorded gain at which the model renders.
-    pub(crate) fn recorded_gain(&self) -> Option<f64> {
-        self.law.as_ref()?.model_gain
-    }
-}
-
 impl ToneSettings {
-    /// The shared part of the curves of a scene, from its training photographs; `None` if their exposure is needed and
-    /// all are almost black, or there are none.
+    /// The curve of a photograph with these statistics; `number` is the value of a setting in the number type.
+    pub(crate) fn curve_of<T: Real>(
+        &self,
+        statistics: &Statistics,
+        number: impl Fn(Variable, f64) -> T,
+    ) -> Curve<T> {
+        let [zero, one, epsilon] = [0.0, 1.0, EPSILON].map(T::of);
+        let measured = |x: f32| T::of(x.into());
+        let mean_luminance = measured(statistics.mean_luminance);
+        let theta = number(Variable::Theta, self.theta);
+        let bounded_gain =
+            |value: T| (theta / value).at_least(T::of(GAINS[0])).at_most(T::of(GAINS[1]));
+        let given = padded(&self.constants);
+        let mut constants: Constants<T> =
+            std::array::from_fn(|index| number(Variable::Constant(index), given[index]));
+        let [white, offset, gain] = match self.white() {
+            White::One => [one, zero, one],
+            White::Mean => {
+                let white = measured(statistics.mean) / theta;
+                [white.at_least(T::of(MIN_WHITE)), zero, one]
+            }
+            White::MeanLuminance => [one, zero, bounded_gain(mean_luminance + epsilon)],
+            White::ChannelMeans => {
+                for (white, mean) in constants.iter_mut().zip(statistics.channel_means) {
+                    *white = (measured(mean) + epsilon) / theta;
+                }
+                [one, zero, one]
+            }
+            White::P80 => [one / bounded_gain(measured(statistics.p80)), zero, one],
+            White::P90 => {
+                let is_rescaled = self.curve.family().is_some_and(|family| family.is_rescaled);
+                let least =
+                    if is_rescaled { number(Variable::BaseGain, self.base_gain) } else { one };
+                let alpha = number(Variable::Alpha, self.alpha);
+                [
+                    measured(statistics.p90),
+                    black_level(alpha, self.beta, statistics.ratio()),
+                    least + number(Variable::GainC, self.gain_c) * mean_luminance,
+                ]
+            }
+        };
+        Curve { number: self.curve.constant(), white, offset, gain, constants }
+    }
+
+    /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90. For the automatic curve it is
+    /// alpha.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn scene(&self, training: &[MeasuredPhotograph]) -> Option<SceneTone> {
-        let exposure = if self.takes_exposure() {
-            let found = Exposure::of(training.iter().map(|one| &one.luminance), self.brightness)?;
-            let seen = training.iter().map(|one| Some((&one.luminance, one.camera?)));
-            let found = match seen.collect::<Option<Vec<_>>>() {
-                Some(seen) => found.seen_by(seen),
-                None => found,
-            };
-            Some(if self.scene_statistics { found.shared() } else { found })
+    pub(crate) fn offset(&self, ratio: f64) -> f64 {
+        if self.curve == Tone::Auto {
+            self.alpha
         } else {
-            None
-        };
-        let statistics: Vec<_> = training.iter().map(|one| one.statistics).collect();
-        let statistics = Statistics::mean_of(&statistics).filter(|_| self.scene_statistics);
-        Some(SceneTone { statistics, exposure, law: None })
+            black_level(self.alpha, self.beta, ratio)
+        }
     }
 
-    /// The tone mapping of a photograph of the scene.
+    /// The curve of a photograph with these statistics, before an automatic gain.
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn tone_mapping(
-        &self,
-        scene: &SceneTone,
-        photograph: &MeasuredPhotograph,
-    ) -> ToneMapping {
-        let statistics = scene.statistics.as_ref().unwrap_or(&photograph.statistics);
-        let parameters = self.parameters(statistics);
-        let Some(exposure) = &scene.exposure else {
-            return ToneMapping { parameters, gain: None };
-        };
-        let gain = exposure.gain_of(&photograph.luminance, photograph.camera.as_ref());
-        self.exposed(exposure, parameters, &photograph.luminance, gain)
+    pub(crate) fn parameters(&self, statistics: &Statistics) -> ToneParameters {
+        let Curve { white, offset, gain, mut constants, .. } =
+            self.curve_of(statistics, |_, value| value);
+        let [white, mut offset, gain] = [white, offset, gain].map(|number| number as f32);
+        if self.curve == Tone::Auto {
+            (offset, constants[0]) = (self.alpha as f32, self.colour);
+        }
+        let constants = constants.map(|constant| constant as f32);
+        ToneParameters { white, offset, gain, weight: 1.0, constants }
     }
 
-    /// The tone mapping of what a camera sees, without a photograph of it: `together` are the measurements of all
-    /// training photographs.
-    pub(crate) fn tone_mapping_at(
-        &self,
-        scene: &SceneTone,
-        camera: &Camera,
-        together: &MeasuredPhotograph,
-    ) -> ToneMapping {
-        let parameters = self.parameters(scene.statistics.as_ref().unwrap_or(&together.statistics));
-        match &scene.exposure {
-            None => ToneMapping { parameters, gain: None },
-            Some(exposure) => {
-                let gain = exposure.gain_around(camera);
-                self.exposed(exposure, parameters, &together.luminance, gain)
+    /// The value that t = 1 corresponds to.
+    pub(crate) fn white(&self) -> White {
+        match &self.curve {
+            Tone::Formula(curve) => curve.family().white,
+            Tone::Table(table) if !table.is_of_stored => White::P90,
+            Tone::Table(_) | Tone::Auto | Tone::Profile(_) => White::One,
+        }
+    }
+
+    /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics. A table of three channels, or a
+    /// profile, is evaluated for green, `lum_preserve` and `per_channel` for grey.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn value(&self, t: f64, statistics: &Statistics) -> f64 {
+        let grey = Statistics { channel_means: [statistics.mean; 3], ..*statistics };
+        let ToneParameters { mut white, offset, gain, constants, .. } = self.parameters(&grey);
+        if self.white() == White::ChannelMeans {
+            white = constants[0];
+        }
+        // Without a scene that determines k: a function of k x.
+        let is_of_t = !self.curve.is_exposed();
+        let t = if is_of_t { t * f64::from(statistics.p90) / f64::from(white) } else { t };
+        match &self.curve {
+            Tone::Table(table) => table.value(t, 1),
+            Tone::Profile(profile) => profile.value([t; 3])[1],
+            Tone::Formula(_) | Tone::Auto => {
+                let scale = [offset.into(), gain.into()];
+                let constants = padded(&self.constants);
+                clamped(curve_at(self.curve.constant(), t, scale, &constants))
             }
         }
     }
 
+    /// Statistics for the plain formula of a curve: no black level, gain 1, and t = 1 at its white.
+    #[cfg_attr(feature = "testing", visibility::make(pub))]
+    pub(crate) fn plain_statistics(&self) -> Statistics {
+        let theta = self.theta as f32;
+        let means = Statistics { mean: theta, channel_means: [theta; 3], ..Statistics::default() };
+        Statistics { p10: 1.0, p80: theta, p90: 1.0, ..means }
+    }
+
     /// The tone mapping at a gain that follows from the exposure.
-    fn exposed(
+    pub(crate) fn exposed(
         &self,
         exposure: &Exposure,
         parameters: ToneParameters,
@@ -133,11 +181,12 @@ impl ToneSettings {
         gain: f64,
     ) -> ToneMapping {
         let strength = match self.curve {
-            ToneCurve::Auto | ToneCurve::Profile => gain,
+            Tone::Auto | Tone::Profile(_) => gain,
             _ => self.strength(&parameters, luminance, gain),
         };
         // A profile applies to bright photographs, too.
-        let weight = if self.profile.is_some() { 1.0 } else { exposure.weight() };
+        let is_profile = matches!(self.curve, Tone::Profile(_));
+        let weight = if is_profile { 1.0 } else { exposure.weight() };
         let (white, weight) = ((1.0 / strength) as f32, weight as f32);
         let parameters = ToneParameters { white, gain: 1.0, weight, ..parameters };
         ToneMapping { parameters, gain: Some(gain) }
@@ -146,11 +195,16 @@ impl ToneSettings {
     /// The factor on x that gives the curve the mean luminance of soft(x; gain).
     fn strength(&self, tone: &ToneParameters, luminance: &LuminanceHistogram, gain: f64) -> f64 {
         let target = luminance.mean_of(|y| super::soft(y, gain));
-        let (curve, law) = (self.curve.constant(), [f64::from(tone.offset), 1.0]);
+        let (curve, scale) = (self.curve.constant(), [f64::from(tone.offset), 1.0]);
         let constants = tone.constants.map(f64::from);
         let mean = |strength: f64| {
-            luminance.mean_of(|y| clamped(curve_at(curve, strength * y, law, &constants)))
+            luminance.mean_of(|y| clamped(curve_at(curve, strength * y, scale, &constants)))
         };
         solved(STRENGTHS, |strength| mean(strength) < target)
     }
+}
+
+/// delta0 = alpha (1 - r)^beta of a photograph with r = p10 / p90; with beta 0 it is alpha for every photograph.
+fn black_level<T: Real>(alpha: T, beta: f64, ratio: f64) -> T {
+    alpha * T::of((1.0 - ratio).powf(beta))
 }

@@ -1,11 +1,11 @@
-//! The tone law of a whole scene as one curve, as a model file states it.
+//! The tone law of a scene as one curve, as a model file states it.
 
 use std::fmt;
-use std::str::FromStr;
 
+use super::{Family, ToneParameters, name_of};
 #[cfg(feature = "io")]
-use super::{InverseTone, ToneSettings};
-use super::{ToneCurve, ToneParameters};
+use super::{InverseTone, Tone, ToneSettings};
+use crate::kernels::curves::CURVE_AUTO;
 #[cfg(feature = "io")]
 use crate::{Error, Result};
 
@@ -13,7 +13,8 @@ use crate::{Error, Result};
 /// together. The file of a trained model states it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SceneLaw {
-    pub(crate) curve: ToneCurve,
+    /// The curve's number in `include/curves.glsl`.
+    pub(crate) curve: u32,
     pub(crate) parameters: ToneParameters,
     pub(crate) stops: f32,
 }
@@ -24,12 +25,12 @@ impl SceneLaw {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn of(settings: &ToneSettings, parameters: &ToneParameters) -> Result<Self> {
         let stops = InverseTone::new(settings, parameters)?.stops_to_target() as f32;
-        if settings.curve == ToneCurve::Table {
+        if matches!(settings.curve, Tone::Table(_)) {
             let problem =
                 "a table of values is too long for a model to state; train with a named curve";
             return Err(Error::Usage(problem.to_owned()));
         }
-        Ok(Self { curve: settings.curve, parameters: *parameters, stops })
+        Ok(Self { curve: settings.curve.constant(), parameters: *parameters, stops })
     }
 
     /// By how many stops the linear light of the photographs has to be raised for the brightness of the model's
@@ -41,36 +42,55 @@ impl SceneLaw {
     /// What [`fmt::Display`] writes; `None` if it is not that.
     pub(crate) fn parse(text: &str) -> Option<Self> {
         let mut words = text.split_whitespace();
-        let curve = ToneCurve::from_str(words.next()?).ok()?;
-        if matches!(curve, ToneCurve::Table | ToneCurve::Profile) {
-            return None;
-        }
-        let mut number = || words.next()?.parse::<f32>().ok().filter(|number| number.is_finite());
-        let (stops, white) = (number()?, number().filter(|white| *white > 0.0)?);
-        let [offset, gain, weight] = [number()?, number()?, number()?];
-        let mut parameters = ToneParameters { white, offset, gain, weight, ..Default::default() };
-        let mut constants = parameters.constants.iter_mut();
-        for word in words {
-            *constants.next()? = word.parse().ok().filter(|number: &f32| number.is_finite())?;
-        }
-        Some(Self { curve, parameters, stops })
+        let curve = match words.next()? {
+            name if name == name_of(CURVE_AUTO) => CURVE_AUTO,
+            name => Family::find(name)?.curve.constant(),
+        };
+        let stops = finite(words.next()?)?;
+        Some(Self { curve, parameters: ToneParameters::parse(words)?, stops })
     }
 }
 
-/// The name of the curve, stops, white, offset, gain, weight, and the constants that are not zero at the end.
-impl fmt::Display for SceneLaw {
+fn finite(word: &str) -> Option<f32> {
+    word.parse().ok().filter(|number: &f32| number.is_finite())
+}
+
+impl ToneParameters {
+    /// What [`fmt::Display`] writes; `None` if it is not that.
+    pub(crate) fn parse<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<Self> {
+        let mut number = || finite(words.next()?);
+        let [white, offset, gain, weight] = [number()?, number()?, number()?, number()?];
+        let mut parameters = Self { white, offset, gain, weight, ..Self::default() };
+        let mut constants = parameters.constants.iter_mut();
+        for word in words {
+            *constants.next()? = finite(word)?;
+        }
+        (white > 0.0).then_some(parameters)
+    }
+}
+
+/// White, offset, gain, weight, and the constants that are not zero at the end.
+impl fmt::Display for ToneParameters {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let ToneParameters { white, offset, gain, weight, constants } = &self.parameters;
-        write!(f, "{} {} {white} {offset} {gain} {weight}", self.curve.name(), self.stops)?;
+        let Self { white, offset, gain, weight, constants } = self;
+        write!(f, "{white} {offset} {gain} {weight}")?;
         let used =
             constants.iter().rposition(|constant| *constant != 0.0).map_or(0, |last| last + 1);
         constants[..used].iter().try_for_each(|constant| write!(f, " {constant}"))
     }
 }
 
+/// The name of the curve, stops, and the parameters.
+impl fmt::Display for SceneLaw {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} {} {}", name_of(self.curve), self.stops, self.parameters)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kernels::curves::{CURVE_AP3, CURVE_HABLE};
 
     #[test]
     fn a_law_is_read_back_to_the_bit_and_anything_else_is_refused() {
@@ -81,8 +101,7 @@ mod tests {
             weight: 0.3,
             ..Default::default()
         };
-        for (curve, constants) in [(ToneCurve::Auto, 1), (ToneCurve::Ap3, 0), (ToneCurve::Hable, 6)]
-        {
+        for (curve, constants) in [(CURVE_AUTO, 1), (CURVE_AP3, 0), (CURVE_HABLE, 6)] {
             parameters.constants[..constants].fill(1.0 / 3.0);
             let law = SceneLaw { curve, parameters, stops: 4.123_456_7 };
             assert_eq!(SceneLaw::parse(&law.to_string()), Some(law));
@@ -114,7 +133,7 @@ mod tests {
             y: vec![vec![0.0, 1.0]],
             ..Default::default()
         };
-        let settings = ToneSettings { table: Some(table), ..ToneSettings::new(ToneCurve::Table) };
+        let settings = ToneSettings::new(Tone::Table(table));
         let parameters =
             ToneParameters { white: 1.0, gain: 1.0, weight: 1.0, ..Default::default() };
         let refused = SceneLaw::of(&settings, &parameters).unwrap_err().to_string();

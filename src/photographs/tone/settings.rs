@@ -8,10 +8,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use super::exposure::BLACK_LEVEL;
-use super::families::{White, padded};
-use super::law::{CurveInputs, black_level, law};
-use super::real::Real;
-use super::{Profile, Statistics, Table, ToneCurve, ToneParameters};
+use super::{Constant, Family, Profile, Table, Tone, ToneCurve};
 use crate::base::settings::{self, Rule, Setting};
 use crate::{Error, Result};
 
@@ -27,8 +24,8 @@ const LARGEST_SHAPE: f64 = 1e8;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "SerializedToneSettings", into = "SerializedToneSettings")]
 pub struct ToneSettings {
-    /// The family.
-    pub curve: ToneCurve,
+    /// The curve.
+    pub curve: Tone,
     /// c: the gain per mean luminance of the photograph.
     pub gain_c: f64,
     /// theta: the target mean of the linear curve over all channels, before clipping.
@@ -52,18 +49,19 @@ pub struct ToneSettings {
     /// Whether a photograph is tone-mapped before it is resized. Reference images were resized after their own tone
     /// curve, and the mean of a curve is not the curve of a mean.
     pub full_resolution: bool,
-    /// The family's constants in the order of its formula.
+    /// The formula's constants in the order of its formula.
     pub constants: Vec<f64>,
-    /// The values of [`ToneCurve::Table`].
-    pub table: Option<Table>,
-    /// The profile of [`ToneCurve::Profile`].
-    pub profile: Option<Profile>,
     /// The file with the tone mapping of every photograph, in place of measuring them.
     pub law: Option<PathBuf>,
 }
 
 /// Largest value for the kernels, which compute in 32 bits.
 const MOST: f64 = 1e30;
+
+/// Whether a curve has this name.
+fn is_name(name: &str) -> bool {
+    Tone::OF_FILES.contains(&name) || name.parse::<Tone>().is_ok()
+}
 
 /// Settings that belong to a curve: choosing another curve resets them.
 pub(crate) const OF_CURVE: [&str; 9] = [
@@ -78,24 +76,11 @@ pub(crate) const OF_CURVE: [&str; 9] = [
     "law",
 ];
 
-impl<T: Real> From<&ToneSettings> for CurveInputs<T> {
-    fn from(settings: &ToneSettings) -> Self {
-        Self {
-            theta: T::of(settings.theta),
-            alpha: T::of(settings.alpha),
-            beta: settings.beta,
-            gain_c: T::of(settings.gain_c),
-            base_gain: T::of(settings.base_gain),
-            constants: padded(&settings.constants).map(T::of),
-        }
-    }
-}
-
 impl ToneSettings {
     /// A row for each setting.
     pub(crate) const SETTINGS: &'static [Setting] = settings::settings! { rows "tone."
         /// The tone curve: a name that `nightsplat tone list` lists.
-        curve => Rule::Text("a curve that `nightsplat tone list` lists", |name| name.parse::<ToneCurve>().is_ok()),
+        curve => Rule::Text("a curve that `nightsplat tone list` lists", is_name),
            "--curve NAME|FILE";
         /// c: the gain per mean luminance of the photograph.
         gain_c, "the curve's" => Rule::from_to(0.0, MOST), "--gain C|auto";
@@ -130,15 +115,15 @@ impl ToneSettings {
 
     /// A curve with its default constants, those of the paper for LOM; c is 3 for ASE and 1 for AP3. The automatic
     /// curve is applied before photographs are resized, the others after.
-    pub fn new(curve: ToneCurve) -> Self {
-        let family = curve.family();
-        let is_auto = curve == ToneCurve::Auto;
-        let is_exposed = is_auto || curve == ToneCurve::Profile;
+    pub fn new(curve: impl Into<Tone>) -> Self {
+        let curve = curve.into();
+        let (family, is_exposed) = (curve.family(), curve.is_exposed());
+        let alpha = if curve == Tone::Auto { BLACK_LEVEL } else { 0.0 };
         Self {
             curve,
-            gain_c: if is_auto { 0.0 } else { family.gain_c },
+            gain_c: family.map_or(0.0, |family| family.gain_c),
             theta: 0.49,
-            alpha: if is_auto { BLACK_LEVEL } else { family.alpha },
+            alpha: family.map_or(alpha, |family| family.alpha),
             beta: 2.5,
             base_gain: 1.0,
             scene_statistics: false,
@@ -146,9 +131,7 @@ impl ToneSettings {
             brightness: None,
             colour: COLOUR,
             full_resolution: is_exposed,
-            constants: family.defaults(),
-            table: None,
-            profile: None,
+            constants: family.map(Family::defaults).unwrap_or_default(),
             law: None,
         }
     }
@@ -157,7 +140,8 @@ impl ToneSettings {
     /// kept. The same curve keeps everything.
     #[must_use]
     #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn with_curve(&self, curve: ToneCurve) -> Self {
+    pub(crate) fn with_curve(&self, curve: impl Into<Tone>) -> Self {
+        let curve = curve.into();
         if curve == self.curve {
             return self.clone();
         }
@@ -198,24 +182,15 @@ impl ToneSettings {
 
     /// Whether the gain follows from the photographs' [`super::Exposure`].
     pub(crate) fn takes_exposure(&self) -> bool {
-        self.auto_gain || self.curve == ToneCurve::Auto
-    }
-
-    /// The curve of a table of values.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn of_table(table: Table) -> Self {
-        Self { table: Some(table), ..Self::new(ToneCurve::Table) }
-    }
-
-    /// The curve of a camera profile, which follows the exposure of the photographs like the automatic curve.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn of_profile(profile: Profile) -> Self {
-        Self { profile: Some(profile), ..Self::new(ToneCurve::Profile) }
+        self.auto_gain || self.curve == Tone::Auto
     }
 
     /// What the targets take from reference images, if anything; results are labelled with it.
     pub(crate) fn knows_references(&self) -> Option<String> {
-        self.profile.as_ref().map(Profile::label)
+        match &self.curve {
+            Tone::Profile(profile) => Some(profile.label()),
+            _ => None,
+        }
     }
 
     /// Checks the constants: the curve must be defined, and its black level within [0, 1].
@@ -239,13 +214,12 @@ impl ToneSettings {
     /// Checks the settings of brightness against each other.
     fn check_gain(&self) -> Result<(), String> {
         let name = self.curve.name();
-        let has_gain = self.curve.is_formula() && self.curve != ToneCurve::None;
-        if self.curve == ToneCurve::Auto && self.gain_c != 0.0 {
+        if self.curve == Tone::Auto && self.gain_c != 0.0 {
             return Err(format!(
                 "the curve `{name}` takes no gain (tone.gain_c); tone.brightness sets its mean luminance"
             ));
         }
-        if self.curve == ToneCurve::Profile
+        if matches!(self.curve, Tone::Profile(_))
             && (self.gain_c != 0.0 || !self.auto_gain || self.brightness.is_some())
         {
             return Err(
@@ -254,8 +228,14 @@ impl ToneSettings {
                     .to_owned(),
             );
         }
-        let is_exposed = matches!(self.curve, ToneCurve::Auto | ToneCurve::Profile);
-        if self.auto_gain && !is_exposed && !has_gain {
+        // The others scale no value by itself.
+        let has_gain = match &self.curve {
+            Tone::Formula(curve) => {
+                !matches!(curve, ToneCurve::None | ToneCurve::LumPreserve | ToneCurve::PerChannel)
+            }
+            other => other.is_exposed(),
+        };
+        if self.auto_gain && !has_gain {
             return Err(format!(
                 "the curve `{name}` has no automatic gain; use `auto`, `ase` or `ap3`"
             ));
@@ -271,30 +251,17 @@ impl ToneSettings {
 
     fn check_constants(&self) -> Result<(), String> {
         let (name, family) = (self.curve.name(), self.curve.family());
-        match (&self.table, self.curve) {
-            (Some(table), ToneCurve::Table) => table.check()?,
-            (None, ToneCurve::Table) => {
-                return Err("the curve `table` needs a file of values; name a .csv or .cube file"
-                    .to_owned());
-            }
-            (Some(_), _) => return Err(format!("the curve `{name}` takes no table of values")),
-            (None, _) => {}
+        match &self.curve {
+            Tone::Table(table) => table.check()?,
+            Tone::Profile(profile) => profile.check()?,
+            Tone::Formula(_) | Tone::Auto => {}
         }
-        match (&self.profile, self.curve) {
-            (Some(profile), ToneCurve::Profile) => profile.check()?,
-            (None, ToneCurve::Profile) => {
-                return Err(
-                    "the curve `profile` needs a camera profile; name a file with --profile"
-                        .to_owned(),
-                );
-            }
-            (Some(_), _) => return Err(format!("the curve `{name}` takes no camera profile")),
-            (None, _) => {}
-        }
-        if self.constants.len() != family.constants.len() {
-            let (given, needed) = (self.constants.len(), family.constants.len());
+        let (given, needed) =
+            (self.constants.len(), family.map_or(0, |family| family.constants.len()));
+        if given != needed {
             return Err(format!("the curve `{name}` has {needed} constants, not {given}"));
         }
+        let Some(family) = family else { return Ok(()) };
         for (constant, value) in family.constants.iter().zip(&self.constants) {
             if !(*value as f32).is_finite() {
                 return Err(format!(
@@ -313,83 +280,6 @@ impl ToneSettings {
             )),
             None => Ok(()),
         }
-    }
-
-    /// delta0 = alpha (1 - r)^beta: the black level of a photograph with r = p10 / p90. For the automatic curve it is
-    /// alpha.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn offset(&self, ratio: f64) -> f64 {
-        if self.curve == ToneCurve::Auto {
-            self.alpha
-        } else {
-            black_level(self.alpha, self.beta, ratio)
-        }
-    }
-
-    /// The curve of a photograph with these statistics; with an automatic gain, use [`Self::tone_mapping`].
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn parameters(&self, statistics: &Statistics) -> ToneParameters {
-        if self.curve == ToneCurve::Profile {
-            return ToneParameters {
-                white: 1.0,
-                gain: 1.0,
-                weight: 1.0,
-                ..ToneParameters::default()
-            };
-        }
-        if self.curve == ToneCurve::Auto {
-            let mut constants = [0.0; _];
-            constants[0] = self.colour as f32;
-            let offset = self.alpha as f32;
-            return ToneParameters { white: 1.0, offset, gain: 1.0, weight: 1.0, constants };
-        }
-        let numbers = CurveInputs::<f64>::from(self);
-        let curve = law(self.curve.family(), self.white(), &numbers, statistics);
-        ToneParameters {
-            white: curve.white as f32,
-            offset: curve.offset as f32,
-            gain: curve.gain as f32,
-            weight: 1.0,
-            constants: curve.constants.map(|constant| constant as f32),
-        }
-    }
-
-    /// The value that t = 1 corresponds to.
-    pub(crate) fn white(&self) -> White {
-        match &self.table {
-            Some(table) => table.input.white(),
-            None if matches!(self.curve, ToneCurve::Auto | ToneCurve::Profile) => White::One,
-            None => self.curve.family().white,
-        }
-    }
-
-    /// The curve at t = x / p90, in [0, 1], for a photograph with these statistics. A table of three channels, or a
-    /// profile, is evaluated for green, `lum_preserve` and `per_channel` for grey.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn value(&self, t: f64, statistics: &Statistics) -> f64 {
-        let grey = Statistics { channel_means: [statistics.mean; 3], ..*statistics };
-        let ToneParameters { mut white, offset, gain, constants, .. } = self.parameters(&grey);
-        if self.white() == White::ChannelMeans {
-            white = constants[0];
-        }
-        let t = match self.curve {
-            // Without a scene that determines k: a function of k x.
-            ToneCurve::Auto | ToneCurve::Profile => t,
-            _ => t * f64::from(statistics.p90) / f64::from(white),
-        };
-        match (&self.table, &self.profile) {
-            (Some(table), _) => table.value(t, 1),
-            (None, Some(profile)) => profile.value([t; 3])[1],
-            (None, None) => self.curve.value(t, offset.into(), gain.into(), &self.constants),
-        }
-    }
-
-    /// Statistics for the plain formula of a curve: no black level, gain 1, and t = 1 at its white.
-    #[cfg_attr(feature = "testing", visibility::make(pub))]
-    pub(crate) fn plain_statistics(&self) -> Statistics {
-        let theta = self.theta as f32;
-        let means = Statistics { mean: theta, channel_means: [theta; 3], ..Statistics::default() };
-        Statistics { p10: 1.0, p80: theta, p90: 1.0, ..means }
     }
 }
 
@@ -418,7 +308,7 @@ impl FromStr for GainChoice {
 
 impl Default for ToneSettings {
     fn default() -> Self {
-        Self::new(ToneCurve::Auto)
+        Self::new(Tone::Auto)
     }
 }
 
@@ -426,7 +316,7 @@ impl Default for ToneSettings {
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SerializedToneSettings {
-    curve: Option<ToneCurve>,
+    curve: Option<String>,
     gain_c: Option<f64>,
     theta: Option<f64>,
     alpha: Option<f64>,
@@ -448,33 +338,49 @@ struct SerializedToneSettings {
     law: Option<PathBuf>,
 }
 
+/// The curve of a name and of the contents of its file.
+fn written_curve(
+    name: Option<String>,
+    table: Option<Table>,
+    profile: Option<Profile>,
+) -> Result<Tone, String> {
+    let problem = match (name.as_deref(), table, profile) {
+        (None, None, None) => return Ok(Tone::Auto),
+        (None | Some("table"), Some(table), None) => return Ok(Tone::Table(table)),
+        (None | Some("profile"), None, Some(profile)) => return Ok(Tone::Profile(profile)),
+        (Some("table"), None, _) => "needs a file of values; name a .csv or .cube file",
+        (Some("profile"), _, None) => "needs a camera profile; name a file with --profile",
+        (Some(name), None, None) => return name.parse().map_err(|error: Error| error.to_string()),
+        (Some("table") | None, _, Some(_)) => "takes no camera profile",
+        (Some(_), Some(_), _) => "takes no table of values",
+        (Some(_), None, Some(_)) => "takes no camera profile",
+    };
+    Err(format!("the curve `{}` {problem}", name.unwrap_or_default()))
+}
+
 impl TryFrom<SerializedToneSettings> for ToneSettings {
     type Error = String;
 
     fn try_from(written: SerializedToneSettings) -> Result<Self, String> {
-        let given = match (&written.table, &written.profile) {
-            (Some(_), _) => ToneCurve::Table,
-            (None, Some(_)) => ToneCurve::Profile,
-            (None, None) => ToneCurve::Auto,
-        };
-        let defaults = Self::new(written.curve.unwrap_or(given));
-        let family = defaults.curve.family();
+        let defaults = Self::new(written_curve(written.curve, written.table, written.profile)?);
+        let (name, family) = (defaults.curve.name(), defaults.curve.family());
         let constants = match written.constants {
             None => defaults.constants,
             Some(mut values) => {
-                let value = |constant: &super::Constant| {
+                let known = family.map_or(&[][..], |family| family.constants);
+                let formula = family.map_or("none", |family| family.formula);
+                let value = |constant: &Constant| {
                     values.remove(constant.name).ok_or_else(|| {
+                        let missing = constant.name;
                         format!(
-                            "the curve `{}` needs the constant `{}`; its formula is {}",
-                            family.name, constant.name, family.formula
+                            "the curve `{name}` needs the constant `{missing}`; its formula is {formula}"
                         )
                     })
                 };
-                let constants = family.constants.iter().map(value).collect::<Result<_, _>>()?;
-                if let Some(name) = values.keys().next() {
+                let constants = known.iter().map(value).collect::<Result<_, _>>()?;
+                if let Some(other) = values.keys().next() {
                     return Err(format!(
-                        "the curve `{}` has no constant `{name}`; its formula is {}",
-                        family.name, family.formula
+                        "the curve `{name}` has no constant `{other}`; its formula is {formula}"
                     ));
                 }
                 constants
@@ -494,8 +400,6 @@ impl TryFrom<SerializedToneSettings> for ToneSettings {
             colour: written.colour.unwrap_or(defaults.colour),
             full_resolution: written.full_resolution.unwrap_or(auto_gain),
             constants,
-            table: written.table,
-            profile: written.profile,
             law: written.law,
         };
         settings.check_constants()?;
@@ -505,11 +409,17 @@ impl TryFrom<SerializedToneSettings> for ToneSettings {
 
 impl From<ToneSettings> for SerializedToneSettings {
     fn from(settings: ToneSettings) -> Self {
-        let names = settings.curve.family().constants.iter();
-        let constants: BTreeMap<String, f64> =
-            names.map(|constant| constant.name.to_owned()).zip(settings.constants).collect();
+        let known = settings.curve.family().map_or(&[][..], |family| family.constants);
+        let names = known.iter().map(|constant| constant.name.to_owned());
+        let constants: BTreeMap<String, f64> = names.zip(settings.constants).collect();
+        let name = settings.curve.name().to_owned();
+        let (table, profile) = match settings.curve {
+            Tone::Table(table) => (Some(table), None),
+            Tone::Profile(profile) => (None, Some(profile)),
+            Tone::Formula(_) | Tone::Auto => (None, None),
+        };
         Self {
-            curve: Some(settings.curve),
+            curve: Some(name),
             gain_c: Some(settings.gain_c),
             theta: Some(settings.theta),
             alpha: Some(settings.alpha),
@@ -521,8 +431,8 @@ impl From<ToneSettings> for SerializedToneSettings {
             colour: Some(settings.colour),
             full_resolution: Some(settings.full_resolution),
             constants: Some(constants).filter(|constants| !constants.is_empty()),
-            table: settings.table,
-            profile: settings.profile,
+            table,
+            profile,
             law: settings.law,
         }
     }

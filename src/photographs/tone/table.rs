@@ -3,38 +3,17 @@
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use super::families::White;
-use super::law::clamped;
+use super::curve::clamped;
 use super::real::Real;
-
-/// The meaning of a table's first column.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum TableInput {
-    /// t = x / p90, as for the families.
-    #[default]
-    T,
-    /// The stored value x itself.
-    X,
-}
-
-impl TableInput {
-    pub(super) fn white(self) -> White {
-        match self {
-            Self::T => White::P90,
-            Self::X => White::One,
-        }
-    }
-}
 
 /// Values of a curve, interpolated by monotone cubics (Fritsch and Carlson 1980); beyond its ends the curve is
 /// constant.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Table {
-    /// The meaning of `x`.
+    /// Whether `x` is the stored value itself; else it is t = x / p90, as for the families.
     #[serde(default)]
-    pub input: TableInput,
+    pub is_of_stored: bool,
     /// Ascending, at least two.
     pub x: Vec<f64>,
     /// The curve's values at `x`, in [0, 1] unless they clip: one row for all channels, or one per channel.
@@ -47,13 +26,13 @@ impl Table {
     #[cfg_attr(feature = "testing", visibility::make(pub))]
     pub(crate) fn from_csv(text: &str) -> Result<Self, String> {
         let mut rows = Rows::default();
-        let mut input = TableInput::T;
+        let mut is_of_stored = false;
         for (line, text) in content(text) {
             let cells: Vec<&str> = text.split([',', ';', '\t']).map(str::trim).collect();
             if rows.x.is_empty() && cells[0].parse::<f64>().is_err() {
-                input = match cells[0].to_ascii_lowercase().as_str() {
-                    "t" => TableInput::T,
-                    "x" => TableInput::X,
+                is_of_stored = match cells[0].to_ascii_lowercase().as_str() {
+                    "t" => false,
+                    "x" => true,
                     other => {
                         return Err(format!(
                             "line {line}: the first column is `{other}`; it must be t (x / p90) or x"
@@ -64,7 +43,7 @@ impl Table {
             }
             rows.push(line, &cells, None)?;
         }
-        rows.table(input)
+        rows.table(is_of_stored)
     }
 
     /// Reads a one-dimensional .cube file; it acts on stored values.
@@ -103,7 +82,7 @@ impl Table {
         if rows.x.len() != size {
             return Err(format!("LUT_1D_SIZE is {size} but there are {} values", rows.x.len()));
         }
-        rows.table(TableInput::X)
+        rows.table(true)
     }
 
     pub(super) fn check(&self) -> Result<(), String> {
@@ -209,8 +188,8 @@ impl Rows {
         Ok(())
     }
 
-    fn table(self, input: TableInput) -> Result<Table, String> {
-        let table = Table { input, x: self.x, y: self.y };
+    fn table(self, is_of_stored: bool) -> Result<Table, String> {
+        let table = Table { is_of_stored, x: self.x, y: self.y };
         table.check()?;
         Ok(table)
     }

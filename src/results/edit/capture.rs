@@ -11,6 +11,7 @@ use crate::camera::Camera;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
+use crate::photographs::targets::Targets;
 use crate::photographs::tone::ToneSettings;
 use crate::results::eval::{After, Evaluation, Extras, Metric, ModelRenderer, ScoreReference};
 use crate::results::finished_run::{FinishedRun, Opener, is_model};
@@ -18,7 +19,7 @@ use crate::results::run;
 use crate::splats::model::Model;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::{Facts, Gaussians};
-use crate::train::{TestTargets, TrainConfig};
+use crate::train::TrainConfig;
 use crate::{Error, Result};
 
 /// The photographs of a model.
@@ -50,8 +51,8 @@ impl Capture {
 
     /// The targets of [`Capture::views`]; `None` without a photograph.
     pub(super) fn targets(&self) -> Result<Vec<Option<Image>>> {
-        let mut targets = TestTargets::new(&self.gpu, &self.tone, &self.dataset)?;
-        self.views().map(|view| targets.of(view)).collect()
+        let targets = Targets::new(&self.gpu, &self.tone, &self.dataset)?;
+        self.views().map(|view| targets.target(view)).collect()
     }
 
     /// The near plane of a model in the edited world, in its units.

@@ -115,7 +115,7 @@ pub fn train_in(
     let mut metrics = evaluation.json(Some(spent.seconds), gaussians, Some(steps));
     metrics[SPENT] = serde_json::json!(spent);
     eval::add_reference(&mut metrics, &config.tone);
-    if let Some(exposure) = trainer.target_exposure() {
+    if let Some(exposure) = trainer.scene().target_exposure(dataset) {
         metrics[TARGET_EXPOSURE] = serde_json::json!(exposure);
     }
     evaluation.add_other_steps(&mut metrics, config.exposure.learn);
@@ -409,12 +409,7 @@ impl<'a> TrainLoop<'a> {
         let _phase = tracing::info_span!("scoring").entered();
         let mut score_reference = match self.score_reference.take() {
             Some(known) => known,
-            None => ScoreReference::in_scene(
-                self.gpu,
-                &self.config.tone,
-                self.dataset,
-                trainer.scene(),
-            )?,
+            None => ScoreReference::in_scene(self.gpu, self.dataset, trainer.scene())?,
         };
         let (step, mut is_first) = (trainer.steps_done(), true);
         let is_even = score_reference.is_evenly_lit(self.dataset);

@@ -7,6 +7,7 @@ use crate::Result;
 use crate::gpu::Gpu;
 use crate::photographs::dataset::{Dataset, View};
 use crate::photographs::image::Image;
+use crate::photographs::targets::Targets;
 use crate::photographs::tone::ToneCurve;
 use crate::results::edit::fingerprint;
 use crate::results::eval::ModelRenderer;
@@ -16,7 +17,7 @@ use crate::results::finished_run::{FinishedRun, is_model};
 use crate::results::run;
 use crate::splats::render::RenderSettings;
 use crate::splats::scene::Gaussians;
-use crate::train::{TestTargets, TrainConfig};
+use crate::train::TrainConfig;
 
 impl ExportOptions<'_> {
     /// The page, with bookmarks of test views, or of all views if there are none. Its viewer has a pinhole camera:
@@ -65,7 +66,7 @@ impl ExportOptions<'_> {
         &self,
         origin: DVec3,
         dataset: &Dataset,
-        mut targets: Option<TestTargets>,
+        targets: Option<Targets>,
         mut renderer: Option<&mut ModelRenderer>,
     ) -> Result<Vec<Bookmark>> {
         let mut views: Vec<&View> = dataset.test_views().collect();
@@ -79,8 +80,8 @@ impl ExportOptions<'_> {
             pictures.extend(view.loaded()?.map(|image| ("photograph", image.into_owned())));
             if let Some(image) = view.loaded_reference()? {
                 pictures.push(("reference", image.into_owned()));
-            } else if let Some(targets) = &mut targets {
-                pictures.extend(targets.of(view)?.map(|image| ("target", image)));
+            } else if let Some(targets) = &targets {
+                pictures.extend(targets.target(view)?.map(|image| ("target", image)));
             }
             if let Some(renderer) = &mut renderer {
                 pictures.push(("model with its networks", renderer.render(view)?.output().clone()));
@@ -106,13 +107,13 @@ fn targets(
     config: &TrainConfig,
     dataset: &Dataset,
     gpu: impl FnOnce() -> Result<Gpu>,
-) -> Result<Option<TestTargets>> {
+) -> Result<Option<Targets>> {
     let lacks = |view: &View| view.has_photograph() && !view.has_reference();
     if config.tone.curve == ToneCurve::None || !dataset.views.iter().any(lacks) {
         return Ok(None);
     }
     match gpu() {
-        Ok(gpu) => TestTargets::new(&gpu, &config.tone, dataset).map(Some),
+        Ok(gpu) => Targets::new(&gpu, &config.tone, dataset).map(Some),
         Err(error) => {
             tracing::warn!("the page has no targets to compare with: {error}");
             Ok(None)

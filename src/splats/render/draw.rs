@@ -152,7 +152,7 @@ impl Renderer {
         if let Some(targets) = &mut self.host_targets {
             targets.reserve(&self.gpu, pixels, target)?;
             if let (Some(law), None) = (law, &targets.photograph) {
-                let tone_curve = law.curve.constant();
+                let tone_curve = law.curve;
                 targets.photograph =
                     Some(self.gpu.pipeline(&photograph_light::Constants { tone_curve })?);
             }

@@ -4,7 +4,8 @@ use super::noise::{self, Noise, Patch};
 use super::sharpness;
 use super::target_noise::{TargetNoise, target_noise};
 use crate::photographs::image::{Image, Mask, linear_from_srgb};
-use crate::photographs::tone::{Exposure, LuminanceHistogram, Statistics, luminance, measurable};
+use crate::photographs::targets::SceneTone;
+use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, luminance, measurable};
 
 /// Blur is measured in the middle of the photograph, in at most this many pixels each way.
 const BLUR_SIDE: u32 = 640;
@@ -15,8 +16,7 @@ const REGIONS: [usize; 2] = [8, 6];
 #[derive(Clone, Debug)]
 pub(super) struct PhotographStatistics {
     pub(super) size: [u32; 2],
-    pub(super) statistics: Statistics,
-    pub(super) histogram: LuminanceHistogram,
+    pub(super) encoded: MeasuredPhotograph,
     pub(super) noise_in_target: Option<TargetNoise>,
     /// The mean luminance in linear light.
     pub(super) light: f64,
@@ -38,8 +38,10 @@ impl PhotographStatistics {
     pub(super) fn of(image: &Image, mask: Option<&Mask>) -> Self {
         let counted = mask.map(|mask| mask.counted(image));
         let counted = counted.as_deref().unwrap_or(&image.data);
-        let histogram = LuminanceHistogram::of(counted);
-        let exposure = Exposure::of([&histogram], None);
+        let encoded = MeasuredPhotograph::of(counted);
+        let scene =
+            SceneTone::from_photographs(&ToneSettings::default(), std::slice::from_ref(&encoded));
+        let curve = scene.and_then(|scene| scene.inverse_of_scene().ok());
         let values = counted.len().max(1) as f64;
         let fraction = |is: fn(f32) -> bool| {
             counted.iter().filter(|&&value| is(value)).count() as f64 / values
@@ -52,9 +54,8 @@ impl PhotographStatistics {
         let luminance = luminances(&linear.planes);
         Self {
             size: [image.width, image.height],
-            statistics: Statistics::of(counted),
-            histogram,
-            noise_in_target: exposure.and_then(|exposure| target_noise(image, &exposure)),
+            noise_in_target: curve.and_then(|curve| target_noise(image, &curve)),
+            encoded,
             light: mean(&luminance),
             // Written so that a NaN is neither.
             clipped_fraction: fraction(|value| value >= 1.0),

@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use super::geometry::median;
 use crate::photographs::image::Image;
-use crate::photographs::tone::{Exposure, luminance, measurable, soft};
+use crate::photographs::tone::{InverseTone, luminance, measurable};
 
 /// Side of a patch, pixels.
 const SIDE: u32 = 32;
@@ -38,14 +38,13 @@ impl TargetNoise {
     }
 }
 
-/// The noise in the target of a photograph under the automatic curve for its own exposure; `None` if it is smaller than
-/// a patch.
-pub(super) fn target_noise(image: &Image, exposure: &Exposure) -> Option<TargetNoise> {
+/// The noise in the target of a photograph under this curve; `None` if it is smaller than a patch.
+pub(super) fn target_noise(image: &Image, curve: &InverseTone) -> Option<TargetNoise> {
     let (columns, rows) = (image.width / SIDE, image.height / SIDE);
     let step = (columns * rows).div_ceil(MOST).max(1) as usize;
     let indices = (0..columns * rows).step_by(step);
     let mut patches: Vec<Patch> = indices
-        .map(|index| Patch::of(image, [index % columns * SIDE, index / columns * SIDE], exposure))
+        .map(|index| Patch::of(image, [index % columns * SIDE, index / columns * SIDE], curve))
         .collect();
     patches.sort_unstable_by(|a, b| a.brightness.total_cmp(&b.brightness));
     let quarter = patches.len() / 4;
@@ -71,13 +70,14 @@ struct Patch {
 }
 
 impl Patch {
-    fn of(image: &Image, [left, top]: [u32; 2], exposure: &Exposure) -> Self {
+    fn of(image: &Image, [left, top]: [u32; 2], curve: &InverseTone) -> Self {
         let side = SIDE / STRIDE;
         let mut values = [const { Vec::new() }; 3];
         for y in 0..side {
             for x in 0..side {
                 let stored = image.pixel(left + STRIDE * x, top + STRIDE * y);
-                let rgb = tone_mapped(stored.map(measurable), exposure);
+                let target = curve.target(stored.map(|x| measurable(x).into()));
+                let rgb = target.map(|value| value.min(1.0) as f32);
                 let luma = f64::from(luminance(rgb));
                 let [red, _, blue] = rgb.map(f64::from);
                 for (values, value) in values.iter_mut().zip([luma, red - luma, blue - luma]) {
@@ -90,20 +90,6 @@ impl Patch {
         let brightness = values[0].iter().sum::<f64>() / values[0].len() as f64;
         Self { brightness, luma, chroma: 0.5 * (red + blue) }
     }
-}
-
-/// Applies the automatic curve to a pixel; a third of the result keeps the ratios of the channels.
-fn tone_mapped(rgb: [f32; 3], exposure: &Exposure) -> [f32; 3] {
-    const KEPT: f64 = 1.0 / 3.0;
-    let (gain, weight) = (exposure.gain, exposure.weight());
-    let y = f64::from(luminance(rgb)).max(1e-6);
-    let black = soft(0.0, gain);
-    let ratio = (soft(y, gain) - black) / y;
-    rgb.map(|value| {
-        let value = f64::from(value);
-        let curved = (1.0 - KEPT) * soft(value, gain) + KEPT * (black + value * ratio);
-        (value + weight * (curved - value)).min(1.0) as f32
-    })
 }
 
 /// The variance of a square of values about the plane fitted to it.
@@ -129,16 +115,18 @@ mod tests {
     use super::*;
     use crate::base::random::Stream;
     use crate::photographs::image::linear_from_srgb;
-    use crate::photographs::tone::LuminanceHistogram;
+    use crate::photographs::targets::SceneTone;
+    use crate::photographs::tone::{MeasuredPhotograph, ToneSettings, soft};
 
     const SIZE: [u32; 2] = [512, 384];
 
     fn found(image: &Image) -> TargetNoise {
-        target_noise(image, &exposure(image)).unwrap()
+        target_noise(image, &scene(image).inverse_of_scene().unwrap()).unwrap()
     }
 
-    fn exposure(image: &Image) -> Exposure {
-        Exposure::of([&LuminanceHistogram::of(&image.data)], None).unwrap()
+    fn scene(image: &Image) -> SceneTone {
+        let measured = MeasuredPhotograph::of(&image.data);
+        SceneTone::from_photographs(&ToneSettings::default(), &[measured]).unwrap()
     }
 
     /// A dark gradient in every patch, with noise of this deviation in each channel, and a textured half.
@@ -158,7 +146,7 @@ mod tests {
     #[test]
     fn noise_of_each_channel_is_found_as_the_curve_amplifies_it() {
         let image = dark([0.002; 3]);
-        let gain = exposure(&image).gain;
+        let gain = scene(&image).exposure.unwrap().gain;
         // In the middle of the flat half; the curve is nearly linear over the noise.
         let slope = (soft(0.051, gain) - soft(0.049, gain)) / 0.002;
         let kept = (soft(0.05, gain) - soft(0.0, gain)) / 0.05;
@@ -181,7 +169,7 @@ mod tests {
         let found = found(&dark([0.0; 3]));
         assert!(found.luma < 3e-3 && found.chroma < 3e-3, "{found:?}");
         let small = Image::filled(31, 200, [0.1; 3]);
-        assert_eq!(target_noise(&small, &exposure(&small)), None);
+        assert_eq!(target_noise(&small, &scene(&small).inverse_of_scene().unwrap()), None);
     }
 
     #[test]

@@ -6,7 +6,7 @@ use super::hostile::{Hostile, camera_of_focal};
 use nightsplat::Result;
 use nightsplat::base::random::Stream;
 use nightsplat::gpu::Gpu;
-use nightsplat::photographs::tone::{ToneCurve, ToneSettings};
+use nightsplat::photographs::tone::ToneSettings;
 use nightsplat::splats::render::RenderSettings;
 use nightsplat::splats::scene::Gaussians;
 
@@ -310,7 +310,7 @@ pub(super) const CASES: &[Case] = &[
     })),
     case("photograph black, curve auto", "refused: all black", Refusal("almost black"), |_| {
         let mut own = Hostile::photograph(|_, _| [0.0; 3]);
-        own.config.tone = ToneSettings::new(ToneCurve::Auto);
+        own.config.tone = ToneSettings::default();
         Ok(own)
     }),
     case("photograph of one value: p10 = p90", "trains", Trains, |_| {

@@ -7,6 +7,7 @@ use nightsplat::gpu::testing::gpu;
 use nightsplat::photographs::dataset::synthetic::{self, SyntheticOptions};
 use nightsplat::photographs::image::{Image, linear_from_srgb, srgb_from_linear};
 use nightsplat::photographs::pseudo_gt::PseudoGt;
+use nightsplat::photographs::targets::SceneTone;
 use nightsplat::photographs::tone::{InverseTone, MeasuredPhotograph, ToneSettings};
 
 use crate::common::command::succeed;
@@ -187,8 +188,8 @@ fn light_on_the_sensor_comes_back_in_an_exr_through_target_and_inverse() {
     let photograph = Image::load(&raw).unwrap();
     let settings = ToneSettings::default();
     let measured = MeasuredPhotograph::of(&photograph.data);
-    let scene = settings.scene(std::slice::from_ref(&measured)).unwrap();
-    let mapping = settings.tone_mapping(&scene, &measured);
+    let scene = SceneTone::from_photographs(&settings, std::slice::from_ref(&measured)).unwrap();
+    let mapping = scene.mapping_of(&measured);
     let pseudo_gt = PseudoGt::new(&gpu(), &settings).unwrap();
     let target = pseudo_gt.tone_mapped(&photograph, &mapping).unwrap();
     assert!(target.pixel(9, 2)[0] > 2.0 * photograph.pixel(9, 2)[0], "the target is brighter");

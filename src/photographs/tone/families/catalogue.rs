@@ -6,7 +6,7 @@
 use std::f64::consts::FRAC_PI_2;
 
 use super::super::real::Real;
-use super::{Constant, Family, OffsetMode, White};
+use super::{Constant, Family, White};
 use crate::kernels::curves::*;
 
 const CODE: &str =
@@ -25,7 +25,7 @@ const FITTED: Family = Family {
     monotone: true,
     bounded: false,
     identifiable: true,
-    law: OffsetMode::Added,
+    is_rescaled: false,
     white: White::P90,
     alpha: 0.0,
     gain_c: 0.0,
@@ -47,31 +47,15 @@ macro_rules! families {
         $({ $($field:ident: $value:expr),* $(,)? })?,
         |$t:ident| $shape:expr;
     )*) => {
-        /// A tone curve, by its number in `include/curves.glsl`.
-        ///
-        /// ```
-        /// use nightsplat::{ToneCurve, ToneSettings, TrainConfig};
-        ///
-        /// let curve: ToneCurve = "ase".parse()?;
-        /// let config = TrainConfig { tone: ToneSettings::new(curve), ..TrainConfig::default() };
-        /// config.check()?;
-        /// # Ok::<(), nightsplat::Error>(())
-        /// ```
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
-        #[serde(try_from = "String", into = "String")]
+        /// The formula of a tone curve, by its number in `include/curves.glsl`.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
         #[repr(u32)]
         pub enum ToneCurve {
             $(#[doc = $formula] $variant = $number,)*
-            /// The curve of a [`crate::photographs::tone::Table`].
-            Table = CURVE_TABLE,
-            /// The curve whose gain follows from all photographs: (1 - lambda) soft(x) + lambda x soft(Y) / Y.
-            Auto = CURVE_AUTO,
-            /// The curve of a [`crate::photographs::tone::Profile`].
-            Profile = CURVE_PROFILE,
         }
 
         /// Every family, by its number; curves from files and the automatic curve are not families.
-        pub static FAMILIES: [Family; ToneCurve::Table as usize] = [$(Family {
+        pub static FAMILIES: [Family; CURVE_TABLE as usize] = [$(Family {
             curve: ToneCurve::$variant,
             name: $name,
             formula: $formula,
@@ -87,7 +71,7 @@ macro_rules! families {
 
         impl ToneCurve {
             /// Every named curve, in the table's order.
-            pub const ALL: [Self; Self::Table as usize] = [$(Self::$variant),*];
+            pub const ALL: [Self; CURVE_TABLE as usize] = [$(Self::$variant),*];
         }
 
         /// The shape of the curve `curve` (a `CURVE_*`) at t >= 0, before black level, gain and clamp.
@@ -126,7 +110,7 @@ families! {
             aliases: &["adaptive_softexp_v2"],
             source: "the paper's adaptive soft exponential",
             bounded: true,
-            law: OffsetMode::Rescaled,
+            is_rescaled: true,
             alpha: 0.12,
             gain_c: 3.0,
         },
@@ -424,7 +408,7 @@ families! {
             aliases: &["adaptive_sigmoid"],
             source: MODE,
             bounded: true,
-            law: OffsetMode::Rescaled,
+            is_rescaled: true,
             alpha: 0.12,
         },
         |t| t.tanh();
@@ -435,7 +419,7 @@ families! {
             aliases: &["v4_floor", "adaptive_softexp_v4_floor"],
             source: "adaptive tone curves for 3DGS, a mode of its code; the share a of the straight line is our \
                  choice, 0 is ASE",
-            law: OffsetMode::Rescaled,
+            is_rescaled: true,
             alpha: 0.12,
             gain_c: 3.0,
         },

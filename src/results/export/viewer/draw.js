@@ -229,7 +229,7 @@ function renderer(gl, changed) {
     gl.uniform3fv(uniform('lampAxis'), [...axis, 1].map((value) => value / length));
     gl.uniform2fv(uniform('lampFalloffs'), falloffs);
     gl.uniform4f(uniform('lampLight'), ambient, exponent, reference, slope);
-    gl.uniform2f(uniform('lampLaw'), black, reach);
+    gl.uniform2f(uniform('lampTones'), black, reach);
   }
 
   // Draws at most a share of the Gaussians, the most important ones. Returns whether all that is asked for is drawn.

@@ -15,8 +15,8 @@ uniform uint degree;  // of the harmonics
 uniform bool isLit;   // by a lamp at the camera
 uniform vec3 lampPosition, lampAxis;  // in the view
 uniform vec2 lampFalloffs;
-uniform vec4 lampLight;  // ambient, exponent, reference distance, slope of the tone law
-uniform vec2 lampLaw;  // the target of no light; the reach of the tone law
+uniform vec4 lampLight;  // ambient, exponent, reference distance, slope of the tone curve
+uniform vec2 lampTones;  // the target of no light; the reach of the tone curve
 
 in vec2 corner;
 in uint id;
@@ -52,19 +52,19 @@ float lampFactor(vec3 point) {
 }
 
 float lampTone(float x) {
-    float reach = lampLaw.y, bent = x / reach;
+    float reach = lampTones.y, bent = x / reach;
     if (reach == 0.0 || bent < 0.0) return x;
     return reach * (bent < LAMP_KNEE ? 1.0 - exp(-bent) : 1.0 - LAMP_LEFT + LAMP_LEFT * (bent - LAMP_KNEE));
 }
 
 float lampToneInverse(float above) {
-    float reach = lampLaw.y, part = above / reach;
+    float reach = lampTones.y, part = above / reach;
     if (reach == 0.0 || part < 0.0) return above;
     return reach * (part < 1.0 - LAMP_LEFT ? -log(1.0 - part) : LAMP_KNEE + (part - (1.0 - LAMP_LEFT)) / LAMP_LEFT);
 }
 
 vec3 lit(vec3 rgb, float factor) {
-    for (int c = 0; c < 3; c++) rgb[c] = lampLaw.x + lampTone(factor * lampToneInverse(rgb[c] - lampLaw.x));
+    for (int c = 0; c < 3; c++) rgb[c] = lampTones.x + lampTone(factor * lampToneInverse(rgb[c] - lampTones.x));
     return rgb;
 }
 

@@ -1,0 +1,66 @@
+//! The curve of one photograph: its numbers, and its value at x. It is generic over the number type: f64 for the
+//! kernels' parameters, dual numbers for the derivatives of a fit, f32 for the kernels' references.
+
+use super::families::{Constants, curve_shape};
+use super::real::{Real, within};
+use crate::kernels::ToneParameters;
+use crate::kernels::curves::*;
+
+/// A setting that a curve is a function of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Variable {
+    /// A constant of the formula.
+    Constant(usize),
+    Theta,
+    Alpha,
+    GainC,
+    BaseGain,
+}
+
+/// The curve of one photograph in any number type; [`ToneParameters`] are its numbers on the device.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Curve<T> {
+    /// A `CURVE_*` number.
+    pub(crate) number: u32,
+    /// The value that t = 1 corresponds to.
+    pub(crate) white: T,
+    pub(crate) offset: T,
+    pub(crate) gain: T,
+    /// The first three are the white of each channel, if channels differ.
+    pub(crate) constants: Constants<T>,
+}
+
+impl<T: Real> Curve<T> {
+    /// Its value at the sRGB-encoded value `x`, unclamped.
+    pub(crate) fn at(&self, x: T) -> T {
+        curve_at(self.number, x / self.white, [self.offset, self.gain], &self.constants)
+    }
+}
+
+/// The pseudo-GT value in [0, 1] of the sRGB-encoded value `x` under the curve `curve` (a `CURVE_*`), as the kernels of
+/// `include/tone.glsl` compute it.
+pub(crate) fn tone_curve(curve: u32, x: f32, tone: &ToneParameters) -> f32 {
+    clamped(curve_at(curve, x / tone.white, [tone.offset, tone.gain], &tone.constants))
+}
+
+/// The curve at t = x / white, unclamped.
+pub(crate) fn curve_at<T: Real>(curve: u32, t: T, [offset, gain]: [T; 2], c: &Constants<T>) -> T {
+    let one = T::of(1.0);
+    match curve {
+        CURVE_NONE | CURVE_LINEAR => t,
+        CURVE_ASE | CURVE_AUTO => offset + (one - offset) * (gain * t).one_minus_exp(),
+        CURVE_AP3 => offset + gain * curve_shape(curve, t, c),
+        CURVE_TANH => offset + (one - offset) * (gain * within(t)).tanh(),
+        CURVE_ASE_FLOOR => {
+            let (t, share, white) = (within(t), c[0], gain.one_minus_exp());
+            let scale = (one - offset) * white / ((one - share) * white + share + T::of(1e-8));
+            offset + scale * ((one - share) * (gain * t).one_minus_exp() + share * t)
+        }
+        _ => offset + gain * curve_shape(curve, within(t), c),
+    }
+}
+
+/// Clamped to [0, 1]; a NaN becomes black.
+pub(crate) fn clamped<T: Real>(y: T) -> T {
+    if y > T::of(0.0) { y.at_most(T::of(1.0)) } else { T::of(0.0) }
+}
