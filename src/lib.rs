@@ -11,8 +11,8 @@
 //! | handle errors | [`Error`]: one line that names the object and the remedy |
 //!
 //! Without default features there is the renderer, forward and backward, and nothing else. Feature `io` adds files,
-//! datasets and training; `check` the CPU references; `cli` the command. `glslang` compiles the kernels, which a checkout
-//! needs and a packaged crate does not.
+//! datasets and training; `check` the CPU references; `cli` the command. `glslang` compiles the kernels, which a
+//! checkout needs and a packaged crate does not.
 //!
 //! # Render a model
 //!
