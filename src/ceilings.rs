@@ -1,4 +1,4 @@
-//! What a device can do at most, for the bench to compare kernels with: bytes moved, multiplications and additions,
+//! The peak rates of a device, with which the bench compares kernels: bytes moved, multiplications and additions,
 //! exchanges between lanes.
 
 use std::time::{Duration, Instant};
@@ -43,7 +43,7 @@ pub(crate) struct Ceiling {
 }
 
 impl Ceiling {
-    /// With as many vectors as the device is fast.
+    /// Large enough for a measurement on this device.
     pub(crate) fn large(gpu: &Gpu) -> Result<Self> {
         let properties = gpu.properties();
         let bound = properties.max_storage_buffer_range as usize / (COMPONENTS * size_of::<f32>());

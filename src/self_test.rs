@@ -1,6 +1,6 @@
-//! Opens a device and tests what its Vulkan limits and features do not guarantee: subgroups of the size that the kernels
-//! are compiled for, their operations, memory between workgroups, and functions. A device that fails would train to
-//! wrong results without a message.
+//! Opens a device and tests what its Vulkan limits and features do not guarantee: subgroups of the size that the
+//! kernels are compiled for, their operations, memory between workgroups, and functions. A device that fails would
+//! train to wrong results without a message.
 
 use crate::gpu::{DeviceChoice, Gpu, Properties, SUBGROUP_VARIABLE, Threads};
 use crate::kernels::self_test::{

@@ -217,9 +217,9 @@ pub(crate) fn row<'a>(rows: &'a [Setting], key: &str) -> Option<&'a Setting> {
 
 /// Declares a struct of settings with its defaults, its rows and the check of its values.
 ///
-/// A field is `name: type = default => rule;`, and its documentation is its help. `default, "value in effect"` is for an
-/// optional setting; `rule, in "unit", "--option VALUE"` adds unit and option. Fields of `sections` have rows of their
-/// own, or none.
+/// A field is `name: type = default => rule;`, and its documentation is its help. `default, "value in effect"` is for
+/// an optional setting; `rule, in "unit", "--option VALUE"` adds unit and option. Fields of `sections` have rows of
+/// their own, or none.
 macro_rules! settings {
     (
         $section:literal

@@ -21,7 +21,7 @@ pub(super) fn mean(vectors: impl ExactSizeIterator<Item = DVec3>) -> DVec3 {
 
 /// What is up in the world, a unit vector: as perpendicular as can be to the horizontal axes of the cameras, which are
 /// held level. The mean of what is up in the images leans where cameras on one side of a scene are pitched. It decides
-/// where all cameras look one way: their axes then tell no pitch, only how the hand shook.
+/// if all cameras look in one direction: their axes then do not determine the pitch.
 pub(crate) fn upwards(poses: &[Camera]) -> DVec3 {
     /// The squared ratio of the angles by which cameras are rolled and pitched: 2 degrees and 30.
     const ROLL_TO_PITCH: f64 = 0.005;
@@ -46,7 +46,7 @@ pub(crate) fn upwards(poses: &[Camera]) -> DVec3 {
     upwards
 }
 
-/// The point with the least squared distances to the optical axes; `None` where they are as good as parallel.
+/// The point with the least squared distances to the optical axes; `None` if they are nearly parallel.
 pub(super) fn nearest_to_axes(poses: &[Camera]) -> Option<DVec3> {
     /// Below it, the axes are too close to parallel to determine a distance.
     const MIN_DETERMINANT: f64 = 1e-6;

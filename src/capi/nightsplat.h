@@ -210,8 +210,7 @@ typedef struct NspRender {
     const struct NspImage *color;
     // View-space depth as R32F, infinite where there is no splat; NULL: none.
     const struct NspImage *depth_out;
-    // The host's depth buffer, behind which splats are hidden: D32, D24 or D16 with or without stencil, or R32F;
-    // NULL: none.
+    // The host's depth buffer, which occludes splats: D32, D24 or D16 with or without stencil, or R32F; NULL: none.
     const struct NspImage *scene_depth;
     // The near plane of `scene_depth` in world units.
     float scene_near;
@@ -240,7 +239,7 @@ typedef struct NspStatus {
     uint32_t capacity;
     // The intersections that were left out, the farthest.
     uint32_t left_out;
-    // The splats of the fullest tile if the device cannot process so many, and the tile is not drawn; else 0.
+    // The splats of the fullest tile if the device cannot process that many, and the tile is not drawn; else 0.
     uint32_t splats_per_tile;
     // Bytes of device memory in use by all objects of the device.
     uint64_t device_bytes;

@@ -111,8 +111,7 @@ pub struct NspRender {
     pub color: *const NspImage,
     /// View-space depth as R32F, infinite where there is no splat; NULL: none.
     pub depth_out: *const NspImage,
-    /// The host's depth buffer, behind which splats are hidden: D32, D24 or D16 with or without stencil, or R32F;
-    /// NULL: none.
+    /// The host's depth buffer, which occludes splats: D32, D24 or D16 with or without stencil, or R32F; NULL: none.
     pub scene_depth: *const NspImage,
     /// The near plane of `scene_depth` in world units.
     pub scene_near: f32,
@@ -149,7 +148,7 @@ pub struct NspStatus {
     pub capacity: u32,
     /// The intersections that were left out, the farthest.
     pub left_out: u32,
-    /// The splats of the fullest tile if the device cannot process so many, and the tile is not drawn; else 0.
+    /// The splats of the fullest tile if the device cannot process that many, and the tile is not drawn; else 0.
     pub splats_per_tile: u32,
     /// Bytes of device memory in use by all objects of the device.
     pub device_bytes: u64,

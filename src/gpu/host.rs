@@ -177,8 +177,7 @@ impl Gpu {
         Ok(())
     }
 
-    /// Tells that the host's device is done with every frame up to `frame`, or that those left were never submitted;
-    /// frees what they used.
+    /// Reports that all frames up to `frame` are done or were never submitted, and frees what they used.
     pub fn frames_done(&self, frame: u64) {
         if let Some(host) = &self.shared.host {
             host.frames_done.fetch_max(frame, Ordering::AcqRel);

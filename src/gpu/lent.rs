@@ -29,7 +29,7 @@ pub struct HostDevice {
     pub queue: u64,
     /// Its family's index.
     pub queue_family: u32,
-    /// The queue is never touched: uploads are part of the next recording, and what submits is an error.
+    /// Nothing is submitted: uploads are part of the next recording, and a call that would submit is an error.
     pub is_record_only: bool,
     /// The host enabled `VK_KHR_push_descriptor`; without it descriptors are bound in sets.
     pub has_push_descriptors: bool,
@@ -91,7 +91,7 @@ pub struct HostAllocation {
     pub offset: vk::DeviceSize,
     /// The address of the first byte where host-visible memory was required; otherwise ignored.
     pub mapped: *mut c_void,
-    /// The host's own.
+    /// For the host's use.
     pub cookie: *mut c_void,
 }
 
@@ -108,7 +108,7 @@ pub struct MemoryFunctions {
         name: *const c_char,
         out: *mut HostAllocation,
     ) -> vk::Result,
-    /// Frees what `allocate` gave.
+    /// Frees memory of `allocate`.
     pub free: unsafe extern "C" fn(user: *mut c_void, allocation: *const HostAllocation),
     /// Passed to both.
     pub user: *mut c_void,

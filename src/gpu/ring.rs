@@ -18,7 +18,7 @@ pub(crate) struct Ring {
     next: usize,
 }
 
-/// The recording that a slot's words are of.
+/// The recording of a slot's words.
 #[derive(Clone, Copy, Debug)]
 struct Slot {
     recording: LastUse,

@@ -37,7 +37,7 @@ pub struct Model {
     pub law: Option<SceneLaw>,
 }
 
-/// With the near plane, the alpha limit and the colours that a file has which does not state them.
+/// Near plane, alpha limit and colours are those of a file that does not state them.
 impl From<Gaussians> for Model {
     fn from(gaussians: Gaussians) -> Self {
         let RenderSettings { near, max_alpha, raw_colors, antialiased, .. } =

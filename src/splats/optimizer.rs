@@ -77,7 +77,7 @@ impl<P> Moments<P> {
         }
     }
 
-    fn map<'a, Q>(self, mut plane: impl FnMut(P) -> Q + 'a) -> Moments<Q> {
+    fn map<Q>(self, mut plane: impl FnMut(P) -> Q) -> Moments<Q> {
         match self {
             Self::Single { first, second } => {
                 Moments::Single { first: plane(first), second: plane(second) }

@@ -12,16 +12,16 @@ use crate::kernels::status::STATUS_WORDS;
 use crate::kernels::{depth_limits, pack_pixels, photograph_light};
 use crate::splats::scene::{GaussianSlice, Layout};
 
-/// How the newest draw that is done went.
+/// The outcome of the newest draw that is done.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Drawn {
     /// The number of its frame; 0 for a submission of our own.
     pub frame: u64,
-    /// The intersections of its view with the most.
+    /// Intersections of splats and tiles, in the view that has the most.
     pub intersections: u32,
     /// The intersections that memory and budget allowed.
     pub capacity: u32,
-    /// Splats of the tile with the most, where the device cannot follow them all and the tile is empty; else 0.
+    /// The splats of the fullest tile if the device cannot process that many, and the tile is not drawn; else 0.
     pub splats_per_tile: u32,
 }
 
@@ -104,7 +104,7 @@ impl Renderer {
         Ok(())
     }
 
-    /// How the newest draw that is done went; `None` before there is one. Waits for nothing.
+    /// The outcome of the newest draw that is done; `None` before there is one. Waits for nothing.
     pub fn drawn(&self) -> Option<Drawn> {
         let newest = self.host_targets.as_ref()?.ring.newest()?;
         let status = super::Status::from_words(&newest.words);

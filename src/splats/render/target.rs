@@ -23,22 +23,22 @@ use crate::{Error, Result};
 pub struct Target<'a> {
     /// RGBA16F, or RGBA8 or BGRA8 as `Unorm` or `Srgb`.
     pub color: Option<&'a HostImage>,
-    /// R32F: depth in the view, world units; infinite where nothing is seen.
+    /// View-space depth in world units as R32F; infinite where there is no splat.
     pub depth: Option<&'a HostImage>,
     /// The kind of depth in `depth`.
     pub depth_kind: DepthKind,
-    /// The host's depth, beyond which nothing is drawn.
+    /// The host's depth buffer, which occludes splats.
     pub scene: Option<SceneDepth<'a>>,
-    /// Over what the colour image holds, instead of replacing it.
+    /// Blends over the contents of the colour image instead of replacing them.
     pub is_over: bool,
-    /// A float image gets display-referred values, as they were trained.
+    /// Writes display-referred values, as they were trained, to a float image; otherwise linear light.
     pub is_display_referred: bool,
     /// Colours are those of the dark photographs, by [`RenderSettings::law`](crate::RenderSettings::law): their linear
     /// light where the image is linear, else their values. The background is the host's, and stays.
     pub is_photograph: bool,
     /// The factor on linear light.
     pub exposure: f32,
-    /// The most intersections; 0: as memory allows. The farthest are left out first.
+    /// The most intersections of splats and tiles, of which the farthest are left out first; 0: as memory allows.
     pub budget: u32,
 }
 

@@ -111,7 +111,7 @@ impl Gaussians {
         })
     }
 
-    /// Appends Gaussians of the same features to those that there are, if any; the higher SH degree is that of both.
+    /// Appends Gaussians of the same features to those that there are, if any; all get the higher of the SH degrees.
     pub(crate) fn add(to: &mut Option<Self>, more: Self) {
         match to {
             _ if more.count == 0 => {}
