@@ -35,7 +35,7 @@
 # compare with those of the program: blend_forward.comp and blend_backward.comp, with the interfaces of those, subst.py,
 # which fits them to the modules of a run, and ../wrap.c, a driver around the real one that replaces modules by hash;
 # PROTOTYPE_FLAGS, for glslangValidator. run: ONLY, the experiments by the names of their functions (all); DRIVER, the
-# library of the real driver; GSPLAT.
+# library of the real driver, if it is not NVIDIA's; GSPLAT.
 set -euo pipefail
 
 # A machine may take 64 MiB with the checkout.
@@ -132,7 +132,8 @@ step() {
     local name=$1 file=$2 limit=$(($3 * patience)) begin=$SECONDS code=0 left=$((until - SECONDS))
     shift 3
     if [ "$left" -lt 3 ]; then
-        say "$name" 'no time left' 0
+        [ -n "$is_late" ] || say "$name and later" 'no time left' 0
+        is_late=yes
         return 1
     fi
     printf '\n== %s: %s\n' "$name" "$*" >> "$out/log.txt"
@@ -149,7 +150,7 @@ step() {
 experiment() {
     [[ " ${ONLY:-$2} " == *" $2 "* ]] || return 0
     until=$((SECONDS + $1 * patience))
-    until=$((until < end ? until : end))
+    until=$((until < end ? until : end)) is_late=
     "$2" || true
     tar -czf "$out/.results" -C "$found" . && mv "$out/.results" "$out/results.tar.gz"
 }
@@ -310,9 +311,9 @@ baseline() {
 
 # The library of the driver in use.
 driver() {
-    local manifest path
-    for manifest in $(tr : ' ' <<< "${VK_DRIVER_FILES:-${VK_ICD_FILENAMES:-}}") \
-        {/etc,/usr/share}/vulkan/icd.d/*"${software:+lvp}"*.json; do
+    local kind=nvidia manifest path
+    [ -z "$software" ] || kind=lvp
+    for manifest in ${VK_DRIVER_FILES:-${VK_ICD_FILENAMES:-}} {/etc,/usr/share}/vulkan/icd.d/*"$kind"*.json; do
         [ -e "$manifest" ] || continue
         path=$(sed -n 's/.*"library_path": *"\([^"]*\)".*/\1/p' "$manifest")
         [[ $path != */* || $path == /* ]] || path=$(dirname "$manifest")/$path
@@ -351,18 +352,19 @@ prototypes() {
             for set in none forward backward both butterfly; do
                 name=ab-$size-$set-$round seen=$(wc -l < "$out/log.txt")
                 WRAP_SUBST=$sets/$set step "$name" "$name.json" 15 "$nightsplat" bench --unchecked --json \
-                    --warm "$warm" --repeats "$REPEATS" --steady $((STEPS / 2)) ${sizes[$size]} || continue
+                    --warm $((warm / 2)) --repeats "$REPEATS" --steady $((STEPS / 2)) ${sizes[$size]} || continue
                 note "$(tail -n "+$seen" "$out/log.txt" | grep -c replaced || true) replaced; step, ms:" \
                     "$(members "$name.json" steady | sed -n 's/device_ms//p');" \
                     "$(members "$name.json" kernels | grep ^blend_ | tr '\n' ' ')"
             done
         done
-    done
-    # What they compute.
-    for set in both butterfly; do
-        WRAP_SUBST=$sets/$set step "checked-$set" "ab-checked-$set.json" 30 \
-            "$nightsplat" bench --json --repeats 1 $LARGE
-        note "error / bound: $(members "ab-checked-$set.json" errors | grep ^blend_ | tr '\n' ' ')"
+        [ "$round" = 1 ] || continue
+        # What they compute.
+        for set in both butterfly; do
+            WRAP_SUBST=$sets/$set step "ab-checked-$set" "ab-checked-$set.json" 30 \
+                "$nightsplat" bench --json --repeats 1 $LARGE || true
+            note "error / bound: $(members "ab-checked-$set.json" errors | grep ^blend_ | tr '\n' ' ')"
+        done
     done
 }
 
@@ -444,14 +446,15 @@ run() {
         software=yes patience=10 warm=0
         shift
         local little='--gaussians 300 --width 64 --height 48'
-        MANY=$little SMALL=$little LARGE=$little MOST=$little TUNE=$little CHECKED=$little STEPS=2 EQUAL=5 ROUNDS=1 CEILINGS= REPEATS=1
+        MANY=$little SMALL=$little LARGE=$little MOST=$little TUNE=$little CHECKED=$little
+        STEPS=2 EQUAL=5 ROUNDS=1 REPEATS=1 CEILINGS=
         PHASES='--downscale 8 --steps 10' LITA='--downscale 8 --steps 3' LOM='--steps 5 --downscale 8'
     fi
     : "${MANY=--gaussians 1000000 --width 1920 --height 1080}" "${SMALL=--gaussians 50000 --width 500 --height 375}"
     : "${LARGE=--gaussians 20000 --width 1280 --height 1024}" "${MOST=--gaussians 4000000 --width 1920 --height 1080}"
     : "${TUNE=--gaussians 100000}" "${STEPS=512}" "${EQUAL=300}" "${ROUNDS=3}" "${LITA=--steps 60}"
     : "${CEILINGS=--ceilings}" "${REPEATS=9}"
-    end=$((SECONDS + ${2:-570} * patience)) until=$((SECONDS + 60 * patience))
+    end=$((SECONDS + ${2:-570} * patience)) until=$((SECONDS + 60 * patience)) is_late=
     mkdir -p "$1"
     out=$(realpath "$1") work=$(mktemp -d) placed=() clocks=
     trap '[ -z "$clocks" ] || kill "$clocks"; rm -rf "$work" ${placed[@]+"${placed[@]}"}' EXIT
