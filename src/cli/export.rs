@@ -22,7 +22,7 @@ pub struct ExportArgs {
     /// Run directory, or a model: PLY, SPZ or SOG
     pub run: PathBuf,
     /// Format
-    #[arg(long, alias = "to", value_name = "FORMAT", value_parser = words::formats())]
+    #[arg(long, value_name = "FORMAT", value_parser = words::formats())]
     pub format: Format,
     /// File to write or replace [default: model.FORMAT in the run]
     #[arg(long, value_name = "FILE")]

@@ -11,7 +11,7 @@ use crate::gpu::{Buffer, Gpu, Recorder};
 #[derive(Debug)]
 pub(super) enum Inner {
     Single(Conv),
-    Half { conv: HalfConv, layers: Vec<PackedWeights> },
+    Half { conv: Box<HalfConv>, layers: Vec<PackedWeights> },
 }
 
 /// A layer and its number.
@@ -39,7 +39,7 @@ impl Inner {
         let Some(matrix) = precision.matrix(gpu) else {
             return Ok(Self::Single(Conv::new(gpu, [channels; 2], Activation::None, adds)?));
         };
-        let conv = HalfConv::new(gpu, channels, matrix, adds)?;
+        let conv = Box::new(HalfConv::new(gpu, channels, matrix, adds)?);
         let layers = (0..layers).map(|_| conv.packed_weights(gpu)).collect::<Result<_>>()?;
         Ok(Self::Half { conv, layers })
     }

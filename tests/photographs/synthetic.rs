@@ -277,7 +277,7 @@ fn a_fisheye_set_trains_renders_scores_and_exports() {
     run(&format!("render {native} --path interpolate --frames 2 --out {}", frames.display()), 0);
     for (to, name) in [("ply", "model.ply"), ("html", "page.html")] {
         let out = dir.path().join(name);
-        run(&format!("export {native} --to {to} --out {}", out.display()), 0);
+        run(&format!("export {native} --format {to} --out {}", out.display()), 0);
         assert!(out.exists());
     }
 }

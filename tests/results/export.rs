@@ -26,7 +26,7 @@ fn every_format_is_one_file_of_the_run_with_its_expected_beginning() {
         ("sog", b"PK\x03\x04"),
         ("html", b"<!DOCTYPE html>"),
     ] {
-        let message = succeed(&format!("export {run} --to {format}"));
+        let message = succeed(&format!("export {run} --format {format}"));
         let path = Path::new(&run).join(format!("model.{format}"));
         assert!(message.contains("Gaussians in"), "{message}");
         assert!(std::fs::read(&path).unwrap().starts_with(magic), "{format}");
@@ -40,14 +40,14 @@ fn every_format_is_one_file_of_the_run_with_its_expected_beginning() {
 
     // Without reference images the targets are what the model is compared with.
     std::fs::remove_dir_all(folder.path().join("set/high")).unwrap();
-    succeed(&format!("export {run} --to html"));
+    succeed(&format!("export {run} --format html"));
     let html = std::fs::read_to_string(Path::new(&run).join("model.html")).unwrap();
     let labels = ["photograph", "target", "reference"]
         .map(|label| html.matches(&format!("\"label\":\"{label}\"")).count());
     assert!(labels[0] > 0 && labels == [labels[0], labels[0], 0], "{labels:?}");
 
     let copy = folder.path().join("copy.ply");
-    succeed(&format!("export {run} --to ply --out {}", copy.display()));
+    succeed(&format!("export {run} --format ply --out {}", copy.display()));
     let header = String::from_utf8_lossy(&std::fs::read(&copy).unwrap()[..300]).into_owned();
     assert!(header.contains("comment curve: ase"), "{header}");
     // Padded to degree 3, for viewers that expect that layout.
@@ -57,7 +57,7 @@ fn every_format_is_one_file_of_the_run_with_its_expected_beginning() {
     assert!(header.contains("property float f_rest_44"), "{header}");
 
     let v3 = folder.path().join("v3.spz");
-    succeed(&format!("export {run} --to spz --spz 3 --out {}", v3.display()));
+    succeed(&format!("export {run} --format spz --spz 3 --out {}", v3.display()));
     assert!(std::fs::read(v3).unwrap().starts_with(&[0x1f, 0x8b]));
 }
 
@@ -80,7 +80,7 @@ fn positions_of_glb(path: &Path) -> Vec<[f32; 3]> {
 fn what_is_up_in_a_listing_of_z_up_is_plus_y_of_a_glb() {
     let folder = tempfile::tempdir().unwrap();
     let run = trained(folder.path());
-    let message = succeed(&format!("export {run} --to glb"));
+    let message = succeed(&format!("export {run} --format glb"));
     assert!(message.contains("(0.000, 0.000, 1.000) of the dataset is +Y, up"), "{message}");
     let model = ply::load(Path::new(&run).join("model.ply")).unwrap();
     let positions = positions_of_glb(&Path::new(&run).join("model.glb"));
@@ -90,7 +90,7 @@ fn what_is_up_in_a_listing_of_z_up_is_plus_y_of_a_glb() {
         let away = mean.x.hypot(mean.y);
         assert!((x.hypot(z) - away).abs() < 1e-4, "{x}, {z} for {mean}");
     }
-    let message = succeed(&format!("export {run} --to spz"));
+    let message = succeed(&format!("export {run} --format spz"));
     assert!(message.contains("is +Y, up"), "{message}");
 }
 
@@ -98,7 +98,7 @@ fn what_is_up_in_a_listing_of_z_up_is_plus_y_of_a_glb() {
 fn a_failed_export_is_one_line_and_leaves_no_file() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path().display();
-    refused(&format!("export {root} --to glb"), 3, &["config.toml"]);
+    refused(&format!("export {root} --format glb"), 3, &["config.toml"]);
     let run = trained(folder.path());
     refused(&format!("export {run} --format ply"), 1, &["is the model itself", "--out"]);
     refused(
@@ -107,7 +107,7 @@ fn a_failed_export_is_one_line_and_leaves_no_file() {
         &["x.spz is a file of --format spz, not of --format html"],
     );
     refused(
-        &format!("export {run} --to glb --out {root}/none/a.glb"),
+        &format!("export {run} --format glb --out {root}/none/a.glb"),
         1,
         &["a.glb", "cannot be written"],
     );
@@ -115,9 +115,13 @@ fn a_failed_export_is_one_line_and_leaves_no_file() {
     if Path::new("/dev/full").exists() {
         let full = folder.path().join("full.glb.partial");
         std::os::unix::fs::symlink("/dev/full", &full).unwrap();
-        refused(&format!("export {run} --to glb --out {root}/full.glb"), 1, &["full.glb", "disk"]);
+        refused(
+            &format!("export {run} --format glb --out {root}/full.glb"),
+            1,
+            &["full.glb", "disk"],
+        );
         assert!(!folder.path().join("full.glb").exists());
     }
     std::fs::remove_file(Path::new(&run).join("model.ply")).unwrap();
-    refused(&format!("export {run} --to spz"), 3, &["no model.ply"]);
+    refused(&format!("export {run} --format spz"), 3, &["no model.ply"]);
 }

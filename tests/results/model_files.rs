@@ -99,7 +99,7 @@ fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
     assert!(fs::read_dir(pictures).unwrap().count() > 0);
 
     for to in ["spz", "glb", "sog"] {
-        succeed(&format!("export {model} --to {to} --up none"));
+        succeed(&format!("export {model} --format {to} --up none"));
         assert!(place.path(&format!("copy.{to}")).is_file(), "{to}");
     }
     for (file, loss) in [("copy.spz", 0.5), ("copy.sog", 0.5)] {
@@ -107,8 +107,8 @@ fn a_model_file_is_scored_rendered_and_exported_without_its_run() {
         let shown = succeed(&format!("eval {} --dataset {set} --json", packed.display()));
         assert!((psnr(&shown) - psnr(&own)).abs() < loss, "{file}: {shown} {own}");
     }
-    succeed(&format!("export {model} --to html --dataset {set}"));
-    refused(&format!("export {model} --to html"), 3, &["copy.ply", "--dataset"]);
+    succeed(&format!("export {model} --format html --dataset {set}"));
+    refused(&format!("export {model} --format html"), 3, &["copy.ply", "--dataset"]);
 }
 
 /// Removes the facts that the file states.
@@ -154,7 +154,10 @@ fn a_model_is_loaded_with_the_facts_of_its_run_or_file_and_otherwise_with_the_de
         match name.strip_prefix("a.") {
             Some(format) => {
                 let out = path.display();
-                succeed(&format!("export {} --to {format} --out {out} --up none", own.display()));
+                succeed(&format!(
+                    "export {} --format {format} --out {out} --up none",
+                    own.display()
+                ));
             }
             None => model.save(&path).unwrap(),
         }
@@ -238,13 +241,14 @@ fn an_export_keeps_the_origin_and_the_page_the_near_plane() {
     gaussians.origin = DVec3::new(4_499_999.6, 519_997.7, 10_001.8);
     ply::save(&gaussians, &path).unwrap();
     let (run, out) = (place.path("run"), place.path("out.ply"));
-    let message = succeed(&format!("export {} --to ply --out {}", run.display(), out.display()));
+    let message =
+        succeed(&format!("export {} --format ply --out {}", run.display(), out.display()));
     assert!(message.contains("world = position + 4499999.6 519997.7 10001.8"), "{message}");
     assert_eq!(ply::load(&out).unwrap(), gaussians.with_sh_degree(3));
     let line = "comment world = position + 4499999.6 519997.7 10001.8";
     assert!(String::from_utf8_lossy(&fs::read(&out).unwrap()).contains(line));
 
-    succeed(&format!("export {} --to html", run.display()));
+    succeed(&format!("export {} --format html", run.display()));
     let html = fs::read_to_string(Path::new(&run).join("model.html")).unwrap();
     let (_, after) = html.split_once("\"near\":").unwrap();
     let near: f64 = after.split([',', '}']).next().unwrap().parse().unwrap();

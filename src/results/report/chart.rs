@@ -254,7 +254,7 @@ impl Frame {
             match mark {
                 Mark::Line => {}
                 Mark::Dots => {
-                    drawn.extend(points.iter().map(|&at| circle(at, 3.5, &color, &color)))
+                    drawn.extend(points.iter().map(|&at| circle(at, 3.5, &color, &color)));
                 }
                 Mark::Star => {
                     for &at in &points {
