@@ -452,8 +452,8 @@ run() {
     fi
     : "${MANY=--gaussians 1000000 --width 1920 --height 1080}" "${SMALL=--gaussians 50000 --width 500 --height 375}"
     : "${LARGE=--gaussians 20000 --width 1280 --height 1024}" "${MOST=--gaussians 4000000 --width 1920 --height 1080}"
-    : "${TUNE=--gaussians 100000}" "${TRAINED=--width 500 --height 375}" "${STEPS=512}" "${EQUAL=300}" "${ROUNDS=3}" "${LITA=--steps 60}"
-    : "${CEILINGS=--ceilings}" "${REPEATS=9}"
+    : "${TUNE=--gaussians 100000}" "${TRAINED=--width 500 --height 375}" "${LITA=--steps 60}"
+    : "${STEPS=512}" "${EQUAL=300}" "${ROUNDS=3}" "${REPEATS=9}" "${CEILINGS=--ceilings}"
     end=$((SECONDS + ${2:-570} * patience)) until=$((SECONDS + 60 * patience)) is_late=
     mkdir -p "$1"
     out=$(realpath "$1") work=$(mktemp -d) placed=() clocks=
