@@ -372,7 +372,7 @@ four_million() { timed bench-4-million 45 $MOST; }
 
 # The tiles of a trained model, which has twice the pixels a splat; then its step with the fastest.
 trained_tiles() {
-    NIGHTSPLAT_TUNE=$work/trained.json tune tune-trained 60 "$work/runs/trained"
+    NIGHTSPLAT_TUNE=$work/trained.json tune tune-trained 60 "$work/runs/trained" $TRAINED
     NIGHTSPLAT_TUNE=$work/trained.json timed bench-trained-tuned 15 "$work/runs/trained"
 }
 
@@ -447,13 +447,13 @@ run() {
         shift
         local little='--gaussians 300 --width 64 --height 48'
         MANY=$little SMALL=$little LARGE=$little MOST=$little TUNE=$little CHECKED=$little
-        STEPS=2 EQUAL=5 ROUNDS=1 REPEATS=1 CEILINGS=
+        TRAINED='--width 64 --height 48' STEPS=2 EQUAL=5 ROUNDS=1 REPEATS=1 CEILINGS=
         PHASES='--downscale 8 --steps 10' LITA='--downscale 8 --steps 3' LOM='--steps 5 --downscale 8'
     fi
     : "${MANY=--gaussians 1000000 --width 1920 --height 1080}" "${SMALL=--gaussians 50000 --width 500 --height 375}"
     : "${LARGE=--gaussians 20000 --width 1280 --height 1024}" "${MOST=--gaussians 4000000 --width 1920 --height 1080}"
-    : "${TUNE=--gaussians 100000}" "${STEPS=512}" "${EQUAL=300}" "${ROUNDS=3}" "${LITA=--steps 60}"
-    : "${CEILINGS=--ceilings}" "${REPEATS=9}"
+    : "${TUNE=--gaussians 100000}" "${TRAINED=--width 500 --height 375}" "${LITA=--steps 60}"
+    : "${STEPS=512}" "${EQUAL=300}" "${ROUNDS=3}" "${REPEATS=9}" "${CEILINGS=--ceilings}"
     end=$((SECONDS + ${2:-570} * patience)) until=$((SECONDS + 60 * patience)) is_late=
     mkdir -p "$1"
     out=$(realpath "$1") work=$(mktemp -d) placed=() clocks=

@@ -78,6 +78,7 @@ impl Trainer {
         dataset: &Dataset,
         initial: &Initial,
     ) -> Result<Self> {
+        let _phase = tracing::info_span!("upload").entered();
         loop {
             let mut trainer = Self::begin(gpu, config.clone(), dataset, initial)?;
             config.patch_pixels = match trainer.fewer_patch_pixels()? {
@@ -98,7 +99,6 @@ impl Trainer {
         dataset: &Dataset,
         initial: &Initial,
     ) -> Result<Self> {
-        let _phase = tracing::info_span!("upload").entered();
         config.check()?;
         config.disable_missing_parts(dataset);
         config.frame.get_or_insert_with(|| dataset.frame());
