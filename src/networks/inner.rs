@@ -9,9 +9,10 @@ use crate::gpu::{Buffer, Gpu, Recorder};
 
 /// Its kernels, with the packed weights of every layer.
 #[derive(Debug)]
+#[expect(clippy::large_enum_variant, reason = "there is one for each stage")]
 pub(super) enum Inner {
     Single(Conv),
-    Half { conv: Box<HalfConv>, layers: Vec<PackedWeights> },
+    Half { conv: HalfConv, layers: Vec<PackedWeights> },
 }
 
 /// A layer and its number.
@@ -39,7 +40,7 @@ impl Inner {
         let Some(matrix) = precision.matrix(gpu) else {
             return Ok(Self::Single(Conv::new(gpu, [channels; 2], Activation::None, adds)?));
         };
-        let conv = Box::new(HalfConv::new(gpu, channels, matrix, adds)?);
+        let conv = HalfConv::new(gpu, channels, matrix, adds)?;
         let layers = (0..layers).map(|_| conv.packed_weights(gpu)).collect::<Result<_>>()?;
         Ok(Self::Half { conv, layers })
     }
