@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Runs `cargo test` with the given arguments, then prints the seconds of each test program and of the ten slowest tests.
 #
-# Not cargo-nextest, which prints the same: it starts a process for each test, which opens a Vulkan device and compiles
-# its kernels anew; the tests of a program share one.
+# Not cargo-nextest, which prints the same: newcomers would have to install it, and a process for each test, with a
+# Vulkan device and kernels of its own, takes longer than one for all tests of a program.
 set -euo pipefail
 
 # As cargo's runner of the programs that it has built.

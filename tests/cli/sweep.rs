@@ -375,20 +375,6 @@ fn without_references_test_views_are_scored_against_their_own_targets() {
 }
 
 #[test]
-fn help_names_the_lists_and_fits_its_lines() {
-    let (help, _) = run("sweep --help-all", 0);
-    assert!(help.lines().all(|line| line.chars().count() < 100), "{help}");
-    for option in
-        "--curves --alpha --beta --gain --theta --offset --grid --seeds --presets --json --table \
-     --jobs --dry-run --steps --set"
-            .split_whitespace()
-    {
-        assert!(help.contains(option), "{option}");
-    }
-    assert!(run("--help", 0).0.contains("sweep"));
-}
-
-#[test]
 fn train_sets_any_setting_by_its_path() {
     let folder = tempfile::tempdir().unwrap();
     let (set, out) = (set().display(), folder.path().join("run"));

@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use clap::Parser as _;
-use nightsplat::Error;
 use nightsplat::cli::tone::apply::{ApplyArgs, ToneReport, apply};
 use nightsplat::photographs::image::{Image, srgb_from_linear};
 use nightsplat::photographs::metrics::psnr;
@@ -127,31 +126,6 @@ fn bad_input_is_named_in_one_line() {
     fails(args(&path("good.png"), &path("broken.png"), ""), "cannot be created", 1);
     fails(args(&path("good.png"), &out, "--gain=-1"), "tone.gain_c", 2);
     fails(args(&path("good.png"), &out, "--theta=nan"), "tone.theta", 2);
-}
-
-#[test]
-fn a_photograph_that_exceeds_a_binding_is_mapped_in_tiles() {
-    let device = nightsplat::gpu::Gpu::new(&Default::default()).unwrap();
-    // lavapipe binds 128 MiB; these are 139 MB of floats.
-    if device.properties().max_storage_buffer_range > 139_000_000 {
-        let name = &device.properties().name;
-        return crate::common::not_run("lavapipe", format_args!("{name} binds more"));
-    }
-    let dir = tempfile::tempdir().unwrap();
-    let photograph = dir.path().join("vast.png");
-    let mut image = Image::filled(4000, 2900, [0.1; 3]);
-    image.data[..4_000_000].fill(0.02);
-    image.save_png8(&photograph).unwrap();
-    let image = Image::load(&photograph).unwrap();
-    let args = args(&photograph, &dir.path().join("out"), "--format png16");
-    let view = apply(&args).unwrap().views["vast"];
-    let statistics = Statistics::of(&image.data);
-    assert_eq!([view.before.p10, view.before.p90], statistics.percentiles());
-    let parameters = ToneSettings::new(ToneCurve::Ap3).parameters(&statistics);
-    let mapped = Image::load(dir.path().join("out/vast.png")).unwrap();
-    for (&x, y) in image.data.iter().zip(&mapped.data).step_by(997) {
-        assert!((ToneCurve::Ap3.apply(x, &parameters) - y).abs() < 1e-4, "{x}: {y}");
-    }
 }
 
 /// A dark and a normal-light folder of three photographs.
@@ -300,16 +274,6 @@ fn degenerate_photographs_have_defined_results_under_every_kind_of_curve() {
         assert!(output.views["black"].after.mean < 0.01, "{text}");
         assert!(output.views["white"].after.mean > 0.4, "{text}");
     }
-}
-
-#[test]
-fn an_unknown_curve_is_misuse_and_lists_the_curves() {
-    let parse = |curve: &str| ToneApply::try_parse_from(["tone", "in", "--curve", curve]);
-    assert!(parse("ase").is_ok());
-    let error = parse("gama").unwrap_err();
-    assert_eq!(error.exit_code(), 2);
-    assert!(error.to_string().contains("linear, ase, ap3"), "{error}");
-    assert!(matches!("gama".parse::<ToneCurve>(), Err(Error::Usage(_))));
 }
 
 #[test]

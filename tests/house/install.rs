@@ -12,6 +12,10 @@ fn every_shell_completes_every_subcommand() {
         for word in ["train", "export", "doctor", "device", "max-gaussians"] {
             assert!(script.contains(word), "{shell} does not complete {word}");
         }
+        // Values of options, where the shell has them.
+        if shell == "bash" {
+            assert!(["balanced", "ap3", "tonemapper", "lita"].iter().all(|it| script.contains(it)));
+        }
     }
     refused("completions tcsh", 2, &["tcsh", "zsh"]);
 }

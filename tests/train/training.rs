@@ -251,20 +251,6 @@ fn recorded_for_a_step(gpu: &Gpu, config: TrainConfig, dataset: &Dataset) -> [u6
     [0, 1].map(|i| (eight[i] - two[i]).div_ceil(6))
 }
 
-#[test]
-fn twenty_five_trainings_give_the_same_bits() {
-    let dataset = dataset();
-    let run = || {
-        let mut trainer = Trainer::new(&gpu(), config(), &dataset).unwrap();
-        let losses: Vec<f64> = advance(&mut trainer, 6).iter().map(|report| report.loss).collect();
-        (losses, trainer.gaussians().unwrap())
-    };
-    let first = run();
-    for repeat in 1..25 {
-        assert_eq!(run(), first, "repeat {repeat}");
-    }
-}
-
 /// Trains a few steps on views of one size, starting from `points` points.
 fn train_on(size: [u32; 2], points: usize) -> (Vec<StepReport>, Gaussians) {
     let mut dataset = crate::common::train::dataset(3, [64, 48]);

@@ -105,8 +105,7 @@ fn a_byte_order_mark_changes_nothing() {
     let big = |text: &str| {
         format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_be_bytes).collect::<Vec<u8>>()
     };
-    let encodings: [&dyn Fn(&str) -> Vec<u8>; 3] = [&utf8, &little, &big];
-    for encode in encodings {
+    for encode in [&utf8 as &dyn Fn(&str) -> Vec<u8>, &little, &big] {
         for (file, text) in files.iter().zip(&texts) {
             fs::write(root.join(file), encode(text)).unwrap();
         }
