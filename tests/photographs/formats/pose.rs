@@ -310,7 +310,7 @@ fn the_sharpest_frame_of_each_window_of_a_clip_is_used() {
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
     let colmap = stub(root, &seen(root));
     let (clip, out) = (root.join("clip.mkv"), root.join("scene"));
-    let arguments = line(clip, &out, &colmap, "--fps 2");
+    let arguments = line(&clip, &out, &colmap, "--fps 2");
     let (_, stderr) = run(&arguments, 3);
     assert!(stderr.contains("4 photographs brightened"), "{stderr}");
     let mut seen: Vec<String> = fs::read_dir(root.join("seen"))
@@ -394,7 +394,7 @@ fn without_the_hdr_filters_of_ffmpeg_the_error_has_the_command() {
     fs::write(root.join("clip.mov"), "a clip").unwrap();
     let [clip, out, ffmpeg] = ["clip.mov", "scene", "ffmpeg"].map(|name| root.join(name));
     let more = format!("--ffmpeg {}", ffmpeg.display());
-    let arguments = line(clip, &out, "true".as_ref(), &more);
+    let arguments = line(&clip, &out, "true".as_ref(), &more);
     let parts = ["clip.mov: is HDR (HLG)", "zscale=t=linear", "sdr.mp4"];
     refused(&arguments, 3, &parts);
     script(&root.join("ffprobe"), "exit 1");
