@@ -11,6 +11,7 @@ mod compilers;
 mod defects;
 mod documents;
 mod install;
+mod names;
 mod settings;
 mod skips;
 mod words;
