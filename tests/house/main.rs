@@ -12,6 +12,7 @@ mod compilers;
 mod defects;
 mod documents;
 mod install;
+mod names;
 mod settings;
 mod skips;
 mod words;
